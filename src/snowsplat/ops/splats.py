@@ -1,0 +1,161 @@
+"""`Splats2D`: the seam between projecting and blending.
+
+One packed tensor holds everything that blending needs, one row per splat, so that the gradient of
+blending is one tensor too and a row is one or two cache lines. `project` makes it from 3D Gaussians;
+2D image fitting makes it directly with `Splats2D.pack`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+# Columns of a packed row. Colours follow at COLORS; the row is padded with zeros to a multiple of ROW.
+MEANS2D = slice(0, 2)
+CONICS = slice(2, 5)
+OPACITIES = 5
+DEPTHS = 6
+RADII = 7
+COLORS = 8
+ROW = 16
+
+
+def packed_width(channels: int) -> int:
+    """Columns of a packed row that carries `channels` colour or feature channels."""
+    return -(-(COLORS + channels) // ROW) * ROW
+
+
+@dataclass
+class Splats2D:
+    """2D Gaussians on the image plane, in pixels. The pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+
+    packed:   (M, 16·ceil((8 + C) / 16)), one row per splat:
+              0:2 `means2d`   x, y
+              2:5 `conics`    a, b, c of the inverse covariance [[a, b], [b, c]]
+              5   `opacities` in [0, 1]
+              6   `depths`    camera z: the blending order, nearest first, equal depths by row
+              7   `radii`     3 σ of the major axis (information only, never has a gradient)
+              8:8+C `colors`; the rest is padding (zero)
+    ids:      (M,) int32, ascending: the Gaussian that each row came from.
+              None: the rows are the Gaussians themselves (2D fitting).
+    channels: C, at least 1.
+
+    The properties are views of `packed`; autograd flows through them.
+    """
+
+    packed: Tensor
+    ids: Tensor | None
+    channels: int
+
+    def __post_init__(self) -> None:
+        if self.channels < 1:
+            raise ValueError(f"Splats2D: channels must be at least 1, got {self.channels}")
+        width = packed_width(self.channels)
+        if self.packed.dim() != 2 or self.packed.shape[1] != width:
+            raise ValueError(
+                f"Splats2D: packed must be (M, {width}) for {self.channels} channels, "
+                f"got {tuple(self.packed.shape)}"
+            )
+        if self.ids is not None:
+            if self.ids.shape != self.packed.shape[:1]:
+                raise ValueError(
+                    f"Splats2D: ids must be ({len(self.packed)},), got {tuple(self.ids.shape)}"
+                )
+            if self.ids.dtype != torch.int32:
+                raise ValueError(f"Splats2D: ids must be int32, got {self.ids.dtype}")
+
+    def __len__(self) -> int:
+        return self.packed.shape[0]
+
+    @property
+    def means2d(self) -> Tensor:
+        """(M, 2) centres in pixels."""
+        return self.packed[:, MEANS2D]
+
+    @property
+    def conics(self) -> Tensor:
+        """(M, 3) a, b, c of the inverse covariance [[a, b], [b, c]], in 1/pixels²."""
+        return self.packed[:, CONICS]
+
+    @property
+    def opacities(self) -> Tensor:
+        """(M,) in [0, 1]."""
+        return self.packed[:, OPACITIES]
+
+    @property
+    def depths(self) -> Tensor:
+        """(M,) camera z in world units."""
+        return self.packed[:, DEPTHS]
+
+    @property
+    def radii(self) -> Tensor:
+        """(M,) 3 σ of the major axis in pixels; no gradient."""
+        return self.packed[:, RADII].detach()
+
+    @property
+    def colors(self) -> Tensor:
+        """(M, C) colours or features."""
+        return self.packed[:, COLORS : COLORS + self.channels]
+
+    @classmethod
+    def pack(
+        cls,
+        means2d: Tensor,
+        conics: Tensor,
+        opacities: Tensor,
+        depths: Tensor,
+        colors: Tensor,
+        radii: Tensor | None = None,
+        ids: Tensor | None = None,
+    ) -> Splats2D:
+        """Packs separate tensors, differentiably (gradients reach every argument but `radii`, `ids`).
+
+        means2d (M, 2), conics (M, 3), opacities (M,), depths (M,), colors (M, C), all of one floating
+        dtype and device. `radii` (M,) defaults to 3 σ of the major axis of each conic.
+        """
+        if means2d.dim() != 2 or colors.dim() != 2:
+            raise ValueError(
+                "Splats2D.pack: means2d must be (M, 2) and colors (M, C), "
+                f"got {tuple(means2d.shape)} and {tuple(colors.shape)}"
+            )
+        count, channels = colors.shape
+        if radii is None:
+            radii = radii_of_conics(conics)
+        expected = {
+            "means2d": (means2d, (count, 2)),
+            "conics": (conics, (count, 3)),
+            "opacities": (opacities, (count,)),
+            "depths": (depths, (count,)),
+            "radii": (radii, (count,)),
+        }
+        for name, (tensor, shape) in expected.items():
+            if tuple(tensor.shape) != shape:
+                raise ValueError(
+                    f"Splats2D.pack: {name} must be {shape}, got {tuple(tensor.shape)}"
+                )
+            if tensor.dtype != colors.dtype or tensor.device != colors.device:
+                raise ValueError(
+                    f"Splats2D.pack: {name} is {tensor.dtype} on {tensor.device}, "
+                    f"but colors is {colors.dtype} on {colors.device}"
+                )
+        padding = colors.new_zeros(count, packed_width(channels) - COLORS - channels)
+        scalars = [opacities, depths, radii.detach()]
+        columns = [means2d, conics, torch.stack(scalars, dim=1), colors, padding]
+        return cls(torch.cat(columns, dim=1), ids, channels)
+
+
+def radii_of_conics(conics: Tensor) -> Tensor:
+    """3 σ of the major axis, (M,), of inverse covariances (M, 3); carries no gradient.
+
+    σ² of the major axis is the larger eigenvalue of the covariance: the inverse of the conic's smaller one.
+    """
+    if conics.dim() != 2 or conics.shape[1] != 3:
+        raise ValueError(f"conics must be (M, 3), got {tuple(conics.shape)}")
+    a, b, c = conics.detach().unbind(dim=1)
+    half_gap = torch.hypot((a - c) / 2, b)
+    # Vieta: the smaller eigenvalue as det / larger one, which does not cancel for long thin splats.
+    larger = (a + c) / 2 + half_gap
+    smaller = (a * c - b * b) / larger
+    return 3 * smaller.rsqrt()
