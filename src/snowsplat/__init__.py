@@ -1,0 +1,3 @@
+"""3D Gaussian Splatting that runs on any computer."""
+
+__version__ = "0.1.0"
