@@ -1,34 +1,90 @@
-# make demo    trains, evaluates and renders a small scene, and says where it is
-# make test    everything that must hold: format, lint, types, layers, all tests on every instruction set
-# make dev     the environment for working on snowsplat; make check / make format / make native use it
+# make demo     trains, evaluates and renders a small scene, and says where it all is
+# make test     all that must hold: format, lint, types, layers, tests on every instruction set
+# make dev      the environment to work in; then, quickly: make check, make format, make native
 #
-# Each works by itself on a fresh clone. PYTHON=/path/to/python uses that environment instead of .venv.
+# Each works by itself on a fresh clone and needs Python >= 3.10 and a C++ compiler. Everything goes
+# into .venv, made by BOOTSTRAP (python3); PYTHON=path/to/python uses a ready environment instead.
 
 SHELL := /bin/sh
-VENV := .venv
 BOOTSTRAP ?= python3
+NO_COMPILER := snowsplat: no C++ compiler found; install one (Debian/Ubuntu: apt install g++)
+NO_PYTHON := snowsplat: $(BOOTSTRAP) is missing or older than 3.10; name one: make BOOTSTRAP=python3.12
+NO_VENV := snowsplat: $(BOOTSTRAP) cannot make environments; install that (Debian/Ubuntu: apt install python3-venv)
+
 ifdef PYTHON
 ENVIRONMENT :=
 else
-PYTHON := $(VENV)/bin/python
-ENVIRONMENT := $(VENV)/.installed
+PYTHON := .venv/bin/python
+ENVIRONMENT := .venv/.installed
 endif
-# Tools (cmake, ninja, ruff ...) are those of the environment.
-BIN := $(abspath $(dir $(PYTHON)))
-export PATH := $(BIN):$(PATH)
+# cmake, ninja, ruff and the rest are those of the environment; the package is that of this checkout.
+export PATH := $(abspath $(dir $(PYTHON))):$(PATH)
+export PYTHONPATH := $(CURDIR)/src
 
 BUILD := build/native
-# Builds of one tree wait for each other.
+# Two builds in one checkout wait for each other.
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
+CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' | sort)
 
-.PHONY: native
+.PHONY: demo test dev check format native compiler lint types layers pytest clean
+
+demo: native
+	$(PYTHON) examples/demo.py out/demo
+
+test: check
+
+dev: native
+
+check: lint types layers pytest
+
+# The environment. Editable without a build of its own: `make native` puts the libraries into src/.
+.venv/.installed: pyproject.toml | compiler
+	@$(BOOTSTRAP) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || \
+	    { echo "$(NO_PYTHON)" >&2; exit 1; }
+	@$(BOOTSTRAP) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(NO_VENV)" >&2; exit 1; }
+	$(BOOTSTRAP) -m venv .venv
+	.venv/bin/python -m pip install --quiet --upgrade pip
+	.venv/bin/python -m pip install --editable '.[dev]' \
+	    --config-settings=wheel.cmake=false --config-settings=editable.mode=inplace
+	@touch $@
+
+compiler:
+	@command -v "$${CXX:-c++}" >/dev/null 2>&1 || command -v g++ >/dev/null 2>&1 || \
+	    command -v clang++ >/dev/null 2>&1 || { echo "$(NO_COMPILER)" >&2; exit 1; }
+
+# One library for each instruction set, into src/snowsplat/_lib; only what changed is compiled.
 native: $(ENVIRONMENT) | compiler
 	@mkdir -p $(BUILD)
-	@$(LOCK) sh -ec 'test -f $(BUILD)/build.ninja || cmake -G Ninja -S . -B $(BUILD) --log-level=WARNING; \
+	@$(LOCK) sh -ec ' \
+	    test -f $(BUILD)/build.ninja || cmake -G Ninja -S . -B $(BUILD) --log-level=WARNING >/dev/null; \
 	    cmake --build $(BUILD) -- --quiet; \
 	    cmake --install $(BUILD) --prefix src >/dev/null'
 
-.PHONY: compiler
-compiler:
-	@command -v "$${CXX:-c++}" >/dev/null 2>&1 || command -v g++ >/dev/null 2>&1 || command -v clang++ >/dev/null 2>&1 || \
-	    { echo "snowsplat: no C++ compiler found; install one (Debian/Ubuntu: apt install g++)" >&2; exit 1; }
+format: $(ENVIRONMENT)
+	ruff format .
+	ruff check --fix .
+	$(if $(CXX_FILES),clang-format -i $(CXX_FILES))
+
+lint: $(ENVIRONMENT)
+	ruff format --check .
+	ruff check .
+	$(if $(CXX_FILES),clang-format --dry-run --Werror $(CXX_FILES))
+
+types: $(ENVIRONMENT)
+	mypy
+
+layers: $(ENVIRONMENT)
+	lint-imports
+
+# All tests on the best instruction set, then those of the ops on each of the others.
+pytest: native
+	$(PYTHON) -m pytest
+	@$(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])' \
+	    | tr ' ' '\n' | while read -r isa; do \
+	        test -z "$$isa" && continue; \
+	        echo "SNOWSPLAT_ISA=$$isa pytest tests/ops"; \
+	        SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops || exit 1; \
+	    done
+
+clean:
+	rm -rf build dist src/snowsplat/_lib .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
