@@ -1,8 +1,8 @@
 """`Splats2D`: the seam between projecting and blending.
 
 One packed tensor holds everything that blending needs, one row per splat, so that the gradient of
-blending is one tensor too and a row is one or two cache lines. `project` makes it from 3D Gaussians;
-2D image fitting makes it directly with `Splats2D.pack`.
+blending is one tensor too and a row is one or two cache lines. `project` makes it from 3D
+Gaussians; 2D image fitting makes it directly with `Splats2D.pack`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Columns of a packed row. Colours follow at COLORS; the row is padded with zeros to a multiple of ROW.
+# Columns of a packed row. C colours follow at COLORS; zeros fill the row up to a multiple of ROW.
 MEANS2D = slice(0, 2)
 CONICS = slice(2, 5)
 OPACITIES = 5
@@ -29,7 +29,7 @@ def packed_width(channels: int) -> int:
 
 @dataclass
 class Splats2D:
-    """2D Gaussians on the image plane, in pixels. The pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+    """2D Gaussians on the image plane, in pixels. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
 
     packed:   (M, 16·ceil((8 + C) / 16)), one row per splat:
               0:2 `means2d`   x, y
@@ -110,10 +110,10 @@ class Splats2D:
         radii: Tensor | None = None,
         ids: Tensor | None = None,
     ) -> Splats2D:
-        """Packs separate tensors, differentiably (gradients reach every argument but `radii`, `ids`).
+        """Packs separate tensors; gradients reach every argument but `radii` and `ids`.
 
-        means2d (M, 2), conics (M, 3), opacities (M,), depths (M,), colors (M, C), all of one floating
-        dtype and device. `radii` (M,) defaults to 3 σ of the major axis of each conic.
+        means2d (M, 2), conics (M, 3), opacities (M,), depths (M,), colors (M, C), all of one
+        floating dtype and device. `radii` (M,) defaults to 3 σ of the major axis of each conic.
         """
         if means2d.dim() != 2 or colors.dim() != 2:
             raise ValueError(
@@ -149,7 +149,8 @@ class Splats2D:
 def radii_of_conics(conics: Tensor) -> Tensor:
     """3 σ of the major axis, (M,), of inverse covariances (M, 3); carries no gradient.
 
-    σ² of the major axis is the larger eigenvalue of the covariance: the inverse of the conic's smaller one.
+    σ² of the major axis is the larger eigenvalue of the covariance: the inverse of the conic's
+    smaller one.
     """
     if conics.dim() != 2 or conics.shape[1] != 3:
         raise ValueError(f"conics must be (M, 3), got {tuple(conics.shape)}")

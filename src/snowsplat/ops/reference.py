@@ -1,0 +1,420 @@
+"""3D Gaussian Splatting in plain PyTorch: the readable twin of every op.
+
+Same names, arguments and results as `snowsplat.ops`, in any floating dtype, differentiable by
+autograd and hundreds of times slower. The native kernels are tested against these functions in
+float64. Read top to bottom, this file is the method:
+
+    project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
+    rasterize       2D splats → image            α, T, C             ibid., §6 and eq. 2–3
+    photometric_loss, ssim                       L1, D-SSIM          ibid., eq. 7; Wang et al. 2004
+    neighbours      the initial size             ibid., §5.1
+    adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
+
+[Kerbl et al. 2023]    3D Gaussian Splatting for Real-Time Radiance Field Rendering. ACM TOG 42(4).
+[Zwicker et al. 2001]  EWA Volume Splatting. IEEE Visualization. (The J and Σ' of `_project_rows`.)
+[Zwicker et al. 2002]  EWA Splatting. IEEE TVCG 8(3). (The low-pass filter, here `LOW_PASS`.)
+
+Frames are OpenCV's: x right, y down, z forward; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from snowsplat.ops.splats import Splats2D
+
+LOW_PASS = 0.3  # pixels²: every splat is blurred by it, so that none slips between pixel centres
+ALPHA_MIN = 1 / 255  # what changes an 8-bit image by less is not blended
+ALPHA_MAX = 0.99  # keeps 1 − α, hence the transmittance and its gradient, away from 0
+TRANSMITTANCE_MIN = 1e-4  # a pixel is finished when less light than this would come through
+JACOBIAN_MARGIN = 0.15  # of the image size: how far outside of it J still follows the centre
+QUAT_EPS = 1e-12
+TILE = 16
+PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+
+# Real spherical harmonics, by degree; with the signs that the scene files of the field assume.
+C0 = 0.28209479177387814  # ½ √(1/π)
+C1 = 0.4886025119029199  # √(3/4π)
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
+
+
+# ---------------------------------------------------------------------------------------- project
+
+
+def project(
+    means: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    opacity_logits: Tensor,
+    sh_dc: Tensor,
+    sh_rest: Tensor,
+    cam_from_world: Tensor,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sh_degree: int,
+    near: float = 0.2,
+) -> Splats2D:
+    """The splats that N Gaussians leave on a camera's image plane; the invisible are left out.
+
+    means (N, 3) world, log_scales (N, 3), quats (N, 4) wxyz of any length (zero: no rotation),
+    opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, K, 3), of which degree `sh_degree` uses the
+    first (sh_degree + 1)² − 1; cam_from_world (3, 4); fx, fy, cx, cy in pixels; near > 0 in world
+    units.
+
+    Visible is what lies beyond `near` and has an opacity ≥ 1/255, if the box around its ellipse
+    {α ≥ 1/255} reaches the pixel centres. A Gaussian whose 2D covariance overflows the dtype is not
+    visible.
+    """
+    if sh_rest.shape[1] < (sh_degree + 1) ** 2 - 1:
+        raise ValueError(
+            f"project: sh_rest has too few rows ({sh_rest.shape[1]}) for degree {sh_degree}"
+        )
+    parameters = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
+    cam_from_world = cam_from_world.to(means)
+    view = (cam_from_world, width, height, fx, fy, cx, cy, sh_degree)
+    with torch.no_grad():
+        depths = means @ cam_from_world[2, :3] + cam_from_world[2, 3]
+        ids = torch.nonzero(depths > near)[:, 0]
+        splats, variances = _project_rows([p[ids] for p in parameters], *view)
+        reach = _half_extents(variances, splats.opacities)
+        last = torch.tensor([width - 0.5, height - 0.5]).to(means)
+        touches = (splats.means2d + reach >= 0.5) & (splats.means2d - reach <= last)
+        ids = ids[touches.all(dim=1)]  # comparisons with NaN are false: invisible
+    # Once more for the visible alone: no gradient, hence no NaN, comes from behind the camera.
+    splats, _ = _project_rows([p[ids] for p in parameters], *view)
+    return Splats2D(splats.packed, ids.to(torch.int32), splats.channels)
+
+
+def _project_rows(
+    parameters: list[Tensor],
+    cam_from_world: Tensor,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sh_degree: int,
+) -> tuple[Splats2D, Tensor]:
+    """Every row of `parameters` (in the order of `project`) to a splat, visible or not.
+
+    Also returns Σ'xx and Σ'yy (M, 2), NaN where det Σ' overflows.
+    """
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = parameters
+    W, t = cam_from_world[:, :3], cam_from_world[:, 3]  # (3, 3), (3,): the viewing transformation
+
+    # The centre. (M, 3) in camera space, then (M, 2) in pixels.
+    x, y, z = (means @ W.T + t).unbind(dim=1)
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
+
+    # Σ = R S Sᵀ Rᵀ (eq. 6), kept as its factor R S. (M, 3, 3)
+    RS = _rotation_matrices(quats) * log_scales.exp()[:, None, :]
+
+    # J, the affine approximation of the projection at the centre (Zwicker et al. 2001, eq. 29). Far
+    # outside of the image it grows without bound, so the ratios are held near the border. (M, 2, 3)
+    x_margin, y_margin = JACOBIAN_MARGIN * width, JACOBIAN_MARGIN * height
+    tx = (x / z).clamp(-(cx + x_margin) / fx, (width - cx + x_margin) / fx)
+    ty = (y / z).clamp(-(cy + y_margin) / fy, (height - cy + y_margin) / fy)
+    zero = torch.zeros_like(z)
+    J_rows = [fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z]
+    J = torch.stack(J_rows, dim=1).reshape(-1, 2, 3)
+
+    # Σ' = J W Σ Wᵀ Jᵀ (eq. 5) plus the low-pass filter, with U = J W R S so that Σ' = U Uᵀ + 0.3 I.
+    u0, u1 = (J @ W @ RS).unbind(dim=1)  # (M, 3) each
+    xx, xy, yy = (u0 * u0).sum(dim=1), (u0 * u1).sum(dim=1), (u1 * u1).sum(dim=1)
+    # det Σ' = |u0 × u1|² + 0.3 (xx + yy) + 0.3². Multiplied out, it would cancel for thin splats.
+    cross = torch.linalg.cross(u0, u1)
+    det = (cross * cross).sum(dim=1) + LOW_PASS * (xx + yy) + LOW_PASS**2
+    xx, yy = xx + LOW_PASS, yy + LOW_PASS
+    conics = torch.stack([yy / det, -xy / det, xx / det], dim=1)
+    major = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)  # the larger eigenvalue of Σ'
+    variances = torch.stack([xx, yy], dim=1)
+    variances = torch.where(det.isfinite()[:, None], variances, torch.nan)
+
+    # Colour as seen from the camera, whose position in the world is −Wᵀ t.
+    directions = means + W.T @ t
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    count = (sh_degree + 1) ** 2
+    coefficients = torch.cat([sh_dc, sh_rest], dim=1)[:, :count]  # (M, count, 3)
+    basis = sh_basis(directions, sh_degree)  # (M, count)
+    colors = (0.5 + (basis[:, :, None] * coefficients).sum(dim=1)).clamp(min=0)
+
+    opacities = torch.sigmoid(opacity_logits)
+    radii = 3 * major.detach().sqrt()
+    return Splats2D.pack(means2d, conics, opacities, z, colors, radii), variances
+
+
+def _rotation_matrices(quats: Tensor) -> Tensor:
+    """Quaternions (M, 4) wxyz of any length to rotations (M, 3, 3). Zero gives the identity."""
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp(min=QUAT_EPS)).unbind(dim=1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics, degrees 0 to `degree` ≤ 3, at unit directions (M, 3).
+
+    Returns (M, (degree + 1)²).
+    """
+    x, y, z = directions.unbind(dim=1)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [torch.full_like(x, C0)]
+    if degree >= 1:
+        basis += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        basis += [
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2 * zz - xx - yy),
+            -C2[0] * x * z,
+            C2[2] * (xx - yy),
+        ]
+    if degree >= 3:
+        basis += [
+            -C3[0] * y * (3 * xx - yy),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4 * zz - xx - yy),
+            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            -C3[2] * x * (4 * zz - xx - yy),
+            C3[4] * z * (xx - yy),
+            -C3[0] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=1)
+
+
+def _half_extents(variances: Tensor, opacities: Tensor) -> Tensor:
+    """Half width and height, (M, 2) pixels, of the box around {α ≥ 1/255}; NaN where that is empty.
+
+    o exp(−½ dᵀ Σ'⁻¹ d) = 1/255 where dᵀ Σ'⁻¹ d = 2 ln(255 o): an ellipse, whose half width is
+    √(2 ln(255 o) Σ'xx).
+    """
+    return (2 * torch.log(opacities / ALPHA_MIN)[:, None] * variances).sqrt()
+
+
+# -------------------------------------------------------------------------------------- rasterize
+
+
+def rasterize(
+    splats: Splats2D,
+    width: int,
+    height: int,
+    background: Tensor | None = None,
+    *,
+    with_depth: bool = False,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
+
+    Returns image (H, W, C) of planar storage, alpha (H, W) and depth (H, W) or None. With T the
+    light that the splats in front let through, image = Σ T α c + T_end · background,
+    alpha = 1 − T_end, depth = Σ T α z (not divided by alpha). Conics must be positive definite.
+    """
+    order = torch.argsort(splats.depths.detach(), stable=True)
+    splats = Splats2D(splats.packed[order], None, splats.channels)
+    means2d, conics, opacities = splats.means2d, splats.conics, splats.opacities
+    values = splats.colors
+    if with_depth:
+        values = torch.cat([values, splats.depths[:, None]], dim=1)
+    if background is None:
+        background = values.new_zeros(splats.channels)
+    with torch.no_grad():
+        a, b, c = conics.unbind(dim=1)
+        variances = torch.stack([c, a], dim=1) / (a * c - b * b)[:, None]  # Σ'xx, Σ'yy
+        reach = _half_extents(variances, opacities).nan_to_num(nan=torch.inf)
+        low, high = means2d - reach - 1e-3, means2d + reach + 1e-3  # never one too few
+
+    bands = []
+    for top in range(0, height, TILE):
+        tiles = []
+        for left in range(0, width, TILE):
+            h, w = min(TILE, height - top), min(TILE, width - left)
+            first = torch.tensor([left + 0.5, top + 0.5]).to(means2d)
+            last = torch.tensor([left + w - 0.5, top + h - 0.5]).to(means2d)
+            tile = ((high >= first) & (low <= last)).all(dim=1).nonzero()[:, 0]
+            pixels = _pixel_centres(left, top, w, h).to(means2d)  # (P, 2)
+            alpha, T, T_end = _blend_weights(pixels, means2d[tile], conics[tile], opacities[tile])
+            blended = (T * alpha) @ values[tile]  # (P, C or C + 1)
+            tiles.append(torch.cat([blended, T_end], dim=1).T.reshape(-1, h, w))
+        bands.append(torch.cat(tiles, dim=2))
+    planes = torch.cat(bands, dim=1)  # (C or C + 1, and T_end; H, W)
+
+    channels, T_end = splats.channels, planes[-1]
+    image = planes[:channels] + T_end * background[:, None, None]
+    depth = planes[channels] if with_depth else None
+    return image.permute(1, 2, 0), 1 - T_end, depth
+
+
+def _pixel_centres(left: int, top: int, width: int, height: int) -> Tensor:
+    """The pixel centres (width · height, 2), row by row, of a block with this left top corner."""
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    return torch.stack([x + left, y + top], dim=2).reshape(-1, 2) + 0.5
+
+
+def _blend_weights(
+    pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """α, T before each splat, both (P, M), and T_end (P, 1) of P pixels and M sorted splats.
+
+    α is 0 where a splat is not blended.
+    """
+    dx, dy = (pixels[:, None, :] - means2d).unbind(dim=2)  # (P, M) each
+    a, b, c = conics.unbind(dim=1)
+    alpha = opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    alpha = torch.where(alpha < ALPHA_MIN, 0, alpha.clamp(max=ALPHA_MAX))
+    # T only falls: a pixel is finished from the first splat on that would bring it too low.
+    unfinished = torch.cumprod(1 - alpha, dim=1) >= TRANSMITTANCE_MIN
+    alpha = torch.where(unfinished, alpha, 0)
+    ones = alpha.new_ones(len(pixels), 1)
+    T = torch.cat([ones, torch.cumprod(1 - alpha, dim=1)], dim=1)  # (P, M + 1)
+    return alpha, T[:, :-1], T[:, -1:]
+
+
+# ----------------------------------------------------------------------------------- photometric
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity (Wang et al. 2004) of images (H, W, C) in [0, 1]: 1 if they are equal.
+
+    The 11 × 11 Gaussian window with σ = 1.5 sums to 1 and sees zeros outside of the image. Returns
+    the mean over all pixels and channels, a scalar.
+    """
+    channels = image.shape[2]
+    offsets = torch.arange(11, dtype=image.dtype, device=image.device) - 5
+    window = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    window = window / window.sum()
+    kernel = torch.outer(window, window).expand(channels, 1, 11, 11)
+
+    def local_mean(values: Tensor) -> Tensor:
+        return conv2d(values[None], kernel, padding=5, groups=channels)[0]
+
+    a, b = image.permute(2, 0, 1), _as_unit(target, image).permute(2, 0, 1)  # (C, H, W)
+    mean_a, mean_b = local_mean(a), local_mean(b)
+    var_a = local_mean(a * a) - mean_a * mean_a
+    var_b = local_mean(b * b) - mean_b * mean_b
+    covariance = local_mean(a * b) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a * mean_a + mean_b * mean_b + c1)
+    structure = (2 * covariance + c2) / (var_a + var_b + c2)
+    return (luminance * structure).mean()
+
+
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+    """(1 − λ) · mean |image − target| + λ · (1 − SSIM), eq. 7 with λ = `ssim_weight`: a scalar.
+
+    image (H, W, C) in [0, 1]; target of the same shape, floating in [0, 1] or uint8.
+    """
+    l1 = (image - _as_unit(target, image)).abs().mean()
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(image, target))
+
+
+def _as_unit(target: Tensor, like: Tensor) -> Tensor:
+    """An 8-bit image as one in [0, 1] of the dtype of `like`; a floating image as it is."""
+    return target.to(like) / 255 if target.dtype == torch.uint8 else target.to(like)
+
+
+# ------------------------------------------------------------------------------------ neighbours
+
+
+def neighbours(points: Tensor, k: int = 3) -> Tensor:
+    """Distances (N, k), ascending, from each of points (N, 3) to its k nearest others.
+
+    A point at the same place is another (distance 0). Where there are fewer than k others: inf.
+    """
+    count = len(points)
+    found = points.new_full((count, k), torch.inf)
+    available = min(k, count - 1)
+    for start in range(0, count, 1024):
+        chunk = points[start : start + 1024]
+        distances = torch.cdist(chunk, points, compute_mode="donot_use_mm_for_euclid_dist")
+        rows = torch.arange(len(chunk))
+        distances[rows, rows + start] = torch.inf  # not itself
+        found[start : start + 1024, :available] = distances.topk(available, largest=False).values
+    return found
+
+
+# ------------------------------------------------------------------------------------- adam_step
+
+
+@torch.no_grad()
+def adam_step(
+    params: Mapping[str, Tensor],
+    exp_avg: Mapping[str, Tensor],
+    exp_avg_sq: Mapping[str, Tensor],
+    ids: Tensor,
+    packed_grad: Tensor,
+    cam_from_world: Tensor,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sh_degree: int,
+    lr: Mapping[str, float],
+    step: int,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-15,
+    visible_only: bool = False,
+) -> None:
+    """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
+
+    params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, shaped as for `project`. A
+        `.grad` that is not None (of a regulariser) is added to the gradient.
+    exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
+    ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns).
+    lr: a rate for each name. step: counts from 1.
+    visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
+        gradient is 0 (plus `.grad`), and their moments decay.
+
+    Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
+    p −= lr · m̂ / √(v̂ + eps²), where the paper has √v̂ + eps. The two agree for v̂ ≫ eps² and at
+    m̂ = v̂ = 0, and this one is a single reciprocal square root.
+    """
+    rows = ids.long()
+    with torch.enable_grad():
+        selected = [params[name].detach()[rows].requires_grad_() for name in PARAMETERS]
+        view = (cam_from_world.to(packed_grad), width, height, fx, fy, cx, cy, sh_degree)
+        splats, _ = _project_rows(selected, *view)
+        grads = torch.autograd.grad(splats.packed, selected, packed_grad)
+
+    beta1, beta2 = betas
+    for name, visible_grad in zip(PARAMETERS, grads, strict=True):
+        p = params[name]
+        grad = torch.zeros_like(p)
+        grad[rows] = visible_grad
+        if p.grad is not None:
+            grad += p.grad
+        m = beta1 * exp_avg[name] + (1 - beta1) * grad
+        v = beta2 * exp_avg_sq[name] + (1 - beta2) * grad * grad
+        m_hat, v_hat = m / (1 - beta1**step), v / (1 - beta2**step)
+        stepped = p - lr[name] * m_hat / (v_hat + eps**2).sqrt()
+
+        taken = torch.ones_like(p, dtype=torch.bool)
+        if visible_only:
+            taken[:] = False
+            taken[rows] = True
+        if name == "sh_rest":
+            taken[:, (sh_degree + 1) ** 2 - 1 :] = False
+        p.copy_(torch.where(taken, stepped, p))
+        exp_avg[name].copy_(torch.where(taken, m, exp_avg[name]))
+        exp_avg_sq[name].copy_(torch.where(taken, v, exp_avg_sq[name]))
