@@ -1,0 +1,148 @@
+"""Checkpoints: everything that a training needs to go on as if it had never stopped.
+
+A checkpoint is a set of named tensors (parameters, optimiser moments, random states, statistics,
+the order of the views) and a JSON value, in ONE safetensors file: a format that holds numbers only
+and cannot execute code. It appears under its name when it is whole and on disk, so a kill at any
+moment leaves the one before. Each tensor's CRC-32 is in the header and is checked on load, as a
+file can also rot or be cut in a copy.
+"""
+
+import json
+import re
+import warnings
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from snowsplat.errors import UserError
+from snowsplat.files import atomic_path
+
+#: One more whenever the meaning of the tensors changes, so that an old file is refused.
+VERSION = 1
+_HEADER = "snowsplat"
+_NAME = re.compile(r"step_(\d+)\.safetensors")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What `save` was given, back from disk and checked."""
+
+    path: Path
+    step: int
+    tensors: dict[str, Tensor]  # on the CPU
+    meta: dict[str, Any]
+
+
+def save(
+    folder: Path | str,
+    step: int,
+    tensors: Mapping[str, Tensor],
+    meta: Mapping[str, Any],
+    *,
+    keep: int = 2,
+) -> Path:
+    """Write ``folder/step_000500.safetensors`` atomically, then remove all but the ``keep`` newest.
+
+    Args:
+        tensors: any shapes and dtypes, 0-dimensional and empty ones too.
+        meta: JSON values.
+
+    Raises:
+        OSError: the folder is not writable, or the disk is full. Older checkpoints are as they
+        were.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob(".*tmp*"):  # of a save that was killed
+        leftover.unlink(missing_ok=True)
+    path = folder / f"step_{step:06d}.safetensors"
+    whole = {name: _owned(tensor) for name, tensor in tensors.items()}
+    header = {
+        "version": VERSION,
+        "step": step,
+        "meta": dict(meta),
+        "crc32": {name: _crc32(tensor) for name, tensor in whole.items()},
+    }
+    with atomic_path(path) as temporary:
+        try:
+            safetensors.torch.save_file(whole, temporary, metadata={_HEADER: json.dumps(header)})
+        except safetensors.SafetensorError as error:
+            raise OSError(f"{path}: cannot be written ({error})") from None
+    for _, old in _steps(folder)[keep:]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def load(path: Path | str) -> Checkpoint:
+    """Read one checkpoint and check every byte of it.
+
+    Raises:
+        UserError: absent, cut, damaged, not a checkpoint, or one of another version.
+    """
+    path = Path(path)
+    try:
+        with safetensors.safe_open(path, framework="pt", device="cpu") as file:
+            header = json.loads((file.metadata() or {})[_HEADER])
+            if header["version"] != VERSION:
+                raise UserError(
+                    f"{path}: a checkpoint of version {header['version']}, this program reads "
+                    f"{VERSION}; go on with the snowsplat that wrote it"
+                )
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        whole = header["crc32"] == {name: _crc32(tensor) for name, tensor in tensors.items()}
+        checkpoint = Checkpoint(path, int(header["step"]), tensors, dict(header["meta"]))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError):
+        raise UserError(f"{path}: damaged, or not a checkpoint") from None
+    if not whole:
+        raise UserError(f"{path}: damaged (its checksums do not match)")
+    return checkpoint
+
+
+def latest(folder: Path | str) -> Checkpoint | None:
+    """The newest whole checkpoint of ``folder``, or None; a warning for each newer, damaged one."""
+    for _, path in _steps(Path(folder)):
+        try:
+            return load(path)
+        except UserError as error:
+            warnings.warn(f"{error}; using the one before it", stacklevel=2)
+    return None
+
+
+def exists(folder: Path | str) -> bool:
+    """Whether ``folder`` holds a checkpoint, whole or not."""
+    return bool(_steps(Path(folder)))
+
+
+def _steps(folder: Path) -> list[tuple[int, Path]]:
+    """Checkpoint files, newest first."""
+    if not folder.is_dir():
+        return []
+    found = [
+        (int(match[1]), path) for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))
+    ]
+    return sorted(found, reverse=True)
+
+
+def _owned(tensor: Tensor) -> Tensor:
+    """On the CPU, contiguous, alone in its storage: safetensors refuses views that share one."""
+    tensor = tensor.detach().cpu().contiguous()
+    alone = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
+    return tensor if alone else tensor.clone()
+
+
+def _crc32(tensor: Tensor) -> int:
+    flat = (
+        tensor.reshape(-1).view(torch.uint8)
+        if tensor.numel()
+        else torch.empty(0, dtype=torch.uint8)
+    )
+    return zlib.crc32(flat.numpy().data)

@@ -1,0 +1,166 @@
+"""PLY files: scenes in the reference implementation's layout, and coloured point clouds.
+
+A scene of SH degree 3 has 62 float properties a Gaussian, in this order: x y z, nx ny nz (zeros),
+f_dc_0..2, f_rest_0..44, opacity, scale_0..2, rot_0..3. Values are the optimised parameters, before
+their activations: opacity a logit, scale a logarithm, rot a quaternion wxyz of any length. f_rest
+is channel-major: all K coefficients of red, then of green, then of blue (`Gaussians.sh_rest` is (N,
+K, 3)). Lower degrees have fewer f_rest.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from snowsplat.errors import UserError
+from snowsplat.files import atomic_path
+from snowsplat.formats.ply_table import PlyTable, open_table
+from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+
+_WRITE_ROWS = 1 << 14
+
+
+def _rest_names(count: int) -> list[str]:
+    return [f"f_rest_{i}" for i in range(3 * count)]
+
+
+_MEANS = ["x", "y", "z"]
+_NORMALS = ["nx", "ny", "nz"]
+_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
+_SCALES = ["scale_0", "scale_1", "scale_2"]
+_QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
+_REQUIRED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
+
+
+def is_scene(table: PlyTable) -> bool:
+    """Whether the columns are those of Gaussians (else, at most, of a point cloud)."""
+    return all(name in table.columns for name in _REQUIRED)
+
+
+def read_gaussians(path: Path | str) -> Gaussians:
+    """Read a scene of any SH degree; properties in any order and of any type, others ignored.
+
+    Values are taken as they are: NaN and infinity, too, where the file holds them.
+
+    Raises:
+        UserError: absent, damaged, too short, or a PLY file of something else.
+    """
+    table = open_table(path)
+    if not is_scene(table):
+        missing = [name for name in _REQUIRED if name not in table.columns]
+        shown = ", ".join(missing[:4]) + (", …" if len(missing) > 4 else "")
+        raise UserError(f"{path}: a PLY file, but not of 3D Gaussians: it has no {shown}")
+    rest = [name for name in table.columns if name.startswith("f_rest_")]
+    if (
+        len(rest) % 3
+        or len(rest) // 3 not in SH_REST_COUNTS
+        or set(rest) != set(_rest_names(len(rest) // 3))
+    ):
+        raise UserError(
+            f"{path}: {len(rest)} f_rest properties are no SH degree; 0, 9, 24 or 45, "
+            "numbered from 0, are possible"
+        )
+    k = len(rest) // 3
+
+    n = table.count
+    means = np.empty((n, 3), np.float32)
+    log_scales = np.empty((n, 3), np.float32)
+    quats = np.empty((n, 4), np.float32)
+    opacity_logits = np.empty(n, np.float32)
+    sh_dc = np.empty((n, 1, 3), np.float32)
+    sh_rest = np.empty((n, k, 3), np.float32)
+    columns: list[tuple[str, np.ndarray]] = [
+        *zip(_MEANS, means.T, strict=True),
+        *zip(_DC, sh_dc[:, 0].T, strict=True),
+        ("opacity", opacity_logits),
+        *zip(_SCALES, log_scales.T, strict=True),
+        *zip(_QUATS, quats.T, strict=True),
+        *zip(_rest_names(k), (sh_rest[:, i, c] for c in range(3) for i in range(k)), strict=True),
+    ]
+    with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 become infinity
+        for start, rows in table.rows():
+            for name, target in columns:
+                target[start : start + len(rows)] = rows[name]
+    arrays = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
+    return Gaussians(*(torch.from_numpy(array) for array in arrays))
+
+
+def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
+    """Write the layout above, binary little-endian, atomically.
+
+    Raises:
+        OSError: the folder is absent or not writable, or the disk is full.
+    """
+    values = [t.detach().to("cpu", torch.float32).numpy() for t in gaussians.parameters().values()]
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = values
+    n, k = sh_rest.shape[:2]
+    names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(k), "opacity", *_SCALES, *_QUATS]
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(_header(n, [("float", name) for name in names]))
+        for start in range(0, n, _WRITE_ROWS):
+            part = slice(start, start + _WRITE_ROWS)
+            rows = np.zeros((len(means[part]), len(names)), "<f4")
+            rows[:, 0:3] = means[part]
+            rows[:, 6:9] = sh_dc[part, 0]
+            rows[:, 9 : 9 + 3 * k] = sh_rest[part].transpose(0, 2, 1).reshape(len(rows), 3 * k)
+            rows[:, -8] = opacity_logits[part]
+            rows[:, -7:-4] = log_scales[part]
+            rows[:, -4:] = quats[part]
+            file.write(rows.tobytes())
+
+
+_RGB = ["red", "green", "blue"]
+_POINT = np.dtype([(name, "<f4") for name in _MEANS + _NORMALS] + [(name, "u1") for name in _RGB])
+
+
+def write_points(path: Path | str, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    """Write a point cloud atomically: ``xyz`` (P, 3) float, ``rgb`` (P, 3) uint8.
+
+    Raises:
+        OSError: the folder is absent or not writable, or the disk is full.
+    """
+    rows = np.zeros(len(xyz), _POINT)
+    for column, name in enumerate(_MEANS):
+        rows[name] = xyz[:, column]
+    for column, name in enumerate(_RGB):
+        rows[name] = rgb[:, column]
+    kinds = [
+        ("uchar" if _POINT[name] == np.uint8 else "float", name) for name in _POINT.names or ()
+    ]
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(_header(len(rows), kinds))
+        file.write(rows.tobytes())
+
+
+def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
+    """Read a point cloud: xyz (P, 3) float32 and rgb (P, 3) uint8 (grey if it has none).
+
+    Colours of a floating type are taken as 0 to 1.
+
+    Raises:
+        UserError: absent, damaged, too short, or without x, y, z.
+    """
+    table = open_table(path)
+    if not all(name in table.columns for name in _MEANS):
+        raise UserError(f"{path}: a PLY file, but not of points: it has no x, y, z")
+    xyz = np.empty((table.count, 3), np.float32)
+    rgb = np.full((table.count, 3), 128, np.uint8)
+    colors = [name for name in _RGB if name in table.columns]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start, rows in table.rows():
+            part = slice(start, start + len(rows))
+            for column, name in enumerate(_MEANS):
+                xyz[part, column] = rows[name]
+            if len(colors) == 3:
+                for column, name in enumerate(colors):
+                    values = rows[name]
+                    if values.dtype.kind == "f":
+                        values = np.nan_to_num(values.astype(np.float32)) * 255.0 + 0.5
+                    rgb[part, column] = np.clip(values, 0, 255)
+    return xyz, rgb
+
+
+def _header(count: int, properties: list[tuple[str, str]]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {kind} {name}" for kind, name in properties]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")

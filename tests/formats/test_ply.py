@@ -1,0 +1,318 @@
+"""PLY: read back to the bit what was written, any dialect alike, damage as one line."""
+
+import contextlib
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.errors import UserError
+from snowsplat.formats import ply, read_gaussians, write_gaussians
+from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+
+REFERENCE = Path(__file__).parents[2].parent / "shared/splats/reference_layout_sh3.ply"
+
+
+def random_gaussians(n: int, degree: int, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    rest = SH_REST_COUNTS[degree]
+    return Gaussians(
+        normal(n, 3), normal(n, 3), normal(n, 4), normal(n), normal(n, 1, 3), normal(n, rest, 3)
+    )
+
+
+def assert_same(a: Gaussians, b: Gaussians) -> None:
+    for name, tensor in a.parameters().items():
+        torch.testing.assert_close(b.parameters()[name], tensor, rtol=0, atol=0, equal_nan=True)
+
+
+def property_names(degree: int) -> list[str]:
+    rest = [f"f_rest_{i}" for i in range(3 * SH_REST_COUNTS[degree])]
+    return [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *rest,
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 257, 20_000])
+def test_round_trip_to_the_bit(tmp_path, degree, n):
+    gaussians = random_gaussians(n, degree)
+    write_gaussians(tmp_path / "scene.ply", gaussians)
+    assert_same(gaussians, read_gaussians(tmp_path / "scene.ply"))
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]  # no temporary stays
+
+
+def test_layout_is_the_62_properties_in_order(tmp_path):
+    gaussians = random_gaussians(2, 3)
+    write_gaussians(tmp_path / "scene.ply", gaussians)
+    header, data = (tmp_path / "scene.ply").read_bytes().split(b"end_header\n")
+    lines = header.decode().splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    assert lines[3:] == [f"property float {name}" for name in property_names(3)]
+    row = dict(zip(property_names(3), struct.unpack("<62f", data[: 62 * 4]), strict=True))
+    # Channel-major: f_rest_0..14 are the 15 coefficients of red.
+    assert row["f_rest_1"] == gaussians.sh_rest[0, 1, 0]
+    assert row["f_rest_15"] == gaussians.sh_rest[0, 0, 1]
+    assert row["f_rest_44"] == gaussians.sh_rest[0, 14, 2]
+    assert row["nx"] == 0.0
+    assert row["opacity"] == gaussians.opacity_logits[0]
+    assert row["rot_0"] == gaussians.quats[0, 0]
+    assert len(data) == 2 * 62 * 4
+
+
+def test_reference_file_reads_and_writes_back_the_same_bytes(tmp_path):
+    if not REFERENCE.exists():
+        pytest.skip(f"{REFERENCE} is absent")
+    gaussians = read_gaussians(REFERENCE)
+    assert len(gaussians) == 9080
+    assert gaussians.sh_degree == 3
+    assert all(t.isfinite().all() for t in gaussians.parameters().values())
+    write_gaussians(tmp_path / "again.ply", gaussians)
+    again = (tmp_path / "again.ply").read_bytes()
+    assert again[:40] == REFERENCE.read_bytes()[:40]
+    assert_same(gaussians, read_gaussians(tmp_path / "again.ply"))
+
+
+# Dialects: the same Gaussians written in other ways, by a writer that shares nothing with ours.
+
+TYPES = {
+    "float": "f",
+    "double": "d",
+    "uchar": "B",
+    "short": "h",
+    "int": "i",
+    "float32": "f",
+    "uint8": "B",
+}
+
+
+def dialect(
+    gaussians: Gaussians,
+    *,
+    format: str = "binary_little_endian",
+    kind: str = "float",
+    newline: str = "\n",
+    order: int | None = None,
+    extra: list[tuple[str, str, float]] = [],  # noqa: B006
+    before: tuple[str, bytes] | None = None,
+    after: tuple[str, bytes] | None = None,
+) -> bytes:
+    names = property_names(gaussians.sh_degree)
+    flat = [
+        gaussians.means,
+        torch.zeros(len(gaussians), 3),
+        gaussians.sh_dc[:, 0],
+        gaussians.sh_rest.transpose(1, 2).flatten(1),
+        gaussians.opacity_logits[:, None],
+        gaussians.log_scales,
+        gaussians.quats,
+    ]
+    table = torch.cat(flat, dim=1).double().tolist()
+    columns = [(kind, name, [row[i] for row in table]) for i, name in enumerate(names)]
+    columns += [(k, name, [value] * len(table)) for k, name, value in extra]
+    if order is not None:
+        np.random.default_rng(order).shuffle(columns)
+    head = ["ply", f"format {format} 1.0", "comment made by a test"]
+    head += before[0].split("\n") if before else []
+    head += [f"element vertex {len(table)}"] + [f"property {k} {name}" for k, name, _ in columns]
+    head += after[0].split("\n") if after else []
+    data = before[1] if before else b""
+    for row in zip(*(values for _, _, values in columns), strict=True):
+        if format == "ascii":
+            data += (" ".join(repr(v) for v in row) + newline).encode()
+        else:
+            mark = "<" if "little" in format else ">"
+            codes = mark + "".join(TYPES[k] for k, _, _ in columns)
+            integers = [
+                int(v) if TYPES[k] in "Bhi" else v
+                for (k, _, _), v in zip(columns, row, strict=True)
+            ]
+            data += struct.pack(codes, *integers)
+    return (
+        (newline.join([*head, "end_header"]) + newline).encode()
+        + data
+        + (after[1] if after else b"")
+    )
+
+
+EXTRA = [("uchar", "red", 200), ("short", "label", -3), ("double", "t", 0.5)]
+CAMERA = "element camera 2\nproperty double k\nproperty uchar w"
+FACES = "element face 2\nproperty list uchar int vertex_indices"
+DIALECTS = {
+    "plain": {},
+    "big endian": {"format": "binary_big_endian"},
+    "ascii": {"format": "ascii"},
+    "crlf header": {"newline": "\r\n"},
+    "crlf ascii": {"format": "ascii", "newline": "\r\n"},
+    "doubles": {"kind": "double"},
+    "float32 spelling": {"kind": "float32"},
+    "shuffled": {"order": 1},
+    "shuffled big-endian doubles": {"order": 2, "kind": "double", "format": "binary_big_endian"},
+    "extra properties": {"extra": EXTRA, "order": 3},
+    "extra, ascii": {"extra": EXTRA, "order": 4, "format": "ascii"},
+    "element before": {"before": (CAMERA, b"\x01" * 18)},
+    "ascii lists before": {"format": "ascii", "before": (FACES, b"3 0 1 2\n2 0 1\n")},
+    "lists after": {"after": (FACES, b"\x03" + b"\x00" * 12 + b"\x01\x00\x00\x00\x00")},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_dialects_read_the_same(tmp_path, name, degree):
+    gaussians = random_gaussians(11, degree)
+    (tmp_path / "scene.ply").write_bytes(dialect(gaussians, **DIALECTS[name]))
+    assert_same(gaussians, read_gaussians(tmp_path / "scene.ply"))
+
+
+def test_missing_normals_are_no_matter_and_nan_is_kept(tmp_path):
+    gaussians = random_gaussians(3, 0)
+    gaussians.means[1, 2] = float("nan")
+    gaussians.log_scales[2, 0] = float("inf")
+    data = dialect(gaussians, format="ascii").replace(
+        b"property float n", b"property float other_n"
+    )
+    (tmp_path / "scene.ply").write_bytes(data)
+    assert_same(gaussians, read_gaussians(tmp_path / "scene.ply"))
+
+
+# Damage
+
+
+def one_line(path: Path) -> str:
+    with pytest.raises(UserError) as caught:
+        read_gaussians(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    return message
+
+
+@pytest.mark.parametrize("format", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_every_truncation_is_one_line(tmp_path, format):
+    whole = dialect(random_gaussians(3, 1), format=format)
+    path = tmp_path / "scene.ply"
+    # ASCII may lose its last line's end, and digits of its last number, and still be whole rows.
+    end = len(whole.rstrip().rsplit(b" ", 1)[0]) if format == "ascii" else len(whole) - 1
+    for length in range(0, end, 7):
+        path.write_bytes(whole[:length])
+        one_line(path)
+    path.write_bytes(whole[:end])
+    one_line(path)
+
+
+@pytest.mark.parametrize(
+    "count", ["1000000000000", "999999999999999", "9" * 30, "-1", "1e9", "²", "4"]
+)
+@pytest.mark.parametrize("format", ["binary_little_endian", "ascii"])
+def test_counts_beyond_the_file_allocate_nothing(tmp_path, count, format):
+    whole = dialect(random_gaussians(3, 0), format=format)
+    path = tmp_path / "scene.ply"
+    path.write_bytes(whole.replace(b"element vertex 3", f"element vertex {count}".encode()))
+    one_line(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ((b"ply\n", b"plz\n"), "not a PLY file"),
+        ((b"format binary_little_endian 1.0\n", b""), "format"),
+        ((b"1.0", b"2.0"), "makes no sense"),
+        ((b"property float opacity", b"property quaternion opacity"), "makes no sense"),
+        ((b"property float opacity", b"property float x"), "twice"),
+        ((b"property float opacity", b"property float alpha"), "no opacity"),
+        ((b"property float f_rest_8", b"property float f_rest_9"), "SH degree"),
+        ((b"property float f_rest_8", b"property float other"), "SH degree"),
+        ((b"property float f_rest_8", b"property list uchar float f_rest_8"), "list property"),
+        ((b"element vertex", b"element vortex"), "'vertex'"),
+        ((b"comment made", b"element vertex 0\ncomment made"), "2 'vertex'"),
+        ((b"comment made by a test", FACES.encode()), "vertex' first"),
+        ((b"end_header", b"end_heads!"), "no end"),
+        ((b"comment made by a test", b"comment " + b"x" * 5000), "no end"),
+    ],
+)
+def test_headers_that_make_no_sense(tmp_path, change, expected):
+    whole = dialect(random_gaussians(3, 1))
+    assert change[0] in whole
+    path = tmp_path / "scene.ply"
+    path.write_bytes(whole.replace(*change))
+    assert expected in one_line(path)
+
+
+@pytest.mark.parametrize("row", [b"0.0 nonsense", b"0.0", b"", b"\xff\xfe"])
+def test_ascii_rows_that_are_not_numbers(tmp_path, row):
+    lines = dialect(random_gaussians(4, 0), format="ascii").split(b"\n")
+    lines[-3] = row.ljust(200)
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"\n".join(lines))
+    one_line(path)
+
+
+def test_random_damage_never_escapes(tmp_path):
+    """Bytes changed anywhere: a scene, or one line; never another exception."""
+    random = np.random.default_rng(0)
+    path = tmp_path / "scene.ply"
+    for format in ("binary_little_endian", "ascii"):
+        whole = dialect(random_gaussians(3, 0), format=format)
+        for _ in range(300):
+            damaged = bytearray(whole)
+            for _ in range(random.integers(1, 4)):
+                damaged[random.integers(len(damaged))] = random.integers(256)
+            path.write_bytes(damaged)
+            with contextlib.suppress(UserError):
+                read_gaussians(path)
+
+
+def test_not_there_and_not_a_file(tmp_path):
+    assert "cannot be read" in one_line(tmp_path / "absent.ply")
+    (tmp_path / "folder.ply").mkdir()
+    assert "cannot be read" in one_line(tmp_path / "folder.ply")
+    with pytest.raises(UserError, match=r"\.ply"):
+        read_gaussians(tmp_path / "scene.obj")
+
+
+def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "scene.ply"
+    write_gaussians(path, random_gaussians(5, 1))
+    old = path.read_bytes()
+    monkeypatch.setattr(ply, "_WRITE_ROWS", 0)  # makes the writer raise after its header
+    with pytest.raises(ValueError, match="range"):
+        write_gaussians(path, random_gaussians(9, 1))
+    assert path.read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_points_round_trip(tmp_path):
+    random = np.random.default_rng(0)
+    xyz = random.normal(size=(100, 3)).astype(np.float32)
+    rgb = random.integers(0, 256, (100, 3)).astype(np.uint8)
+    ply.write_points(tmp_path / "input.ply", xyz, rgb)
+    again = ply.read_points(tmp_path / "input.ply")
+    np.testing.assert_array_equal(again[0], xyz)
+    np.testing.assert_array_equal(again[1], rgb)
+    header = (tmp_path / "input.ply").read_bytes().split(b"end_header")[0].decode()
+    names = [line.split()[-1] for line in header.splitlines() if line.startswith("property")]
+    assert names == ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"]
+
+
+def test_points_without_colour_or_with_float_colour(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    head += "property float x\nproperty float y\nproperty float z\n"
+    path = tmp_path / "points.ply"
+    path.write_text(head + "end_header\n1 2 3\n")
+    xyz, rgb = ply.read_points(path)
+    assert xyz.tolist() == [[1, 2, 3]]
+    assert rgb.tolist() == [[128, 128, 128]]
+    colors = "".join(f"property float {c}\n" for c in ("red", "green", "blue"))
+    path.write_text(head + colors + "end_header\n1 2 3 0 0.5 2.0\n")
+    assert ply.read_points(path)[1].tolist() == [[0, 128, 255]]
+    path.write_text(head.replace("property float z\n", "") + "end_header\n1 2\n")
+    with pytest.raises(UserError, match="not of points"):
+        ply.read_points(path)
