@@ -1,0 +1,126 @@
+"""What a user meets first: the wheel, where it is put, a machine without a compiler."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from snowsplat import __version__
+from snowsplat.ops import native
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+NO_COMPILER = "snowsplat: no C++ compiler found; install one (Debian/Ubuntu: apt install g++)"
+
+
+def run(*command: str | Path, **options) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, **options)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    pytest.importorskip("scikit_build_core")
+    folder = tmp_path_factory.mktemp("wheel")
+    # The build folder of `make native`: nothing is compiled a second time.
+    command = [sys.executable, "-m", "pip", "wheel", REPOSITORY, "--no-deps", "--no-index"]
+    command += ["--no-build-isolation", "--wheel-dir", folder, "-C", "build-dir=build/native"]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    if shutil.which("flock"):
+        command = ["flock", "build/native.lock", *command]
+    result = run(*command, cwd=REPOSITORY, env=os.environ | {"PATH": path})
+    assert result.returncode == 0, result.stdout + result.stderr
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_one_wheel_for_every_python_of_a_platform(wheel):
+    name, version, python, abi, platform = wheel.stem.split("-")
+    assert (name, version, python, abi) == ("snowsplat", __version__, "py3", "none")
+    assert platform != "any"
+
+
+def test_wheel_carries_the_libraries_and_all_of_python(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for isa in native.available_isas():
+        assert f"snowsplat/_lib/libsnowsplat_{isa}.so" in names
+    package = REPOSITORY / "src" / "snowsplat"
+    sources = {f"snowsplat/{p.relative_to(package).as_posix()}" for p in package.rglob("*.py")}
+    assert sources <= names
+    assert "snowsplat/py.typed" in names
+    assert not any(name.startswith("snowsplat/native/cpu") for name in names)
+
+
+def test_wheel_works_out_of_the_checkout(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path)
+    code = (
+        "import snowsplat; from snowsplat.ops import native; native.set_num_threads(1);"
+        "print(snowsplat.__file__, snowsplat.__version__, native.isa())"
+    )
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("SNOWSPLAT_")}
+    result = run(
+        sys.executable, "-c", code, cwd=tmp_path, env=clean | {"PYTHONPATH": str(tmp_path)}
+    )
+    file = tmp_path / "snowsplat" / "__init__.py"
+    assert result.stdout.split() == [str(file), __version__, native.available_isas()[-1]]
+
+
+def test_libraries_need_nothing_but_the_c_library():
+    if not (readelf := shutil.which("readelf")):
+        pytest.skip("needs readelf (apt install binutils)")
+    for isa in native.available_isas():
+        library = REPOSITORY / "src" / "snowsplat" / "_lib" / f"libsnowsplat_{isa}.so"
+        dynamic = run(readelf, "--dynamic", library).stdout.splitlines()
+        needed = {line.split("[")[1].rstrip("]") for line in dynamic if "(NEEDED)" in line}
+        assert {name.split(".")[0] for name in needed} <= {
+            "libc",
+            "libm",
+            "libpthread",
+            "ld-linux-x86-64",
+            "ld-linux-aarch64",
+        }
+
+
+@pytest.fixture
+def bare_path(tmp_path) -> str:
+    """A PATH with the tools of a fresh system and of the environment, but no compiler."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for tool in ("sh", "env", "make", "mkdir", "cmake", "ninja", "uname"):
+        beside = Path(sys.executable).parent / tool
+        found = beside if beside.exists() else shutil.which(tool)
+        if found:
+            (folder / tool).symlink_to(found)
+    return str(folder)
+
+
+def test_cmake_without_a_compiler_says_what_to_install(tmp_path, bare_path):
+    environment = {"PATH": bare_path, "HOME": str(tmp_path)}
+    command = ["cmake", "-G", "Ninja", "-S", REPOSITORY, "-B", tmp_path / "build"]
+    result = run(f"{bare_path}/cmake", *command[1:], env=environment)
+    assert result.returncode != 0
+    assert NO_COMPILER in [line.strip() for line in result.stderr.splitlines()]
+
+
+def test_make_without_a_compiler_says_what_to_install(bare_path):
+    command = [f"{bare_path}/make", "--no-print-directory", f"PYTHON={bare_path}/python", "native"]
+    result = run(*command, cwd=REPOSITORY, env={"PATH": bare_path})
+    assert result.returncode != 0
+    assert result.stderr.splitlines()[0] == NO_COMPILER
+
+
+def test_command_is_installed():
+    pyproject = (REPOSITORY / "pyproject.toml").read_text()
+    assert 'snowsplat = "snowsplat.cli.main:main"' in pyproject
+    result = run(
+        sys.executable,
+        "-m",
+        "snowsplat",
+        "--help",
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY / "src")},
+    )
+    assert result.returncode == 0, result.stderr
+    for verb in ("train", "render", "evaluate", "info"):
+        assert verb in result.stdout
