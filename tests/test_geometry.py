@@ -71,7 +71,7 @@ def test_zero_quaternion_is_the_identity_with_finite_gradient():
 def test_gradients():
     quats = random_quats(4, 1).requires_grad_()
     assert torch.autograd.gradcheck(rotation_from_quat, quats)
-    # The inverse too, through matrices that it may take as it likes: near half turns and in general.
+    # The inverse too, near half turns and in general.
     near_half_turns = torch.eye(4, dtype=F64)[1:] + 0.01
     for start in (quats.detach(), near_half_turns):
         assert torch.autograd.gradcheck(

@@ -1,4 +1,4 @@
-"""PLY files: scenes in the reference implementation's layout, and coloured point clouds.
+"""PLY files: scenes in the reference implementation's layout.
 
 A scene of SH degree 3 has 62 float properties a Gaussian, in this order: x y z, nx ny nz (zeros),
 f_dc_0..2, f_rest_0..44, opacity, scale_0..2, rot_0..3. Values are the optimised parameters, before
@@ -14,8 +14,8 @@ import torch
 
 from snowsplat.errors import UserError
 from snowsplat.files import atomic_path
-from snowsplat.formats.ply_table import PlyTable, open_table
 from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.ply_table import PlyTable, header, open_table
 
 _WRITE_ROWS = 1 << 14
 
@@ -96,7 +96,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     n, k = sh_rest.shape[:2]
     names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(k), "opacity", *_SCALES, *_QUATS]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(_header(n, [("float", name) for name in names]))
+        file.write(header(n, [("float", name) for name in names]))
         for start in range(0, n, _WRITE_ROWS):
             part = slice(start, start + _WRITE_ROWS)
             rows = np.zeros((len(means[part]), len(names)), "<f4")
@@ -107,60 +107,3 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
             rows[:, -7:-4] = log_scales[part]
             rows[:, -4:] = quats[part]
             file.write(rows.tobytes())
-
-
-_RGB = ["red", "green", "blue"]
-_POINT = np.dtype([(name, "<f4") for name in _MEANS + _NORMALS] + [(name, "u1") for name in _RGB])
-
-
-def write_points(path: Path | str, xyz: np.ndarray, rgb: np.ndarray) -> None:
-    """Write a point cloud atomically: ``xyz`` (P, 3) float, ``rgb`` (P, 3) uint8.
-
-    Raises:
-        OSError: the folder is absent or not writable, or the disk is full.
-    """
-    rows = np.zeros(len(xyz), _POINT)
-    for column, name in enumerate(_MEANS):
-        rows[name] = xyz[:, column]
-    for column, name in enumerate(_RGB):
-        rows[name] = rgb[:, column]
-    kinds = [
-        ("uchar" if _POINT[name] == np.uint8 else "float", name) for name in _POINT.names or ()
-    ]
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(_header(len(rows), kinds))
-        file.write(rows.tobytes())
-
-
-def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
-    """Read a point cloud: xyz (P, 3) float32 and rgb (P, 3) uint8 (grey if it has none).
-
-    Colours of a floating type are taken as 0 to 1.
-
-    Raises:
-        UserError: absent, damaged, too short, or without x, y, z.
-    """
-    table = open_table(path)
-    if not all(name in table.columns for name in _MEANS):
-        raise UserError(f"{path}: a PLY file, but not of points: it has no x, y, z")
-    xyz = np.empty((table.count, 3), np.float32)
-    rgb = np.full((table.count, 3), 128, np.uint8)
-    colors = [name for name in _RGB if name in table.columns]
-    with np.errstate(over="ignore", invalid="ignore"):
-        for start, rows in table.rows():
-            part = slice(start, start + len(rows))
-            for column, name in enumerate(_MEANS):
-                xyz[part, column] = rows[name]
-            if len(colors) == 3:
-                for column, name in enumerate(colors):
-                    values = rows[name]
-                    if values.dtype.kind == "f":
-                        values = np.nan_to_num(values.astype(np.float32)) * 255.0 + 0.5
-                    rgb[part, column] = np.clip(values, 0, 255)
-    return xyz, rgb
-
-
-def _header(count: int, properties: list[tuple[str, str]]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property {kind} {name}" for kind, name in properties]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")

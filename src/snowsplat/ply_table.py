@@ -213,3 +213,10 @@ def _parse_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Elemen
     if format is None:
         raise UserError(f"{path}: the PLY header does not say its format")
     return format, elements
+
+
+def header(count: int, properties: list[tuple[str, str]]) -> bytes:
+    """The header of a little-endian file of vertices; properties are pairs (PLY type, name)."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {kind} {name}" for kind, name in properties]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
