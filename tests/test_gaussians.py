@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from snowsplat.camera import Camera
-from snowsplat.gaussians import SH_C0, Gaussians, bounds_in_view
+from snowsplat.gaussians import SH_C0, Gaussians
 
 
 def zeros(n: int, rest: int = 15, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
@@ -118,42 +117,3 @@ def test_random_in_bounds_is_inside_and_repeatable():
     assert (a.means.amax(0) - a.means.amin(0) > 0.9 * (bounds[1] - bounds[0])).all()
     for name, tensor in a.parameters().items():
         assert torch.equal(tensor, b.parameters()[name])
-
-
-def looking(position: list[float], forward: list[float]) -> Camera:
-    """A 90° camera at ``position``; the roll is any."""
-    z = torch.nn.functional.normalize(torch.tensor(forward, dtype=torch.float64), dim=0)
-    side = torch.tensor([0.3, 0.5, -0.8], dtype=torch.float64)
-    x = torch.nn.functional.normalize(torch.linalg.cross(side, z), dim=0)
-    rotation = torch.stack([x, torch.linalg.cross(z, x), z])
-    t = -rotation @ torch.tensor(position, dtype=torch.float64)
-    return Camera(200, 100, 100.0, 100.0, 100.0, 50.0, torch.cat([rotation, t[:, None]], 1))
-
-
-def test_bounds_in_view_of_cameras_around_an_object():
-    middle = torch.tensor([1.0, -2.0, 0.5])
-    cameras = []
-    for i in range(12):
-        direction = torch.tensor([math.cos(i), math.sin(i), 0.3 * math.sin(3 * i)])
-        direction = direction / direction.norm()
-        cameras.append(looking((middle - 4 * direction).tolist(), direction.tolist()))
-    low, high = bounds_in_view(cameras)
-    torch.testing.assert_close((low + high) / 2, middle, atol=0.02, rtol=0)
-    torch.testing.assert_close(high - low, torch.full((3,), 8.0), atol=0.1, rtol=0)  # 90° at 4
-
-
-@pytest.mark.parametrize(
-    "cameras",
-    [
-        [looking([0, 0, 0], [0, 0, 1])],
-        [looking([float(i), 0, 0], [0, 0, 1]) for i in range(5)],  # parallel
-        [looking([math.cos(i), math.sin(i), 0], [math.cos(i), math.sin(i), 0]) for i in range(9)],
-    ],
-    ids=["one", "parallel", "outward"],
-)
-def test_bounds_in_view_always_have_a_size_and_hold_the_cameras_region(cameras):
-    low, high = bounds_in_view(cameras)
-    assert low.isfinite().all()
-    assert high.isfinite().all()
-    assert (high - low > 0.5).all()
-    assert (high - low < 100).all()

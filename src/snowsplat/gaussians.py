@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.camera import Camera
 
 #: The constant basis function of the spherical harmonics, Y_00 = 1 / (2 sqrt(pi)).
 SH_C0 = 0.28209479177387814
@@ -213,38 +212,3 @@ def _spacing(points: Tensor) -> Tensor:
     # is relative to the cloud, so that the unit of length of the capture does not matter.
     floor = 1e-3 * float(spacing.median())
     return spacing.clamp_min(floor if floor > 0.0 else 1e-6)
-
-
-def bounds_in_view(cameras: Sequence[Camera]) -> Tensor:
-    """(2, 3) corners of a cube around what the cameras look at, for a capture without points.
-
-    The centre is the point nearest to all optical axes in the least-squares sense; the half side is
-    what the median camera sees at that distance. Cameras that look apart or in parallel meet
-    nowhere useful: then the cube is around the cameras themselves, three times as wide as they
-    spread.
-
-    Raises:
-        ValueError: no cameras.
-    """
-    if not cameras:
-        raise ValueError("bounds_in_view needs at least one camera")
-    poses = torch.stack([camera.cam_from_world.detach().to(torch.float64) for camera in cameras])
-    axes = poses[:, 2, :3]
-    centres = -torch.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
-    spread = float((centres - centres.mean(0)).norm(dim=1).max()) or 1.0
-
-    # Minimise the sum over cameras of |(I − d dᵀ)(p − c)|². A little pull towards the middle of the
-    # cameras keeps the system regular where all the axes are parallel.
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
-    pull = 1e-3 * len(cameras)
-    system = across.sum(0) + pull * torch.eye(3, dtype=torch.float64)
-    target = torch.einsum("nij,nj->i", across, centres) + pull * centres.mean(0)
-    centre = torch.linalg.solve(system, target)
-
-    depth = float(torch.einsum("ni,ni->n", centre - centres, axes).median())
-    if depth > 0.1 * spread:
-        tangents = [0.5 * max(c.width / c.fx, c.height / c.fy) for c in cameras]
-        half = depth * float(torch.tensor(tangents).median())
-    else:
-        centre, half = centres.mean(0), 3.0 * spread
-    return torch.stack([centre - half, centre + half]).to(torch.float32)
