@@ -1,0 +1,98 @@
+"""`neighbours`: known distances, and native against the twin."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.ops import reference
+
+from .scenes import Variant, as_float32, assert_close, generator, normal, one_line, uniform
+
+pytestmark = pytest.mark.isa
+
+
+def grid(*counts: int, spacing: float = 1.0) -> Tensor:
+    axes = [torch.arange(n, dtype=torch.float64) * spacing for n in counts]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, len(counts))
+
+
+def test_grid(variant: Variant) -> None:
+    """Every point of a grid has three neighbours at the spacing, every corner exactly three."""
+    points = grid(7, 5, 4, spacing=0.25).to(variant.dtype)
+    distances = variant.ops.neighbours(points, k=4)
+    assert distances.dtype == variant.dtype
+    assert (distances[:, :3] == 0.25).all()
+    corner = torch.tensor([0.25, 0.25, 0.25, 0.25 * math.sqrt(2)])
+    assert_close(distances[0], corner, 1e-6)
+
+
+def test_line(variant: Variant) -> None:
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [7, 0, 0]]).to(variant.dtype)
+    expected = torch.tensor([[1.0, 3, 7], [1, 2, 6], [2, 3, 4], [4, 6, 7]])
+    assert torch.equal(variant.ops.neighbours(points).float(), expected)
+    assert torch.equal(variant.ops.neighbours(points, k=1).float(), expected[:, :1])
+
+
+def test_points_at_the_same_place(variant: Variant) -> None:
+    points = torch.zeros(10, 3, dtype=variant.dtype)
+    points[9] = torch.tensor([3.0, 4.0, 0.0])
+    distances = variant.ops.neighbours(points)
+    assert (distances[:9] == 0).all()
+    assert (distances[9] == 5).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_fewer_points_than_neighbours(variant: Variant, count: int) -> None:
+    """What does not exist is infinitely far away."""
+    distances = variant.ops.neighbours(grid(count, 1, 1).to(variant.dtype), k=3)
+    assert distances.shape == (count, 3)
+    assert distances.isfinite().sum(dim=1).tolist() == [count - 1] * count
+
+
+CLOUDS = {
+    "4 points": lambda g: normal(g, 4, 3),
+    "17 points": lambda g: normal(g, 17, 3),
+    "Gaussian": lambda g: normal(g, 1500, 3),
+    "uniform": lambda g: uniform(g, 0, 1, 1500, 3),
+    "plane": lambda g: normal(g, 1000, 3) * torch.tensor([1.0, 0, 1]),
+    "line": lambda g: normal(g, 800, 1) * torch.tensor([1.0, 2, -3]),
+    "clusters": lambda g: 100 * normal(g, 8, 3).repeat(100, 1) + 0.01 * normal(g, 800, 3),
+    "heavy tails": lambda g: normal(g, 1000, 3) * torch.exp(3 * normal(g, 1000, 1)),
+    "duplicates": lambda g: normal(g, 60, 3).repeat(10, 1),
+    "far from the origin": lambda g: 64 + uniform(g, 0, 1, 700, 3),
+    "one outlier": lambda g: torch.cat([uniform(g, 0, 1, 700, 3), torch.tensor([[1e6, 0, 0]])]),
+}
+
+
+@pytest.mark.parametrize("k", [1, 3, 5])
+@pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS.keys())
+def test_native_is_the_twin(native: Variant, cloud, k: int) -> None:
+    points = as_float32(cloud(generator(0)).double())
+    k = min(k, len(points) - 1)
+    expected = reference.neighbours(points, k)
+    actual = native.ops.neighbours(points.to(native.dtype), k)
+    # Every distance by itself: the L2 over all would let the outlier hide the rest.
+    torch.testing.assert_close(actual.double(), expected, rtol=native.forward * 1e-1, atol=1e-12)
+
+
+WRONG = {
+    "two columns": (torch.zeros(5, 2), 3),
+    "one point": (torch.zeros(3), 3),
+    "no neighbours": (torch.zeros(5, 3), 0),
+    "integers": (torch.zeros(5, 3, dtype=torch.int32), 3),
+    "half": (torch.zeros(5, 3, dtype=torch.float16), 3),
+    "NaN": (torch.full((5, 3), math.nan), 3),
+    "infinity": (torch.full((5, 3), math.inf), 3),
+}
+
+
+@pytest.mark.parametrize(("points", "k"), WRONG.values(), ids=WRONG.keys())
+def test_wrong_input(points: Tensor, k: int) -> None:
+    with pytest.raises(ValueError, match="neighbours") as caught:
+        ops.neighbours(points, k)
+    assert one_line(caught.value)

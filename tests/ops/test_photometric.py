@@ -1,0 +1,216 @@
+"""`ssim` and `photometric_loss`: closed forms, a loop, finite differences, native against the twin."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+
+from .scenes import (
+    TWIN,
+    Variant,
+    as_float32,
+    assert_close,
+    generator,
+    one_line,
+    uniform,
+)
+
+pytestmark = pytest.mark.isa
+
+SIZES = [(1, 1), (5, 3), (3, 5), (11, 11), (17, 23), (16, 16), (33, 64), (70, 41)]
+C1, C2 = 0.01**2, 0.03**2
+
+
+def images(seed: int, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """A smooth picture and a noisy, shifted version of it, (H, W, 3) of planar storage, in [0, 1]."""
+    g = generator(seed)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    waves = [torch.sin(0.3 * x + 0.2 * y + phase) for phase in (0.0, 1.0, 2.0)]
+    smooth = 0.5 + 0.35 * torch.stack(waves).double()
+    noisy = (smooth + uniform(g, -0.15, 0.15, 3, height, width)).clamp(0, 1)
+    return as_float32(smooth).permute(1, 2, 0), as_float32(noisy.roll(1, dims=2)).permute(1, 2, 0)
+
+
+def window() -> list[float]:
+    weights = [math.exp(-((i - 5) ** 2) / (2 * 1.5**2)) for i in range(11)]
+    return [w / sum(weights) for w in weights]
+
+
+def ssim_slowly(a: Tensor, b: Tensor) -> float:
+    """The definition, a pixel at a time: moments under the window, zeros outside of the image."""
+    height, width, channels = a.shape
+    w = window()
+    total = 0.0
+    for channel in range(channels):
+        for j in range(height):
+            for i in range(width):
+                moments = [0.0] * 5
+                for dj in range(max(-5, -j), min(6, height - j)):
+                    for di in range(max(-5, -i), min(6, width - i)):
+                        weight = w[dj + 5] * w[di + 5]
+                        p = float(a[j + dj, i + di, channel])
+                        q = float(b[j + dj, i + di, channel])
+                        for k, value in enumerate((p, q, p * p, q * q, p * q)):
+                            moments[k] += weight * value
+                p, q, pp, qq, pq = moments
+                luminance = (2 * p * q + C1) / (p * p + q * q + C1)
+                structure = (2 * (pq - p * q) + C2) / (pp - p * p + qq - q * q + C2)
+                total += luminance * structure
+    return total / a.numel()
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_ssim_of_equal_images_is_one(variant: Variant, height: int, width: int) -> None:
+    a = images(0, height, width)[0].to(variant.dtype)
+    assert abs(float(variant.ops.ssim(a, a)) - 1) < 1e-6
+    loss = variant.ops.photometric_loss(a.requires_grad_(), a.detach().clone())
+    assert abs(loss.item()) < 1e-6
+    loss.backward()
+    assert a.grad is not None
+    assert a.grad.abs().max() < 1e-3 / a.numel()
+
+
+def test_ssim_of_one_pixel(variant: Variant) -> None:
+    """The window sees the pixel with its central weight, and zeros."""
+    p, q = 0.75, 0.25
+    a, b = torch.full((1, 1, 3), p).to(variant.dtype), torch.full((1, 1, 3), q).to(variant.dtype)
+    w = window()[5] ** 2
+    luminance = (2 * w * w * p * q + C1) / (w * w * (p * p + q * q) + C1)
+    structure = (2 * (w - w * w) * p * q + C2) / ((w - w * w) * (p * p + q * q) + C2)
+    assert float(variant.ops.ssim(a, b)) == pytest.approx(luminance * structure, rel=1e-5)
+
+
+def test_ssim_of_constant_images(variant: Variant) -> None:
+    """Far from the border of flat images only the luminance counts; the border is left out here."""
+    p, q = 0.75, 0.25
+    luminance = (2 * p * q + C1) / (p * p + q * q + C1)
+    totals = []
+    for size in (30, 31):
+        a = torch.full((size, size, 3), p).to(variant.dtype)
+        b = torch.full((size, size, 3), q).to(variant.dtype)
+        totals.append(float(variant.ops.ssim(a, b).double()) * size**2)
+    # One row and column more: 2 · 30 + 1 pixels, of which 2 · 10 lie within 5 of a border, the rest
+    # inside. Three sizes tell the border's share apart.
+    a = torch.full((32, 32, 3), p).to(variant.dtype)
+    b = torch.full((32, 32, 3), q).to(variant.dtype)
+    totals.append(float(variant.ops.ssim(a, b).double()) * 32**2)
+    # S(n) = (n − 10)² l + border terms linear in n, so that the second difference is 2 l.
+    assert totals[2] - 2 * totals[1] + totals[0] == pytest.approx(2 * luminance, rel=2e-3)
+
+
+def test_definition(variant: Variant) -> None:
+    a, b = images(1, 7, 13)
+    expected = ssim_slowly(a, b)
+    assert float(variant.ops.ssim(a.to(variant.dtype), b.to(variant.dtype))) == pytest.approx(
+        expected, rel=1e-5
+    )
+
+
+def test_loss_is_the_weighted_sum(variant: Variant) -> None:
+    a, b = (i.to(variant.dtype) for i in images(2, 17, 23))
+    l1, dssim = float((a - b).abs().mean()), 1 - float(variant.ops.ssim(a, b))
+    for weight in (0.0, 0.2, 1.0):
+        loss = variant.ops.photometric_loss(a, b, weight)
+        assert loss.shape == ()
+        assert float(loss) == pytest.approx((1 - weight) * l1 + weight * dssim, rel=1e-5)
+    default = variant.ops.photometric_loss(a, b)
+    assert float(default) == pytest.approx(0.8 * l1 + 0.2 * dssim, rel=1e-5)
+
+
+def test_bytes_are_a_target_too(variant: Variant) -> None:
+    a, b = images(3, 17, 23)
+    a = a.to(variant.dtype).requires_grad_()
+    levels = (b * 255).round().to(torch.uint8)
+    as_bytes = variant.ops.photometric_loss(a, levels)
+    as_bytes.backward()
+    grad, a.grad = a.grad, None
+    as_floats = variant.ops.photometric_loss(a, levels.to(variant.dtype) / 255)
+    as_floats.backward()
+    assert grad is not None
+    assert a.grad is not None
+    assert float(as_bytes) == pytest.approx(float(as_floats), rel=1e-6)
+    assert_close(grad, a.grad, 1e-5)
+    assert float(variant.ops.ssim(a, levels)) == pytest.approx(
+        float(variant.ops.ssim(a, levels.to(variant.dtype) / 255)), rel=1e-6
+    )
+
+
+def test_storage_does_not_matter(variant: Variant) -> None:
+    """Interleaved images (H, W, C) are as good as planar ones."""
+    a, b = (i.to(variant.dtype) for i in images(4, 17, 23))
+    assert not a.is_contiguous()
+    planar = variant.ops.photometric_loss(a, b)
+    interleaved = variant.ops.photometric_loss(a.contiguous(), b.contiguous())
+    assert_close(interleaved, planar, 1e-6)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_finite_differences(double: Variant, weight: float) -> None:
+    a, b = images(5, 6, 13)
+    assert (a - b).abs().min() > 1e-5  # |a − b| has a kink where they are equal
+
+    def loss(image: Tensor) -> Tensor:
+        return double.ops.photometric_loss(image, b, weight)
+
+    assert torch.autograd.gradcheck(loss, (a.requires_grad_(),), eps=1e-6, atol=1e-8, rtol=1e-5)
+
+
+def test_finite_differences_of_ssim(double: Variant) -> None:
+    a, b = images(6, 5, 9)
+
+    def similarity(image: Tensor) -> Tensor:
+        return double.ops.ssim(image, b)
+
+    assert torch.autograd.gradcheck(
+        similarity, (a.requires_grad_(),), eps=1e-6, atol=1e-8, rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize(("height", "width"), [*SIZES, (3, 2000), (500, 2)])
+@pytest.mark.parametrize("name", ["ssim", "photometric_loss"])
+def test_native_is_the_twin(native: Variant, name: str, height: int, width: int) -> None:
+    a, b = images(height + width, height, width)
+    values, grads = [], []
+    for variant in (TWIN, native):
+        image = a.to(variant.dtype, copy=True).requires_grad_()
+        value = getattr(variant.ops, name)(image, b.to(variant.dtype))
+        assert value.dtype == variant.dtype
+        (3 * value).backward()
+        values.append(value)
+        grads.append(image.grad)
+    assert_close(values[1], values[0], native.forward, "value")
+    assert_close(grads[1], grads[0], native.backward, "gradient")
+
+
+def test_native_is_the_twin_on_flat_images(native: Variant) -> None:
+    """Without structure the variances are differences of nearly equal numbers."""
+    a = as_float32(torch.full((20, 30, 3), 0.9, dtype=torch.float64)).permute(0, 1, 2)
+    b = as_float32(torch.full((20, 30, 3), 0.85, dtype=torch.float64))
+    values = [v.ops.ssim(a.to(v.dtype), b.to(v.dtype)) for v in (TWIN, native)]
+    assert_close(values[1], values[0], native.forward)
+
+
+WRONG = {
+    "another size": (torch.zeros(5, 4, 3), torch.zeros(4, 5, 3)),
+    "a batch": (torch.zeros(1, 5, 4, 3), torch.zeros(1, 5, 4, 3)),
+    "another number of channels": (torch.zeros(5, 4, 3), torch.zeros(5, 4, 1)),
+    "an empty image": (torch.zeros(0, 4, 3), torch.zeros(0, 4, 3)),
+    "bytes as the image": (torch.zeros(5, 4, 3, dtype=torch.uint8), torch.zeros(5, 4, 3)),
+    "half": (torch.zeros(5, 4, 3, dtype=torch.float16), torch.zeros(5, 4, 3)),
+    "target of integers": (torch.zeros(5, 4, 3), torch.zeros(5, 4, 3, dtype=torch.int32)),
+    "target of another precision": (torch.zeros(5, 4, 3), torch.zeros(5, 4, 3).double()),
+    "target elsewhere": (torch.zeros(5, 4, 3), torch.zeros(5, 4, 3, device="meta")),
+}
+
+
+@pytest.mark.parametrize(("image", "target"), WRONG.values(), ids=WRONG.keys())
+@pytest.mark.parametrize("name", ["ssim", "photometric_loss"])
+def test_wrong_input(name: str, image: Tensor, target: Tensor) -> None:
+    with pytest.raises(ValueError, match=name) as caught:
+        getattr(ops, name)(image, target)
+    assert one_line(caught.value)

@@ -1,0 +1,347 @@
+"""`project`: closed forms, visibility, finite differences, and native against the twin."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.ops import reference
+
+from .scenes import (
+    PARAMETERS,
+    Scene,
+    Variant,
+    assert_close,
+    differentiable_columns,
+    generator,
+    normal,
+    one_line,
+    random_scene,
+    smooth_scene,
+    view_of,
+    world_points,
+)
+
+pytestmark = pytest.mark.isa
+
+IDENTITY = torch.eye(3, 4, dtype=torch.float64)
+VIEW = view_of(40, 30, focal=50.0, sh_degree=0)
+
+
+def single(
+    mean: tuple[float, float, float],
+    scales: tuple[float, float, float] = (0.1, 0.1, 0.1),
+    quat: tuple[float, float, float, float] = (1, 0, 0, 0),
+    logit: float = 1.0,
+) -> Scene:
+    """One Gaussian before a camera at the origin that looks along z."""
+    tensor = partial(torch.tensor, dtype=torch.float64)
+    params = {
+        "means": tensor([mean]),
+        "log_scales": tensor([scales]).log(),
+        "quats": tensor([quat]),
+        "opacity_logits": tensor([logit]),
+        "sh_dc": tensor([[[0.5, -0.25, -9.0]]]),
+        "sh_rest": torch.zeros(1, 0, 3, dtype=torch.float64),
+    }
+    return Scene(params, IDENTITY, VIEW)
+
+
+def covariance(conic: Tensor) -> Tensor:
+    a, b, c = conic.double().tolist()
+    return torch.linalg.inv(torch.tensor([[a, b], [b, c]], dtype=torch.float64))
+
+
+def test_gaussian_on_the_axis(variant: Variant) -> None:
+    scene = single((0, 0, 2), (0.1, 0.2, 0.4)).to(variant.dtype)
+    splats = scene.project(variant.ops)
+    assert splats.ids is not None
+    assert splats.ids.tolist() == [0]
+    assert splats.packed.shape == (1, 16)
+    assert splats.packed.dtype == variant.dtype
+    close = partial(torch.testing.assert_close, rtol=1e-5, atol=1e-6, check_dtype=False)
+    close(splats.means2d[0], torch.tensor([VIEW["cx"], VIEW["cy"]]))
+    # The variances are (f s / z)² + 0.3 and the depth axis of the Gaussian does not matter.
+    sxx, syy = (VIEW["fx"] * 0.1 / 2) ** 2 + 0.3, (VIEW["fy"] * 0.2 / 2) ** 2 + 0.3
+    close(splats.conics[0], torch.tensor([1 / sxx, 0, 1 / syy]))
+    close(splats.opacities[0], torch.tensor(1 / (1 + math.exp(-1))))
+    close(splats.depths[0], torch.tensor(2.0))
+    close(splats.radii[0], torch.tensor(3 * math.sqrt(syy)))
+    c0 = 0.5 / math.sqrt(math.pi)
+    close(splats.colors[0], torch.tensor([0.5 + 0.5 * c0, 0.5 - 0.25 * c0, 0.0]))
+
+
+def test_quaternion_turns_the_axes(variant: Variant) -> None:
+    """wxyz: a quarter turn about z swaps x and y; an eighth makes x → (x + y)/√2, positive xy."""
+    quarter, eighth = math.pi / 4, math.pi / 8
+    turned = single((0, 0, 2), (0.2, 0.05, 0.1), (math.cos(quarter), 0, 0, math.sin(quarter)))
+    plain = single((0, 0, 2), (0.05, 0.2, 0.1))
+    conics = [s.to(variant.dtype).project(variant.ops).conics[0] for s in (turned, plain)]
+    torch.testing.assert_close(conics[0], conics[1], rtol=1e-5, atol=1e-6)
+    slanted = single((0, 0, 2), (0.2, 0.05, 0.1), (math.cos(eighth), 0, 0, math.sin(eighth)))
+    assert covariance(slanted.to(variant.dtype).project(variant.ops).conics[0])[0, 1] > 1
+
+
+def test_length_of_the_quaternion_does_not_matter(variant: Variant) -> None:
+    scene = random_scene(3, 20).to(variant.dtype)
+    expected = scene.project(variant.ops)
+    for factor in (1e-3, 7.0, 1e4):
+        scaled = Scene(
+            {**scene.params, "quats": scene.params["quats"] * factor},
+            scene.cam_from_world,
+            scene.view,
+        )
+        assert_close(scaled.project(variant.ops).packed, expected.packed, 1e-5)
+
+
+def test_zero_quaternion_is_no_rotation(variant: Variant) -> None:
+    plain = single((0.1, 0.2, 2), (0.2, 0.05, 0.1)).to(variant.dtype)
+    zero = single((0.1, 0.2, 2), (0.2, 0.05, 0.1), (0, 0, 0, 0)).to(variant.dtype)
+    splats = zero.project(variant.ops)
+    assert_close(splats.packed, plain.project(variant.ops).packed, 1e-6)
+    splats.packed.sum().backward()
+    assert zero.params["quats"].grad is not None
+    assert zero.params["quats"].grad.isfinite().all()
+
+
+def test_isotropic_gaussian_off_the_axis(variant: Variant) -> None:
+    x, y, z, s = 0.3, -0.2, 2.0, 0.15
+    splats = single((x, y, z), (s, s, s)).to(variant.dtype).project(variant.ops)
+    fx, fy = VIEW["fx"], VIEW["fy"]
+    J = torch.tensor([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]]).double()
+    expected = s**2 * J @ J.T + 0.3 * torch.eye(2)
+    assert_close(covariance(splats.conics[0]), expected, 1e-5)
+    centre = torch.tensor([[fx * x / z + VIEW["cx"], fy * y / z + VIEW["cy"]]])
+    assert_close(splats.means2d, centre, 1e-6)
+
+
+def test_jacobian_is_held_outside_of_the_image(variant: Variant) -> None:
+    """The centre is at x/z = 1.5; the ratio in J stops 15% of the width beyond the border."""
+    s, z = 1.0, 2.0
+    splats = single((3.0, 0, z), (s, s, s)).to(variant.dtype).project(variant.ops)
+    fx, fy, cx = VIEW["fx"], VIEW["fy"], VIEW["cx"]
+    tx = (40 - cx + 0.15 * 40) / fx
+    J = torch.tensor([[fx / z, 0, -fx * tx / z], [0, fy / z, 0]]).double()
+    assert_close(covariance(splats.conics[0]), s**2 * J @ J.T + 0.3 * torch.eye(2), 1e-5)
+    assert_close(splats.means2d[:, 0], torch.tensor([fx * 1.5 + cx]), 1e-6)
+
+
+def test_what_is_visible(variant: Variant) -> None:
+    """Near plane, opacity, and the box of the ellipse {α ≥ 1/255} against the pixel centres."""
+    cx, fx, z = VIEW["cx"], VIEW["fx"], 2.0
+    sigma = math.sqrt((fx * 0.1 / z) ** 2 + 0.3)
+    opacity = 1 / (1 + math.exp(-1))
+    reach = math.sqrt(2 * math.log(255 * opacity)) * sigma
+
+    def at_column(px: float) -> tuple[float, float, float]:
+        return ((px - cx) * z / fx, 0.0, z)
+
+    # Far outside, J is larger by the slant: take the scale along z away, and y does not matter.
+    scales = (0.1, 0.1, 1e-6)
+    cases = [
+        (single((0, 0, 2)), True),
+        (single((0, 0, 0.2 + 1e-3)), True),
+        (single((0, 0, 0.2 - 1e-3)), False),
+        (single((0, 0, 0)), False),
+        (single((0, 0, -2)), False),
+        (single((0, 0, 2), logit=math.log(1 / 254) + 1e-3), True),
+        (single((0, 0, 2), logit=math.log(1 / 254) - 1e-3), False),
+        (single(at_column(0.5 - reach + 0.01), scales), True),
+        (single(at_column(0.5 - reach - 0.01), scales), False),
+        (single(at_column(39.5 + reach - 0.01), scales), True),
+        (single(at_column(39.5 + reach + 0.01), scales), False),
+    ]
+    params = {n: torch.cat([scene.params[n] for scene, _ in cases]) for n in PARAMETERS}
+    splats = Scene(params, IDENTITY, VIEW).to(variant.dtype).project(variant.ops)
+    assert splats.ids is not None
+    assert splats.ids.dtype == torch.int32
+    assert splats.ids.tolist() == [i for i, (_, visible) in enumerate(cases) if visible]
+
+
+def test_near_is_an_argument(variant: Variant) -> None:
+    scene = single((0, 0, 2)).to(variant.dtype)
+    assert len(scene.project(variant.ops, near=1.99)) == 1
+    assert len(scene.project(variant.ops, near=2.01)) == 0
+
+
+def test_moving_world_and_camera_together_changes_nothing(variant: Variant) -> None:
+    scene = random_scene(5, 30, sh_degree=0)
+    w, x, y, z = turn = torch.tensor([0.5, 0.1, -0.7, 0.5], dtype=torch.float64)  # of length 1
+    rotation = reference._rotation_matrices(turn[None])[0]
+    product = torch.stack(  # turn · q = product @ q
+        [
+            torch.stack([w, -x, -y, -z]),
+            torch.stack([x, w, -z, y]),
+            torch.stack([y, z, w, -x]),
+            torch.stack([z, -y, x, w]),
+        ]
+    )
+    shift = torch.tensor([0.5, -2.0, 1.0], dtype=torch.float64)
+    R, t = scene.cam_from_world[:, :3], scene.cam_from_world[:, 3]
+    R_moved = R @ rotation.T
+    params = {
+        **scene.params,
+        "means": scene.params["means"] @ rotation.T + shift,
+        "quats": scene.params["quats"] @ product.T,
+    }
+    moved = Scene(params, torch.cat([R_moved, (t - R_moved @ shift)[:, None]], dim=1), scene.view)
+    before, after = (s.to(variant.dtype).project(variant.ops) for s in (scene, moved))
+    assert before.ids is not None
+    assert after.ids is not None
+    assert before.ids.tolist() == after.ids.tolist()
+    assert_close(after.packed, before.packed, 1e-5)
+
+
+def test_harmonics_are_orthonormal() -> None:
+    """∫ Yᵢ Yⱼ over the sphere is 1 for i = j, else 0: exact by Gauss-Legendre × uniform angles."""
+    heights, weights = np.polynomial.legendre.leggauss(8)
+    z, w = torch.tensor(heights)[:, None], torch.tensor(weights)[:, None]
+    angles = torch.arange(16, dtype=torch.float64) * 2 * math.pi / 16
+    r = (1 - z * z).sqrt()
+    sphere = [r * angles.cos(), r * angles.sin(), z.expand(8, 16)]
+    directions = torch.stack(sphere, dim=2).reshape(-1, 3)
+    area = (w * 2 * math.pi / 16).expand(8, 16).reshape(-1, 1)
+    basis = reference.sh_basis(directions, 3)
+    torch.testing.assert_close(basis.T @ (area * basis), torch.eye(16, dtype=torch.float64))
+
+
+def test_harmonics_of_degree_one_point_along_the_axes(variant: Variant) -> None:
+    """The three coefficients weigh −y, z, −x of the direction of view, by √(3/4π)."""
+    scene = single((0.4, -0.3, 2.0))
+    scene.params["sh_dc"].zero_()
+    scene.params["sh_rest"] = torch.eye(3, dtype=torch.float64)[None]  # each its own channel
+    splats = scene.to(variant.dtype).project(variant.ops, sh_degree=1)
+    x, y, z = (torch.tensor([0.4, -0.3, 2.0]) / math.sqrt(0.4**2 + 0.3**2 + 4)).tolist()
+    expected = 0.5 + math.sqrt(3 / (4 * math.pi)) * torch.tensor([[-y, z, -x]])
+    assert_close(splats.colors, expected, 1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_finite_differences(double: Variant, degree: int) -> None:
+    scene = smooth_scene(degree, sh_degree=degree).to(torch.float64)
+    view = {**scene.view, "sh_degree": degree}
+
+    def columns(*leaves: Tensor) -> Tensor:
+        return differentiable_columns(double.ops.project(*leaves, **view))
+
+    leaves = tuple(scene.leaves().values())
+    assert len(columns(*leaves)) == 4
+    assert torch.autograd.gradcheck(columns, leaves, eps=1e-6, atol=1e-6, rtol=1e-6)
+
+
+CASES = [
+    (degree, rest) for rest in (0, 3, 8, 15) for degree in range(4) if (degree + 1) ** 2 <= rest + 1
+]
+
+
+@pytest.mark.parametrize(("degree", "rest"), CASES)
+def test_native_is_the_twin(native: Variant, degree: int, rest: int) -> None:
+    compare(native, random_scene(degree, 67, sh_degree=degree, rest=rest))
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 15, 16, 17, 31, 33, 64, 300])
+def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
+    compare(native, random_scene(40 + count, count))
+
+
+def compare(native: Variant, scene: Scene) -> None:
+    """Values and gradients of every input, with a random cotangent on every column."""
+    expected, actual = scene.to(torch.float64), scene.to(native.dtype)
+    wanted, got = expected.project(reference), actual.project(native.ops)
+    assert wanted.ids is not None
+    assert got.ids is not None
+    assert got.ids.tolist() == wanted.ids.tolist()
+    cotangent = normal(generator(1), len(wanted), 7 + 3)
+    # The float32 rounding of a thin splat's conic is of the size of its largest entry.
+    for name in ("means2d", "conics", "opacities", "depths", "radii", "colors"):
+        assert_close(getattr(got, name), getattr(wanted, name), native.forward, name)
+    if len(wanted) == 0:
+        return
+    (differentiable_columns(wanted) * cotangent).sum().backward()
+    (differentiable_columns(got) * cotangent.to(native.dtype)).sum().backward()
+    for name, leaf in expected.leaves().items():
+        grad = actual.leaves()[name].grad
+        assert grad is not None
+        assert leaf.grad is not None
+        assert grad.dtype == actual.leaves()[name].dtype
+        assert_close(grad, leaf.grad, native.backward, f"gradient of {name}")
+
+
+def test_gradients_only_where_asked(native: Variant) -> None:
+    scene = random_scene(6, 25).to(native.dtype, requires_grad=False)
+    for asked in (*PARAMETERS, "cam_from_world"):
+        leaves = {n: t.detach().clone() for n, t in scene.leaves().items()}
+        leaves[asked].requires_grad_()
+        splats = native.ops.project(**leaves, **scene.view)
+        splats.packed.square().sum().backward()
+        assert leaves[asked].grad is not None
+        assert leaves[asked].grad.norm() > 0
+    with torch.no_grad():
+        assert not scene.project(native.ops).packed.requires_grad
+
+
+def test_rows_beyond_the_degree_get_no_gradient(variant: Variant) -> None:
+    scene = random_scene(7, 25, sh_degree=1).to(variant.dtype)
+    scene.project(variant.ops).packed.square().sum().backward()
+    grad = scene.params["sh_rest"].grad
+    assert grad is not None
+    assert grad[:, :3].norm() > 0
+    assert grad[:, 3:].norm() == 0
+
+
+def test_native_takes_any_strides(native: Variant) -> None:
+    """A transposed or sliced tensor is as good as a contiguous one."""
+    scene = random_scene(8, 20).to(native.dtype, requires_grad=False)
+    strided = {n: torch.stack([p, p], dim=-1)[..., 0] for n, p in scene.params.items()}
+    assert not strided["means"].is_contiguous()
+    got = native.ops.project(**strided, cam_from_world=scene.cam_from_world, **scene.view)
+    assert torch.equal(got.packed, scene.project(native.ops).packed)
+
+
+def test_points_seen_from_the_world_frame() -> None:
+    """The helper of these tests: cam_from_world maps `world_points` back."""
+    scene = random_scene(9, 5)
+    points = normal(generator(2), 5, 3)
+    world = world_points(scene.cam_from_world, points)
+    back = world @ scene.cam_from_world[:, :3].T + scene.cam_from_world[:, 3]
+    assert_close(back, points, 1e-6)
+
+
+WRONG = {
+    "means is not (N, 3)": {"means": torch.zeros(4, 2)},
+    "log_scales is longer": {"log_scales": torch.zeros(5, 3)},
+    "quats has three columns": {"quats": torch.zeros(4, 3)},
+    "opacity_logits is a column": {"opacity_logits": torch.zeros(4, 1)},
+    "sh_dc without its middle": {"sh_dc": torch.zeros(4, 3)},
+    "sh_rest of 7 rows": {"sh_rest": torch.zeros(4, 7, 3)},
+    "pose is 4 x 4": {"cam_from_world": torch.eye(4, dtype=torch.float64)},
+    "mixed dtypes": {"quats": torch.zeros(4, 4, dtype=torch.float64)},
+    "integers": {"means": torch.zeros(4, 3, dtype=torch.int32)},
+    "half": {"means": torch.zeros(4, 3, dtype=torch.float16)},
+    "another device": {"means": torch.zeros(4, 3, device="meta")},
+    "no width": {"width": 0},
+    "negative height": {"height": -3},
+    "focal length 0": {"fx": 0.0},
+    "focal length NaN": {"fy": math.nan},
+    "principal point infinite": {"cx": math.inf},
+    "degree 4": {"sh_degree": 4},
+    "degree -1": {"sh_degree": -1},
+    "degree beyond the rows": {"sh_rest": torch.zeros(4, 3, 3), "sh_degree": 2},
+    "near is not positive": {"near": 0.0},
+    "near NaN": {"near": math.nan},
+}
+
+
+@pytest.mark.parametrize("change", WRONG.values(), ids=WRONG.keys())
+def test_wrong_input(change: dict) -> None:
+    scene = random_scene(1, 4).to(torch.float32, requires_grad=False)
+    arguments = {**scene.leaves(), **scene.view, **change}
+    with pytest.raises(ValueError, match="project") as caught:
+        ops.project(**arguments)
+    assert one_line(caught.value)

@@ -1,0 +1,446 @@
+"""`rasterize`: closed forms, a per-pixel loop, finite differences, and native against the twin."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.ops import reference
+from snowsplat.ops.splats import Splats2D
+
+from .scenes import (
+    TWIN,
+    Scene,
+    Variant,
+    assert_close,
+    differentiable_columns,
+    generator,
+    leaf_splats,
+    normal,
+    one_line,
+    random_scene,
+    random_splats,
+    smooth_scene,
+    uniform,
+)
+
+pytestmark = pytest.mark.isa
+
+
+def flat_stack(opacities: list[float], depths: list[float] | None = None) -> Splats2D:
+    """Splats so wide that α is the opacity all over a small image; the i-th has the i-th colour."""
+    count = len(opacities)
+    wide = 1e-9
+    return Splats2D.pack(
+        torch.full((count, 2), 2.0, dtype=torch.float64),
+        torch.tensor([[wide, 0, wide]] * count, dtype=torch.float64),
+        torch.tensor(opacities, dtype=torch.float64),
+        torch.tensor(depths or range(1, count + 1), dtype=torch.float64),
+        torch.eye(count, dtype=torch.float64),
+    )
+
+
+def blend_slowly(
+    splats: Splats2D, width: int, height: int, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The definition, a pixel and a splat at a time."""
+    rows = sorted(range(len(splats)), key=lambda row: (float(splats.depths[row]), row))
+    image = torch.zeros(height, width, splats.channels, dtype=torch.float64)
+    alpha, depth = torch.zeros(height, width).double(), torch.zeros(height, width).double()
+    for j in range(height):
+        for i in range(width):
+            T = 1.0
+            for row in rows:
+                a, b, c = splats.conics[row].tolist()
+                dx, dy = i + 0.5 - float(splats.means2d[row, 0]), j + 0.5 - splats.means2d[row, 1]
+                falloff = math.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+                weight = float(splats.opacities[row]) * falloff
+                if weight < 1 / 255:
+                    continue
+                weight = min(0.99, weight)
+                if T * (1 - weight) < 1e-4:
+                    break
+                image[j, i] += T * weight * splats.colors[row]
+                depth[j, i] += T * weight * splats.depths[row]
+                T *= 1 - weight
+            image[j, i] += T * background
+            alpha[j, i] = 1 - T
+    return image, alpha, depth
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_definition(variant: Variant, seed: int) -> None:
+    splats = random_splats(seed, 70, 19, 18, opacity=(0.3, 1.0))
+    background = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float64)
+    wanted = blend_slowly(splats, 19, 18, background)
+    assert wanted[1].max() > 0.999  # some pixels stop early
+    got = variant.ops.rasterize(
+        leaf_splats(splats, variant.dtype), 19, 18, background.to(variant.dtype), with_depth=True
+    )
+    for actual, expected in zip(got, wanted, strict=True):
+        assert actual is not None
+        assert_close(actual, expected, max(variant.forward, 1e-7))
+
+
+def test_one_splat_is_a_gaussian(variant: Variant) -> None:
+    opacity, sigma, depth = 0.8, 2.0, 3.0
+    color = torch.tensor([[0.25, 0.5, 1.0]], dtype=torch.float64)
+    background = torch.tensor([1.0, 0.0, 0.5], dtype=torch.float64)
+    splats = Splats2D.pack(
+        torch.tensor([[8.5, 6.5]], dtype=torch.float64),
+        torch.tensor([[sigma**-2, 0, sigma**-2]], dtype=torch.float64),
+        torch.tensor([opacity], dtype=torch.float64),
+        torch.tensor([depth], dtype=torch.float64),
+        color,
+    )
+    image, alpha, z = variant.ops.rasterize(
+        leaf_splats(splats, variant.dtype), 20, 13, background.to(variant.dtype), with_depth=True
+    )
+    y, x = torch.meshgrid(torch.arange(13), torch.arange(20), indexing="ij")
+    squared = (x - 8.0) ** 2 + (y - 6.0) ** 2  # the centre is that of the pixel (8, 6)
+    expected = opacity * torch.exp(-squared.double() / (2 * sigma**2))
+    expected = torch.where(expected < 1 / 255, 0, expected)
+    assert z is not None
+    assert_close(alpha, expected, 1e-6)
+    assert_close(z, depth * expected, 1e-6)
+    assert_close(image, expected[..., None] * (color - background) + background, 1e-6)
+
+
+def test_shapes_and_storage(variant: Variant) -> None:
+    splats = leaf_splats(random_splats(0, 9, 20, 13, channels=5), variant.dtype)
+    image, alpha, depth = variant.ops.rasterize(splats, 20, 13)
+    assert image.shape == (13, 20, 5)
+    assert image.permute(2, 0, 1).is_contiguous()
+    assert alpha.shape == (13, 20)
+    assert depth is None
+    assert image.dtype == alpha.dtype == variant.dtype
+
+
+def test_opacity_is_clamped(variant: Variant) -> None:
+    """α stops at 0.99, and there neither opacity nor conic nor centre has a gradient."""
+    splats = leaf_splats(flat_stack([1.0]), variant.dtype)
+    image, alpha, _ = variant.ops.rasterize(splats, 3, 2)
+    assert_close(alpha, torch.full((2, 3), 0.99), 1e-6)
+    image.sum().backward()
+    assert splats.packed.grad is not None
+    assert splats.packed.grad[0, :8].abs().max() == 0
+    assert_close(splats.packed.grad[0, 8], torch.tensor(6 * 0.99), 1e-6)
+
+
+def test_opaque_stack_stops(variant: Variant) -> None:
+    """T falls to 0.2, …, 0.2⁵ = 3.2e-4; the sixth would make it 6.4e-5 and is not blended."""
+    splats = leaf_splats(flat_stack([0.8] * 9), variant.dtype)
+    image, alpha, depth = variant.ops.rasterize(splats, 3, 2, with_depth=True)
+    weights = torch.tensor([0.8 * 0.2**i if i < 5 else 0.0 for i in range(9)])
+    assert_close(image, weights.expand(2, 3, 9), 1e-6)
+    assert_close(1 - alpha, torch.full((2, 3), 0.2**5), 1e-3)
+    assert depth is not None
+    (image.sum() + depth.sum() + alpha.sum()).backward()
+    assert splats.packed.grad is not None
+    assert (splats.packed.grad[:5].abs().sum(dim=1) > 0).all()
+    assert (splats.packed.grad[5:] == 0).all()
+
+
+def test_a_finished_pixel_stays_finished(variant: Variant) -> None:
+    """After the stop nothing is blended, not even what is transparent enough."""
+    splats = leaf_splats(flat_stack([0.99, 0.95, 0.9, 0.01]), variant.dtype)
+    image, _, _ = variant.ops.rasterize(splats, 1, 1)
+    assert_close(image[0, 0], torch.tensor([0.99, 0.01 * 0.95, 0, 0]), 1e-6)
+
+
+def test_faint_is_skipped(variant: Variant) -> None:
+    splats = leaf_splats(flat_stack([0.00391, 0.00393, 0.0]), variant.dtype)  # 1/255 = 0.003922
+    image, _, _ = variant.ops.rasterize(splats, 1, 1)
+    assert_close(image[0, 0], torch.tensor([0, 0.00393, 0]), 1e-5)
+
+
+def test_equal_depths_blend_by_row(variant: Variant) -> None:
+    splats = leaf_splats(flat_stack([0.5] * 4, [2.0, 1.0, 2.0, 1.0]), variant.dtype)
+    image, _, _ = variant.ops.rasterize(splats, 1, 1)
+    assert_close(image[0, 0], torch.tensor([0.125, 0.5, 0.0625, 0.25]), 1e-6)
+
+
+@pytest.mark.parametrize("depth", [0.21, 1.5, 1000.0, 1e-3, 1e6])
+def test_close_depths_blend_in_order(variant: Variant, depth: float) -> None:
+    """Depths one float32 step apart are still told apart."""
+    near = torch.tensor(depth)
+    far = torch.nextafter(near, torch.tensor(math.inf))
+    splats = leaf_splats(flat_stack([0.5, 0.5], [float(far), float(near)]), variant.dtype)
+    image, _, _ = variant.ops.rasterize(splats, 1, 1)
+    assert_close(image[0, 0], torch.tensor([0.25, 0.5]), 1e-6)
+
+
+def test_order_of_rows_does_not_matter(variant: Variant) -> None:
+    splats = random_splats(3, 60, 23, 17)
+    shuffled = Splats2D(splats.packed[torch.randperm(60, generator=generator(0))], None, 3)
+    images = [
+        variant.ops.rasterize(leaf_splats(s, variant.dtype), 23, 17)[0] for s in (splats, shuffled)
+    ]
+    assert_close(images[0], images[1], variant.forward)
+
+
+def test_nothing_to_blend(variant: Variant) -> None:
+    splats = leaf_splats(random_splats(0, 0, 5, 4), variant.dtype)
+    background = torch.tensor([0.25, 0.5, 1.0], dtype=variant.dtype, requires_grad=True)
+    image, alpha, depth = variant.ops.rasterize(splats, 5, 4, background, with_depth=True)
+    assert depth is not None
+    assert torch.equal(image, background.expand(4, 5, 3))
+    assert (alpha == 0).all()
+    assert (depth == 0).all()
+    image.sum().backward()
+    assert background.grad is not None
+    assert background.grad.tolist() == [20, 20, 20]
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_finite_differences(double: Variant, with_depth: bool) -> None:
+    """Every column and the background, on splats where no threshold is near."""
+    with torch.no_grad():
+        splats = smooth_scene().project(reference)
+    background = uniform(generator(4), 0, 1, 3).requires_grad_()
+    columns = differentiable_columns(splats).requires_grad_()
+
+    def outputs(columns: Tensor, background: Tensor) -> tuple[Tensor, ...]:
+        made = Splats2D.pack(
+            columns[:, 0:2], columns[:, 2:5], columns[:, 5], columns[:, 6], columns[:, 7:]
+        )
+        image, alpha, depth = double.ops.rasterize(made, 5, 4, background, with_depth=with_depth)
+        return (image, alpha) if depth is None else (image, alpha, depth)
+
+    assert torch.autograd.gradcheck(outputs, (columns, background), eps=1e-6, atol=1e-6, rtol=1e-6)
+
+
+def test_finite_differences_from_gaussian_to_pixel(double: Variant) -> None:
+    scene = smooth_scene(1, sh_degree=1)
+    scene.params["sh_rest"] = scene.params["sh_rest"][:, :3].contiguous()
+    scene = scene.to(torch.float64)
+
+    def image(*leaves: Tensor) -> Tensor:
+        splats = double.ops.project(*leaves, **scene.view)
+        return double.ops.rasterize(splats, *scene.size)[0]
+
+    leaves = tuple(scene.leaves().values())
+    assert torch.autograd.gradcheck(image, leaves, eps=1e-6, atol=1e-6, rtol=1e-6)
+
+
+def compare(
+    native: Variant,
+    splats: Splats2D,
+    width: int,
+    height: int,
+    *,
+    with_background: bool = True,
+    with_depth: bool = True,
+) -> None:
+    """Values, and gradients of every column and the background, by random cotangents."""
+    g = generator(9)
+    background = uniform(g, 0, 1, splats.channels) if with_background else None
+    cotangents = [normal(g, height, width, splats.channels), *normal(g, 2, height, width)]
+    results = []
+    for variant in (TWIN, native):
+        leaf = leaf_splats(splats, variant.dtype)
+        b = None
+        if background is not None:
+            b = background.to(variant.dtype, copy=True).requires_grad_()
+        outputs = variant.ops.rasterize(leaf, width, height, b, with_depth=with_depth)
+        assert (outputs[2] is not None) == with_depth
+        pairs = [(o, c) for o, c in zip(outputs, cotangents, strict=True) if o is not None]
+        sum((o * c.to(o)).sum() for o, c in pairs).backward()
+        grads = {} if b is None else {"background": b.grad}
+        grads.update(columns_of(leaf))
+        results.append(([o for o, _ in pairs], grads))
+    (wanted, wanted_grads), (got, got_grads) = results
+    for name, actual, expected in zip(("image", "alpha", "depth"), got, wanted, strict=False):
+        assert_close(actual, expected, native.forward, name)
+    for name, expected in wanted_grads.items():
+        assert_close(got_grads[name], expected, native.backward, f"gradient of {name}")
+    assert (got_grads["radii and padding"] == 0).all()
+
+
+def columns_of(leaf: Splats2D) -> dict[str, Tensor]:
+    """The gradient of `packed`, by column."""
+    assert leaf.packed.grad is not None
+    grad = Splats2D(leaf.packed.grad, None, leaf.channels)
+    rest = torch.cat([grad.packed[:, 7:8], grad.packed[:, 8 + leaf.channels :]], dim=1)
+    names = ("means2d", "conics", "opacities", "depths", "colors")
+    return {**{name: getattr(grad, name) for name in names}, "radii and padding": rest}
+
+
+@pytest.mark.parametrize("with_background", [False, True])
+@pytest.mark.parametrize("channels", [1, 3, 4, 7, 8, 9, 30])
+def test_native_is_the_twin(native: Variant, channels: int, with_background: bool) -> None:
+    splats = random_splats(channels, 60, 23, 17, channels)
+    compare(native, splats, 23, 17, with_background=with_background)
+
+
+def test_native_is_the_twin_without_depth(native: Variant) -> None:
+    compare(native, random_splats(2, 60, 23, 17), 23, 17, with_depth=False)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "count"),
+    [(1, 1, 5), (16, 16, 30), (17, 16, 30), (15, 33, 60), (64, 1, 20), (1, 50, 20), (83, 41, 400)],
+)
+def test_native_is_the_twin_at_any_size(
+    native: Variant, width: int, height: int, count: int
+) -> None:
+    compare(native, random_splats(width + height, count, width, height), width, height)
+
+
+def test_native_is_the_twin_on_a_long_strip(native: Variant) -> None:
+    """Pixel coordinates of five digits, where float32 leaves a thousandth of a pixel."""
+    splats = random_splats(4, 400, 16384, 3, pixels=30.0)
+    compare(native, splats, 16384, 3)
+
+
+@pytest.mark.parametrize("opacity", [(0.005, 0.02), (0.1, 0.4), (0.9, 1.0)])
+def test_native_is_the_twin_when_splats_are_many(
+    native: Variant, opacity: tuple[float, float]
+) -> None:
+    """Hundreds in a tile: faint ones that all count, and opaque ones of which most do not."""
+    compare(native, random_splats(11, 500, 20, 18, pixels=5.0, opacity=opacity), 20, 18)
+
+
+def test_native_is_the_twin_for_tiny_splats(native: Variant) -> None:
+    """Splats below a pixel, many between the centres: none may be lost or counted twice."""
+    compare(native, random_splats(12, 500, 40, 40, pixels=0.4), 40, 40)
+
+
+def test_native_is_the_twin_for_needles(native: Variant) -> None:
+    splats = random_splats(13, 40, 40, 40)
+    angle = torch.arange(40, dtype=torch.float64) * math.pi / 40
+    cos, sin, major, minor = angle.cos(), angle.sin(), 30.0, 0.55
+    conics = [
+        (cos / major) ** 2 + (sin / minor) ** 2,
+        cos * sin * (major**-2 - minor**-2),
+        (sin / major) ** 2 + (cos / minor) ** 2,
+    ]
+    splats.packed[:, 2:5] = torch.stack(conics, dim=1).float()
+    compare(native, splats, 40, 40)
+
+
+def test_native_is_the_twin_from_gaussian_to_pixel(native: Variant) -> None:
+    scene = random_scene(21, 120)
+    background = torch.tensor([0.1, 0.9, 0.4], dtype=torch.float64)
+    cotangent = normal(generator(3), 17, 23, 3)
+    results: list[tuple[Tensor, Scene]] = []
+    for variant in (TWIN, native):
+        leaf = scene.to(variant.dtype)
+        splats = leaf.project(variant.ops)
+        image, _, _ = variant.ops.rasterize(splats, 23, 17, background.to(variant.dtype))
+        (image * cotangent.to(image)).sum().backward()
+        results.append((image, leaf))
+    (wanted, expected), (got, actual) = results
+    assert_close(got, wanted, native.forward, "image")
+    for name, leaf_tensor in expected.leaves().items():
+        grad = actual.leaves()[name].grad
+        assert grad is not None
+        assert leaf_tensor.grad is not None
+        assert_close(grad, leaf_tensor.grad, native.backward, f"gradient of {name}")
+
+
+@pytest.mark.parametrize("asked", ["packed", "background"])
+def test_gradients_only_where_asked(native: Variant, asked: str) -> None:
+    splats = leaf_splats(random_splats(0, 20, 9, 9), native.dtype, requires_grad=False)
+    background = torch.rand(3, generator=generator(0)).to(native.dtype)
+    leaf = splats.packed if asked == "packed" else background
+    leaf.requires_grad_()
+    native.ops.rasterize(splats, 9, 9, background)[0].square().sum().backward()
+    assert leaf.grad is not None
+    assert leaf.grad.norm() > 0
+
+
+def test_backward_of_alpha_or_depth_alone(native: Variant) -> None:
+    splats = random_splats(5, 30, 12, 12)
+    for output in (0, 1, 2):
+        grads = []
+        for variant in (TWIN, native):
+            leaf = leaf_splats(splats, variant.dtype)
+            outputs = variant.ops.rasterize(leaf, 12, 12, with_depth=True)
+            outputs[output].square().sum().backward()
+            grads.append(leaf.packed.grad)
+        assert_close(grads[1], grads[0], native.backward)
+
+
+def test_two_dimensional_fitting(variant: Variant) -> None:
+    """Splats made by hand, without ids, learn a picture by gradient descent."""
+    target = torch.zeros(16, 16, 3, dtype=variant.dtype)
+    target[4:12, 6:14] = torch.tensor([0.9, 0.5, 0.1], dtype=variant.dtype)
+    start = random_splats(0, 24, 16, 16, opacity=(0.4, 0.8))
+    means2d, colors = start.means2d.to(variant.dtype), start.colors.to(variant.dtype)
+    log_sigmas = torch.full((24, 2), 0.7, dtype=variant.dtype)
+    logits = torch.zeros(24, dtype=variant.dtype)
+    leaves = [means2d.clone(), colors.clone(), log_sigmas, logits]
+    optimiser = torch.optim.Adam([leaf.requires_grad_() for leaf in leaves], lr=0.05)
+    losses = []
+    for _ in range(60):
+        inverse = torch.exp(-2 * leaves[2])
+        conics = torch.stack([inverse[:, 0], 0 * inverse[:, 0], inverse[:, 1]], dim=1)
+        depths = torch.arange(24, dtype=variant.dtype)
+        splats = Splats2D.pack(leaves[0], conics, leaves[3].sigmoid(), depths, leaves[1])
+        image, _, _ = variant.ops.rasterize(splats, 16, 16)
+        loss = (image - target).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.1 * losses[0]
+
+
+WRONG = {
+    "no width": {"width": 0},
+    "negative height": {"height": -1},
+    "background of another length": {"background": torch.zeros(4)},
+    "background is an image": {"background": torch.zeros(3, 5, 5)},
+    "background of another dtype": {"background": torch.zeros(3, dtype=torch.float64)},
+    "background of integers": {"background": torch.zeros(3, dtype=torch.int32)},
+    "background elsewhere": {"background": torch.zeros(3, device="meta")},
+    "half": {"splats": Splats2D(torch.zeros(2, 16, dtype=torch.float16), None, 3)},
+    "integers": {"splats": Splats2D(torch.zeros(2, 16, dtype=torch.int64), None, 3)},
+}
+
+
+@pytest.mark.parametrize("change", WRONG.values(), ids=WRONG.keys())
+def test_wrong_input(change: dict) -> None:
+    splats = leaf_splats(random_splats(0, 3, 5, 5), torch.float32)
+    arguments = {"splats": splats, "width": 5, "height": 5, "background": None, **change}
+    with pytest.raises(ValueError, match="rasterize") as caught:
+        ops.rasterize(**arguments)
+    assert one_line(caught.value)
+
+
+def test_wrong_splats() -> None:
+    with pytest.raises(ValueError, match="packed must be"):
+        Splats2D(torch.zeros(3, 16), None, 9)
+    with pytest.raises(ValueError, match="packed must be"):
+        Splats2D(torch.zeros(16), None, 3)
+    with pytest.raises(ValueError, match="channels"):
+        Splats2D(torch.zeros(3, 16), None, 0)
+    with pytest.raises(ValueError, match="ids must be int32"):
+        Splats2D(torch.zeros(3, 16), torch.zeros(3, dtype=torch.int64), 3)
+    with pytest.raises(ValueError, match="ids must be"):
+        Splats2D(torch.zeros(3, 16), torch.zeros(2, dtype=torch.int32), 3)
+    two, ones = torch.zeros(2, 2), torch.ones(2)
+    with pytest.raises(ValueError, match="conics must be"):
+        Splats2D.pack(two, torch.zeros(2, 4), ones, ones, torch.zeros(2, 3))
+    with pytest.raises(ValueError, match="opacities must be"):
+        Splats2D.pack(two, torch.zeros(2, 3), torch.ones(3), ones, torch.zeros(2, 3))
+    with pytest.raises(ValueError, match="depths is"):
+        Splats2D.pack(two, torch.zeros(2, 3), ones, ones.double(), torch.zeros(2, 3))
+
+
+def test_pack_and_its_views() -> None:
+    splats = random_splats(0, 6, 9, 9, channels=9)
+    assert splats.packed.shape == (6, 32)
+    again = Splats2D.pack(
+        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.colors
+    )
+    assert torch.equal(again.packed, splats.packed)
+    a, b, c = splats.conics.unbind(dim=1)
+    conic = torch.stack([a, b, b, c], dim=1).reshape(-1, 2, 2)
+    major = torch.linalg.eigvalsh(torch.linalg.inv(conic))[:, 1]
+    assert_close(splats.radii, 3 * major.sqrt(), 1e-9)
