@@ -1,0 +1,128 @@
+"""`TrainConfig`: the knobs of a training, how to change one by name, how to write them down."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Literal
+
+from snowsplat.density import AdaptiveDensity, DensityConfig, McmcDensity
+from snowsplat.errors import UserError
+from snowsplat.optim import LearningRates, When, at_step
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides what a training does; the defaults are the paper's.
+
+    A moment (`When`) is an int, that step, or a float, that fraction of ``iterations``.
+
+    Attributes:
+        iterations: steps in all, one view each.
+        seed: of every random choice. The same seed gives the same scene to the bit, on any number
+            of threads.
+        background: the colour behind the scene; "random" draws one a step, against fog in captures
+            with a transparent background.
+        sh_degree: of the spherical harmonics in the end, 0 to 3.
+        sh_interval: steps between two degrees, beginning with 0.
+        ssim_weight: λ of (1 − λ) · L1 + λ · D-SSIM.
+        initial_points: how many random ones, for a capture without points.
+        initial_opacity: of every Gaussian at the start.
+        initial_scale: of every Gaussian at the start, in mean distances to its 3 neighbours.
+        learning_rates, density: see there.
+        visible_only: Gaussians that a view does not see skip the optimiser in its step. The paper
+            lets their momentum carry them on; this is faster and loses nothing measurable.
+        coarse_to_fine: the last moments at a quarter and at a half of the resolution. 0 is never.
+        image_memory: bytes for decoded images; 0 is half of what is available.
+        test_iterations: steps after which `Trainer.run` evaluates the test views.
+        checkpoint_every: steps between checkpoints, which the caller of `Trainer.run` writes; 0 is
+            none.
+    """
+
+    iterations: int = 30_000
+    seed: int = 0
+    background: Literal["black", "white", "random"] = "black"
+    sh_degree: int = 3
+    sh_interval: int = 1000
+    ssim_weight: float = 0.2
+    initial_points: int = 100_000
+    initial_opacity: float = 0.1
+    initial_scale: float = 1.0
+    learning_rates: LearningRates = field(default_factory=LearningRates)
+    density: DensityConfig = field(default_factory=AdaptiveDensity)
+    visible_only: bool = False
+    coarse_to_fine: tuple[When, When] = (0, 0)
+    image_memory: int = 0
+    test_iterations: tuple[int, ...] = (7_000, 30_000)
+    checkpoint_every: int = 0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise UserError(f"--iterations is {self.iterations}; it must be at least 1")
+        if self.sh_degree not in (0, 1, 2, 3):
+            raise UserError(f"--sh-degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
+
+    def downscale_at(self, step: int) -> int:
+        """1, 2 or 4: by what the images of this step are reduced."""
+        quarter, half = (at_step(when, self.iterations) for when in self.coarse_to_fine)
+        return 4 if step <= quarter else 2 if step <= half else 1
+
+    def sh_degree_at(self, step: int) -> int:
+        """The degree in use at this step."""
+        return min(self.sh_degree, step // self.sh_interval) if self.sh_interval else self.sh_degree
+
+
+def changed(config: TrainConfig, **knobs: Any) -> TrainConfig:
+    """``config`` with other values for some knobs, wherever they are.
+
+    Args:
+        knobs: fields of `TrainConfig`; fields of its density control (``grad_threshold=4e-4``); and
+            fields of `LearningRates` after ``lr_`` (``lr_means=1e-4``). Those that are None stay.
+
+    Raises:
+        UserError: a knob that this configuration does not have.
+    """
+    given = {name: value for name, value in knobs.items() if value is not None}
+    rates = {f"lr_{f.name}": f.name for f in fields(config.learning_rates)}
+    density = {f.name for f in fields(config.density)}
+    whole = {f.name for f in fields(config)}
+    for name in given:
+        if name not in whole | density | rates.keys():
+            kind = type(config.density).__name__
+            raise UserError(
+                f"--{name.replace('_', '-')} means nothing with {kind}; leave it out, or take "
+                "another recipe"
+            )
+    config = replace(config, **{name: value for name, value in given.items() if name in whole})
+    return replace(
+        config,
+        learning_rates=replace(
+            config.learning_rates, **{rates[n]: value for n, value in given.items() if n in rates}
+        ),
+        density=replace(
+            config.density, **{name: value for name, value in given.items() if name in density}
+        ),
+    )
+
+
+def config_to_json(config: TrainConfig) -> dict[str, Any]:
+    """JSON values from which `config_from_json` makes an equal configuration."""
+    return asdict(config) | {"density_control": type(config.density).__name__}
+
+
+def config_from_json(values: dict[str, Any]) -> TrainConfig:
+    """What `config_to_json` wrote down.
+
+    Raises:
+        UserError: of another version of the program.
+    """
+    controls = {kind.__name__: kind for kind in (AdaptiveDensity, McmcDensity)}
+    values = dict(values)
+    try:
+        density = controls[values.pop("density_control")](**values.pop("density"))
+        rates = LearningRates(**values.pop("learning_rates"))
+        lists = {name: tuple(v) for name, v in values.items() if isinstance(v, (list, tuple))}
+        return TrainConfig(**(values | lists), density=density, learning_rates=rates)
+    except (KeyError, TypeError):
+        raise UserError(
+            "this configuration was written by another version of snowsplat; go on with that one"
+        ) from None

@@ -1,0 +1,237 @@
+"""Training: Algorithm 1 of the paper. A `Capture` goes in, `Gaussians` come out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.camera import Camera
+from snowsplat.capture.capture import Capture, Points
+from snowsplat.capture.decode import LoadedImage
+from snowsplat.capture.images import ImageLoader
+from snowsplat.config import TrainConfig
+from snowsplat.density.rows import morton_order
+from snowsplat.errors import UserError
+from snowsplat.evaluate import Evaluation, evaluate_views
+from snowsplat.gaussians import Gaussians
+from snowsplat.losses import view_loss
+from snowsplat.ops.splats import Splats2D
+from snowsplat.optim import Adam
+from snowsplat.process import interrupts_between_steps, single_threaded
+
+__all__ = ["Progress", "TrainConfig", "Trainer"]
+
+#: Views whose images are decoded ahead of their step.
+LOOKAHEAD = 16
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What `Trainer.run` reports after each step."""
+
+    step: int
+    loss: float
+    gaussians: int
+    downscale: int
+    metrics: Evaluation | None = None
+
+
+class Trainer:
+    """One training of one capture.
+
+        trainer = Trainer(capture, TrainConfig(iterations=7000))
+        trainer.run()
+        trainer.gaussians
+
+    Between two steps everything is in `state_tensors`: a trainer that loads them goes on bitwise as
+    this one would have.
+    """
+
+    def __init__(self, capture: Capture, config: TrainConfig) -> None:
+        """Raises: UserError: a capture without training views."""
+        if not capture.train:
+            raise UserError("the capture has no training views; check its folder and its split")
+        self.capture = capture
+        self.config = config
+        self.step = 0
+        # One generator for each kind of choice, so that one kind does not disturb another.
+        self._generators = {
+            name: torch.Generator().manual_seed(4 * config.seed + i)
+            for i, name in enumerate(("start", "views", "background", "density"))
+        }
+        self._order: list[int] = []  # the views to come
+        fixed = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}.get(config.background)
+        self._background = None if fixed is None else torch.tensor(fixed)
+        self._images = ImageLoader(
+            capture.train, background=fixed, budget_bytes=config.image_memory or None
+        )
+        with single_threaded():
+            self.gaussians = self._start()
+        self._optimizer = Adam(
+            self.gaussians,
+            config.learning_rates,
+            iterations=config.iterations,
+            extent=capture.extent,
+            visible_only=config.visible_only,
+        )
+        self._density = config.density.control(
+            len(self.gaussians),
+            iterations=config.iterations,
+            extent=capture.extent,
+            generator=self._generators["density"],
+        )
+
+    def _start(self) -> Gaussians:
+        """One Gaussian a point: those of the capture, or random ones; no more than the cap."""
+        config, generator = self.config, self._generators["start"]
+        points = self.capture.points
+        cap = config.density.max_gaussians or math.inf
+        if points is None:
+            count = int(min(config.initial_points, cap))
+            gaussians = Gaussians.random_in_bounds(
+                self.capture.bounds, count, generator, config.sh_degree, config.initial_opacity
+            )
+        else:
+            if len(points) > cap:
+                chosen = torch.randperm(len(points), generator=generator)[: int(cap)]
+                points = Points(points.xyz[chosen], points.rgb[chosen])
+            gaussians = Gaussians.from_points(points, config.sh_degree, config.initial_opacity)
+        gaussians.log_scales += math.log(config.initial_scale)
+        return gaussians.select(morton_order(gaussians.means))
+
+    def run(
+        self, on_progress: Callable[[Progress], None] | None = None, until: int | None = None
+    ) -> None:
+        """Step on to step ``until`` (default: the last one), with a report after each.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C, after the step that it fell into: the state is whole.
+            UserError: the loss is no longer finite.
+        """
+        until = self.config.iterations if until is None else min(until, self.config.iterations)
+        with interrupts_between_steps() as let_interrupt:
+            while self.step < until:
+                loss = self.step_once()
+                metrics = self.evaluate() if self.step in self.config.test_iterations else None
+                if on_progress is not None:
+                    downscale = self.config.downscale_at(self.step)
+                    count = len(self.gaussians)
+                    on_progress(Progress(self.step, loss, count, downscale, metrics))
+                let_interrupt()
+
+    @torch.no_grad()
+    def step_once(self) -> float:
+        """One iteration of Algorithm 1; gives its loss.
+
+        Raises:
+            UserError: the loss is not finite.
+        """
+        with single_threaded():
+            # The refinement that ends an iteration of the paper waits for the next one to begin, so
+            # that nothing evaluates or saves a scene that was cloned or reset a moment ago.
+            if self.step > 0:
+                self.gaussians = self._density.after_step(
+                    self.step, self.gaussians, self._optimizer
+                )
+            step = self.step + 1
+            camera, photo = self._next_view(step)
+            background = self._background
+            if background is None:
+                background = torch.rand(3, generator=self._generators["background"])
+            sh_degree = self.config.sh_degree_at(step)
+
+            splats = self._project(camera, sh_degree)
+            with torch.enable_grad():  # of the splats; the optimiser carries it on to the Gaussians
+                splats.packed.requires_grad_()
+                image, _, _ = ops.rasterize(splats, camera.width, camera.height, background)
+                loss = view_loss(image, photo, background, self.config.ssim_weight)
+                loss.backward()
+            value = float(loss)
+            if not math.isfinite(value):
+                raise UserError(
+                    f"the loss is {value} at step {step}: training has diverged; "
+                    "lower the learning rates, or go on from an earlier checkpoint"
+                )
+            self._density.after_backward(step, self.gaussians, splats, camera.width, camera.height)
+            self._optimizer.step(self.gaussians, splats, camera, sh_degree, step)
+            self.step = step
+            return value
+
+    def evaluate(self) -> Evaluation:
+        """Figures of the test views as the scene is now; a random background counts as black."""
+        background = (0.0, 0.0, 0.0) if self._background is None else self._background.tolist()
+        with single_threaded():
+            return evaluate_views(self.gaussians, self.capture.test, background=background)
+
+    def _next_view(self, step: int) -> tuple[Camera, LoadedImage]:
+        """The next of endlessly shuffled views, and its photo at this step's resolution."""
+        downscale = self.config.downscale_at(step)
+        if len(self._order) <= LOOKAHEAD:
+            while len(self._order) <= LOOKAHEAD:
+                count = len(self.capture.train)
+                self._order += torch.randperm(count, generator=self._generators["views"]).tolist()
+            self._prefetch(downscale)
+        elif downscale != self.config.downscale_at(step - 1):
+            self._prefetch(downscale)
+        view = self.capture.train[self._order.pop(0)]
+        return view.camera.downscaled(downscale), self._images.get(view, downscale)
+
+    def _prefetch(self, downscale: int) -> None:
+        self._images.prefetch([self.capture.train[i] for i in self._order], downscale)
+
+    def _project(self, camera: Camera, sh_degree: int) -> Splats2D:
+        return ops.project(
+            **self.gaussians.parameters(),
+            cam_from_world=camera.cam_from_world,
+            width=camera.width,
+            height=camera.height,
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            sh_degree=sh_degree,
+        )
+
+    def state_tensors(self) -> dict[str, Tensor]:
+        """All that the steps to come depend on, beside capture and config. Not copied."""
+        parts = {
+            "gaussians": self.gaussians.parameters(),
+            "optimizer": self._optimizer.state_tensors(),
+            "density": self._density.state_tensors(),
+            "random": {name: random.get_state() for name, random in self._generators.items()},
+        }
+        tensors = {f"{part}.{key}": t for part, of in parts.items() for key, t in of.items()}
+        order = torch.tensor(self._order, dtype=torch.int64)
+        return tensors | {"step": torch.tensor(self.step), "order": order}
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """Take over (copy) what `state_tensors` of a trainer with equal capture and config gave.
+
+        Raises:
+            UserError: it is of another density control, SH degree or capture.
+        """
+        own = self.state_tensors()
+        fits = own.keys() == tensors.keys() and all(
+            own[name].shape[1:] == tensors[name].shape[1:] for name in own
+        )
+        if not fits or bool((tensors["order"] >= len(self.capture.train)).any()):
+            raise UserError(
+                "the checkpoint is of another capture or recipe; go on with those it was made with"
+            )
+        parts: dict[str, dict[str, Tensor]] = {}
+        for name, tensor in tensors.items():
+            part, _, key = name.partition(".")
+            parts.setdefault(part, {})[key] = tensor
+        self.gaussians = Gaussians(**parts["gaussians"]).clone()
+        self._optimizer.load_state(parts["optimizer"])
+        self._density.load_state(parts.get("density", {}))
+        for name, random in self._generators.items():
+            random.set_state(parts["random"][name])
+        self.step = int(tensors["step"])
+        self._order = tensors["order"].tolist()
+        self._prefetch(self.config.downscale_at(self.step + 1))
