@@ -135,7 +135,7 @@ def random_scene(
     g = generator(seed)
     view, pose = view_of(width, height, sh_degree=sh_degree), tilted_pose()
     depth = uniform(g, 1.0, 6.0, count)
-    depth[::11] *= -1
+    depth[6::11] *= -1
     x = (uniform(g, -0.2, 1.2, count) * width - view["cx"]) / view["fx"] * depth
     y = (uniform(g, -0.2, 1.2, count) * height - view["cy"]) / view["fy"] * depth
     size = math.log(pixels / view["fx"]) + depth.abs().log()
@@ -147,7 +147,7 @@ def random_scene(
         "sh_dc": as_float32(0.8 * normal(g, count, 1, 3)),
         "sh_rest": as_float32(0.3 * normal(g, count, rest, 3)),
     }
-    params["opacity_logits"][::13] = -6.0
+    params["opacity_logits"][8::13] = -6.0
     return Scene(params, pose, view)
 
 

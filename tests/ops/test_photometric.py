@@ -1,4 +1,4 @@
-"""`ssim` and `photometric_loss`: closed forms, a loop, finite differences, native against the twin."""
+"""`ssim` and `photometric_loss`: closed forms, a loop, finite differences, native and twin."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def images(seed: int, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A smooth picture and a noisy, shifted version of it, (H, W, 3) of planar storage, in [0, 1]."""
+    """A smooth picture and a noisy, shifted version of it, (H, W, 3) planar, in [0, 1]."""
     g = generator(seed)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     waves = [torch.sin(0.3 * x + 0.2 * y + phase) for phase in (0.0, 1.0, 2.0)]
@@ -69,7 +69,7 @@ def test_ssim_of_equal_images_is_one(variant: Variant, height: int, width: int) 
     a = images(0, height, width)[0].to(variant.dtype)
     assert abs(float(variant.ops.ssim(a, a)) - 1) < 1e-6
     loss = variant.ops.photometric_loss(a.requires_grad_(), a.detach().clone())
-    assert abs(loss.item()) < 1e-6
+    assert abs(float(loss.detach())) < 1e-6
     loss.backward()
     assert a.grad is not None
     assert a.grad.abs().max() < 1e-3 / a.numel()
@@ -86,21 +86,19 @@ def test_ssim_of_one_pixel(variant: Variant) -> None:
 
 
 def test_ssim_of_constant_images(variant: Variant) -> None:
-    """Far from the border of flat images only the luminance counts; the border is left out here."""
+    """Inside flat images only the luminance counts: (2 p q + C1) / (p² + q² + C1) a pixel.
+
+    With n × n pixels the sum is (n − 10)² of those, and a border that grows linearly with n, so the
+    second difference in n is twice the luminance.
+    """
     p, q = 0.75, 0.25
     luminance = (2 * p * q + C1) / (p * p + q * q + C1)
-    totals = []
-    for size in (30, 31):
-        a = torch.full((size, size, 3), p).to(variant.dtype)
-        b = torch.full((size, size, 3), q).to(variant.dtype)
-        totals.append(float(variant.ops.ssim(a, b).double()) * size**2)
-    # One row and column more: 2 · 30 + 1 pixels, of which 2 · 10 lie within 5 of a border, the rest
-    # inside. Three sizes tell the border's share apart.
-    a = torch.full((32, 32, 3), p).to(variant.dtype)
-    b = torch.full((32, 32, 3), q).to(variant.dtype)
-    totals.append(float(variant.ops.ssim(a, b).double()) * 32**2)
-    # S(n) = (n − 10)² l + border terms linear in n, so that the second difference is 2 l.
-    assert totals[2] - 2 * totals[1] + totals[0] == pytest.approx(2 * luminance, rel=2e-3)
+    sums = []
+    for n in (30, 31, 32):
+        a, b = (torch.full((n, n, 3), level).to(variant.dtype) for level in (p, q))
+        sums.append(float(variant.ops.ssim(a, b)) * n * n)
+    second_difference = sums[2] - 2 * sums[1] + sums[0]
+    assert second_difference == pytest.approx(2 * luminance, rel=2e-3)
 
 
 def test_definition(variant: Variant) -> None:
@@ -133,7 +131,7 @@ def test_bytes_are_a_target_too(variant: Variant) -> None:
     as_floats.backward()
     assert grad is not None
     assert a.grad is not None
-    assert float(as_bytes) == pytest.approx(float(as_floats), rel=1e-6)
+    assert_close(as_bytes, as_floats, 1e-6)
     assert_close(grad, a.grad, 1e-5)
     assert float(variant.ops.ssim(a, levels)) == pytest.approx(
         float(variant.ops.ssim(a, levels.to(variant.dtype) / 255)), rel=1e-6
@@ -188,11 +186,14 @@ def test_native_is_the_twin(native: Variant, name: str, height: int, width: int)
 
 
 def test_native_is_the_twin_on_flat_images(native: Variant) -> None:
-    """Without structure the variances are differences of nearly equal numbers."""
-    a = as_float32(torch.full((20, 30, 3), 0.9, dtype=torch.float64)).permute(0, 1, 2)
+    """Without structure the variances are differences of equal numbers, and their rounding counts.
+
+    In float32 that is 1e-7 against C2 = 9e-4, so this case alone may err by more.
+    """
+    a = as_float32(torch.full((20, 30, 3), 0.9, dtype=torch.float64))
     b = as_float32(torch.full((20, 30, 3), 0.85, dtype=torch.float64))
     values = [v.ops.ssim(a.to(v.dtype), b.to(v.dtype)) for v in (TWIN, native)]
-    assert_close(values[1], values[0], native.forward)
+    assert_close(values[1], values[0], 5 * native.forward)
 
 
 WRONG = {

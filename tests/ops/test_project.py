@@ -198,17 +198,22 @@ def test_moving_world_and_camera_together_changes_nothing(variant: Variant) -> N
     assert_close(after.packed, before.packed, 1e-5)
 
 
-def test_harmonics_are_orthonormal() -> None:
-    """∫ Yᵢ Yⱼ over the sphere is 1 for i = j, else 0: exact by Gauss-Legendre × uniform angles."""
-    heights, weights = np.polynomial.legendre.leggauss(8)
-    z, w = torch.tensor(heights)[:, None], torch.tensor(weights)[:, None]
-    angles = torch.arange(16, dtype=torch.float64) * 2 * math.pi / 16
-    r = (1 - z * z).sqrt()
-    sphere = [r * angles.cos(), r * angles.sin(), z.expand(8, 16)]
-    directions = torch.stack(sphere, dim=2).reshape(-1, 3)
-    area = (w * 2 * math.pi / 16).expand(8, 16).reshape(-1, 1)
-    basis = reference.sh_basis(directions, 3)
-    torch.testing.assert_close(basis.T @ (area * basis), torch.eye(16, dtype=torch.float64))
+def test_harmonics_are_those_of_the_books() -> None:
+    """Yₗₘ = (−1)ᵐ N Pₗ^|m|(cos θ) · {√2 sin |m|φ, 1, √2 cos mφ} for m < 0, m = 0, m > 0."""
+    directions = normal(generator(0), 50, 3)
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    x, y, z = directions.numpy().T
+    phi = np.arctan2(y, x)
+    expected = []
+    for l in range(4):
+        for m in range(-l, l + 1):
+            k = abs(m)
+            legendre = np.polynomial.Legendre.basis(l).deriv(k)(z) * (1 - z * z) ** (k / 2)
+            norm = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - k))
+            norm /= math.sqrt(math.factorial(l + k))
+            turn = 1.0 if m == 0 else math.sqrt(2) * (np.sin(k * phi) if m < 0 else np.cos(k * phi))
+            expected.append(torch.tensor((-1) ** k * norm * legendre * turn))
+    torch.testing.assert_close(reference.sh_basis(directions, 3), torch.stack(expected, dim=1))
 
 
 def test_harmonics_of_degree_one_point_along_the_axes(variant: Variant) -> None:

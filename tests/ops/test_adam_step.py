@@ -1,0 +1,294 @@
+"""`adam_step`: what Adam is known to do, and native against the twin."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.ops import reference
+
+from .scenes import (
+    PARAMETERS,
+    TWIN,
+    Scene,
+    Variant,
+    assert_close,
+    generator,
+    normal,
+    one_line,
+    random_scene,
+    uniform,
+)
+
+pytestmark = pytest.mark.isa
+
+RATES = {
+    "means": 0.1,
+    "log_scales": 5e-3,
+    "quats": 1e-2,
+    "opacity_logits": 0.05,
+    "sh_dc": 2e-2,
+    "sh_rest": 1e-2,
+}
+
+
+class Optimised:
+    """A scene with moments, and what one training step does to it with the ops of a variant."""
+
+    def __init__(self, variant: Variant, scene: Scene, *, fresh: bool = False) -> None:
+        self.variant = variant
+        self.scene = scene.to(variant.dtype, requires_grad=False)
+        self.params = self.scene.params
+        g = generator(77)
+        self.m = {n: 0.1 * normal(g, *p.shape).to(p) for n, p in self.params.items()}
+        self.v = {n: uniform(g, 0.01, 0.1, *p.shape).to(p) for n, p in self.params.items()}
+        if fresh:
+            for moments in (self.m, self.v):
+                for moment in moments.values():
+                    moment.zero_()
+
+    def tensors(self) -> dict[str, Tensor]:
+        named = {"": self.params, "m of ": self.m, "v of ": self.v}
+        return {prefix + n: t for prefix, group in named.items() for n, t in group.items()}
+
+    def copy(self) -> dict[str, Tensor]:
+        return {name: tensor.clone() for name, tensor in self.tensors().items()}
+
+    def visible(self) -> Tensor:
+        ids = self.scene.project(self.variant.ops).ids
+        assert ids is not None
+        return ids
+
+    def step(self, packed_grad: Tensor, step: int = 1, **options: Any) -> None:
+        arguments = {**self.scene.view, "lr": RATES, **options}
+        self.variant.ops.adam_step(
+            self.params,
+            self.m,
+            self.v,
+            self.visible(),
+            packed_grad.to(self.variant.dtype),
+            self.scene.cam_from_world,
+            step=step,
+            **arguments,
+        )
+
+
+def packed_grads(seed: int, count: int) -> Tensor:
+    """A cotangent (M, 16) with something in every column: radii and padding have to be ignored."""
+    return normal(generator(seed), count, 16)
+
+
+def gradients(scene: Scene, packed_grad: Tensor) -> dict[str, Tensor]:
+    """The float64 gradient of every parameter, by autograd through the twin's `project`."""
+    leaf = scene.to(torch.float64)
+    splats = leaf.project(reference)
+    splats.packed.backward(packed_grad)
+    grads = {name: p.grad for name, p in leaf.params.items()}
+    return {name: grad for name, grad in grads.items() if grad is not None}
+
+
+def test_first_step_is_the_learning_rate(variant: Variant) -> None:
+    """From zero moments m̂ = g and v̂ = g²: every value moves by its rate against its gradient."""
+    scene = random_scene(0, 20)
+    state = Optimised(variant, scene, fresh=True)
+    before = state.copy()
+    grad = packed_grads(1, len(state.visible()))
+    wanted = gradients(scene, grad)
+    state.step(grad)
+    for name in PARAMETERS:
+        moved = (state.params[name] - before[name]).double()
+        clear = wanted[name].abs() > 1e-3 * wanted[name].abs().max()
+        assert clear.any()
+        expected = -RATES[name] * wanted[name].sign()
+        torch.testing.assert_close(moved[clear], expected[clear], rtol=1e-3, atol=1e-6)
+
+
+def test_step_is_that_of_the_paper(variant: Variant) -> None:
+    """Three steps of torch.optim.Adam on the same gradients."""
+    scene = random_scene(1, 25)
+    state = Optimised(variant, scene, fresh=True)
+    leaf = scene.to(torch.float64)
+    groups = [{"params": [leaf.params[n]], "lr": RATES[n]} for n in PARAMETERS]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
+    for step in (1, 2, 3):
+        splats = leaf.project(reference)
+        grad = packed_grads(10 + step, len(splats))
+        adam.zero_grad()
+        splats.packed.backward(grad)
+        adam.step()
+        state.step(grad, step)
+    tolerance = max(variant.backward, 1e-9)  # eps is inside the root here, outside there
+    for name in PARAMETERS:
+        adam_state = adam.state[leaf.params[name]]
+        assert_close(state.params[name], leaf.params[name], tolerance, name)
+        assert_close(state.m[name], adam_state["exp_avg"], tolerance, f"m of {name}")
+        assert_close(state.v[name], adam_state["exp_avg_sq"], tolerance, f"v of {name}")
+
+
+@pytest.mark.parametrize("regularised", [False, True])
+@pytest.mark.parametrize("visible_only", [False, True])
+@pytest.mark.parametrize(("degree", "rest"), [(0, 0), (0, 15), (1, 3), (1, 15), (2, 8), (3, 15)])
+def test_native_is_the_twin(
+    native: Variant, degree: int, rest: int, visible_only: bool, regularised: bool
+) -> None:
+    """Three steps from given moments: every parameter and moment."""
+    scene = random_scene(degree, 61, sh_degree=degree, rest=rest)
+    states = [Optimised(v, scene) for v in (TWIN, native)]
+    before = states[0].copy()
+    for step in (5, 6, 7):
+        grad = packed_grads(step, len(states[0].visible()))
+        for state in states:
+            for k, (name, p) in enumerate(state.params.items()):
+                # Not all of them: a parameter without a regulariser has no .grad.
+                wanted = regularised and name in ("means", "opacity_logits", "sh_rest")
+                p.grad = 0.1 * normal(generator(100 * step + k), *p.shape).to(p) if wanted else None
+            state.step(grad, step, visible_only=visible_only)
+    wanted_tensors, got = states[0].tensors(), states[1].tensors()
+    for name, tensor in wanted_tensors.items():
+        change, wanted_change = got[name].double() - before[name], tensor - before[name]
+        assert_close(change, wanted_change, native.backward, f"change of {name}")
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 17, 33, 300])
+def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
+    states = [Optimised(v, random_scene(50 + count, count)) for v in (TWIN, native)]
+    before = states[0].copy()
+    grad = packed_grads(1, len(states[0].visible()))
+    for state in states:
+        state.step(grad, 10)
+    for name, tensor in states[0].tensors().items():
+        change = states[1].tensors()[name].double() - before[name]
+        assert_close(change, tensor - before[name], native.backward, name)
+
+
+def test_options_reach_the_step(native: Variant) -> None:
+    """Other betas, a large eps, and rates of zero."""
+    states = [Optimised(v, random_scene(2, 20)) for v in (TWIN, native)]
+    before = states[0].copy()
+    grad = packed_grads(1, len(states[0].visible()))
+    rates = {**RATES, "quats": 0.0}
+    for state in states:
+        state.step(grad, 4, betas=(0.8, 0.9), eps=0.5, lr=rates)
+    assert torch.equal(states[1].params["quats"].double(), before["quats"])
+    for name, tensor in states[0].tensors().items():
+        change = states[1].tensors()[name].double() - before[name]
+        assert_close(change, tensor - before[name], native.backward, name)
+
+
+def test_invisible_rows_are_left_alone(variant: Variant) -> None:
+    """visible_only: their values and moments keep every bit, even where a `.grad` is given."""
+    state = Optimised(variant, random_scene(3, 40))
+    ids = state.visible().long()
+    hidden = torch.ones(40, dtype=torch.bool)
+    hidden[ids] = False
+    assert 0 < hidden.sum() < 40
+    for p in state.params.values():
+        p.grad = torch.ones_like(p)
+    before = state.copy()
+    state.step(packed_grads(0, len(ids)), visible_only=True)
+    for name, tensor in state.tensors().items():
+        assert torch.equal(tensor[hidden], before[name][hidden]), name
+        assert not torch.equal(tensor[~hidden], before[name][~hidden]), name
+
+
+def test_moments_of_invisible_rows_decay(variant: Variant) -> None:
+    """Dense Adam: no gradient, so that m shrinks by β1, v by β2, and the value still moves."""
+    state = Optimised(variant, random_scene(3, 40))
+    ids = state.visible().long()
+    hidden = torch.ones(40, dtype=torch.bool)
+    hidden[ids] = False
+    before = state.copy()
+    state.step(packed_grads(0, len(ids)), step=3)
+    for name in PARAMETERS:
+        old_m, old_v = before[f"m of {name}"][hidden], before[f"v of {name}"][hidden]
+        assert_close(state.m[name][hidden], 0.9 * old_m, 1e-6)
+        assert_close(state.v[name][hidden], 0.999 * old_v, 1e-6)
+        m_hat, v_hat = 0.9 * old_m / (1 - 0.9**3), 0.999 * old_v / (1 - 0.999**3)
+        moved = state.params[name][hidden] - before[name][hidden]
+        assert_close(moved, -RATES[name] * m_hat / v_hat.sqrt(), 1e-3)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_rows_of_inactive_degrees_are_left_alone(variant: Variant, degree: int) -> None:
+    state = Optimised(variant, random_scene(4, 20, sh_degree=degree))
+    state.params["sh_rest"].grad = torch.ones_like(state.params["sh_rest"])
+    before = state.copy()
+    state.step(packed_grads(0, len(state.visible())), sh_degree=degree)
+    active = (degree + 1) ** 2 - 1
+    for name in ("sh_rest", "m of sh_rest", "v of sh_rest"):
+        tensor = state.tensors()[name]
+        assert torch.equal(tensor[:, active:], before[name][:, active:]), name
+        assert active == 0 or not torch.equal(tensor[:, :active], before[name][:, :active])
+
+
+def test_nothing_visible(variant: Variant) -> None:
+    state = Optimised(variant, random_scene(5, 10))
+    state.params["means"] += torch.tensor([1e4, 0, 0])
+    assert len(state.visible()) == 0
+    before = state.copy()
+    state.step(packed_grads(0, 0), visible_only=True)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in state.tensors().items())
+    state.step(packed_grads(0, 0), step=2)
+    assert_close(state.m["means"], 0.9 * before["m of means"], 1e-6)
+
+
+def test_values_at_rest_stay(variant: Variant) -> None:
+    """Zero moments and no gradient: 0 / √(0 + eps²) is 0, not NaN."""
+    state = Optimised(variant, random_scene(6, 10), fresh=True)
+    before = state.copy()
+    state.step(torch.zeros(len(state.visible()), 16))
+    assert all(torch.equal(tensor, before[name]) for name, tensor in state.tensors().items())
+
+
+def arguments() -> dict[str, Any]:
+    scene = random_scene(1, 4).to(torch.float32, requires_grad=False)
+    return {
+        "params": scene.params,
+        "exp_avg": {n: torch.zeros_like(p) for n, p in scene.params.items()},
+        "exp_avg_sq": {n: torch.zeros_like(p) for n, p in scene.params.items()},
+        "ids": torch.arange(2, dtype=torch.int32),
+        "packed_grad": torch.zeros(2, 16),
+        "cam_from_world": scene.cam_from_world,
+        **scene.view,
+        "lr": RATES,
+        "step": 1,
+    }
+
+
+WRONG = {
+    "ids without their gradient": {"packed_grad": torch.zeros(3, 16)},
+    "gradient of another width": {"packed_grad": torch.zeros(2, 32)},
+    "gradient of another dtype": {"packed_grad": torch.zeros(2, 16).double()},
+    "ids of another type": {"ids": torch.arange(2)},
+    "no first step": {"step": 0},
+    "pose of another shape": {"cam_from_world": torch.eye(4, dtype=torch.float64)},
+    "degree beyond the rows": {"sh_degree": 4},
+    "a rate is missing": {"lr": {"means": 0.1}},
+    "focal length NaN": {"fx": math.nan},
+    "no width": {"width": 0},
+}
+
+
+@pytest.mark.parametrize("change", WRONG.values(), ids=WRONG.keys())
+def test_wrong_input(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="adam_step") as caught:
+        ops.adam_step(**{**arguments(), **change})
+    assert one_line(caught.value)
+
+
+@pytest.mark.parametrize("group", ["params", "exp_avg", "exp_avg_sq"])
+def test_wrong_tensors(group: str) -> None:
+    """Another shape, another dtype, or a name that is missing."""
+    for wrong in (torch.zeros(4, 4), torch.zeros(4, 3).double(), None):
+        given = arguments()
+        given[group] = {n: t for n, t in given[group].items() if n != "means"}
+        if wrong is not None:
+            given[group]["means"] = wrong
+        with pytest.raises(ValueError, match="adam_step") as caught:
+            ops.adam_step(**given)
+        assert one_line(caught.value)

@@ -1,0 +1,142 @@
+"""The native ops give the same bits for any number of threads, and again for every run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+
+from .scenes import (
+    Scene,
+    generator,
+    leaf_splats,
+    normal,
+    random_scene,
+    random_splats,
+    uniform,
+)
+
+pytestmark = pytest.mark.isa
+
+THREADS = (1, 2, 3, 7, 2)
+COUNT, WIDTH, HEIGHT = 6000, 150, 90  # several blocks of rows, 60 tiles
+DTYPES = [torch.float32, torch.float64]
+
+
+@pytest.fixture(autouse=True)
+def _threads_as_before() -> Iterator[None]:
+    before = ops.get_num_threads()
+    yield
+    ops.set_num_threads(before)
+
+
+def assert_same_bits(results: list[dict[str, Tensor]]) -> None:
+    for threads, result in zip(THREADS[1:], results[1:], strict=True):
+        for name, expected in results[0].items():
+            # As bytes: equal NaNs are the same, and −0 is not 0.
+            same = torch.equal(bits(result[name]), bits(expected))
+            assert same, f"{name} with {threads} threads is not what it is with one"
+
+
+def bits(tensor: Tensor) -> Tensor:
+    return tensor.detach().contiguous().flatten().view(torch.uint8)
+
+
+def the_scene() -> Scene:
+    return random_scene(0, COUNT, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_project(dtype: torch.dtype) -> None:
+    results = []
+    for threads in THREADS:
+        ops.set_num_threads(threads)
+        scene = the_scene().to(dtype)
+        splats = scene.project(ops)
+        assert splats.ids is not None
+        splats.packed.backward(normal(generator(1), *splats.packed.shape).to(dtype))
+        result = {name: leaf.grad for name, leaf in scene.leaves().items()}
+        results.append({**result, "packed": splats.packed, "ids": splats.ids})
+    assert_same_bits(results)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("channels", [3, 5])
+def test_rasterize(dtype: torch.dtype, channels: int) -> None:
+    results = []
+    for threads in THREADS:
+        ops.set_num_threads(threads)
+        splats = leaf_splats(random_splats(2, 3000, WIDTH, HEIGHT, channels), dtype)
+        background = uniform(generator(3), 0, 1, channels).to(dtype).requires_grad_()
+        image, alpha, depth = ops.rasterize(splats, WIDTH, HEIGHT, background, with_depth=True)
+        outputs = {"image": image, "alpha": alpha, "depth": depth}
+        torch.autograd.backward(
+            list(outputs.values()),
+            [normal(generator(4), *o.shape).to(dtype) for o in outputs.values()],
+        )
+        grads = {"packed": splats.packed.grad, "background": background.grad}
+        results.append({**outputs, **grads})
+    assert_same_bits(results)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_photometric_loss(dtype: torch.dtype) -> None:
+    results = []
+    target = uniform(generator(1), 0, 1, HEIGHT, WIDTH, 3).to(dtype)
+    for threads in THREADS:
+        ops.set_num_threads(threads)
+        image = uniform(generator(0), 0, 1, HEIGHT, WIDTH, 3).to(dtype).requires_grad_()
+        loss = ops.photometric_loss(image, target)
+        loss.backward()
+        results.append({"loss": loss, "gradient": image.grad, "ssim": ops.ssim(image, target)})
+    assert_same_bits(results)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_neighbours(dtype: torch.dtype) -> None:
+    points = normal(generator(0), 5000, 3).to(dtype)
+    results = []
+    for threads in THREADS:
+        ops.set_num_threads(threads)
+        results.append({"distances": ops.neighbours(points)})
+    assert_same_bits(results)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_training_steps(dtype: torch.dtype, visible_only: bool) -> None:
+    """Project, blend, compare, and step, three times over: nothing differs in the end."""
+    rates = dict.fromkeys(the_scene().params, 0.01)
+    results = []
+    target = uniform(generator(1), 0, 1, HEIGHT, WIDTH, 3).to(dtype)
+    for threads in THREADS:
+        ops.set_num_threads(threads)
+        scene = the_scene().to(dtype, requires_grad=False)
+        m = {name: torch.zeros_like(p) for name, p in scene.params.items()}
+        v = {name: torch.zeros_like(p) for name, p in scene.params.items()}
+        for step in (1, 2, 3):
+            splats = scene.project(ops)
+            splats.packed.requires_grad_()
+            image, _, _ = ops.rasterize(splats, WIDTH, HEIGHT)
+            ops.photometric_loss(image, target).backward()
+            assert splats.ids is not None
+            assert splats.packed.grad is not None
+            ops.adam_step(
+                scene.params,
+                m,
+                v,
+                splats.ids,
+                splats.packed.grad,
+                scene.cam_from_world,
+                lr=rates,
+                step=step,
+                visible_only=visible_only,
+                **scene.view,
+            )
+        moments = {f"m of {n}": t for n, t in m.items()} | {f"v of {n}": t for n, t in v.items()}
+        results.append({**scene.params, **moments})
+    assert_same_bits(results)

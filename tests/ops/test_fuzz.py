@@ -1,0 +1,166 @@
+"""Extreme input: whatever finite numbers the parameters hold, all results are finite."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from .scenes import (
+    Scene,
+    Variant,
+    as_float32,
+    generator,
+    leaf_splats,
+    normal,
+    random_scene,
+    random_splats,
+    uniform,
+)
+
+pytestmark = pytest.mark.isa
+
+COUNT = 64
+
+
+def wild(seed: int) -> dict[str, Tensor]:
+    """Parameters of `random_scene`, made extreme one by one: the tests choose among them."""
+    g = generator(seed)
+    scene = random_scene(seed, COUNT)
+    means, pose = scene.params["means"], scene.cam_from_world
+    position = -pose[:, :3].T @ pose[:, 3]
+    forward = pose[2, :3]
+    on_axis = position + uniform(g, -3, 3, COUNT, 1) * forward
+    at_near = position + 0.2 * forward + 1e-4 * normal(g, COUNT, 3)
+    zero_quats = scene.params["quats"].clone()
+    zero_quats[::2] = 0
+    return {
+        "huge_scales": torch.full((COUNT, 3), 27.0),
+        "tiny_scales": torch.full((COUNT, 3), -27.0),
+        "mixed_scales": uniform(g, -27, 27, COUNT, 3),
+        "needles": torch.tensor([-27.0, 3.0, -27.0]).expand(COUNT, 3),
+        "discs": torch.tensor([3.0, -27.0, 3.0]).expand(COUNT, 3),
+        "long_discs": torch.tensor([12.0, -27.0, 3.0]).expand(COUNT, 3),
+        "behind": means - 20 * forward,
+        "at_camera": position.expand(COUNT, 3),
+        "around_camera": position + 0.3 * normal(g, COUNT, 3),
+        "on_axis": on_axis,
+        "at_near": at_near,
+        "far": position + 1e6 * (means - position),
+        "sideways": means + 1e5 * pose[0, :3],
+        "everywhere": 10 ** uniform(g, -6, 12, COUNT, 1) * normal(g, COUNT, 3),
+        "zero_quats": zero_quats,
+        "tiny_quats": scene.params["quats"] * 1e-30,
+        "huge_quats": scene.params["quats"] * 1e15,
+        "opaque": torch.full((COUNT,), 100.0),
+        "transparent": torch.full((COUNT,), -100.0),
+        "huge_colors": scene.params["sh_rest"] * 1e6,
+        "negative_colors": torch.full((COUNT, 1, 3), -100.0),
+    }
+
+
+NAMES = {
+    "means": "behind at_camera around_camera on_axis at_near far sideways everywhere",
+    "log_scales": "huge_scales tiny_scales mixed_scales needles discs long_discs",
+    "quats": "zero_quats tiny_quats huge_quats",
+    "opacity_logits": "opaque transparent",
+    "sh_rest": "huge_colors",
+    "sh_dc": "negative_colors",
+}
+SINGLE = [(name, case) for name, cases in NAMES.items() for case in cases.split()]
+
+
+def check(variant: Variant, scene: Scene) -> None:
+    """Projects, blends with depth, and steps; looks at every number on the way."""
+    leaf = scene.to(variant.dtype)
+    splats = leaf.project(variant.ops)
+    splats.packed.retain_grad()
+    width, height = leaf.size
+    background = torch.ones(3, dtype=variant.dtype)
+    outputs = variant.ops.rasterize(splats, width, height, background, with_depth=True)
+    found = {"packed": splats.packed, "image": outputs[0], "alpha": outputs[1]}
+    target = torch.rand(height, width, 3, generator=generator(0)).to(variant.dtype)
+    loss = variant.ops.photometric_loss(outputs[0], target) + outputs[1].mean()
+    loss.backward()
+    assert splats.packed.grad is not None
+    found.update({"depth": outputs[2], "loss": loss, "packed gradient": splats.packed.grad})
+    found.update({f"gradient of {n}": t.grad for n, t in leaf.leaves().items()})
+    assert_finite(found)
+    assert outputs[1].min() >= 0
+    assert outputs[1].max() <= 1
+
+    stepped = scene.to(variant.dtype, requires_grad=False)
+    m = {name: torch.zeros_like(p) for name, p in stepped.params.items()}
+    v = {name: torch.zeros_like(p) for name, p in stepped.params.items()}
+    assert splats.ids is not None
+    variant.ops.adam_step(
+        stepped.params,
+        m,
+        v,
+        splats.ids,
+        splats.packed.grad,
+        stepped.cam_from_world,
+        lr=dict.fromkeys(m, 1e-3),
+        step=1,
+        **stepped.view,
+    )
+    assert_finite(stepped.params)
+    assert_finite({f"m of {name}": tensor for name, tensor in m.items()})
+
+
+def assert_finite(tensors: dict[str, Tensor | None]) -> None:
+    for name, tensor in tensors.items():
+        assert tensor is not None, name
+        assert tensor.isfinite().all(), f"{name} is not finite"
+
+
+@pytest.mark.parametrize(("name", "case"), SINGLE, ids=[case for _, case in SINGLE])
+def test_one_extreme(variant: Variant, name: str, case: str) -> None:
+    scene = random_scene(0, COUNT)
+    scene.params[name] = as_float32(wild(0)[case].double())
+    check(variant, scene)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_extremes_together(variant: Variant, seed: int) -> None:
+    """Every parameter of every Gaussian from another case."""
+    scene, cases = random_scene(seed, COUNT), wild(seed)
+    g = generator(1000 + seed)
+    for name, listed in NAMES.items():
+        for case in listed.split():
+            taken = torch.rand(COUNT, generator=g) < 0.15
+            scene.params[name][taken] = as_float32(cases[case].double())[taken]
+    check(variant, scene)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_none_or_one(variant: Variant, count: int) -> None:
+    check(variant, random_scene(3, count))
+
+
+def test_none_visible(variant: Variant) -> None:
+    scene = random_scene(4, 20)
+    scene.params["opacity_logits"][:] = -20.0
+    leaf = scene.to(variant.dtype)
+    splats = leaf.project(variant.ops)
+    assert len(splats) == 0
+    assert splats.ids is not None
+    assert splats.ids.shape == (0,)
+    check(variant, scene)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (16, 16), (17, 31)])
+def test_any_image_size(variant: Variant, size: tuple[int, int]) -> None:
+    check(variant, random_scene(5, 30, *size))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
+def test_splats_of_any_size(variant: Variant, scale: float) -> None:
+    splats = random_splats(0, 50, 23, 17)
+    splats.packed[:, 2:5] *= scale
+    splats.packed[::7, :2] = 1e7
+    leaf = leaf_splats(splats, variant.dtype)
+    image, alpha, depth = variant.ops.rasterize(leaf, 23, 17, with_depth=True)
+    assert depth is not None
+    (image.sum() + alpha.sum() + depth.sum()).backward()
+    assert_finite({"image": image, "alpha": alpha, "depth": depth, "gradient": leaf.packed.grad})
