@@ -124,3 +124,22 @@ def test_command_is_installed():
     assert result.returncode == 0, result.stderr
     for verb in ("train", "render", "evaluate", "info"):
         assert verb in result.stdout
+
+
+def test_public_names_are_there_and_typed():
+    import snowsplat
+
+    assert sorted(snowsplat._MODULES) == sorted(snowsplat.__all__)
+    for name in snowsplat.__all__:
+        assert getattr(snowsplat, name).__name__ == name
+    assert set(snowsplat.__all__) <= set(dir(snowsplat))
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = snowsplat.nonsense
+
+
+def test_importing_the_package_does_not_import_torch():
+    code = "import sys, snowsplat; print('torch' in sys.modules)"
+    result = run(
+        sys.executable, "-c", code, env=os.environ | {"PYTHONPATH": str(REPOSITORY / "src")}
+    )
+    assert result.stdout == "False\n"
