@@ -8,8 +8,8 @@ from torch import Tensor
 
 from snowsplat.camera import Camera
 
-#: The cube's half side, as a share of what the median camera sees at the distance of its centre. With
-#: it the synthetic Blender scenes get ±1.3, the cube in which they are known to lie.
+#: The cube's half side, as a share of what the median camera sees at the distance of its centre.
+#: With it the synthetic Blender scenes get ±1.3, the cube in which they are known to lie.
 _SHARE_OF_VIEW = 0.9
 
 
@@ -18,10 +18,11 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
 
     With points: the box of them without the outermost 1% at each side.
 
-    Without: a cube about the point nearest to all optical axes (least squares), as large as the median
-    camera sees there. Two kinds of capture have no such point. Cameras that look the same way: the
-    cube is set in front of them, five extents away, which is a guess, since nothing tells the distance.
-    Cameras that look apart, from within: the cube is set around them, five extents to each side.
+    Without: a cube about the point nearest to all optical axes (least squares), as large as the
+    median camera sees there. Two kinds of capture have no such point. Cameras that look the same
+    way: the cube is set in front of them, five extents away, which is a guess, since nothing
+    tells the distance. Cameras that look apart, from within: the cube is set around them, five
+    extents to each side.
 
     Raises:
         ValueError: no cameras.
@@ -40,8 +41,8 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
     middle = centres.mean(0)
     spread = float((centres - middle).norm(dim=1).max()) or 1.0
 
-    # Minimise the sum over cameras of |(I − d dᵀ)(p − c)|². Its matrix is singular along a direction
-    # that all axes share; 1e-3 is axes within about two degrees of each other.
+    # Minimise the sum over cameras of |(I − d dᵀ)(p − c)|². Its matrix is singular along a
+    # direction that all axes share; 1e-3 is axes within about two degrees of each other.
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     system = across.mean(0)
     if float(torch.linalg.eigvalsh(system)[0]) > 1e-3:

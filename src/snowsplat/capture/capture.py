@@ -39,8 +39,8 @@ class View:
 class Capture:
     """What training needs; always posed.
 
-    ``train`` and ``test`` are in the order of their names. ``points`` is None where the capture came
-    without: then `bounds` says where to begin.
+    ``train`` and ``test`` are in the order of their names. ``points`` is None where the capture
+    came without: then `bounds` says where to begin.
     """
 
     train: list[View]
@@ -51,14 +51,14 @@ class Capture:
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float32: low and high corner of the box in which the scene is; see `scene_bounds`."""
+        """(2, 3) float32: low and high corner of a box around the scene; see `scene_bounds`."""
         points = None if self.points is None else self.points.xyz
         return scene_bounds([view.camera for view in self.train or self.test], points)
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """What a reader found: an image file and its camera, at the size that the camera was made for."""
+    """What a reader found: an image file, and its camera at the size it was made for."""
 
     name: str  # as `View.name`
     camera: Camera
@@ -68,6 +68,7 @@ class PosedImage:
     file: str  # relative to ``folder``; the file is there
     mask: Path | None = None
     split: Literal["train", "test"] | None = None  # what the capture's own files say
+    divided: int = 1  # by how much the files here are smaller because -r asked for such copies
 
     @property
     def path(self) -> Path:
@@ -83,8 +84,8 @@ def safe_name(path: str) -> str:
 def scene_extent(cameras: list[Camera]) -> float:
     """1.1 × the largest distance of a camera centre from their mean (the paper's scene extent).
 
-    It scales the learning rate of positions, so it must not be 0: cameras that all stand in one place
-    give 1.
+    It scales the learning rate of positions, so it must not be 0: cameras that all stand in one
+    place give 1.
     """
     centres = torch.stack([camera.position.detach() for camera in cameras])
     radius = float((centres - centres.mean(0)).norm(dim=1).max())

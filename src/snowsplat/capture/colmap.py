@@ -19,18 +19,20 @@ from snowsplat.capture.colmap_files import (
     ColmapImage,
     ColmapModel,
     count_images,
+    make_points,
     model_is_text,
     read_model,
     read_points,
 )
+from snowsplat.capture.decode import is_file
 from snowsplat.capture.points_ply import read_points as read_points_ply
 from snowsplat.errors import UserError
 from snowsplat.geometry import rotation_from_quat
 
 logger = logging.getLogger(__name__)
 
-# The camera models that are a pinhole camera when all parameters after the principal point are 0, and
-# whether they have one focal length (f, cx, cy) or two (fx, fy, cx, cy).
+# The camera models that are a pinhole camera when all parameters after the principal point are 0,
+# and whether they have one focal length (f, cx, cy) or two (fx, fy, cx, cy).
 _FOCAL_LENGTHS = {
     "SIMPLE_PINHOLE": 1,
     "PINHOLE": 2,
@@ -61,9 +63,11 @@ def read_colmap(
     folder = models[0]
     shown = folder.relative_to(root).as_posix()
     if len(models) > 1:
-        others = ", ".join(f"{m.relative_to(root).as_posix()} ({count_images(m)})" for m in models[1:])
+        others = ", ".join(
+            f"{m.relative_to(root).as_posix()} ({count_images(m)})" for m in models[1:]
+        )
         logger.warning(
-            "%s: COLMAP made %d models that do not connect; taking the largest, %s (%d images), not %s",
+            "%s: COLMAP made %d separate models; taking the largest, %s (%d images), not %s",
             root,
             len(models),
             shown,
@@ -82,7 +86,7 @@ def read_colmap(
         )
     posed, missing = [], []
     for image in model.images:
-        if not _is_file(image_folder / image.name):
+        if not is_file(image_folder / image.name):
             missing.append(image.name)
             continue
         posed.append(
@@ -108,8 +112,11 @@ def read_colmap(
             missing[0],
         )
     points = read_points(folder)
-    if points is None and (folder / "points3D.ply").is_file():
-        points = read_points_ply(folder / "points3D.ply")
+    ply = folder / "points3D.ply"
+    if points is None and ply.is_file():
+        points = make_points(ply, *read_points_ply(ply))
+    if points is None:
+        logger.warning("%s: the model has no points; training starts from random ones", folder)
     return posed, points, f"COLMAP model {shown} ({'text' if model.text else 'binary'})"
 
 
@@ -126,8 +133,7 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
             "does not hold; copy the model again"
         )
     fx, fy, cx, cy = _pinhole(model.folder, colmap)
-    quat = torch.tensor(image.quat, dtype=torch.float64)
-    translation = torch.tensor(image.translation, dtype=torch.float64)
+    quat, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
     if not (0.5 < float(quat.norm()) < 2.0 and float(translation.abs().max()) < 1e15):
         raise UserError(f"{model.folder}: the pose of image {image.name} is damaged; copy it again")
     pose = torch.cat([rotation_from_quat(quat), translation[:, None]], 1)
@@ -149,15 +155,8 @@ def _pinhole(folder: Path, camera: ColmapCamera) -> tuple[float, float, float, f
 
 
 def _find_mask(folder: Path, name: str) -> Path | None:
-    """``masks/NAME.png`` (COLMAP's way, with the image's own ending before) or ``masks/STEM.png``."""
+    """``masks/IMG.jpg.png``, as COLMAP names the mask of ``IMG.jpg``, or ``masks/IMG.png``."""
     for candidate in (f"{name}.png", str(Path(name).with_suffix(".png"))):
-        if _is_file(folder / candidate):
+        if is_file(folder / candidate):
             return folder / candidate
     return None
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # a damaged name may be no name at all
-        return False

@@ -56,8 +56,7 @@ class ColmapCamera:
 class ColmapImage:
     name: str
     camera_id: int
-    quat: tuple[float, float, float, float]  # wxyz, cam_from_world
-    translation: tuple[float, float, float]
+    pose: tuple[float, ...]  # cam_from_world: quaternion wxyz, translation
 
 
 @dataclass(frozen=True)
@@ -223,7 +222,7 @@ def _read_images_binary(path: Path) -> list[ColmapImage]:
         name = cursor.take_string()
         (observations,) = cursor.take(_COUNT)
         cursor.skip(24 * observations)  # x, y, point id
-        images.append(ColmapImage(name, camera_id, tuple(pose[:4]), tuple(pose[4:])))
+        images.append(ColmapImage(name, camera_id, tuple(pose)))
     cursor.finish()
     return images
 
@@ -255,7 +254,7 @@ def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """The lines of a text file without comments; a warning if a comment tells that some are missing."""
+    """The lines of a text file, without comments."""
     text = _read(path).decode("utf-8", errors="surrogateescape")
     for line in io.StringIO(text):
         if not line.startswith("#"):
@@ -295,8 +294,8 @@ def _read_images_text(path: Path) -> list[ColmapImage]:
     for line in filter(None, lines):
         words = line.split(maxsplit=9)
         try:
-            pose = [float(word) for word in words[1:8]]
-            image = ColmapImage(words[9], int(words[8]), tuple(pose[:4]), tuple(pose[4:]))
+            pose = tuple(float(word) for word in words[1:8])
+            image = ColmapImage(words[9], int(words[8]), pose)
         except (ValueError, IndexError):
             raise _damaged(path, f"no image in the line {line[:60]!r}") from None
         images.append(image)
@@ -373,7 +372,7 @@ def _binary_files(
             for key, camera in cameras.items()
         ],
         "images": [
-            _IMAGE_HEAD.pack(number, *image.quat, *image.translation, image.camera_id)
+            _IMAGE_HEAD.pack(number, *image.pose, image.camera_id)
             + image.name.encode("utf-8", errors="surrogateescape")
             + b"\0"
             + _COUNT.pack(0)
@@ -408,9 +407,7 @@ def _text_files(
         "images": [
             f"# Number of images: {len(images)}",
             *(
-                " ".join(
-                    map(str, (number, *image.quat, *image.translation, image.camera_id, image.name))
-                )
+                " ".join(map(str, (number, *image.pose, image.camera_id, image.name)))
                 + "\n"  # the line of observations, empty
                 for number, image in enumerate(images, 1)
             ),

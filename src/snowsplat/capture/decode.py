@@ -16,8 +16,9 @@ from torch import Tensor
 
 from snowsplat.errors import UserError
 
-# What photographs come as. Pillow also knows formats that start other programs or hold other things.
-_FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM")
+# What photographs come as (a phone's MPO counts as JPEG). Pillow also knows formats that start
+# other programs.
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 #: The endings that are tried where a capture names its images without one.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 _EXIF_ORIENTATION = 0x0112
@@ -27,8 +28,8 @@ _EXIF_ORIENTATION = 0x0112
 class ImageSource:
     """An image that stays on disk until it is wanted, and the size it is then brought to.
 
-    ``turn``: apply the orientation that the camera noted in the file. Off unless the sizes prove that
-    the pose was made for the turned picture: COLMAP poses are made for the pixels as stored.
+    ``turn``: apply the orientation that the camera noted in the file. Off unless the sizes prove
+    that the pose was made for the turned picture: COLMAP poses are made for the pixels as stored.
     """
 
     path: Path
@@ -83,8 +84,10 @@ def read_header(path: Path) -> Header:
     """
     try:
         with Image.open(path, formats=_FORMATS) as image:
-            orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
-            return Header(*image.size, sideways=orientation in (5, 6, 7, 8))
+            # Where a PNG has no such note up front, getexif() would decode all of it to find one.
+            noted = "exif" in image.info or image.format == "TIFF"
+            orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if noted else 1
+            return Header(image.width, image.height, sideways=orientation in (5, 6, 7, 8))
     except Exception as error:  # Pillow's parsers raise anything on damaged files
         raise _unreadable(path, error) from None
 
@@ -138,8 +141,8 @@ def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:
 def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
     """(C, H, W) uint8 to (C, height, width): each pixel is the mean of the area that it covers.
 
-    Exact for any ratio, so that intrinsics scaled by each axis' ratio fit the result exactly. Meant for
-    making smaller.
+    Exact for any ratio, so that intrinsics scaled by each axis' ratio fit the result exactly.
+    Meant for making smaller.
     """
     old_height, old_width = planes.shape[1:]
     if (old_width, old_height) == (width, height):
@@ -194,8 +197,16 @@ def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.nd
     return np.rint(colours + (1 - alpha) * behind).clip(0, 255).astype(np.uint8)
 
 
+def is_file(path: Path) -> bool:
+    """Whether a file is there; a name that a damaged file gave may be no name at all."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def _unreadable(path: Path, error: Exception) -> UserError:
-    if not path.exists():
+    if not is_file(path):
         return UserError(f"{path}: no such image")
     if isinstance(error, PermissionError):
         return UserError(f"{path}: may not be read (permissions)")

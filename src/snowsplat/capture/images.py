@@ -1,7 +1,7 @@
-"""Images for training: decoded ahead in background threads, kept in memory as far as a budget goes.
+"""Images for training: decoded ahead in background threads, kept as far as a memory budget goes.
 
-What `ImageLoader.get` returns depends on the files alone, never on which thread was first or on what
-was kept: a cache miss decodes the same bytes again.
+What `ImageLoader.get` returns depends on the files alone, never on which thread was first or on
+what was kept: a cache miss decodes the same bytes again.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from snowsplat.capture.capture import View
@@ -59,10 +60,10 @@ class ImageLoader:
         self._pumping = False
 
     def prefetch(self, order: Iterable[View], downscale: int | None = None) -> None:
-        """Decode in the background what will be asked for next, in this order; replaces the last one.
+        """Decode in the background what is asked for next, in this order; replaces the last.
 
-        Only as far ahead as half of the budget, so that nothing is dropped before its use. A file that
-        cannot be decoded is reported by the `get` that asks for it.
+        Only as far ahead as half of the budget, so that nothing is dropped before its use. A file
+        that cannot be decoded is reported by the `get` that asks for it.
         """
         with self._lock:
             self._queue = deque(self._key(view, downscale) for view in order)
@@ -149,7 +150,7 @@ class ImageLoader:
                     break
                 self._ahead[key] = size
                 self._running[key] = future = self._pool.submit(self._decode, key)
-                future.add_done_callback(lambda done, key=key: self._finished(key, done))
+                future.add_done_callback(partial(self._finished, key))
             self._queue.popleft()
         self._pumping = False
 
