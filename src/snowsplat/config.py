@@ -82,24 +82,20 @@ def changed(config: TrainConfig, **knobs: Any) -> TrainConfig:
         UserError: a knob that this configuration does not have.
     """
     given = {name: value for name, value in knobs.items() if value is not None}
-    rates = {f"lr_{f.name}": f.name for f in fields(config.learning_rates)}
-    density = {f.name for f in fields(config.density)}
-    whole = {f.name for f in fields(config)}
-    for name in given:
-        if name not in whole | density | rates.keys():
-            kind = type(config.density).__name__
-            raise UserError(
-                f"--{name.replace('_', '-')} means nothing with {kind}; leave it out, or take "
-                "another recipe"
-            )
-    config = replace(config, **{name: value for name, value in given.items() if name in whole})
+    whole = {f.name for f in fields(config)} & given.keys()
+    config = replace(config, **{name: given.pop(name) for name in whole})
+    density = {f.name for f in fields(config.density)} & given.keys()
+    rates = {f"lr_{f.name}" for f in fields(config.learning_rates)} & given.keys()
+    for name in given.keys() - density - rates:
+        raise UserError(
+            f"--{name.replace('_', '-')} means nothing with {type(config.density).__name__}; "
+            "leave it out, or take another recipe"
+        )
     return replace(
         config,
+        density=replace(config.density, **{name: given[name] for name in density}),
         learning_rates=replace(
-            config.learning_rates, **{rates[n]: value for n, value in given.items() if n in rates}
-        ),
-        density=replace(
-            config.density, **{name: value for name, value in given.items() if name in density}
+            config.learning_rates, **{name.removeprefix("lr_"): given[name] for name in rates}
         ),
     )
 

@@ -151,7 +151,7 @@ class Trainer:
                 image, _, _ = ops.rasterize(splats, camera.width, camera.height, background)
                 loss = view_loss(image, photo, background, self.config.ssim_weight)
                 loss.backward()
-            value = float(loss)
+            value = float(loss.detach())
             if not math.isfinite(value):
                 raise UserError(
                     f"the loss is {value} at step {step}: training has diverged; "

@@ -1,0 +1,95 @@
+"""Recipes, and changing single knobs of them."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from snowsplat.config import TrainConfig, changed, config_from_json, config_to_json
+from snowsplat.density import AdaptiveDensity, McmcDensity
+from snowsplat.errors import UserError
+from snowsplat.optim import at_step
+from snowsplat.recipes import RECIPES, recipe
+
+
+def test_the_paper_is_the_papers_at_any_length():
+    for iterations in (7000, 30_000):
+        config = recipe("paper", iterations=iterations)
+        density = config.density
+        assert isinstance(density, AdaptiveDensity)
+        assert config.sh_interval == 1000
+        assert config.ssim_weight == 0.2
+        assert not config.visible_only
+        assert config.downscale_at(1) == 1
+        assert at_step(density.densify_from, iterations) == 500
+        assert at_step(density.densify_until, iterations) == 15_000
+        assert at_step(config.learning_rates.means_steps, iterations) == 30_000
+        assert (density.densify_interval, density.opacity_reset_interval) == (100, 3000)
+        assert (density.grad_threshold, density.prune_opacity) == (2e-4, 0.005)
+
+
+def test_the_short_one_scales_with_its_length():
+    config = recipe("default", iterations=1000)
+    assert at_step(config.density.densify_until, config.iterations) == 500
+    assert [config.downscale_at(step) for step in (1, 150, 151, 400, 401, 1000)] == [
+        4,
+        4,
+        2,
+        2,
+        1,
+        1,
+    ]
+    assert config.learning_rates.at(1000, 1000, 1.0)["means"] == pytest.approx(1.6e-6)
+    assert config.density.opacity_reset_interval == 0
+    assert config.density.prune_world_size == 0
+
+
+def test_degrees_rise_by_interval():
+    config = TrainConfig(sh_interval=200, sh_degree=3)
+    assert [config.sh_degree_at(s) for s in (1, 199, 200, 400, 600, 5000)] == [0, 0, 1, 2, 3, 3]
+    assert replace(config, sh_degree=1).sh_degree_at(5000) == 1
+    assert replace(config, sh_interval=0).sh_degree_at(1) == 3
+
+
+def test_knobs_are_found_where_they_are():
+    config = recipe("default", iterations=50, grad_threshold=4e-4, lr_quats=0.5, seed=None)
+    assert config.iterations == 50
+    assert config.seed == 0
+    assert config.density.grad_threshold == 4e-4
+    assert config.learning_rates.quats == 0.5
+    assert recipe("mcmc", max_gaussians=7).density.max_gaussians == 7
+    other = changed(config, density=McmcDensity(), growth=0.1)
+    assert other.density == McmcDensity(growth=0.1)
+
+
+@pytest.mark.parametrize("name", ["lr_nothing", "growth", "nothing"])
+def test_a_knob_that_is_not_there_is_one_clear_line(name):
+    with pytest.raises(UserError, match=f"--{name.replace('_', '-')} means nothing"):
+        recipe("paper", **{name: 1.0})
+
+
+def test_no_such_recipe():
+    with pytest.raises(UserError, match="no recipe 'fast'; there are default, paper, mcmc"):
+        recipe("fast")
+
+
+def test_values_that_cannot_be():
+    with pytest.raises(UserError, match="--iterations is 0"):
+        recipe("paper", iterations=0)
+    with pytest.raises(UserError, match="--sh-degree is 4"):
+        recipe("paper", sh_degree=4)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_written_down_and_read_back(name):
+    config = recipe(name, test_iterations=(10, 20), coarse_to_fine=(5, 0.25))
+    written = json.dumps(config_to_json(config))
+    assert config_from_json(json.loads(written)) == config
+
+
+def test_a_configuration_of_another_version():
+    values = config_to_json(TrainConfig())
+    with pytest.raises(UserError, match="another version"):
+        config_from_json(values | {"gravity": 9.81})
+    with pytest.raises(UserError, match="another version"):
+        config_from_json({})
