@@ -37,13 +37,11 @@ def load_capture(
     Args:
         images: name of the folder of images.
         resolution: 1, 2, 4 or 8 divide the size of the images (``images_2`` … are used where they
-            are whole); any other number is the width in pixels to bring wider images to; None or
-            −1
-            take them as they are.
+            are whole); any other number is the width in pixels to bring wider images to; None
+            or −1 takes them as they are.
         hold_out: every so many-th image, in the order of names, beginning with the first, is held
             out for testing; splits that the capture itself brings come first. None trains on all.
-        test_list: the names of the images to hold out instead, or a text file with one on each
-        line.
+        test_list: the names of the images to hold out instead, or a text file of one a line.
 
     Raises:
         UserError: no capture there; files that are damaged; cameras with lens distortion; images

@@ -133,7 +133,7 @@ def _check_model(where: str, values: _Json) -> None:
     if model not in _PINHOLE_MODELS or values.get("is_fisheye"):
         kind = model if model not in _PINHOLE_MODELS else "fisheye"
         raise UserError(
-            f"{where}: its camera model is {kind[:40]}, but Gaussians are drawn with pinhole cameras; "
+            f"{where}: its camera model is {kind[:40]}, but Gaussians need pinhole cameras; "
             "undistort the images first, e.g. with colmap image_undistorter"
         )
 
