@@ -29,7 +29,7 @@ def packed_width(channels: int) -> int:
 
 @dataclass
 class Splats2D:
-    """2D Gaussians on the image plane, in pixels. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+    """2D Gaussians on the image plane, in pixels. Pixel (i, j) is centred at (i + 0.5, j + 0.5).
 
     packed:   (M, 16·ceil((8 + C) / 16)), one row per splat:
               0:2 `means2d`   x, y

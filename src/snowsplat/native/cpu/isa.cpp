@@ -1,14 +1,14 @@
 // Which instruction set this library was built for, and which is the best one this machine runs.
 //
-// The loader (ops/native.py) asks the baseline library, which runs everywhere, before it touches the others:
-// merely loading a library may run its static constructors.
+// The loader (ops/native.py) asks the baseline library, which runs everywhere, before it touches
+// the others: merely loading a library may run its static constructors.
 #include <cstdint>
 
 #if defined(__x86_64__)
 #include <cpuid.h>
 #endif
 
-#define SNOWSPLAT_EXPORT extern "C" __attribute__((visibility("default")))
+#include "cpu/pool.h"
 
 namespace {
 
@@ -16,39 +16,40 @@ namespace {
 enum Isa : int64_t { kBaseline = 0, kAvx2 = 1, kAvx512 = 2 };
 
 #if defined(__x86_64__)
-// lzcnt decodes as bsr where it is missing: wrong results instead of a fault. Older compilers do not know its name.
+// lzcnt decodes as bsr where it is missing: wrong results instead of a fault. Older compilers do
+// not know its name.
 bool has_lzcnt() {
-    unsigned a = 0, b = 0, c = 0, d = 0;
-    return __get_cpuid(0x80000001u, &a, &b, &c, &d) && (c & (1u << 5));
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  return __get_cpuid(0x80000001u, &a, &b, &c, &d) && (c & (1u << 5));
 }
 #endif
 
 }  // namespace
 
 // What this library was built for.
-SNOWSPLAT_EXPORT int64_t built_isa() {
+SNOW_EXPORT int64_t built_isa() {
 #if defined(SNOWSPLAT_ISA_AVX512)
-    return kAvx512;
+  return kAvx512;
 #elif defined(SNOWSPLAT_ISA_AVX2)
-    return kAvx2;
+  return kAvx2;
 #else
-    return kBaseline;
+  return kBaseline;
 #endif
 }
 
 // The best one that the processor has and the operating system saves on a task switch
 // (__builtin_cpu_supports looks at XCR0 for the wide registers).
-SNOWSPLAT_EXPORT int64_t best_isa() {
+SNOW_EXPORT int64_t best_isa() {
 #if defined(__x86_64__)
-    __builtin_cpu_init();
-    const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-                      __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") &&
-                      __builtin_cpu_supports("popcnt") && has_lzcnt();
-    const bool avx512 = avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-                        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
-                        __builtin_cpu_supports("avx512cd");
-    if (avx512) return kAvx512;
-    if (avx2) return kAvx2;
+  __builtin_cpu_init();
+  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+                    __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") &&
+                    __builtin_cpu_supports("popcnt") && has_lzcnt();
+  const bool avx512 = avx2 && __builtin_cpu_supports("avx512f") &&
+                      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
+                      __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512cd");
+  if (avx512) return kAvx512;
+  if (avx2) return kAvx2;
 #endif
-    return kBaseline;
+  return kBaseline;
 }

@@ -1,0 +1,165 @@
+// adam_step: the gradient of the splats, carried through the projection and used up at once by Adam
+// (Kingma & Ba 2015), without ever writing the gradients of the parameters to memory.
+//
+//   m ← β₁ m + (1 − β₁) g,   v ← β₂ v + (1 − β₂) g²,   p ← p − lr m̂ / √(v̂ + ε²)
+//
+// ε is inside the root, where a fast reciprocal root applies; for the ε = 1e-15 of this field that
+// is the same number.
+#include <algorithm>
+#include <cmath>
+
+#include "cpu/gaussian_rows.h"
+#include "cpu/pool.h"
+
+namespace snow {
+namespace {
+
+constexpr int64_t kBlock = 2048;
+constexpr int kParameters = 6;  // means, log_scales, quats, opacity_logits, sh_dc, sh_rest
+
+template <class T>
+struct AdamTensor {
+  T *value, *m, *v;
+  const T* extra;  // a gradient to add, of the whole tensor; or null
+  int64_t stride;  // columns as stored
+  T rate;          // lr / (1 − β₁ᵗ)
+};
+
+template <class V>
+struct AdamRule {
+  V beta1, beta2, gain1, gain2, inv_correction2, eps2;
+  SNOW_INLINE void step(V g, V& m, V& v, V& p, V rate) const {
+    m = beta1 * m + gain1 * g;
+    v = beta2 * v + gain2 * g * g;
+    p -= rate * m * rsqrt(v * inv_correction2 + eps2);
+  }
+};
+
+// K columns (few) of W rows, in lanes.
+template <int K, class V, class T = typename V::Scalar>
+SNOW_INLINE void update_lanes(const AdamRule<V>& rule, const AdamTensor<T>& t,
+                              const RowIndex<V::width>& rows, V* g) {
+  T *value[V::width], *pm[V::width], *pv[V::width];
+  V p[K + 3], m[K + 3], v[K + 3];
+  rows.pointers(t.value, K, value), gather_rows<K>(value, p);
+  rows.pointers(t.m, K, pm), gather_rows<K>(pm, m);
+  rows.pointers(t.v, K, pv), gather_rows<K>(pv, v);
+  if (t.extra) {
+    const T* pe[V::width];
+    V e[K + 3];
+    rows.pointers(t.extra, K, pe), gather_rows<K>(pe, e);
+    for (int k = 0; k < K; k++) g[k] += e[k];
+  }
+  for (int k = 0; k < K; k++) rule.step(g[k], m[k], v[k], p[k], V(t.rate));
+  scatter_rows<K>(value, p, rows.count);
+  scatter_rows<K>(pm, m, rows.count);
+  scatter_rows<K>(pv, v, rows.count);
+}
+
+// `columns` (many) of one row, contiguous; g may be null (zero gradient).
+template <class V, class T = typename V::Scalar>
+SNOW_INLINE void update_row(const AdamRule<V>& rule, const AdamTensor<T>& t, int64_t row,
+                            int columns, const T* g) {
+  T *value = t.value + row * t.stride, *m = t.m + row * t.stride, *v = t.v + row * t.stride;
+  const T* extra = t.extra ? t.extra + row * t.stride : nullptr;
+  for (int c = 0; c < columns; c += V::width) {
+    const int n = columns - c;
+    V gradient = g ? V::load(g + c) : V(0.f), mc, vc, pc;
+    if (n >= V::width) {
+      mc = V::load(m + c), vc = V::load(v + c), pc = V::load(value + c);
+      if (extra) gradient += V::load(extra + c);
+      rule.step(gradient, mc, vc, pc, V(t.rate));
+      mc.store(m + c), vc.store(v + c), pc.store(value + c);
+    } else {
+      mc = V::load_first(m + c, n), vc = V::load_first(v + c, n), pc = V::load_first(value + c, n);
+      if (extra) gradient += V::load_first(extra + c, n);
+      rule.step(gradient, mc, vc, pc, V(t.rate));
+      mc.store_first(m + c, n), vc.store_first(v + c, n), pc.store_first(value + c, n);
+    }
+  }
+}
+
+template <class V, class T = typename V::Scalar>
+void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, int degree,
+          const PinholeCamera<T>& cam, const T* grad_packed, const AdamTensor<T>* t,
+          const AdamRule<V>& rule, bool visible_only) {
+  constexpr int W = V::width;
+  const int sh_columns = 3 * ((degree + 1) * (degree + 1) - 1);
+  // Tasks are ranges of Gaussians, each with the splats that came from it: ids ascend.
+  const int64_t units = visible_only ? m : n;
+  parallel_for((units + kBlock - 1) / kBlock, [&](int64_t block) {
+    const int64_t begin = block * kBlock, end = std::min(begin + kBlock, units);
+    int64_t first = begin, last = end;
+    if (!visible_only) {
+      first = std::lower_bound(ids, ids + m, int32_t(begin)) - ids;
+      last = std::lower_bound(ids, ids + m, int32_t(end)) - ids;
+    }
+    for (int64_t i = first; i < last; i += W) {
+      GaussianGroup<V> g;
+      g.rows = RowIndex<W>::of(ids, i, last);
+      g.load_shape(tensors);
+      g.load_sh(tensors, degree);
+      GaussianGroupGradient<V> d;
+      group_vjp<V>(g, cam, degree, grad_packed, i, last, d, nullptr, nullptr);
+      update_lanes<3>(rule, t[0], g.rows, d.shape.mean);
+      update_lanes<3>(rule, t[1], g.rows, d.shape.log_scale);
+      update_lanes<4>(rule, t[2], g.rows, d.shape.quat);
+      update_lanes<1>(rule, t[3], g.rows, &d.shape.opacity_logit);
+      update_lanes<3>(rule, t[4], g.rows, d.dc);
+      if (degree > 0) {
+        alignas(64) T by_row[W][48] = {};
+        T* p[W];
+        for (int l = 0; l < W; l++) p[l] = by_row[l];
+        scatter_rows_n(p, sh_columns, d.rest, W);
+        for (int l = 0; l < g.rows.count; l++)
+          update_row(rule, t[5], g.rows.row[l], sh_columns, by_row[l]);
+      }
+    }
+    if (visible_only) return;
+    for (int64_t row = begin, i = first; row < end; row++) {
+      if (i < last && ids[i] == row) {
+        i++;
+        continue;
+      }
+      for (int k = 0; k < 5; k++) update_row(rule, t[k], row, int(t[k].stride), (const T*)nullptr);
+      if (degree > 0) update_row(rule, t[5], row, sh_columns, (const T*)nullptr);
+    }
+  });
+}
+
+}  // namespace
+}  // namespace snow
+
+using namespace snow;
+
+// Per parameter, in the order means, log_scales, quats, opacity_logits, sh_dc, sh_rest: value,
+// first and second moment, extra gradient or null, and learning rate.
+#define SNOW_ADAM_ENTRY(NAME, V)                                                                   \
+  SNOW_EXPORT int64_t NAME(                                                                        \
+      int64_t n, int64_t m, const int32_t* ids, const V::Scalar* grad_packed,                      \
+      const V::Scalar* cam_from_world, double width, double height, double fx, double fy,          \
+      double cx, double cy, double near, int64_t sh_rest_rows, int64_t degree, V::Scalar* p0,      \
+      V::Scalar* m0, V::Scalar* v0, const V::Scalar* e0, double lr0, V::Scalar* p1, V::Scalar* m1, \
+      V::Scalar* v1, const V::Scalar* e1, double lr1, V::Scalar* p2, V::Scalar* m2, V::Scalar* v2, \
+      const V::Scalar* e2, double lr2, V::Scalar* p3, V::Scalar* m3, V::Scalar* v3,                \
+      const V::Scalar* e3, double lr3, V::Scalar* p4, V::Scalar* m4, V::Scalar* v4,                \
+      const V::Scalar* e4, double lr4, V::Scalar* p5, V::Scalar* m5, V::Scalar* v5,                \
+      const V::Scalar* e5, double lr5, int64_t adam_step, double beta1, double beta2, double eps,  \
+      int64_t visible_only) {                                                                      \
+    using T = V::Scalar;                                                                           \
+    const double c1 = 1 - std::pow(beta1, double(adam_step));                                      \
+    const double c2 = 1 - std::pow(beta2, double(adam_step));                                      \
+    const AdamTensor<T> tensors[kParameters] = {                                                   \
+        {p0, m0, v0, e0, 3, T(lr0 / c1)}, {p1, m1, v1, e1, 3, T(lr1 / c1)},                        \
+        {p2, m2, v2, e2, 4, T(lr2 / c1)}, {p3, m3, v3, e3, 1, T(lr3 / c1)},                        \
+        {p4, m4, v4, e4, 3, T(lr4 / c1)}, {p5, m5, v5, e5, 3 * sh_rest_rows, T(lr5 / c1)}};        \
+    const AdamRule<V> rule = {V(beta1),     V(beta2),  V(1 - beta1),                               \
+                              V(1 - beta2), V(1 / c2), V(eps * eps)};                              \
+    step<V>(n, m, ids, {p0, p1, p2, p3, p4, p5, sh_rest_rows}, int(degree),                        \
+            {cam_from_world, width, height, fx, fy, cx, cy, near}, grad_packed, tensors, rule,     \
+            visible_only != 0);                                                                    \
+    return 0;                                                                                      \
+  }
+
+SNOW_ADAM_ENTRY(adam_step, VecF)
+SNOW_ADAM_ENTRY(adam_step_f64, VecD)

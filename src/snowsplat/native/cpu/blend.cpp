@@ -1,0 +1,407 @@
+// Blending: the splats of each 16×16 tile, front to back, and the gradient of that.
+//
+// Pixels are in SIMD lanes: a block is W neighbouring pixels of one row (a whole row at W = 16), a
+// tile has 256/W blocks, numbered column-major: block = (x / W) · 16 + y. One vector test per
+// (tile, splat) finds the blocks its ellipse touches; the forward pass keeps these bits for the
+// backward.
+//
+// Forward   takes chunks of 64 splats and walks block by block, so that a block's transmittance and
+//           colour stay in registers over the chunk.
+// Backward  walks splat by splat, front to back again. With S = Σ of what lies behind (known at the
+//           start: S₀ = ∂L/∂C · C, since the whole pixel lies behind), the derivative with respect
+//           to log α is w·(g·c) − α S/(1 − α): no division by T, no last index per pixel. A splat's
+//           sums stay in lanes over its blocks and are folded once, into a slot of its own: no
+//           atomics, so the result is the same for any number of threads.
+#include "cpu/pool.h"
+#include "cpu/records.h"
+#include "simd.h"
+
+namespace snow {
+namespace {
+
+constexpr int kChunk = 64;
+
+template <int W>
+struct BlocksOf;
+template <>
+struct BlocksOf<16> {
+  using Bits = uint16_t;
+};
+template <>
+struct BlocksOf<8> {
+  using Bits = uint32_t;
+};
+template <>
+struct BlocksOf<4> {
+  using Bits = uint64_t;
+};
+
+SNOW_INLINE int first_bit(uint64_t b) { return __builtin_ctzll(b); }
+
+template <class V>
+struct Tile {
+  using T = typename V::Scalar;
+  using Bits = typename BlocksOf<V::width>::Bits;
+  static constexpr int W = V::width;
+  static constexpr int kColumns = kTile / W;        // blocks side by side
+  static constexpr int kBlocks = kTile * kColumns;  // blocks of a tile
+  static constexpr int kRowVectors = kTile / W;     // vectors that hold one value per row
+
+  int x, y, columns, rows;  // first pixel; how much of the tile lies inside the image
+
+  Tile(int64_t index, int64_t tiles_x, int64_t width, int64_t height) {
+    x = int(index % tiles_x) * kTile, y = int(index / tiles_x) * kTile;
+    columns = width - x < kTile ? int(width - x) : kTile;
+    rows = height - y < kTile ? int(height - y) : kTile;
+  }
+  // Lanes of a block that are pixels of the image.
+  SNOW_INLINE int lanes(int block) const {
+    const int n = columns - block / kTile * W;
+    return block % kTile < rows ? (n < 0 ? 0 : n < W ? n : W) : 0;
+  }
+  SNOW_INLINE int64_t pixel(int block, int64_t width) const {
+    return int64_t(y + block % kTile) * width + x + block / kTile * W;
+  }
+};
+
+// The quadratic of a splat along each row of a tile: log₂α = (A X + p1[row]) X + p0[row] for the
+// pixel X columns into the tile. `reach` returns the bits of the blocks that can hold α ≥ 1/255.
+template <class V>
+struct RowTerms {
+  using T = typename V::Scalar;
+  alignas(64) T p0[kTile], p1[kTile], dy[kTile];
+
+  SNOW_INLINE void set(const SplatTerms<T>& s, const Tile<V>& tile) {
+    const T x0 = s.mean_x - (T(tile.x) + T(0.5)), y0 = s.mean_y - (T(tile.y) + T(0.5));
+    const V A(s.A), B(s.B), C(s.C), u(x0), log2_opacity(s.log2_opacity);
+    for (int k = 0; k < Tile<V>::kRowVectors; k++) {
+      const V d = V::iota() + V(T(k * V::width) - y0);
+      const V b = B * d, at_mean = C * d * d + log2_opacity;
+      (b - V(2.f) * A * u).store(p1 + k * V::width);
+      ((A * u - b) * u + at_mean).store(p0 + k * V::width);
+      d.store(dy + k * V::width);
+    }
+  }
+  SNOW_INLINE typename Tile<V>::Bits reach(const SplatTerms<T>& s, const Tile<V>& tile) const {
+    const T x0 = s.mean_x - (T(tile.x) + T(0.5));
+    const V threshold(kLog2MinAlpha - kCullSlack);
+    typename Tile<V>::Bits bits = 0;
+    for (int k = 0; k < Tile<V>::kRowVectors; k++) {
+      const V d = V::load(dy + k * V::width), b = V(s.B) * d;
+      const V at_mean = V(s.C) * d * d + V(s.log2_opacity);
+      for (int c = 0; c < Tile<V>::kColumns; c++) {
+        const T left = T(c * V::width) - x0;
+        const V x = min(max(V(s.slope_x) * d, V(left)), V(left + T(V::width - 1)));
+        const V peak = (V(s.A) * x + b) * x + at_mean;
+        bits |= typename Tile<V>::Bits(V::bits(peak >= threshold)) << (c * kTile + k * V::width);
+      }
+    }
+    return bits;
+  }
+};
+
+// For each block, which of the chunk's splats touch it: the transpose of the splats' block bits.
+template <class V>
+struct BlockLists {
+  uint64_t list[Tile<V>::kBlocks] = {};
+  SNOW_INLINE void add(int splat, uint64_t blocks) {
+    for (; blocks; blocks &= blocks - 1) list[first_bit(blocks)] |= uint64_t(1) << splat;
+  }
+  SNOW_INLINE void finish() {}
+};
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+template <>
+struct BlockLists<Simd<float, 16>> {
+  alignas(64) uint32_t low[16], high[16];
+  uint64_t list[16];
+  __m512i lo = _mm512_setzero_si512(), hi = lo;
+  SNOW_INLINE void add(int splat, uint64_t blocks) {
+    const __mmask16 m = __mmask16(blocks);
+    const __m512i bit = _mm512_set1_epi32(int(1u << (splat & 31)));
+    if (splat < 32)
+      lo = _mm512_mask_or_epi32(lo, m, lo, bit);
+    else
+      hi = _mm512_mask_or_epi32(hi, m, hi, bit);
+  }
+  SNOW_INLINE void finish() {
+    _mm512_store_si512(low, lo), _mm512_store_si512(high, hi);
+    for (int b = 0; b < 16; b++) list[b] = low[b] | uint64_t(high[b]) << 32;
+  }
+};
+#endif
+
+template <class V>
+struct Frame {
+  using T = typename V::Scalar;
+  int64_t width, height, tiles_x;
+  const SplatRecord<T>* records;
+  const uint32_t *tile_start, *instance_splat;
+  uint32_t* tile_end;  // where the forward pass stopped, every pixel opaque
+  typename Tile<V>::Bits* instance_blocks;
+};
+
+template <class V, int C, class T = typename V::Scalar>
+void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* background, T* image,
+                  T* alpha) {
+  using TileV = Tile<V>;
+  using Bits = typename TileV::Bits;
+  constexpr int B = TileV::kBlocks;
+  const TileV tile(index, f.tiles_x, f.width, f.height);
+  struct Block {
+    V transmittance, color[C], stopped;  // stopped: the final transmittance of finished lanes
+  };
+  alignas(64) Block block[B];
+  uint32_t alive[B];
+  Bits live = 0;
+  for (int b = 0; b < B; b++) {
+    const int n = tile.lanes(b);
+    alive[b] = V::bits(V::first(n));
+    block[b].transmittance = zero_unless(V::first(n), V(1.f));
+    block[b].stopped = V(0.f);
+    for (int k = 0; k < C; k++) block[b].color[k] = V(0.f);
+    if (n) live |= Bits(1) << b;
+  }
+  const V threshold(kLog2MinAlpha), max_alpha(kMaxAlpha), min_t(kMinTransmittance);
+  const uint32_t end = f.tile_start[index + 1];
+  uint32_t i = f.tile_start[index];
+  RowTerms<V> rows[kChunk];
+  const SplatRecord<T>* splat[kChunk];
+  for (; i < end && live; i += kChunk) {
+    const int n = end - i < kChunk ? int(end - i) : kChunk;
+    Bits* blocks_of = f.instance_blocks + i;
+    BlockLists<V> lists;
+    for (int j = 0; j < n; j++) {
+      prefetch(&f.records[f.instance_splat[i + j + 16 < end ? i + j + 16 : end - 1]]);
+      const SplatRecord<T>& r = f.records[f.instance_splat[i + j]];
+      splat[j] = &r;
+      rows[j].set(r.terms, tile);
+      const Bits touched = rows[j].reach(r.terms, tile) & live;
+      blocks_of[j] = touched;
+      lists.add(j, touched);
+    }
+    lists.finish();
+    for (Bits todo = live; todo; todo &= Bits(todo - 1)) {
+      const int b = first_bit(todo), row = b % kTile;
+      uint64_t list = lists.list[b];
+      if (!list) continue;
+      const V X = V::iota() + V(T(b / kTile * V::width));
+      V transmittance = block[b].transmittance, color[C];
+      for (int k = 0; k < C; k++) color[k] = block[b].color[k];
+      uint32_t still = alive[b];
+      while (list) {
+        const int j = first_bit(list);
+        list &= list - 1;
+        const SplatRecord<T>& r = *splat[j];
+        const V power = (V(r.terms.A) * X + V(rows[j].p1[row])) * X + V(rows[j].p0[row]);
+        const V a = zero_unless(power >= threshold, min(exp2_blend(power), max_alpha));
+        V weight = a * transmittance, next = transmittance - weight;
+        const auto open = next >= min_t;
+        if (__builtin_expect(V::bits(open) != still, 0)) {
+          // Some lanes would fall below the least transmittance: they stop here, before this splat.
+          const auto stops = V::from_bits(still & ~V::bits(open));
+          block[b].stopped = select(stops, transmittance, block[b].stopped);
+          still = V::bits(open);
+          weight = zero_unless(open, weight), next = zero_unless(open, next);
+          if (!still) {
+            live &= Bits(~(Bits(1) << b));
+            for (; list; list &= list - 1) blocks_of[first_bit(list)] &= Bits(~(Bits(1) << b));
+          }
+        }
+        transmittance = next;
+        for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
+      }
+      block[b].transmittance = transmittance;
+      for (int k = 0; k < C; k++) block[b].color[k] = color[k];
+      alive[b] = still;
+    }
+  }
+  f.tile_end[index] = i < end ? i : end;
+  const int64_t plane = f.width * f.height;
+  for (int b = 0; b < B; b++) {
+    const int n = tile.lanes(b);
+    if (!n) continue;
+    const int64_t at = tile.pixel(b, f.width);
+    const V rest = block[b].transmittance + block[b].stopped;
+#pragma GCC unroll 4
+    for (int k = 0; k < C; k++)
+      if (k < channels)
+        (block[b].color[k] + rest * V(background[k])).store_first(image + k * plane + at, n);
+    if (alpha) (V(1.f) - rest).store_first(alpha + at, n);
+  }
+}
+
+// grad_alpha may be null. image and grad_image are the group's planes.
+template <class V, int C, class T = typename V::Scalar>
+void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_t* instance_slot,
+                   const T* image, const T* grad_image, const T* alpha, const T* grad_alpha,
+                   T* slots) {
+  using TileV = Tile<V>;
+  using Bits = typename TileV::Bits;
+  constexpr int B = TileV::kBlocks;
+  const TileV tile(index, f.tiles_x, f.width, f.height);
+  const int64_t plane = f.width * f.height;
+  struct Block {
+    V transmittance, behind, grad[C], grad_alpha;
+  };
+  alignas(64) Block block[B];
+  uint32_t alive[B];
+  for (int b = 0; b < B; b++) {
+    const int n = tile.lanes(b);
+    const int64_t at = n ? tile.pixel(b, f.width) : 0;
+    alive[b] = V::bits(V::first(n));
+    block[b].transmittance = zero_unless(V::first(n), V(1.f));
+    V behind(0.f);
+#pragma GCC unroll 4
+    for (int k = 0; k < C; k++) {
+      V g(0.f);
+      if (k < channels) {
+        g = V::load_first(grad_image + k * plane + at, n);
+        behind += g * V::load_first(image + k * plane + at, n);
+      }
+      block[b].grad[k] = g;
+    }
+    block[b].grad_alpha = V(0.f);
+    if (grad_alpha) {
+      block[b].grad_alpha = V::load_first(grad_alpha + at, n);
+      behind += block[b].grad_alpha * V::load_first(alpha + at, n);
+    }
+    block[b].behind = behind;
+  }
+  const V threshold(kLog2MinAlpha), max_alpha(kMaxAlpha), min_t(kMinTransmittance), one(1.f);
+  const uint32_t end = f.tile_end[index];
+  uint32_t i = f.tile_start[index];
+  RowTerms<V> rows;
+  for (; i < end; i++) {
+    if (i + 12 < end) prefetch(&f.records[f.instance_splat[i + 12]]);
+    T* slot = slots + int64_t(instance_slot[i]) * kSlotWidth;
+    Bits touched = f.instance_blocks[i];
+    if (!touched) {
+      for (int k = 0; k < kSlotWidth; k += V::width) V(0.f).store(slot + k);
+      continue;
+    }
+    const SplatRecord<T>& r = f.records[f.instance_splat[i]];
+    rows.set(r.terms, tile);
+    const T x0 = r.terms.mean_x - (T(tile.x) + T(0.5));
+    const V A(r.terms.A);
+    V color[C], sums[C + 6];
+    for (int k = 0; k < C; k++) color[k] = V(r.color[k]);
+    for (int k = 0; k < C + 6; k++) sums[k] = V(0.f);
+    for (int column = 0; column < TileV::kColumns; column++) {
+      const V X = V::iota() + V(T(column * V::width));
+      V q0(0.f), qy(0.f), qyy(0.f);
+      uint32_t rows_left = uint32_t(touched >> (column * kTile)) & 0xffff;
+      if (TileV::kColumns > 1 && !rows_left) continue;
+      for (; rows_left; rows_left &= rows_left - 1) {
+        const int row = __builtin_ctz(rows_left), b = column * kTile + row;
+        Block& s = block[b];
+        const V power = (A * X + V(rows.p1[row])) * X + V(rows.p0[row]);
+        const V e = exp2_blend(power);
+        const V a = zero_unless(power >= threshold, min(e, max_alpha));
+        V weight = a * s.transmittance, next = s.transmittance - weight;
+        const auto open = next >= min_t;
+        if (__builtin_expect(V::bits(open) != alive[b], 0)) {
+          alive[b] = V::bits(open);
+          weight = zero_unless(open, weight), next = zero_unless(open, next);
+        }
+        s.transmittance = next;
+        V seen = s.grad_alpha;
+        for (int k = 0; k < C; k++) {
+          seen += color[k] * s.grad[k];
+          sums[k] += weight * s.grad[k];
+        }
+        const V ahead = weight * seen, behind = s.behind - ahead;
+        s.behind = behind;
+        const V q =
+            zero_unless(open & (e < max_alpha), ahead - a * behind * reciprocal_estimate(one - a));
+        const V dy(rows.dy[row]);
+        q0 += q;
+        qy += q * dy;
+        qyy += q * (dy * dy);
+      }
+      const V dx = X - V(x0), qx = q0 * dx;
+      sums[C] += q0, sums[C + 1] += qx, sums[C + 2] += qy;
+      sums[C + 3] += qx * dx, sums[C + 4] += qy * dx, sums[C + 5] += qyy;
+    }
+    sum_lanes<C + 6>(sums, slot);
+  }
+  for (; i < f.tile_start[index + 1]; i++) {
+    T* slot = slots + int64_t(instance_slot[i]) * kSlotWidth;
+    for (int k = 0; k < kSlotWidth; k += V::width) V(0.f).store(slot + k);
+  }
+}
+
+// Sum over pixels of grad_image · (1 − alpha), a row at a time: the gradient of the background.
+template <class T>
+void background_rows(int64_t height, int64_t width, int64_t channels, const T* grad_image,
+                     const T* alpha, double* rows) {
+  parallel_for(height, [&](int64_t y) {
+    for (int64_t k = 0; k < channels; k++) {
+      double sum = 0;
+      for (int64_t x = 0; x < width; x++)
+        sum +=
+            double(grad_image[(k * height + y) * width + x]) * (1.0 - double(alpha[y * width + x]));
+      rows[y * channels + k] = sum;
+    }
+  });
+}
+
+template <class F>
+void for_tiles(int64_t tiles, F&& body) {
+  constexpr int64_t kTogether = 4;  // tiles a task: neighbours share splats in the cache
+  parallel_for((tiles + kTogether - 1) / kTogether, [&](int64_t task) {
+    for (int64_t t = task * kTogether; t < tiles && t < (task + 1) * kTogether; t++) body(t);
+  });
+}
+
+}  // namespace
+}  // namespace snow
+
+using namespace snow;
+
+#define SNOW_BLEND_ENTRIES(SUFFIX, V)                                                             \
+  SNOW_EXPORT int64_t blend_fwd##SUFFIX(                                                          \
+      int64_t tiles, int64_t width, int64_t height, const SplatRecord<V::Scalar>* records,        \
+      const uint32_t* tile_start, uint32_t* tile_end, const uint32_t* instance_splat,             \
+      Tile<V>::Bits* instance_blocks, int64_t channels, const V::Scalar* background,              \
+      V::Scalar* image, V::Scalar* alpha) {                                                       \
+    const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
+                        records,  tile_start,     instance_splat,                                 \
+                        tile_end, instance_blocks};                                               \
+    for_tiles(tiles, [&](int64_t t) {                                                             \
+      if (channels <= 3)                                                                          \
+        forward_tile<V, 3>(f, t, int(channels), background, image, alpha);                        \
+      else                                                                                        \
+        forward_tile<V, 4>(f, t, int(channels), background, image, alpha);                        \
+    });                                                                                           \
+    return 0;                                                                                     \
+  }                                                                                               \
+  SNOW_EXPORT int64_t blend_bwd##SUFFIX(                                                          \
+      int64_t tiles, int64_t width, int64_t height, const SplatRecord<V::Scalar>* records,        \
+      const uint32_t* tile_start, uint32_t* tile_end, const uint32_t* instance_splat,             \
+      Tile<V>::Bits* instance_blocks, int64_t channels, const uint32_t* instance_slot,            \
+      const V::Scalar* image, const V::Scalar* grad_image, const V::Scalar* alpha,                \
+      const V::Scalar* grad_alpha, V::Scalar* slots) {                                            \
+    const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
+                        records,  tile_start,     instance_splat,                                 \
+                        tile_end, instance_blocks};                                               \
+    for_tiles(tiles, [&](int64_t t) {                                                             \
+      if (channels <= 3)                                                                          \
+        backward_tile<V, 3>(f, t, int(channels), instance_slot, image, grad_image, alpha,         \
+                            grad_alpha, slots);                                                   \
+      else                                                                                        \
+        backward_tile<V, 4>(f, t, int(channels), instance_slot, image, grad_image, alpha,         \
+                            grad_alpha, slots);                                                   \
+    });                                                                                           \
+    return 0;                                                                                     \
+  }                                                                                               \
+  SNOW_EXPORT int64_t background_bwd##SUFFIX(int64_t height, int64_t width, int64_t channels,     \
+                                             const V::Scalar* grad_image, const V::Scalar* alpha, \
+                                             double* rows) {                                      \
+    background_rows(height, width, channels, grad_image, alpha, rows);                            \
+    return 0;                                                                                     \
+  }                                                                                               \
+  /* Bytes of instance_blocks per (tile, splat) instance. */                                      \
+  SNOW_EXPORT int64_t blend_block_bytes##SUFFIX(int64_t) { return sizeof(Tile<V>::Bits); }
+
+SNOW_BLEND_ENTRIES(, VecF)
+SNOW_BLEND_ENTRIES(_f64, VecD)

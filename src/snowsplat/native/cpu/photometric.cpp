@@ -1,0 +1,221 @@
+// photometric: L1 and SSIM between two images and the gradient of their weighted sum, in one pass.
+//
+// Images are planar, (3, H, W). A task is one channel of a strip of columns over a segment of rows;
+// it slides down the rows and keeps the last 11 horizontally filtered rows in rings: first of the
+// window means, then of the derivatives, so that nothing but the images touches memory. The cut
+// into tasks depends on the image size alone, and partial sums are added in order.
+#include <cmath>
+#include <cstring>
+#include <vector>
+
+#include "cpu/pool.h"
+#include "simd.h"
+#include "ssim.h"
+
+namespace snow {
+namespace {
+
+constexpr int kTaps = 2 * kSsimRadius + 1;
+constexpr int kStrip = 128;  // columns of a task
+constexpr int kMargin = 16;  // columns computed on each side for the second filter
+constexpr int kPad = 32;     // columns of buffer on each side
+constexpr int kRow = kStrip + 2 * kPad;
+constexpr int kSegment = 540;  // rows of a task, about
+
+struct Window {
+  double tap[kTaps];
+  Window() {
+    double sum = 0;
+    for (int k = 0; k < kTaps; k++) {
+      const double x = k - kSsimRadius;
+      tap[k] = std::exp(-x * x / (2 * 1.5 * 1.5));
+      sum += tap[k];
+    }
+    for (double& t : tap) t /= sum;
+  }
+};
+const Window window;
+
+// n pixels (n ≤ W) of either kind of image.
+template <class V>
+SNOW_INLINE V load_pixels(const typename V::Scalar* p, int64_t n) {
+  return n >= V::width ? V::load(p) : V::load_first(p, int(n));
+}
+template <class V>
+SNOW_INLINE V load_pixels(const uint8_t* p, int64_t n) {
+  uint8_t bytes[V::width] = {};
+  if (n < V::width) std::memcpy(bytes, p, size_t(n));
+  return V::load_bytes(n >= V::width ? p : bytes) * V(1.0 / 255.0);
+}
+
+template <class V>
+struct Filter {
+  using T = typename V::Scalar;
+  V tap[kTaps];
+  Filter() {
+    for (int k = 0; k < kTaps; k++) tap[k] = V(window.tap[k]);
+  }
+  SNOW_INLINE V along(const T* row, int x) const {
+    V sum(0.f);
+#pragma GCC unroll 11
+    for (int k = 0; k < kTaps; k++) sum += tap[k] * V::load(row + x + k - kSsimRadius);
+    return sum;
+  }
+  SNOW_INLINE V across(const T* const* rows, int offset) const {
+    V sum(0.f);
+#pragma GCC unroll 11
+    for (int k = 0; k < kTaps; k++) sum += tap[k] * V::load(rows[k] + offset);
+    return sum;
+  }
+};
+
+template <class V>
+struct Scratch {
+  using T = typename V::Scalar;
+  alignas(64) T a[kRow], b[kRow], squares[kRow], product[kRow];
+  alignas(64) T means[kTaps][4][kRow];  // of a, b, a² + b², ab
+  alignas(64) T derivatives[3][kRow];   // d.mean_a, d.mean_aa, d.mean_ab
+  alignas(64) T filtered[kTaps][3][kRow];
+};
+
+template <class V, class Target>
+struct Photometric {
+  using T = typename V::Scalar;
+  int64_t width, height;
+  const T* image;
+  const Target* target;
+  double l1_weight, ssim_weight;  // already divided by the number of values
+  T* grad;                        // null: values only
+
+  void run(int channel, int64_t strip, int64_t row_begin, int64_t row_end, double* sums) const {
+    thread_local Scratch<V> s;
+    constexpr int W = V::width;
+    const Filter<V> filter;
+    const int64_t plane = int64_t(channel) * width * height;
+    const int64_t x0 = strip * kStrip;
+    const int64_t x1 = x0 + kStrip < width ? x0 + kStrip : width;
+    const int64_t from = x0 - kMargin - kSsimRadius < 0 ? 0 : x0 - kMargin - kSsimRadius;
+    const int64_t to = x1 + kMargin + kSsimRadius < width ? x1 + kMargin + kSsimRadius : width;
+    std::memset(s.a, 0, sizeof s.a), std::memset(s.b, 0, sizeof s.b);
+    std::memset(s.squares, 0, sizeof s.squares), std::memset(s.product, 0, sizeof s.product);
+    const int first = kPad - kMargin, last = kPad + kStrip + kMargin;
+
+    for (int64_t y = row_begin - 2 * kSsimRadius; y < row_end + 2 * kSsimRadius; y++) {
+      auto& means = s.means[(y + 2 * kTaps) % kTaps];
+      if (y >= 0 && y < height) {
+        const int64_t row = plane + y * width;
+        for (int64_t x = from; x < to; x += W) {
+          const int64_t at = x - x0 + kPad;
+          const V a = load_pixels<V>(image + row + x, to - x);
+          const V b = load_pixels<V>(target + row + x, to - x);
+          a.store(s.a + at), b.store(s.b + at);
+          (a * a + b * b).store(s.squares + at), (a * b).store(s.product + at);
+        }
+        for (int x = first; x < last; x += W) {
+          filter.along(s.a, x).store(means[0] + x), filter.along(s.b, x).store(means[1] + x);
+          filter.along(s.squares, x).store(means[2] + x);
+          filter.along(s.product, x).store(means[3] + x);
+        }
+      } else {
+        std::memset(means, 0, sizeof means);
+      }
+
+      const int64_t ys = y - kSsimRadius;  // the row whose SSIM is complete now
+      if (ys < row_begin - kSsimRadius) continue;
+      auto& filtered = s.filtered[(ys + 2 * kTaps) % kTaps];
+      if (ys >= 0 && ys < height) {
+        const bool mine = ys >= row_begin && ys < row_end;
+        const T* rows[kTaps];
+        for (int k = 0; k < kTaps; k++)
+          rows[k] = s.means[(ys - kSsimRadius + k + 2 * kTaps) % kTaps][0];
+        V sum(0.f);
+        for (int x = first; x < last; x += W) {
+          SsimDerivatives<V> d;
+          V value =
+              ssim_pixel(filter.across(rows, x), filter.across(rows, kRow + x),
+                         filter.across(rows, 2 * kRow + x), filter.across(rows, 3 * kRow + x), d);
+          // Windows are centred on pixels of the image only.
+          const int64_t column = x0 + x - kPad;
+          if (column < 0 || column + W > width) {
+            const V c = V::iota() + V(double(column));
+            const auto inside = (c >= V(0.f)) & (V(double(width)) > c);
+            value = zero_unless(inside, value), d.mean_a = zero_unless(inside, d.mean_a);
+            d.mean_aa = zero_unless(inside, d.mean_aa), d.mean_ab = zero_unless(inside, d.mean_ab);
+          }
+          if (mine && x >= kPad && x < kPad + kStrip) sum += value;
+          d.mean_a.store(s.derivatives[0] + x), d.mean_aa.store(s.derivatives[1] + x);
+          d.mean_ab.store(s.derivatives[2] + x);
+        }
+        for (int l = 0; l < W; l++) sums[1] += double(sum.v[l]);
+        if (grad)
+          for (int x = kPad; x < kPad + kStrip; x += W)
+            for (int k = 0; k < 3; k++) filter.along(s.derivatives[k], x).store(filtered[k] + x);
+      } else {
+        std::memset(filtered, 0, sizeof filtered);
+      }
+
+      const int64_t yo = ys - kSsimRadius;  // the row whose gradient is complete now
+      if (yo < row_begin) continue;
+      const T* rows[kTaps];
+      for (int k = 0; k < kTaps; k++)
+        rows[k] = s.filtered[(yo - kSsimRadius + k + 2 * kTaps) % kTaps][0];
+      const V up(l1_weight), down(-l1_weight), weight(ssim_weight), zero(0.f);
+      V sum(0.f);
+      for (int64_t x = x0; x < x1; x += W) {
+        const int64_t at = plane + yo * width + x;
+        const int n = x1 - x < W ? int(x1 - x) : W;
+        const V a = load_pixels<V>(image + at, x1 - x), b = load_pixels<V>(target + at, x1 - x);
+        const V difference = a - b;
+        sum += max(difference, -difference);
+        if (!grad) continue;
+        const int offset = int(x - x0) + kPad;
+        const V sign = select(difference > zero, up, select(zero > difference, down, zero));
+        const V g = sign + weight * (filter.across(rows, offset) +
+                                     V(2.f) * a * filter.across(rows, kRow + offset) +
+                                     b * filter.across(rows, 2 * kRow + offset));
+        g.store_first(grad + at, n);
+      }
+      for (int l = 0; l < W; l++) sums[0] += double(sum.v[l]);
+    }
+  }
+};
+
+template <class V, class Target>
+void photometric(int64_t channels, int64_t width, int64_t height, const typename V::Scalar* image,
+                 const Target* target, double l1_weight, double ssim_weight,
+                 typename V::Scalar* grad, double* means) {
+  const int64_t strips = (width + kStrip - 1) / kStrip;
+  const int64_t segments = (height + kSegment - 1) / kSegment;
+  const double count = double(channels * width * height);
+  const Photometric<V, Target> p = {
+      width, height, image, target, l1_weight / count, ssim_weight / count, grad};
+  const int64_t tasks = channels * strips * segments;
+  std::vector<double> sums(size_t(2 * tasks), 0.0);
+  parallel_for(tasks, [&](int64_t task) {
+    const int64_t segment = task % segments, strip = task / segments % strips;
+    const Range rows = split_range(height, segments, segment);
+    p.run(int(task / segments / strips), strip, rows.begin, rows.end, &sums[size_t(2 * task)]);
+  });
+  means[0] = means[1] = 0;
+  for (int64_t t = 0; t < tasks; t++)
+    means[0] += sums[size_t(2 * t)], means[1] += sums[size_t(2 * t + 1)];
+  means[0] /= count, means[1] /= count;
+}
+
+}  // namespace
+}  // namespace snow
+
+using namespace snow;
+
+#define SNOW_PHOTOMETRIC_ENTRY(NAME, V, TARGET)                                                  \
+  SNOW_EXPORT int64_t NAME(int64_t channels, int64_t width, int64_t height,                      \
+                           const V::Scalar* image, const TARGET* target, double l1_weight,       \
+                           double ssim_weight, V::Scalar* grad, double* means) {                 \
+    photometric<V>(channels, width, height, image, target, l1_weight, ssim_weight, grad, means); \
+    return 0;                                                                                    \
+  }
+
+SNOW_PHOTOMETRIC_ENTRY(photometric, VecF, float)
+SNOW_PHOTOMETRIC_ENTRY(photometric_u8, VecF, uint8_t)
+SNOW_PHOTOMETRIC_ENTRY(photometric_f64, VecD, double)
+SNOW_PHOTOMETRIC_ENTRY(photometric_u8_f64, VecD, uint8_t)

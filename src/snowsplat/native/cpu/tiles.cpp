@@ -1,0 +1,385 @@
+// From splats to a depth-sorted list of splats for each 16×16 tile:
+//   splats_prepare   records, tile rectangles and depth keys
+//   splats_sort      radix sort of the depth keys (stable, so equal depths keep row order)
+//   tiles_count      exactly which tiles each splat touches; counts per tile
+//   tiles_fill       a stable counting scatter by tile, in depth order
+// and back: splats_reduce sums the gradients of a splat's tiles. The result of each is the same for
+// any number of threads.
+#include <cstring>
+#include <vector>
+
+#include "cpu/pool.h"
+#include "cpu/records.h"
+#include "simd.h"
+
+namespace snow {
+namespace {
+
+constexpr int64_t kBlock = 2048;
+constexpr int64_t kSerialBelow = 50000;  // splats; under this one part is faster than several
+
+int64_t part_count(int64_t m) { return m < kSerialBelow ? 1 : pool_size(); }
+
+inline uint32_t ordered_bits(float x) {  // unsigned integers in the order of the floats
+  uint32_t b;
+  std::memcpy(&b, &x, 4);
+  return b & 0x80000000u ? ~b : b | 0x80000000u;
+}
+inline uint64_t ordered_bits(double x) {
+  uint64_t b;
+  std::memcpy(&b, &x, 8);
+  return b >> 63 ? ~b : b | 0x8000000000000000ull;
+}
+template <class T>
+struct KeyOf;
+template <>
+struct KeyOf<float> {
+  using type = uint32_t;
+};
+template <>
+struct KeyOf<double> {
+  using type = uint64_t;
+};
+
+template <class T>
+SNOW_INLINE void set_colors(SplatRecord<T>& r, const T* row, const int64_t* columns) {
+  for (int k = 0; k < kGroupChannels; k++) r.color[k] = columns[k] < 0 ? T(0) : row[columns[k]];
+}
+
+template <class V, class T = typename V::Scalar>
+void prepare(int64_t m, const T* packed, int64_t stride, double width, double height,
+             const int64_t* columns, SplatRecord<T>* records, typename KeyOf<T>::type* keys) {
+  constexpr int W = V::width;
+  parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
+    const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
+    for (int64_t i = begin; i < end; i += W) {
+      const int count = end - i < W ? int(end - i) : W;
+      const T* p[W];
+      for (int l = 0; l < W; l++) p[l] = packed + (i + (l < count ? l : count - 1)) * stride;
+      V c[8];
+      gather_rows<7>(p, c);
+      c[7] = V(0.f);
+      const V det = c[2] * c[4] - c[3] * c[3];
+      const V k2 = V(2 * kLn2) * (log2(c[5]) - V(kLog2MinAlpha));
+      const V reach = max(k2, V(0.f)) / det;
+      const V ex = sqrt(reach * c[4]), ey = sqrt(reach * c[2]);
+      const V half(0.5f), right(width - 1), bottom(height - 1);
+      const V x0 = max(c[0] - ex - half, V(0.f)), x1 = min(c[0] + ex - half, right);
+      const V y0 = max(c[1] - ey - half, V(0.f)), y1 = min(c[1] + ey - half, bottom);
+      const uint32_t seen =
+          V::bits((k2 >= V(0.f)) & (det > V(0.f)) & (c[2] > V(0.f)) & (x1 >= x0) & (y1 >= y0));
+      const SplatTerms<V> t = splat_terms(c[0], c[1], c + 2, c[5]);
+      V terms[8] = {t.mean_x, t.mean_y, t.A, t.B, t.C, t.log2_opacity, t.slope_x, t.slope_y};
+      T* out[W];
+      for (int l = 0; l < W; l++) out[l] = (T*)(records + i + (l < count ? l : 0));
+      scatter_rows<8>(out, terms, count);
+      alignas(64) T rect[4][W];
+      x0.store(rect[0]), y0.store(rect[1]), x1.store(rect[2]), y1.store(rect[3]);
+      for (int l = 0; l < count; l++) {
+        SplatRecord<T>& r = records[i + l];
+        set_colors(r, p[l], columns);
+        const bool on = seen >> l & 1;
+        r.tile_x0 = on ? uint16_t(int(rect[0][l]) / kTile) : 1;
+        r.tile_y0 = on ? uint16_t(int(rect[1][l]) / kTile) : 1;
+        r.tile_x1 = on ? uint16_t(int(rect[2][l]) / kTile) : 0;
+        r.tile_y1 = on ? uint16_t(int(rect[3][l]) / kTile) : 0;
+        keys[i + l] = ordered_bits(p[l][6]);
+      }
+    }
+  });
+}
+
+// Least significant digit first, 11 bits a pass, over only as many bits as the keys differ in.
+template <class Key>
+void radix_sort(int64_t m, Key* keys, Key* keys2, uint32_t* order, uint32_t* order2) {
+  constexpr int kBits = 11, kBins = 1 << kBits;
+  const int64_t parts = part_count(m);
+  std::vector<Key> lows(static_cast<size_t>(parts), ~Key(0)), highs(static_cast<size_t>(parts), 0);
+  parallel_for(parts, [&](int64_t part) {
+    const Range r = split_range(m, parts, part);
+    Key low = ~Key(0), high = 0;
+    for (int64_t i = r.begin; i < r.end; i++) {
+      low = keys[i] < low ? keys[i] : low;
+      high = keys[i] > high ? keys[i] : high;
+    }
+    lows[size_t(part)] = low, highs[size_t(part)] = high;
+  });
+  Key low = ~Key(0), high = 0;
+  for (int64_t p = 0; p < parts; p++) {
+    low = lows[size_t(p)] < low ? lows[size_t(p)] : low;
+    high = highs[size_t(p)] > high ? highs[size_t(p)] : high;
+  }
+  int passes = 0;
+  for (Key span = m > 0 ? high - low : 0; span;
+       span = passes * kBits < int(8 * sizeof(Key)) ? Key(high - low) >> (passes * kBits) : 0)
+    passes++;
+  if (passes == 0) {
+    for (int64_t i = 0; i < m; i++) order[i] = uint32_t(i);
+    return;
+  }
+  std::vector<uint32_t> histogram(size_t(parts * kBins));
+  for (int pass = 0; pass < passes; pass++) {
+    const int shift = pass * kBits;
+    const bool last = pass == passes - 1, to_order = (passes - 1 - pass) % 2 == 0;
+    const Key* key_in = pass % 2 == 0 ? keys : keys2;
+    Key* key_out = pass % 2 == 0 ? keys2 : keys;
+    const uint32_t* in = to_order ? order2 : order;
+    uint32_t* out = to_order ? order : order2;
+    parallel_for(parts, [&](int64_t part) {
+      uint32_t* h = &histogram[size_t(part * kBins)];
+      std::memset(h, 0, sizeof(uint32_t) * kBins);
+      const Range r = split_range(m, parts, part);
+      for (int64_t i = r.begin; i < r.end; i++) h[(key_in[i] - low) >> shift & (kBins - 1)]++;
+    });
+    uint32_t sum = 0;
+    for (int d = 0; d < kBins; d++)
+      for (int64_t p = 0; p < parts; p++) {
+        uint32_t& h = histogram[size_t(p * kBins + d)];
+        const uint32_t c = h;
+        h = sum, sum += c;
+      }
+    parallel_for(parts, [&](int64_t part) {
+      uint32_t* h = &histogram[size_t(part * kBins)];
+      const Range r = split_range(m, parts, part);
+      for (int64_t i = r.begin; i < r.end; i++) {
+        const Key k = key_in[i];
+        const uint32_t at = h[(k - low) >> shift & (kBins - 1)]++;
+        if (!last) key_out[at] = k;
+        out[at] = pass == 0 ? uint32_t(i) : in[i];
+      }
+    });
+  }
+}
+
+// The tiles of one splat: a rectangle, and for small ones (≤ 16 tiles) the exact subset as bits,
+// row-major in a rectangle `width` tiles wide. Large ones are walked again with the same test.
+struct TileSpan {
+  uint16_t x0, y0, bits;
+  uint8_t width, large;
+};
+static_assert(sizeof(TileSpan) == 8, "layout of the scratch tensor");
+
+// Which of 16 tiles touch the splat: tile k of the 16 is at (k % width, k / width) from (x, y).
+template <class V, class T = typename V::Scalar>
+struct TileTest {
+  alignas(64) T column[kTile + 1][16], row[kTile + 1][16];
+  TileTest() {
+    for (int w = 1; w <= 16; w++)
+      for (int k = 0; k < 16; k++) column[w][k] = T(k % w * kTile), row[w][k] = T(k / w * kTile);
+  }
+  SNOW_INLINE uint32_t operator()(const SplatTerms<T>& t, int width, int x, int y) const {
+    const SplatTerms<V> s = {V(0.f), V(0.f), V(t.A),       V(t.B),
+                             V(t.C), V(0.f), V(t.slope_x), V(t.slope_y)};
+    const V threshold(kLog2MinAlpha - kCullSlack - t.log2_opacity);
+    const V left(x * kTile + 0.5 - t.mean_x), top(y * kTile + 0.5 - t.mean_y);
+    const V size(kTile - 1);
+    uint32_t bits = 0;
+    for (int k = 0; k < 16; k += V::width) {
+      const V x0 = V::load(column[width] + k) + left, y0 = V::load(row[width] + k) + top;
+      const V peak = peak_over_rectangle(s, x0, y0, x0 + size, y0 + size);
+      bits |= V::bits(peak >= threshold) << k;
+    }
+    return bits;
+  }
+};
+
+template <class V>
+const TileTest<V>& tile_test() {
+  static const TileTest<V> test;
+  return test;
+}
+
+template <class V, class T, class F>
+SNOW_INLINE void for_each_tile_of_large(const SplatRecord<T>& r, int64_t tiles_x, F&& f) {
+  const int width = r.tile_x1 - r.tile_x0 + 1;
+  for (int y = r.tile_y0; y <= r.tile_y1; y++)
+    for (int x = 0; x < width; x += 16) {
+      const int n = width - x < 16 ? width - x : 16;
+      uint32_t bits = tile_test<V>()(r.terms, 16, r.tile_x0 + x, y) & ((1u << n) - 1);
+      for (; bits; bits &= bits - 1) f(y * tiles_x + r.tile_x0 + x + __builtin_ctz(bits));
+    }
+}
+
+struct SmallOffsets {  // tile offset of bit k in a span `width` wide
+  uint32_t at[17][16];
+  explicit SmallOffsets(int64_t tiles_x) {
+    for (int w = 1; w <= 16; w++)
+      for (int k = 0; k < 16; k++) at[w][k] = uint32_t(k / w * tiles_x + k % w);
+  }
+};
+
+template <class V, class T = typename V::Scalar>
+int64_t count_tiles(int64_t m, const uint32_t* order, const SplatRecord<T>* records,
+                    int64_t tiles_x, int64_t tiles_y, int64_t parts, uint32_t* counts,
+                    uint32_t* tile_start, TileSpan* spans, uint32_t* part_slots) {
+  const int64_t tiles = tiles_x * tiles_y;
+  const SmallOffsets offsets(tiles_x);
+  parallel_for(parts, [&](int64_t part) {
+    uint32_t* count = counts + part * tiles;
+    std::memset(count, 0, sizeof(uint32_t) * size_t(tiles));
+    uint32_t total = 0;
+    const Range range = split_range(m, parts, part);
+    for (int64_t i = range.begin; i < range.end; i++) {
+      if (i + 12 < range.end) prefetch(&records[order[i + 12]]);
+      const SplatRecord<T>& r = records[order[i]];
+      TileSpan s = {r.tile_x0, r.tile_y0, 0, 0, 0};
+      const int w = r.tile_x1 - r.tile_x0 + 1, h = r.tile_y1 - r.tile_y0 + 1;
+      if (w > 0 && w * h <= 16) {
+        s.width = uint8_t(w);
+        s.bits = w * h == 1 ? 1
+                            : uint16_t(tile_test<V>()(r.terms, w, r.tile_x0, r.tile_y0) &
+                                       ((1u << (w * h)) - 1));
+        const int64_t first = r.tile_y0 * tiles_x + r.tile_x0;
+        for (uint32_t b = s.bits; b; b &= b - 1) count[first + offsets.at[w][__builtin_ctz(b)]]++;
+        total += uint32_t(__builtin_popcount(s.bits));
+      } else if (w > 0) {
+        s.large = 1;
+        for_each_tile_of_large<V>(r, tiles_x, [&](int64_t tile) { count[tile]++, total++; });
+      }
+      spans[i] = s;
+    }
+    part_slots[part] = total;
+  });
+  uint32_t sum = 0;
+  for (int64_t tile = 0; tile < tiles; tile++) {
+    tile_start[tile] = sum;
+    for (int64_t part = 0; part < parts; part++) {
+      uint32_t& c = counts[part * tiles + tile];
+      const uint32_t n = c;
+      c = sum, sum += n;
+    }
+  }
+  tile_start[tiles] = sum;
+  uint32_t slots = 0;
+  for (int64_t part = 0; part < parts; part++) {
+    const uint32_t n = part_slots[part];
+    part_slots[part] = slots, slots += n;
+  }
+  return sum;
+}
+
+template <class V, class T = typename V::Scalar>
+void fill_tiles(int64_t m, const uint32_t* order, const SplatRecord<T>* records, int64_t tiles_x,
+                int64_t tiles_y, int64_t parts, uint32_t* counts, const TileSpan* spans,
+                const uint32_t* part_slots, uint32_t* instance_splat, uint32_t* instance_slot,
+                uint32_t* slot_range) {
+  const int64_t tiles = tiles_x * tiles_y;
+  const SmallOffsets offsets(tiles_x);
+  parallel_for(parts, [&](int64_t part) {
+    uint32_t *next = counts + part * tiles, slot = part_slots[part];
+    const Range range = split_range(m, parts, part);
+    for (int64_t i = range.begin; i < range.end; i++) {
+      const uint32_t splat = order[i], first_slot = slot;
+      const TileSpan s = spans[i];
+      if (!s.large) {
+        const int64_t first = s.y0 * tiles_x + s.x0;
+        for (uint32_t b = s.bits; b; b &= b - 1) {
+          const uint32_t at = next[first + offsets.at[s.width][__builtin_ctz(b)]]++;
+          instance_splat[at] = splat, instance_slot[at] = slot++;
+        }
+      } else {
+        for_each_tile_of_large<V>(records[splat], tiles_x, [&](int64_t tile) {
+          const uint32_t at = next[tile]++;
+          instance_splat[at] = splat, instance_slot[at] = slot++;
+        });
+      }
+      slot_range[2 * splat] = first_slot, slot_range[2 * splat + 1] = slot;
+    }
+  });
+}
+
+// Sums each splat's slots in slot order and writes (or, for further channel groups, adds) its row
+// of the packed gradient. `channels` colours of the group went to `columns`.
+template <class V, class T = typename V::Scalar>
+void reduce(int64_t m, const T* slots, const uint32_t* slot_range, const T* packed, int64_t stride,
+            int64_t channels, const int64_t* columns, bool add, T* grad) {
+  constexpr int W = V::width, kVectors = kSlotWidth / W;
+  const int base = channels <= 3 ? 3 : 4;
+  parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
+    const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
+    for (int64_t i = begin; i < end; i++) {
+      if (i + 8 < end) prefetch(slots + int64_t(slot_range[2 * (i + 8)]) * kSlotWidth);
+      V sum[kVectors];
+      for (int k = 0; k < kVectors; k++) sum[k] = V(0.f);
+      for (int64_t s = slot_range[2 * i]; s < slot_range[2 * i + 1]; s++)
+        for (int k = 0; k < kVectors; k++) sum[k] += V::load(slots + s * kSlotWidth + k * W);
+      alignas(64) T total[kSlotWidth];
+      for (int k = 0; k < kVectors; k++) sum[k].store(total + k * W);
+      const T *row = packed + i * stride, *q = total + base;
+      T* g = grad + i * stride;
+      T d_mean[2], d_conic[3], d_opacity = 0;
+      const bool drawn = slot_range[2 * i] < slot_range[2 * i + 1];
+      splat_terms_vjp<T>(row + 2, drawn ? row[5] : T(1), {q[0], q[1], q[2], q[3], q[4], q[5]},
+                         d_mean, d_conic, d_opacity);
+      if (!add) {
+        for (int64_t k = 0; k < stride; k++) g[k] = 0;
+      }
+      if (drawn) {
+        g[0] += d_mean[0], g[1] += d_mean[1];
+        for (int k = 0; k < 3; k++) g[2 + k] += d_conic[k];
+        g[5] += d_opacity;
+        for (int k = 0; k < channels; k++)
+          if (columns[k] >= 0) g[columns[k]] += total[k];
+      }
+    }
+  });
+}
+
+template <class T>
+void recolor(int64_t m, const T* packed, int64_t stride, const int64_t* columns,
+             SplatRecord<T>* records) {
+  for (int64_t i = 0; i < m; i++) set_colors(records[i], packed + i * stride, columns);
+}
+
+}  // namespace
+}  // namespace snow
+
+using namespace snow;
+
+#define SNOW_TILE_ENTRIES(SUFFIX, V)                                                             \
+  SNOW_EXPORT int64_t splats_prepare##SUFFIX(                                                    \
+      int64_t m, const V::Scalar* packed, int64_t stride, double width, double height,           \
+      const int64_t* columns, SplatRecord<V::Scalar>* records, KeyOf<V::Scalar>::type* keys) {   \
+    prepare<V>(m, packed, stride, width, height, columns, records, keys);                        \
+    return 0;                                                                                    \
+  }                                                                                              \
+  SNOW_EXPORT int64_t splats_recolor##SUFFIX(int64_t m, const V::Scalar* packed, int64_t stride, \
+                                             const int64_t* columns,                             \
+                                             SplatRecord<V::Scalar>* records) {                  \
+    recolor(m, packed, stride, columns, records);                                                \
+    return 0;                                                                                    \
+  }                                                                                              \
+  SNOW_EXPORT int64_t splats_sort##SUFFIX(int64_t m, KeyOf<V::Scalar>::type* keys,               \
+                                          KeyOf<V::Scalar>::type* keys2, uint32_t* order,        \
+                                          uint32_t* order2) {                                    \
+    radix_sort(m, keys, keys2, order, order2);                                                   \
+    return 0;                                                                                    \
+  }                                                                                              \
+  SNOW_EXPORT int64_t tiles_count##SUFFIX(                                                       \
+      int64_t m, const uint32_t* order, const SplatRecord<V::Scalar>* records, int64_t tiles_x,  \
+      int64_t tiles_y, int64_t parts, uint32_t* counts, uint32_t* tile_start, TileSpan* spans,   \
+      uint32_t* part_slots) {                                                                    \
+    return count_tiles<V>(m, order, records, tiles_x, tiles_y, parts, counts, tile_start, spans, \
+                          part_slots);                                                           \
+  }                                                                                              \
+  SNOW_EXPORT int64_t tiles_fill##SUFFIX(                                                        \
+      int64_t m, const uint32_t* order, const SplatRecord<V::Scalar>* records, int64_t tiles_x,  \
+      int64_t tiles_y, int64_t parts, uint32_t* counts, const TileSpan* spans,                   \
+      const uint32_t* part_slots, uint32_t* instance_splat, uint32_t* instance_slot,             \
+      uint32_t* slot_range) {                                                                    \
+    fill_tiles<V>(m, order, records, tiles_x, tiles_y, parts, counts, spans, part_slots,         \
+                  instance_splat, instance_slot, slot_range);                                    \
+    return 0;                                                                                    \
+  }                                                                                              \
+  SNOW_EXPORT int64_t splats_reduce##SUFFIX(                                                     \
+      int64_t m, const V::Scalar* slots, const uint32_t* slot_range, const V::Scalar* packed,    \
+      int64_t stride, int64_t channels, const int64_t* columns, int64_t add, V::Scalar* grad) {  \
+    reduce<V>(m, slots, slot_range, packed, stride, channels, columns, add != 0, grad);          \
+    return 0;                                                                                    \
+  }
+
+SNOW_TILE_ENTRIES(, VecF)
+SNOW_TILE_ENTRIES(_f64, VecD)
+
+// How many parts tiles_count and tiles_fill should be given for m splats.
+SNOW_EXPORT int64_t tiles_parts(int64_t m) { return part_count(m); }

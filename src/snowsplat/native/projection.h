@@ -1,0 +1,221 @@
+// The geometry of one Gaussian: world → camera → 2D splat (EWA splatting, Zwicker et al. 2002;
+// Kerbl et al. 2023, eq. 5 and 6), and its vector-Jacobian product below.
+//
+//   Σ  = R S Sᵀ Rᵀ            3D covariance, R from the quaternion, S = diag(exp(log_scales))
+//   Σ' = J W Σ Wᵀ Jᵀ + 0.3 I  2D covariance, W the rotation of cam_from_world, J the Jacobian of
+//                             the pinhole projection at the mean
+//
+// Written as Σ' = U Uᵀ + 0.3 I with U = T M, T = J W (2×3), M = R S (3×3): no 3D covariance is
+// formed.
+#pragma once
+
+#include "portable.h"
+
+namespace snow {
+
+// A pinhole camera. Pixel (i, j) has its centre at (i + 0.5, j + 0.5); z points forward.
+template <class T>
+struct PinholeCamera {
+  T rotation[9], translation[3];  // cam_from_world
+  T position[3];                  // camera centre in the world, -Rᵀ t
+  T fx, fy, cx, cy, width, height, near;
+  // J is evaluated with x/z and y/z clamped to 15% beyond the image, where the linearisation of the
+  // projection would otherwise blow up.
+  T min_tx, max_tx, min_ty, max_ty;
+
+  SNOW_INLINE PinholeCamera(const T* cam_from_world, double width_, double height_, double fx_,
+                            double fy_, double cx_, double cy_, double near_)
+      : fx(T(fx_)), fy(T(fy_)), cx(T(cx_)), cy(T(cy_)), width(T(width_)), height(T(height_)),
+        near(T(near_)) {
+    for (int i = 0; i < 3; i++) {
+      for (int j = 0; j < 3; j++) rotation[3 * i + j] = cam_from_world[4 * i + j];
+      translation[i] = cam_from_world[4 * i + 3];
+    }
+    for (int k = 0; k < 3; k++) {
+      position[k] = -(rotation[k] * translation[0] + rotation[3 + k] * translation[1] +
+                      rotation[6 + k] * translation[2]);
+    }
+    min_tx = T(-(cx_ + 0.15 * width_) / fx_), max_tx = T((width_ - cx_ + 0.15 * width_) / fx_);
+    min_ty = T(-(cy_ + 0.15 * height_) / fy_), max_ty = T((height_ - cy_ + 0.15 * height_) / fy_);
+  }
+};
+
+template <class Real>
+struct GaussianShape {  // the inputs of one Gaussian that geometry depends on
+  Real mean[3], log_scale[3], quat[4], opacity_logit;
+};
+
+template <class Real>
+struct ProjectedGaussian {
+  Real x, y, z, inv_z;     // mean in the camera frame
+  Real tx, ty;             // clamped x/z, y/z
+  Real scale[3], quat[4];  // activated: exp, normalised
+  Real inv_quat_norm;
+  Real R[9], M[9], T[6], U[6];
+  Real cov_xx, cov_xy, cov_yy, inv_det;
+  Real mean2d[2], conic[3], opacity;
+};
+
+// Quaternion wxyz (unit) → rotation matrix, row-major.
+template <class Real>
+SNOW_INLINE void quat_to_rotation(const Real* q, Real* R) {
+  const Real one(1.f), two(2.f);
+  const Real w = q[0], x = q[1], y = q[2], z = q[3];
+  R[0] = one - two * (y * y + z * z), R[1] = two * (x * y - w * z), R[2] = two * (x * z + w * y);
+  R[3] = two * (x * y + w * z), R[4] = one - two * (x * x + z * z), R[5] = two * (y * z - w * x);
+  R[6] = two * (x * z - w * y), R[7] = two * (y * z + w * x), R[8] = one - two * (x * x + y * y);
+}
+
+template <class Real>
+SNOW_INLINE void quat_to_rotation_vjp(const Real* q, const Real* dR, Real* dq) {
+  const Real two(2.f);
+  const Real w = q[0], x = q[1], y = q[2], z = q[3];
+  dq[0] = two * (x * (dR[7] - dR[5]) + y * (dR[2] - dR[6]) + z * (dR[3] - dR[1]));
+  dq[1] = two * (y * (dR[1] + dR[3]) + z * (dR[2] + dR[6]) + w * (dR[7] - dR[5]) -
+                 two * x * (dR[4] + dR[8]));
+  dq[2] = two * (x * (dR[1] + dR[3]) + z * (dR[5] + dR[7]) + w * (dR[2] - dR[6]) -
+                 two * y * (dR[0] + dR[8]));
+  dq[3] = two * (x * (dR[2] + dR[6]) + y * (dR[5] + dR[7]) + w * (dR[3] - dR[1]) -
+                 two * z * (dR[0] + dR[4]));
+}
+
+template <class Real, class T>
+SNOW_INLINE void project_gaussian(const GaussianShape<Real>& g, const PinholeCamera<T>& cam,
+                                  ProjectedGaussian<Real>& p) {
+  const T* W = cam.rotation;
+  const Real mx = g.mean[0], my = g.mean[1], mz = g.mean[2];
+  p.x = Real(W[0]) * mx + Real(W[1]) * my + Real(W[2]) * mz + Real(cam.translation[0]);
+  p.y = Real(W[3]) * mx + Real(W[4]) * my + Real(W[5]) * mz + Real(cam.translation[1]);
+  p.z = Real(W[6]) * mx + Real(W[7]) * my + Real(W[8]) * mz + Real(cam.translation[2]);
+  p.inv_z = Real(1.f) / p.z;
+
+  // A zero quaternion stays zero, which quat_to_rotation turns into the identity.
+  Real norm2 = g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] +
+               g.quat[3] * g.quat[3] + Real(1e-24f);
+  p.inv_quat_norm = Real(1.f) / sqrt(norm2);
+  for (int k = 0; k < 4; k++) p.quat[k] = g.quat[k] * p.inv_quat_norm;
+  quat_to_rotation(p.quat, p.R);
+  for (int k = 0; k < 3; k++) p.scale[k] = exp(g.log_scale[k]);
+  for (int i = 0; i < 3; i++)
+    for (int k = 0; k < 3; k++) p.M[3 * i + k] = p.R[3 * i + k] * p.scale[k];
+
+  const Real u = p.x * p.inv_z, v = p.y * p.inv_z;
+  p.tx = min(max(u, Real(cam.min_tx)), Real(cam.max_tx));
+  p.ty = min(max(v, Real(cam.min_ty)), Real(cam.max_ty));
+  const Real j00 = Real(cam.fx) * p.inv_z, j11 = Real(cam.fy) * p.inv_z;
+  const Real j02 = -(j00 * p.tx), j12 = -(j11 * p.ty);
+  for (int k = 0; k < 3; k++) {
+    p.T[k] = j00 * Real(W[k]) + j02 * Real(W[6 + k]);
+    p.T[3 + k] = j11 * Real(W[3 + k]) + j12 * Real(W[6 + k]);
+  }
+  for (int i = 0; i < 2; i++)
+    for (int k = 0; k < 3; k++)
+      p.U[3 * i + k] =
+          p.T[3 * i] * p.M[k] + p.T[3 * i + 1] * p.M[3 + k] + p.T[3 * i + 2] * p.M[6 + k];
+  const Real* U = p.U;
+  p.cov_xx = U[0] * U[0] + U[1] * U[1] + U[2] * U[2] + Real(kDilation);
+  p.cov_xy = U[0] * U[3] + U[1] * U[4] + U[2] * U[5];
+  p.cov_yy = U[3] * U[3] + U[4] * U[4] + U[5] * U[5] + Real(kDilation);
+  p.inv_det = Real(1.f) / (p.cov_xx * p.cov_yy - p.cov_xy * p.cov_xy);
+  p.conic[0] = p.cov_yy * p.inv_det;
+  p.conic[1] = -(p.cov_xy * p.inv_det);
+  p.conic[2] = p.cov_xx * p.inv_det;
+  p.mean2d[0] = Real(cam.fx) * u + Real(cam.cx);
+  p.mean2d[1] = Real(cam.fy) * v + Real(cam.cy);
+  p.opacity = Real(1.f) / (Real(1.f) + exp(-g.opacity_logit));
+}
+
+template <class Real>
+struct SplatGradient {  // with respect to the geometric columns of Splats2D
+  Real mean2d[2], conic[3], opacity, depth;
+};
+
+template <class Real>
+struct PoseGradient {  // of one Gaussian, with respect to cam_from_world
+  Real rotation[9], translation[3];
+};
+
+// `grad` receives mean, log_scale, quat and opacity_logit gradients; `pose` may be null.
+template <class Real, class T>
+SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const PinholeCamera<T>& cam,
+                                      const ProjectedGaussian<Real>& p,
+                                      const SplatGradient<Real>& d, GaussianShape<Real>& grad,
+                                      PoseGradient<Real>* pose) {
+  const T* W = cam.rotation;
+  const Real two(2.f), half(0.5f);
+  grad.opacity_logit = d.opacity * p.opacity * (Real(1.f) - p.opacity);
+
+  // conic K = Σ'⁻¹ ⇒ dΣ' = −K G K, G symmetric with half of d.conic[1] off the diagonal.
+  const Real a = p.conic[0], b = p.conic[1], c = p.conic[2];
+  const Real ga = d.conic[0], gb = half * d.conic[1], gc = d.conic[2];
+  const Real k00 = a * ga + b * gb, k01 = a * gb + b * gc;
+  const Real k10 = b * ga + c * gb, k11 = b * gb + c * gc;
+  const Real h00 = -(k00 * a + k01 * b), h01 = -(k00 * b + k01 * c), h11 = -(k10 * b + k11 * c);
+
+  // Σ' = U Uᵀ ⇒ dU = 2 H U;  U = T M.
+  Real dU[6], dM[9], dT[6];
+  for (int k = 0; k < 3; k++) {
+    dU[k] = two * (h00 * p.U[k] + h01 * p.U[3 + k]);
+    dU[3 + k] = two * (h01 * p.U[k] + h11 * p.U[3 + k]);
+  }
+  for (int i = 0; i < 3; i++)
+    for (int k = 0; k < 3; k++) dM[3 * i + k] = p.T[i] * dU[k] + p.T[3 + i] * dU[3 + k];
+  for (int i = 0; i < 2; i++)
+    for (int k = 0; k < 3; k++)
+      dT[3 * i + k] =
+          dU[3 * i] * p.M[3 * k] + dU[3 * i + 1] * p.M[3 * k + 1] + dU[3 * i + 2] * p.M[3 * k + 2];
+
+  // T = J W, J = [[fx/z, 0, −fx tx/z], [0, fy/z, −fy ty/z]].
+  Real dj00(0.f), dj02(0.f), dj11(0.f), dj12(0.f);
+  for (int k = 0; k < 3; k++) {
+    dj00 += dT[k] * Real(W[k]), dj02 += dT[k] * Real(W[6 + k]);
+    dj11 += dT[3 + k] * Real(W[3 + k]), dj12 += dT[3 + k] * Real(W[6 + k]);
+  }
+  const Real fx(cam.fx), fy(cam.fy), iz = p.inv_z;
+  const Real u = p.x * iz, v = p.y * iz;
+  const auto free_x = (u >= Real(cam.min_tx)) & (Real(cam.max_tx) >= u);
+  const auto free_y = (v >= Real(cam.min_ty)) & (Real(cam.max_ty) >= v);
+  // With respect to u = x/z and v = y/z: through the mean, and through J where it is not clamped.
+  const Real zero(0.f);
+  const Real du = fx * d.mean2d[0] - select(free_x, dj02 * fx * iz, zero);
+  const Real dv = fy * d.mean2d[1] - select(free_y, dj12 * fy * iz, zero);
+  // With respect to 1/z at fixed u, v.
+  const Real diz = dj00 * fx + dj11 * fy - dj02 * fx * p.tx - dj12 * fy * p.ty;
+  const Real dx = du * iz, dy = dv * iz;
+  const Real dz = d.depth - iz * (du * u + dv * v + diz * iz);
+  for (int k = 0; k < 3; k++)
+    grad.mean[k] = Real(W[k]) * dx + Real(W[3 + k]) * dy + Real(W[6 + k]) * dz;
+
+  if (pose) {
+    const Real dcam[3] = {dx, dy, dz};
+    const Real j00 = fx * iz, j11 = fy * iz, j02 = -(j00 * p.tx), j12 = -(j11 * p.ty);
+    for (int i = 0; i < 3; i++) {
+      pose->translation[i] = dcam[i];
+      for (int k = 0; k < 3; k++) pose->rotation[3 * i + k] = dcam[i] * g.mean[k];
+    }
+    for (int k = 0; k < 3; k++) {  // T = J W
+      pose->rotation[k] += j00 * dT[k];
+      pose->rotation[3 + k] += j11 * dT[3 + k];
+      pose->rotation[6 + k] += j02 * dT[k] + j12 * dT[3 + k];
+    }
+  }
+
+  // M = R S.
+  Real dR[9], dq[4];
+  for (int k = 0; k < 3; k++) {
+    Real ds = p.R[k] * dM[k] + p.R[3 + k] * dM[3 + k] + p.R[6 + k] * dM[6 + k];
+    grad.log_scale[k] = ds * p.scale[k];
+    for (int i = 0; i < 3; i++) dR[3 * i + k] = dM[3 * i + k] * p.scale[k];
+  }
+  quat_to_rotation_vjp(p.quat, dR, dq);
+  const Real radial = dq[0] * p.quat[0] + dq[1] * p.quat[1] + dq[2] * p.quat[2] + dq[3] * p.quat[3];
+  for (int k = 0; k < 4; k++) grad.quat[k] = (dq[k] - radial * p.quat[k]) * p.inv_quat_norm;
+}
+
+// Squared Mahalanobis radius at which the splat fades to alpha = 1/255: α = o exp(−k²/2).
+template <class Real>
+SNOW_INLINE Real squared_cutoff(Real opacity) {
+  return Real(2 * kLn2) * (log2(opacity) - Real(kLog2MinAlpha));
+}
+
+}  // namespace snow

@@ -1,0 +1,34 @@
+// Structural similarity of two images at one pixel (Wang et al. 2004), from the windowed means of
+// a, b, a² + b² and ab, and its derivatives with respect to those that depend on a.
+#pragma once
+
+#include "portable.h"
+
+namespace snow {
+
+constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
+constexpr int kSsimRadius = 5;  // 11×11 window, Gaussian with σ = 1.5
+
+template <class Real>
+struct SsimDerivatives {
+  Real mean_a, mean_aa, mean_ab;
+};
+
+template <class Real>
+SNOW_INLINE Real ssim_pixel(Real mean_a, Real mean_b, Real mean_squares, Real mean_ab,
+                            SsimDerivatives<Real>& d) {
+  const Real two(2.f), c1(kSsimC1), c2(kSsimC2);
+  const Real ab = mean_a * mean_b, squares = mean_a * mean_a + mean_b * mean_b;
+  const Real l_up = two * ab + c1, l_down = squares + c1;
+  const Real s_up = two * (mean_ab - ab) + c2, s_down = mean_squares - squares + c2;
+  const Real inverse = reciprocal(l_down * s_down);
+  const Real ssim = l_up * s_up * inverse;
+  d.mean_ab = two * l_up * inverse;
+  d.mean_aa = -(ssim * inverse * l_down);
+  d.mean_a =
+      two * (mean_b * s_up * inverse - mean_a * ssim * inverse * s_down - mean_a * d.mean_aa) -
+      mean_b * d.mean_ab;
+  return ssim;
+}
+
+}  // namespace snow

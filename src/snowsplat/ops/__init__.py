@@ -1,0 +1,24 @@
+"""The numerical operations, on tensors: each has a native kernel and a readable twin in `reference`.
+
+`project` → `Splats2D` → `rasterize` → `photometric_loss`, and `adam_step` back to the parameters.
+"""
+
+from snowsplat.ops.adam import adam_step
+from snowsplat.ops.native import get_num_threads, set_num_threads
+from snowsplat.ops.neighbours import neighbours
+from snowsplat.ops.photometric import photometric_loss, ssim
+from snowsplat.ops.project import project
+from snowsplat.ops.rasterize import rasterize
+from snowsplat.ops.splats import Splats2D
+
+__all__ = [
+    "Splats2D",
+    "adam_step",
+    "get_num_threads",
+    "neighbours",
+    "photometric_loss",
+    "project",
+    "rasterize",
+    "set_num_threads",
+    "ssim",
+]

@@ -1,0 +1,101 @@
+"""`adam_step`: the gradient of the splats carried through `project`, fused with Adam."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from snowsplat.ops.check import check_tensor, variant
+from snowsplat.ops.native import launch
+from snowsplat.ops.project import camera_args, check_parameters
+from snowsplat.ops.splats import packed_width
+
+PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+
+
+@torch.no_grad()
+def adam_step(
+    params: Mapping[str, Tensor],
+    exp_avg: Mapping[str, Tensor],
+    exp_avg_sq: Mapping[str, Tensor],
+    ids: Tensor,
+    packed_grad: Tensor,
+    cam_from_world: Tensor,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sh_degree: int,
+    lr: Mapping[str, float],
+    step: int,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-15,
+    visible_only: bool = False,
+) -> None:
+    """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
+
+    The gradients of the parameters never reach memory, which halves the time of this part of a
+    training step. The arguments of the camera and `sh_degree` are those that `project` was given.
+
+    params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, shaped as for `project`,
+        contiguous. A `.grad` that is not None (of a regulariser) is added to the gradient.
+    exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
+    ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, 16).
+    lr: a rate for each name. step: counts from 1 (bias correction).
+    visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
+        gradient is 0 (plus `.grad`), and their moments decay.
+
+    Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
+    p −= lr · m̂ / √(v̂ + eps²) (Kingma & Ba 2015, with ε inside the root).
+
+    Raises ValueError where shapes, dtypes or devices do not fit.
+    """
+    for what, given in (
+        ("params", params),
+        ("exp_avg", exp_avg),
+        ("exp_avg_sq", exp_avg_sq),
+        ("lr", lr),
+    ):
+        missing = [name for name in PARAMETERS if name not in given]
+        if missing:
+            raise ValueError(f"adam_step: {what} lacks {', '.join(missing)}")
+    tensors = [params[name] for name in PARAMETERS]
+    check_parameters("adam_step", *tensors, sh_degree)
+    means = tensors[0]
+    check_tensor("adam_step", "packed_grad", packed_grad, (len(ids), packed_width(3)), means)
+    if ids.dtype != torch.int32 or ids.device != means.device:
+        raise ValueError(
+            f"adam_step: ids must be torch.int32 on {means.device}, got {ids.dtype} on {ids.device}"
+        )
+    if step < 1:
+        raise ValueError(f"adam_step: step counts from 1, got {step}")
+    per_parameter: list[Tensor | float | None] = []
+    for name, value in zip(PARAMETERS, tensors, strict=True):
+        m, v = exp_avg[name], exp_avg_sq[name]
+        shape = tuple(value.shape)
+        check_tensor("adam_step", f"exp_avg[{name!r}]", m, shape, value)
+        check_tensor("adam_step", f"exp_avg_sq[{name!r}]", v, shape, value)
+        extra = None if value.grad is None else value.grad.contiguous()
+        per_parameter += [value.detach(), m, v, extra, float(lr[name])]
+    camera = camera_args("adam_step", cam_from_world.to(means.dtype), width, height, fx, fy, cx, cy)
+    launch(
+        variant("adam_step", means),
+        len(means),
+        len(ids),
+        ids,
+        packed_grad.contiguous(),
+        *camera,
+        tensors[5].shape[1],
+        sh_degree,
+        *per_parameter,
+        step,
+        float(betas[0]),
+        float(betas[1]),
+        float(eps),
+        visible_only,
+    )

@@ -1,0 +1,38 @@
+"""The checks that every public op makes once, at its door: one line each on what is wrong."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+FLOATS = (torch.float32, torch.float64)
+
+
+def check_tensor(
+    op: str, name: str, tensor: Tensor, shape: tuple[int | None, ...], like: Tensor
+) -> None:
+    """Raises ValueError unless `tensor` has `shape` (None: any) and the dtype and device of `like`."""
+    if tensor.dim() != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, tensor.shape, strict=True)
+    ):
+        wanted = ", ".join("any" if s is None else str(s) for s in shape)
+        raise ValueError(f"{op}: {name} must be ({wanted}), got {tuple(tensor.shape)}")
+    if tensor.dtype != like.dtype:
+        raise ValueError(f"{op}: {name} must be {like.dtype}, got {tensor.dtype}")
+    if tensor.device != like.device:
+        raise ValueError(f"{op}: {name} must be on {like.device}, got {tensor.device}")
+
+
+def check_float(op: str, name: str, tensor: Tensor) -> None:
+    if tensor.dtype not in FLOATS:
+        raise ValueError(f"{op}: {name} must be float32 or float64, got {tensor.dtype}")
+
+
+def check_size(op: str, width: int, height: int) -> None:
+    if width < 1 or height < 1:
+        raise ValueError(f"{op}: the image must be at least 1×1, got {width}×{height}")
+
+
+def variant(name: str, tensor: Tensor) -> str:
+    """The native entry for the dtype of `tensor`."""
+    return name if tensor.dtype == torch.float32 else name + "_f64"

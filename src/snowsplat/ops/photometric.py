@@ -1,0 +1,92 @@
+"""`photometric_loss` and `ssim`: how far an image is from a photo."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from snowsplat.ops.check import check_float, variant
+from snowsplat.ops.native import launch
+
+
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+    """(1 − λ) · mean |a − b| + λ · (1 − SSIM), a scalar (Kerbl et al. 2023, eq. 7; λ `ssim_weight`).
+
+    image (H, W, 3) float, target (H, W, 3) of the same dtype or uint8 (then divided by 255), both
+    best of planar storage: `planar.permute(1, 2, 0)`. The gradient flows to `image` alone; it is
+    computed together with the value, in one pass over the images.
+
+    Raises ValueError where shapes, dtypes or devices do not fit.
+    """
+    weighted = _Photometric.apply(image, target, 1 - ssim_weight, -ssim_weight, "photometric_loss")
+    return weighted + ssim_weight
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean structural similarity over pixels and channels (Wang et al. 2004), a scalar.
+
+    11×11 Gaussian window of σ = 1.5, zero padding, C₁ = 0.01², C₂ = 0.03². Arguments and errors as
+    for `photometric_loss`.
+    """
+    return _Photometric.apply(image, target, 0.0, 1.0, "ssim")
+
+
+def _planar(op: str, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    check_float(op, "image", image)
+    if image.dim() != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ValueError(f"{op}: image must be (H, W, 3), got {tuple(image.shape)}")
+    if target.shape != image.shape:
+        raise ValueError(
+            f"{op}: target must be {tuple(image.shape)} as image is, got {tuple(target.shape)}"
+        )
+    if target.dtype not in (image.dtype, torch.uint8):
+        raise ValueError(f"{op}: target must be {image.dtype} or uint8, got {target.dtype}")
+    if target.device != image.device:
+        raise ValueError(f"{op}: target must be on {image.device}, got {target.device}")
+    return image.permute(2, 0, 1).contiguous(), target.permute(2, 0, 1).contiguous()
+
+
+class _Photometric(torch.autograd.Function):
+    """l1_weight · L1 + ssim_weight · SSIM; `op` is the name for error lines."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        target: Tensor,
+        l1_weight: float,
+        ssim_weight: float,
+        op: str,
+    ) -> Tensor:
+        planes, goal = _planar(op, image.detach(), target)
+        grad = torch.empty_like(planes) if ctx.needs_input_grad[0] else None
+        means = torch.empty(2, dtype=torch.float64)
+        name = "photometric_u8" if goal.dtype == torch.uint8 else "photometric"
+        channels, height, width = planes.shape
+        launch(
+            variant(name, planes),
+            channels,
+            width,
+            height,
+            planes,
+            goal,
+            l1_weight,
+            ssim_weight,
+            grad,
+            means,
+        )
+        ctx.grad = grad
+        l1, similarity = means.tolist()
+        return planes.new_tensor(l1_weight * l1 + ssim_weight * similarity)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_value: Tensor) -> tuple[Tensor | None, ...]:
+        if ctx.grad is None:
+            return None, None, None, None, None
+        scale = float(grad_value)
+        grad = ctx.grad if scale == 1.0 else ctx.grad * scale
+        return grad.permute(1, 2, 0), None, None, None, None

@@ -1,0 +1,168 @@
+"""`project`: 3D Gaussians → the 2D splats that a camera sees."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from snowsplat.ops.check import check_float, check_size, check_tensor, variant
+from snowsplat.ops.native import launch
+from snowsplat.ops.splats import Splats2D, packed_width
+
+
+def project(
+    means: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    opacity_logits: Tensor,
+    sh_dc: Tensor,
+    sh_rest: Tensor,
+    cam_from_world: Tensor,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sh_degree: int,
+    near: float = 0.2,
+) -> Splats2D:
+    """The splats that N Gaussians leave on a camera's image plane; the invisible are left out.
+
+    means (N, 3) in world units, log_scales (N, 3), quats (N, 4) wxyz of any length (zero: no
+    rotation), opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, K, 3), of which degree `sh_degree`
+    uses the first (sh_degree + 1)² − 1; cam_from_world (3, 4), OpenCV axes; fx, fy, cx, cy in
+    pixels; near > 0 in world units. All tensors float32, or all float64.
+
+    Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (Kerbl et al. 2023, eq. 5), the colour is max(0, ½ + Σ SH(direction)).
+    Visible is what lies beyond `near` and is at least 1/255 opaque, if the box around its ellipse
+    {α ≥ 1/255} reaches the pixel centres. Gradients flow to every tensor, the camera's pose too.
+
+    Raises ValueError where shapes, dtypes or devices do not fit.
+    """
+    pose = cam_from_world.to(means.dtype)
+    camera = camera_args("project", pose, width, height, fx, fy, cx, cy, near)
+    check_parameters("project", means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_degree)
+    parameters = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
+    packed, ids = _Project.apply(sh_degree, camera[1:], camera[0], *parameters)
+    return Splats2D(packed, ids, 3)
+
+
+def camera_args(
+    op: str,
+    cam_from_world: Tensor,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    near: float = 0.2,
+) -> tuple[Tensor, float, float, float, float, float, float, float]:
+    """The camera in the order in which the native functions take it, checked."""
+    check_size(op, width, height)
+    if cam_from_world.shape != (3, 4):
+        raise ValueError(f"{op}: cam_from_world must be (3, 4), got {tuple(cam_from_world.shape)}")
+    intrinsics = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "near": near}
+    for name, value in intrinsics.items():
+        positive = name in ("fx", "fy", "near")
+        if not math.isfinite(value) or (positive and value <= 0):
+            kind = "positive and finite" if positive else "finite"
+            raise ValueError(f"{op}: {name} must be {kind}, got {value}")
+    sizes = (float(width), float(height))
+    rest = (float(fx), float(fy), float(cx), float(cy), float(near))
+    return (cam_from_world.contiguous(), *sizes, *rest)
+
+
+def check_parameters(
+    op: str,
+    means: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    opacity_logits: Tensor,
+    sh_dc: Tensor,
+    sh_rest: Tensor,
+    sh_degree: int,
+) -> None:
+    """Raises ValueError unless the six are parameters of the same Gaussians."""
+    check_float(op, "means", means)
+    count = means.shape[0] if means.dim() else None
+    check_tensor(op, "means", means, (count, 3), means)
+    check_tensor(op, "log_scales", log_scales, (count, 3), means)
+    check_tensor(op, "quats", quats, (count, 4), means)
+    check_tensor(op, "opacity_logits", opacity_logits, (count,), means)
+    check_tensor(op, "sh_dc", sh_dc, (count, 1, 3), means)
+    check_tensor(op, "sh_rest", sh_rest, (count, None, 3), means)
+    if not 0 <= sh_degree <= 3:
+        raise ValueError(f"{op}: sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
+    if sh_rest.shape[1] < (sh_degree + 1) ** 2 - 1:
+        raise ValueError(
+            f"{op}: sh_rest has too few rows ({sh_rest.shape[1]}) for degree {sh_degree}"
+        )
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        sh_degree: int,
+        intrinsics: tuple[float, ...],
+        cam_from_world: Tensor,
+        *parameters: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        parameters = tuple(p.detach().contiguous() for p in parameters)
+        means, sh_rest = parameters[0], parameters[5]
+        camera = (cam_from_world, *intrinsics)
+        ids = torch.empty(len(means), dtype=torch.int32)
+        cull = variant("project_cull", means)
+        visible = launch(cull, len(means), *parameters[:4], *camera, ids)
+        ids = ids[:visible].clone()
+        packed = means.new_empty(visible, packed_width(3))
+        shape = (sh_rest.shape[1], sh_degree)
+        launch(variant("project_fwd", means), visible, ids, *parameters, *shape, *camera, packed)
+        ctx.mark_non_differentiable(ids)
+        ctx.save_for_backward(ids, cam_from_world, *parameters)
+        ctx.sh_degree, ctx.intrinsics = sh_degree, intrinsics
+        return packed, ids
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_packed: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        ids, cam_from_world, *parameters = ctx.saved_tensors
+        grads = [torch.zeros_like(p) for p in parameters]
+        pose = None
+        if ctx.needs_input_grad[2]:
+            pose = torch.empty(launch("project_pose_blocks", len(ids)), 15, dtype=torch.float64)
+        launch(
+            variant("project_bwd", parameters[0]),
+            len(ids),
+            ids,
+            *parameters,
+            parameters[5].shape[1],
+            ctx.sh_degree,
+            cam_from_world,
+            *ctx.intrinsics,
+            grad_packed.contiguous(),
+            *grads,
+            pose,
+        )
+        return None, None, _pose_grad(cam_from_world, pose), *grads
+
+
+def _pose_grad(cam_from_world: Tensor, pose: Tensor | None) -> Tensor | None:
+    """(3, 4) from the kernel's sums: 9 for R, 3 for t, 3 for the camera's centre c = −Rᵀ t."""
+    if pose is None:
+        return None
+    total = torch.zeros(15, dtype=torch.float64)
+    for row in pose:  # in order: a reduction by torch depends on its number of threads
+        total += row
+    d_rotation, d_translation, d_centre = total[:9].view(3, 3), total[9:12], total[12:]
+    rotation, translation = cam_from_world[:, :3].double(), cam_from_world[:, 3].double()
+    d_rotation = d_rotation - torch.outer(translation, d_centre)
+    d_translation = d_translation - rotation @ d_centre
+    return torch.cat([d_rotation, d_translation[:, None]], dim=1).to(cam_from_world.dtype)
