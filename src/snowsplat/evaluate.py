@@ -2,7 +2,7 @@
 
 The image rendered is clamped to 0..1, as a screen or a file would, and is NOT rounded to 8 bits;
 the photo has 8 bits as it is. (The reference's `metrics.py` reads both back from PNG files, so its
-renders are rounded: that lowers PSNR by less than 0.01 dB at 30 dB.) Transparent photos are composed
+renders are rounded: that costs less than 0.01 dB at 30 dB.) Transparent photos are composed
 over the background colour. Where a view has a mask, PSNR is of the pixels that count, and the
 others are taken as perfect by SSIM and LPIPS.
 """

@@ -1,0 +1,19 @@
+"""How a field of a verb's dataclass becomes a flag."""
+
+from typing import Any
+
+import tyro
+
+
+def flag(metavar: str, *aliases: str, default: str = "") -> Any:
+    """A flag shown as ``metavar``, with other spellings, and words for what it is by default.
+
+    tyro takes hyphens and underscores alike in every spelling.
+    """
+    hint = f"(default: {default})" if default else ""
+    return tyro.conf.arg(metavar=metavar, aliases=list(aliases) or None, help_behavior_hint=hint)
+
+
+def switch(*aliases: str) -> Any:
+    """A flag without a value."""
+    return tyro.conf.arg(aliases=list(aliases) or None, help_behavior_hint="")

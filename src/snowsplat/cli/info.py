@@ -1,0 +1,209 @@
+"""`snowsplat info`: what is in a file or folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.output import OutputFolder
+from snowsplat.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.gaussians import Gaussians
+
+_PERCENTILES = (1, 50, 99)
+
+
+@dataclass
+class Info:
+    """Tell what a scene, a point cloud, a capture, a checkpoint or an output folder holds.
+
+    Examples:
+      snowsplat info out/garden
+      snowsplat info out/garden/point_cloud/iteration_3000/point_cloud.ply
+      snowsplat info garden
+    """
+
+    path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT|CAPTURE")] = None
+    """A .ply file, a checkpoint, the output folder of a training, or a capture."""
+    json: Annotated[bool, switch()] = False
+    """Print JSON, for programs."""
+
+    def run(self) -> int:
+        """Gives the exit code, 0."""
+        if self.path is None:
+            raise UserError("info needs a file or folder; name one")
+        facts = describe(self.path)
+        if self.json:
+            print(json.dumps(facts, indent=2))
+        else:
+            _print(facts)
+        return 0
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Names and values, JSON values all of them, of whatever ``path`` is.
+
+    Raises:
+        UserError: absent, damaged, or nothing that we know.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: no such file or folder")
+    if path.suffix == ".ply":
+        return _ply(path)
+    if path.suffix == ".safetensors":
+        return _checkpoint(path)
+    folder = OutputFolder(path)
+    if folder.is_one() or folder.scenes():
+        return _output(folder)
+    return _capture(path)
+
+
+def _ply(path: Path) -> dict[str, Any]:
+    from snowsplat.formats import ply
+    from snowsplat.ply_table import open_table
+
+    table = open_table(path)
+    size = {"file": str(path), "bytes": path.stat().st_size, "encoding": table.format}
+    if ply.is_scene(table):
+        return {"kind": "scene", **size, **_gaussians(ply.read_gaussians(path))}
+    from snowsplat.capture.points_ply import read_points
+
+    xyz, _ = read_points(path)
+    return {"kind": "point cloud", **size, "points": len(xyz), **_bounds(xyz)}
+
+
+def _gaussians(gaussians: Gaussians) -> dict[str, Any]:
+    finite = gaussians.means.isfinite().all(1)
+    for tensor in gaussians.parameters().values():
+        finite &= tensor.flatten(1).isfinite().all(1) if tensor.ndim > 1 else tensor.isfinite()
+    good = gaussians.select(finite)
+    facts: dict[str, Any] = {
+        "gaussians": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "bytes_in_memory": sum(t.nbytes for t in gaussians.parameters().values()),
+    }
+    if len(good) < len(gaussians):
+        facts["not_finite"] = len(gaussians) - len(good)
+    if len(good):
+        facts |= _bounds(good.means.numpy())
+        facts["opacity"] = _percentiles(good.opacities)
+        facts["scale"] = _percentiles(good.scales.amax(1))
+        ratio = good.scales.amax(1) / good.scales.amin(1).clamp_min(1e-12)
+        facts["longest_to_shortest_axis"] = _percentiles(ratio)
+    return facts
+
+
+def _bounds(xyz: Any) -> dict[str, Any]:
+    import numpy as np
+
+    xyz = xyz[np.isfinite(xyz).all(1)]
+    if not len(xyz):
+        return {}
+    low, high = np.percentile(xyz, [1, 99], axis=0)
+    return {
+        "bounds": [_short(xyz.min(0)), _short(xyz.max(0))],
+        "bounds_of_98_percent": [_short(low), _short(high)],
+    }
+
+
+def _percentiles(values: Any) -> dict[str, float]:
+    import numpy as np
+
+    found = np.percentile(values.numpy(), _PERCENTILES)
+    return {f"p{p}": float(f"{v:.4g}") for p, v in zip(_PERCENTILES, found, strict=True)}
+
+
+def _short(values: Any) -> list[float]:
+    return [float(f"{float(v):.5g}") for v in values]
+
+
+def _checkpoint(path: Path) -> dict[str, Any]:
+    from snowsplat import checkpoint
+
+    loaded = checkpoint.load(path)
+    return {
+        "kind": "checkpoint",
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "step": loaded.step,
+        **loaded.meta,
+        "tensors": {name: list(tensor.shape) for name, tensor in loaded.tensors.items()},
+    }
+
+
+def _output(folder: OutputFolder) -> dict[str, Any]:
+    facts: dict[str, Any] = {"kind": "output folder", "path": str(folder.path)}
+    if folder.is_one():
+        settings, background = folder.settings()
+        facts["capture"] = settings.path
+        facts["background"] = list(background)
+    facts["scenes"] = folder.scenes()
+    if folder.checkpoints.is_dir():
+        facts["checkpoints"] = sorted(p.name for p in folder.checkpoints.glob("step_*.safetensors"))
+    metrics = folder.path / "metrics.json"
+    if metrics.is_file():
+        try:
+            figures = json.loads(metrics.read_text(encoding="utf-8"))
+            facts["metrics"] = {name: v for name, v in figures.items() if name != "views"}
+        except (ValueError, AttributeError):
+            raise UserError(f"{metrics}: damaged; it is not JSON") from None
+    if facts["scenes"]:
+        facts["last_scene"] = _ply(folder.scene_path(facts["scenes"][-1]))
+    return facts
+
+
+def _capture(path: Path) -> dict[str, Any]:
+    from collections import Counter
+
+    from snowsplat.capture import load_capture
+
+    capture = load_capture(path)
+    views = [*capture.train, *capture.test]
+    sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in views)
+    focal = sorted(view.camera.fx for view in views)
+    return {
+        "kind": "capture",
+        "path": str(path),
+        "description": capture.description,
+        "photos": len(views),
+        "held_out_with_eval": len(capture.test),
+        "sizes": dict(sizes),
+        "focal_length_pixels": _short([focal[0], focal[-1]]),
+        "masks": sum(view.mask is not None for view in views),
+        "points": 0 if capture.points is None else len(capture.points),
+        "extent": float(f"{capture.extent:.5g}"),
+        "bounds": [_short(corner) for corner in capture.bounds.tolist()],
+    }
+
+
+def _print(facts: dict[str, Any], indent: str = "") -> None:
+    width = max(len(name) for name in facts)
+    for name, value in facts.items():
+        label = f"{indent}{name.replace('_', ' '):{width}}"
+        if isinstance(value, dict) and any(isinstance(v, dict | list) for v in value.values()):
+            print(label.rstrip())
+            _print(value, indent + "  ")
+        elif isinstance(value, dict):
+            print(label, ", ".join(f"{k} {_text(v)}" for k, v in value.items()))
+        else:
+            print(label, _text(value))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, list):
+        return (
+            " … ".join(map(_text, value))
+            if any(isinstance(v, list) for v in value)
+            else (" ".join(map(_text, value)) or "none")
+        )
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

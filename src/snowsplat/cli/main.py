@@ -1,0 +1,93 @@
+"""The command `snowsplat`: finds the verb, runs it, turns errors into a line and an exit code.
+
+Exit codes: 0 done; 2 a mistake in the flags or the input, told in one line on stderr; 130 stopped
+by Ctrl-C, all that was reached is saved. Anything else is a defect of the program, with its
+traceback.
+"""
+
+import inspect
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Annotated, Any, Union
+
+import tyro
+
+from snowsplat.cli.evaluate import Evaluate
+from snowsplat.cli.info import Info
+from snowsplat.cli.render import Render
+from snowsplat.cli.train import Train
+from snowsplat.errors import UserError
+
+VERBS: dict[str, Any] = {"train": Train, "render": Render, "evaluate": Evaluate, "info": Info}
+
+DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, shown in real time.
+
+  snowsplat train CAPTURE -o OUT --eval     photos with known cameras -> a scene in OUT
+  snowsplat evaluate OUT                    PSNR, SSIM of the photos held out
+  snowsplat render OUT                      pictures of the scene beside the photos
+  snowsplat info ANYTHING                   what is in a scene, a capture, an output folder
+
+Each has its own help: snowsplat train --help
+
+For completion in the shell, put this into a file that it reads:
+  eval "$(snowsplat --tyro-print-completion bash)"    (or zsh)"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with ``argv`` (those of the process by default); gives its exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    _say_notes_and_warnings_in_one_line()
+    try:
+        return int(_parse(arguments or ["--help"]).run())
+    except UserError as error:
+        return _fail(str(error), 2)
+    except KeyboardInterrupt:
+        return _fail("stopped by Ctrl-C", 130)
+    except BrokenPipeError:  # the reader of our output has gone, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except MemoryError:
+        return _fail("out of memory; try --max-gaussians with a smaller number, or -r 2", 2)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{where}{error.strerror or error}", 2)
+
+
+def _parse(arguments: list[str]) -> Any:
+    """The verb's dataclass. Leaves the process, as argparse does, after help or with a mistake."""
+    choices = []
+    for name, verb in VERBS.items():
+        # The list of verbs shows what each does, its own help also how to use it.
+        text = inspect.cleandoc(verb.__doc__ or "")
+        shown = text if arguments[0] == name else text.splitlines()[0]
+        choices.append(Annotated[verb, tyro.conf.subcommand(name, description=shown)])
+    union: Any = Union[tuple(choices)]  # noqa: UP007 (made at run time)
+    return tyro.cli(
+        union,
+        prog="snowsplat",
+        description=DESCRIPTION,
+        args=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+
+
+def _fail(message: str, code: int) -> int:
+    line = " ".join(message.split())
+    print(f"snowsplat: {line}", file=sys.stderr)
+    return code
+
+
+def _say_notes_and_warnings_in_one_line() -> None:
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        _fail(f"warning: {message}", 0)
+
+    warnings.showwarning = show
+    logger = logging.getLogger("snowsplat")
+    if not logger.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("snowsplat: %(message)s"))
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)

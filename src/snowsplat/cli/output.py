@@ -1,0 +1,253 @@
+"""The output folder of a training, laid out as the reference implementation does, for its tools.
+
+    OUT/cfg_args                                   its settings, in the reference's spelling
+    OUT/cameras.json                               all cameras
+    OUT/input.ply                                  the points that training began with
+    OUT/point_cloud/iteration_N/point_cloud.ply    the scene after N steps
+    OUT/config.json                                ours: every setting, exactly
+    OUT/checkpoints/step_N.safetensors             ours: see snowsplat.checkpoint
+    OUT/metrics.json                               figures of the last evaluation
+    OUT/test/ours_N/renders, gt                    what `snowsplat render` makes; train/ alike
+
+Folders that the reference itself made are read as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import re
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from snowsplat import __version__
+from snowsplat.errors import UserError
+from snowsplat.files import write_json, write_text
+
+if TYPE_CHECKING:
+    from snowsplat.capture import Capture
+    from snowsplat.config import TrainConfig
+    from snowsplat.evaluate import Evaluation
+    from snowsplat.gaussians import Gaussians
+
+_SCENE = re.compile(r"iteration_(\d+)")
+_RESULTS = ("point_cloud", "checkpoints", "train", "test")
+_FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", "metrics.json")
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """How the capture of a training was read: the arguments of `load_capture`."""
+
+    path: str
+    images: str = "images"
+    resolution: int = -1
+    hold_out: int | None = None
+    test_list: str | None = None
+
+    def load(self) -> Capture:
+        """Read the capture.
+
+        Raises:
+            UserError: see `snowsplat.capture.load_capture`.
+        """
+        from snowsplat.capture import load_capture
+
+        return load_capture(
+            self.path,
+            images=self.images,
+            resolution=self.resolution,
+            hold_out=self.hold_out,
+            test_list=self.test_list,
+        )
+
+
+@dataclass(frozen=True)
+class OutputFolder:
+    """An output folder, existing or to come."""
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    def is_one(self) -> bool:
+        """Whether a training, ours or the reference's, has written here."""
+        return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))
+
+    # Before a training
+
+    def check_free(self, *, resume: bool, overwrite: bool) -> None:
+        """Refuse a place that is taken; writes nothing.
+
+        Raises:
+            UserError: a file, a folder of something else, or a training that is not to be touched.
+        """
+        if not self.path.exists():
+            return
+        if not self.path.is_dir():
+            raise UserError(f"{self.path}: is a file; name a folder for the output")
+        if any(self.path.iterdir()) and not self.is_one():
+            raise UserError(f"{self.path}: holds other files; name a new or an empty folder")
+        if self.is_one() and not resume and not overwrite:
+            raise UserError(
+                f"{self.path}: holds a training already; add --resume to go on with it, "
+                "--overwrite to replace it, or name another folder"
+            )
+
+    def begin(self, capture: Capture, settings: CaptureSettings, config: TrainConfig) -> None:
+        """Make the folder and write what is known before the first step, without old results."""
+        for name in _RESULTS:
+            shutil.rmtree(self.path / name, ignore_errors=True)
+        (self.path / "metrics.json").unlink(missing_ok=True)
+        self.path.mkdir(parents=True, exist_ok=True)
+        if capture.points is not None:
+            from snowsplat.capture.points_ply import write_points
+
+            points = capture.points
+            write_points(self.path / "input.ply", points.xyz.numpy(), points.rgb.numpy())
+        write_json(self.path / "cameras.json", _cameras(capture))
+        self.write_config(settings, config)
+
+    def write_config(self, settings: CaptureSettings, config: TrainConfig) -> None:
+        """`config.json` and `cfg_args`."""
+        from snowsplat.config import config_to_json
+
+        whole = {
+            "snowsplat": __version__,
+            "capture": asdict(settings),
+            "training": config_to_json(config),
+        }
+        write_json(self.path / "config.json", whole)
+        namespace = argparse.Namespace(
+            data_device="cpu",
+            eval=settings.hold_out is not None,
+            images=settings.images,
+            model_path=str(self.path.absolute()),
+            resolution=settings.resolution,
+            sh_degree=config.sh_degree,
+            source_path=settings.path,
+            white_background=config.background == "white",
+        )
+        write_text(self.path / "cfg_args", repr(namespace))
+
+    def discard(self) -> None:
+        """Take back what `begin` wrote, if nothing has come of it."""
+        if self.scenes() or self.checkpoints.exists():
+            return
+        for name in _FILES:
+            (self.path / name).unlink(missing_ok=True)
+        if self.path.is_dir() and not any(self.path.iterdir()):
+            self.path.rmdir()
+
+    # Scenes
+
+    def scenes(self) -> list[int]:
+        """The iterations whose scene is there, ascending."""
+        folder = self.path / "point_cloud"
+        if not folder.is_dir():
+            return []
+        found = [_SCENE.fullmatch(entry.name) for entry in folder.iterdir()]
+        steps = sorted(int(match[1]) for match in found if match)
+        return [step for step in steps if self.scene_path(step).is_file()]
+
+    def scene_path(self, iteration: int) -> Path:
+        return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+    def write_scene(self, iteration: int, gaussians: Gaussians) -> Path:
+        """Save the scene; gives its file."""
+        from snowsplat.formats import write_gaussians
+
+        path = self.scene_path(iteration)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_gaussians(path, gaussians)
+        return path
+
+    def read_scene(self, iteration: int | None) -> tuple[int, Gaussians]:
+        """The scene of an iteration, the last one by default.
+
+        Raises:
+            UserError: no such folder or scene, or a damaged one.
+        """
+        from snowsplat.formats import read_gaussians
+
+        if not self.path.is_dir():
+            raise UserError(f"{self.path}: no such folder; give the output folder of a training")
+        scenes = self.scenes()
+        if not scenes:
+            raise UserError(f"{self.path}: holds no scene (no point_cloud/iteration_N in it)")
+        chosen = scenes[-1] if iteration is None else iteration
+        if chosen not in scenes:
+            there = ", ".join(map(str, scenes))
+            raise UserError(f"{self.path}: holds no scene of iteration {chosen}; there are {there}")
+        return chosen, read_gaussians(self.scene_path(chosen))
+
+    def write_metrics(self, iteration: int, split: str, evaluation: Evaluation) -> None:
+        """`metrics.json`: which scene, which views, the mean figures, and those of each view."""
+        head = {"iteration": iteration, "split": split}
+        write_json(self.path / "metrics.json", head | evaluation.as_json())
+
+    # Settings
+
+    def settings(self) -> tuple[CaptureSettings, tuple[float, float, float]]:
+        """How the capture was read, and the background colour.
+
+        Raises:
+            UserError: no settings here, or damaged ones.
+        """
+        ours, theirs = self.path / "config.json", self.path / "cfg_args"
+        try:
+            if ours.is_file():
+                whole = json.loads(ours.read_text(encoding="utf-8"))
+                capture = CaptureSettings(**whole["capture"])
+                white = whole["training"]["background"] == "white"
+            elif theirs.is_file():
+                values = _namespace(theirs.read_text(encoding="utf-8"))
+                capture = CaptureSettings(
+                    path=str(values["source_path"]),
+                    images=str(values.get("images", "images")),
+                    resolution=int(values.get("resolution", -1)),
+                    hold_out=8 if values.get("eval") else None,
+                )
+                white = bool(values.get("white_background"))
+            else:
+                raise UserError(
+                    f"{self.path}: not the output folder of a training (no config.json)"
+                )
+        except (KeyError, TypeError, ValueError, SyntaxError, AttributeError):
+            where = ours if ours.is_file() else theirs
+            raise UserError(f"{where}: damaged; it does not name the capture") from None
+        return capture, (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+
+
+def _namespace(text: str) -> dict[str, Any]:
+    """The values of ``Namespace(name=literal, …)``, without running anything."""
+    call = ast.parse(text.strip(), mode="eval").body
+    if not isinstance(call, ast.Call):
+        raise ValueError("not a Namespace")
+    return {word.arg: ast.literal_eval(word.value) for word in call.keywords if word.arg}
+
+
+def _cameras(capture: Capture) -> list[dict[str, Any]]:
+    """`cameras.json`: position and rotation are those of world_from_cam; sizes are in pixels."""
+    entries = []
+    for i, view in enumerate([*capture.train, *capture.test]):
+        camera = view.camera
+        pose = camera.world_from_cam.detach()
+        entries.append(
+            {
+                "id": i,
+                "img_name": Path(view.name).stem,
+                "width": camera.width,
+                "height": camera.height,
+                "position": pose[:, 3].tolist(),
+                "rotation": pose[:, :3].tolist(),
+                "fy": camera.fy,
+                "fx": camera.fx,
+            }
+        )
+    return entries

@@ -1,0 +1,147 @@
+"""The progress of a training: a bar in a terminal, a line every few seconds in a file."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+if TYPE_CHECKING:
+    from snowsplat import trainer
+    from snowsplat.evaluate import Evaluation
+
+_LINE_SECONDS = 5.0
+_RATE_SECONDS = 3.0  # the rate shown is the mean of about this long
+_LOSS_STEPS = 50  # and the loss of about as many views
+
+
+class TrainingProgress:
+    """Callback for `Trainer.run`; use it as a context, so that the terminal is left in order."""
+
+    def __init__(self, total: int, start: int = 0, stream: TextIO | None = None) -> None:
+        self.total = total
+        self.stream = stream or sys.stdout
+        self._start_step = start
+        self._start_time = self._last_line = self._last_time = time.monotonic()
+        self._last_step = start
+        self._rate = 0.0  # steps a second
+        self._loss = math.nan
+        self._psnr = ""
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+        if self.stream.isatty():
+            self._bar = Progress(
+                TextColumn("{task.completed}/{task.total}"),
+                BarColumn(bar_width=None),
+                TextColumn("{task.description}"),
+                console=Console(file=self.stream),
+                expand=True,
+                refresh_per_second=4,
+            )
+            self._task = self._bar.add_task("starting", total=total, completed=start)
+
+    def __enter__(self) -> TrainingProgress:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    @property
+    def seconds(self) -> float:
+        """Since this was made."""
+        return time.monotonic() - self._start_time
+
+    def __call__(self, progress: trainer.Progress) -> None:
+        now = time.monotonic()
+        weight = 1.0 if math.isnan(self._loss) else 1.0 / _LOSS_STEPS
+        self._loss = (
+            progress.loss if weight == 1.0 else self._loss + weight * (progress.loss - self._loss)
+        )
+        self._update_rate(progress.step, now)
+        done = progress.step >= self.total
+        if progress.metrics is not None and progress.metrics.views:
+            self._psnr = f"  PSNR {progress.metrics.psnr:.2f}"
+            self.say(held_out_line(progress.step, progress.metrics))
+        if self._bar is not None:
+            text = self._text(progress)
+            self._bar.update(self._task, completed=progress.step, description=text)
+        elif done or now - self._last_line >= _LINE_SECONDS:
+            self._last_line = now
+            percent = 100 * progress.step // self.total
+            counted = f"step {progress.step}/{self.total} ({percent}%)"
+            print(f"{counted}  {self._text(progress)}", file=self.stream, flush=True)
+
+    def say(self, line: str) -> None:
+        """A line that stays, above the bar."""
+        if self._bar is not None:
+            self._bar.console.print(line, highlight=False)
+        else:
+            print(line, file=self.stream, flush=True)
+
+    def _update_rate(self, step: int, now: float) -> None:
+        elapsed = now - self._last_time
+        if elapsed < 0.25 and step < self.total:
+            return
+        rate = (step - self._last_step) / max(elapsed, 1e-9)
+        keep = math.exp(-elapsed / _RATE_SECONDS) if self._rate else 0.0
+        self._rate = keep * self._rate + (1.0 - keep) * rate
+        self._last_time, self._last_step = now, step
+
+    def _text(self, progress: trainer.Progress) -> str:
+        rate = self._rate or (progress.step - self._start_step) / max(self.seconds, 1e-9)
+        left = (self.total - progress.step) / rate if rate else math.inf
+        remaining = "done in " + duration(self.seconds) if left == 0 else duration(left) + " left"
+        return (
+            f"{rate:.1f} it/s  loss {self._loss:.4f}  {progress.gaussians:,} Gaussians"
+            f"{self._psnr}  {resident_bytes() / 1e6:.0f} MB  {remaining}"
+        )
+
+
+def held_out_line(step: int, evaluation: Evaluation) -> str:
+    """Step, number of views, and their mean figures."""
+    count = len(evaluation.views)
+    figures = f"PSNR {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.3f}"
+    if evaluation.lpips is not None:
+        figures += f"  LPIPS {evaluation.lpips:.3f}"
+    return f"step {step}: {count} views  {figures}"
+
+
+def duration(seconds: float) -> str:
+    """12 s, 3:25 or 1:02:45."""
+    if not math.isfinite(seconds):
+        return "?"
+    if seconds < 60:
+        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
+    minutes, s = divmod(round(seconds), 60)
+    hours, m = divmod(minutes, 60)
+    return f"{hours}:{m:02d}:{s:02d}" if hours else f"{m}:{s:02d}"
+
+
+def resident_bytes() -> int:
+    """Memory that this process holds now (where the system does not tell: has held at most)."""
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * resource.getpagesize()
+    except (ImportError, OSError, ValueError, IndexError):
+        pass
+    return peak_bytes()
+
+
+def peak_bytes() -> int:
+    """The most memory that this process has held; 0 where the system does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,0 +1,67 @@
+"""What `render` and `evaluate` share: the flags that name a scene and its views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from snowsplat.cli.flags import flag
+from snowsplat.cli.output import OutputFolder
+from snowsplat.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.capture import Capture
+    from snowsplat.gaussians import Gaussians
+
+
+@dataclass
+class SceneFlags:
+    """Base of the verbs that take the output folder of a training."""
+
+    output: Annotated[Path | None, tyro.conf.Positional, flag("OUT")] = None
+    """Output folder of a training, ours or the reference implementation's."""
+    model_path: Annotated[Path | None, flag("OUT", "-m", "-o")] = None
+    """The reference's way to name it."""
+    iteration: Annotated[int | None, flag("N", default="the last")] = None
+    """Which of the scenes in OUT."""
+    capture: Annotated[
+        Path | None, flag("CAPTURE", "-s", "--source-path", default="as trained")
+    ] = None
+    """The photos and their cameras, if they are no longer where they were."""
+    resolution: Annotated[int | None, flag("N", "-r", default="as trained")] = None
+    """1, 2, 4 or 8 divide the size of the photos; any other number is a width."""
+    threads: Annotated[int | None, flag("N", default="all cores")] = None
+    """Threads to compute with."""
+
+    def folder(self) -> OutputFolder:
+        """Raises: UserError: none named, or two."""
+        if (self.output is None) == (self.model_path is None):
+            raise UserError("name the output folder of a training, once")
+        folder = OutputFolder(self.output or self.model_path or Path())
+        if not folder.path.is_dir():
+            raise UserError(f"{folder.path}: no such folder; give the output folder of a training")
+        return folder
+
+    def load(self) -> tuple[int, Gaussians, Capture, tuple[float, float, float]]:
+        """Iteration, scene, capture and background colour.
+
+        Raises:
+            UserError: one of them is absent or damaged.
+        """
+        folder = self.folder()
+        settings, background = folder.settings()
+        if self.capture is not None:
+            settings = replace(settings, path=str(self.capture))
+        if self.resolution is not None:
+            settings = replace(settings, resolution=self.resolution)
+        if self.threads is not None:
+            from snowsplat import ops
+
+            if self.threads < 1:
+                raise UserError(f"--threads is {self.threads}; it must be at least 1")
+            ops.set_num_threads(self.threads)
+        iteration, gaussians = folder.read_scene(self.iteration)
+        return iteration, gaussians, settings.load(), background

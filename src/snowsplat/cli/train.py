@@ -1,0 +1,357 @@
+"""`snowsplat train`: a posed capture becomes a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.output import CaptureSettings, OutputFolder
+from snowsplat.cli.progress import TrainingProgress, duration, held_out_line, peak_bytes
+from snowsplat.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.capture import Capture
+    from snowsplat.checkpoint import Checkpoint
+    from snowsplat.config import TrainConfig
+    from snowsplat.evaluate import Evaluation
+    from snowsplat.trainer import Progress, Trainer
+
+# Flags that are knobs of the configuration, under the same name.
+_KNOBS = (
+    *("iterations", "seed", "background", "sh_degree", "ssim_weight", "test_iterations"),
+    *("max_gaussians", "grad_threshold", "densify_from", "densify_until", "densify_interval"),
+    *("percent_dense", "opacity_reset_interval", "initial_points", "checkpoint_every"),
+    *("lr_means", "lr_means_final", "lr_means_steps", "lr_log_scales", "lr_quats"),
+    *("lr_opacity_logits", "lr_sh_dc", "lr_sh_rest"),
+)
+# Those that may differ from what a checkpoint was made with, without being another training.
+_FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
+
+RECIPE = "the recipe's"
+
+
+@dataclass
+class Train:
+    """Train a scene from photos whose cameras are known (COLMAP, or transforms.json).
+
+    Examples:
+      snowsplat train garden -o out                   3000 steps, some minutes on a laptop
+      snowsplat train garden -o out --eval            hold out every 8th photo, measure on them
+      snowsplat train garden -o out -r 4              photos at a quarter of their size: quicker
+      snowsplat train garden -o out --recipe paper    the 30,000 steps of the paper
+      snowsplat train garden -o out --checkpoint-every 1000
+      snowsplat train -o out --resume                 go on after Ctrl-C, a crash, a power cut
+
+    The scene is OUT/point_cloud/iteration_N/point_cloud.ply. Ctrl-C saves what is reached. The
+    flags of the reference implementation are understood (-s -m -i -r -w --eval --iterations …).
+    """
+
+    capture: Annotated[Path | None, tyro.conf.Positional, flag("CAPTURE")] = None
+    """Folder of photos and cameras: images/ and sparse/0/ of COLMAP, or transforms.json."""
+    output: Annotated[Path | None, flag("OUT", "-o", "-m", "--model-path")] = None
+    """Folder for the result; made if it is not there."""
+
+    recipe: Annotated[
+        Literal["default", "paper", "mcmc"] | None,
+        flag("{default,paper,mcmc}", default="default"),
+    ] = None
+    """Where all other settings come from. default: a few thousand quick steps; paper: the schedule
+    of the paper, 30,000 steps; mcmc: 30,000 steps with a fixed number of Gaussians."""
+    iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
+    """Training steps, one photo each."""
+    eval: Annotated[bool, switch()] = False
+    """Hold out every 8th photo (or the capture's own test split) and measure on it at the end."""
+    test_list: Annotated[Path | None, flag("FILE")] = None
+    """Text file naming the photos to hold out instead, one a line. Means --eval."""
+    images: Annotated[str | None, flag("NAME", "-i", default="images")] = None
+    """Name of the folder of photos in the capture."""
+    resolution: Annotated[int | None, flag("N", "-r", default="as they are")] = None
+    """1, 2, 4 or 8 divide the size of the photos; any other number is the width to be had."""
+    background: Annotated[
+        Literal["black", "white", "random"] | None,
+        flag("{black,white,random}", default="black"),
+    ] = None
+    """Colour behind the scene, and behind transparent photos."""
+    white_background: Annotated[bool, switch("-w")] = False
+    """The same as --background white."""
+
+    max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
+    """Most Gaussians that the scene may have: memory and time follow it. 0: no limit."""
+    checkpoint_every: Annotated[int | None, flag("N", default="none")] = None
+    """Steps between checkpoints, from which --resume goes on exactly."""
+    resume: Annotated[bool, switch()] = False
+    """Go on from the newest checkpoint in OUT, to the same result as without the stop."""
+    overwrite: Annotated[bool, switch()] = False
+    """Replace a training that is in OUT."""
+    threads: Annotated[int | None, flag("N", default="all cores")] = None
+    """Threads to compute with. The result is the same with any number."""
+    seed: Annotated[int | None, flag("N", default="0")] = None
+    """Of all random choices. The same seed gives the same scene, to the bit."""
+    test_iterations: Annotated[tuple[int, ...] | None, flag("[N ...]", default=RECIPE)] = None
+    """Steps after which to measure on the held-out photos as well; -1 or nothing for none."""
+    save_iterations: Annotated[tuple[int, ...], flag("[N ...]")] = ()
+    """Steps after which to save the scene as well as at the end."""
+
+    sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
+    """How far colours may change with the direction of view; less takes less memory."""
+    ssim_weight: Annotated[float | None, flag("F", "--lambda-dssim", default=RECIPE)] = None
+    """Share of 1 - SSIM in the loss; the rest is the mean absolute difference."""
+    initial_points: Annotated[int | None, flag("N", default=RECIPE)] = None
+    """Random Gaussians to begin with where the capture has no points."""
+    grad_threshold: Annotated[
+        float | None, flag("F", "--densify-grad-threshold", default=RECIPE)
+    ] = None
+    """Gaussians are added where the view-space gradient is larger. Raise it for fewer Gaussians."""
+    densify_interval: Annotated[
+        int | None, flag("N", "--densification-interval", default=RECIPE)
+    ] = None
+    """Steps between densifications. Raise it for fewer Gaussians."""
+    densify_from: Annotated[
+        int | float | None, flag("N|F", "--densify-from-iter", default=RECIPE)
+    ] = None
+    """First step that may densify; with a point (0.1), that share of all steps."""
+    densify_until: Annotated[
+        int | float | None, flag("N|F", "--densify-until-iter", default=RECIPE)
+    ] = None
+    """Last step that may densify; with a point (0.5), that share of all steps."""
+    opacity_reset_interval: Annotated[int | None, flag("N", default=RECIPE)] = None
+    """Steps between resets of opacity; 0: none."""
+    percent_dense: Annotated[float | None, flag("F", default=RECIPE)] = None
+    """Gaussians smaller than this share of the scene's extent are cloned, larger ones split."""
+    lr_means: Annotated[float | None, flag("F", "--position-lr-init", default=RECIPE)] = None
+    """Learning rate of the positions at the first step, in extents of the scene."""
+    lr_means_final: Annotated[float | None, flag("F", "--position-lr-final", default=RECIPE)] = None
+    """… and at the last."""
+    lr_means_steps: Annotated[
+        int | float | None, flag("N|F", "--position-lr-max-steps", default=RECIPE)
+    ] = None
+    """The step that counts as the last for it."""
+    lr_log_scales: Annotated[float | None, flag("F", "--scaling-lr", default=RECIPE)] = None
+    """Learning rate of the sizes."""
+    lr_quats: Annotated[float | None, flag("F", "--rotation-lr", default=RECIPE)] = None
+    """Learning rate of the rotations."""
+    lr_opacity_logits: Annotated[float | None, flag("F", "--opacity-lr", default=RECIPE)] = None
+    """Learning rate of the opacities."""
+    lr_sh_dc: Annotated[float | None, flag("F", default=RECIPE)] = None
+    """Learning rate of the colours."""
+    lr_sh_rest: Annotated[float | None, flag("F", default=RECIPE)] = None
+    """Learning rate of the colours' change with direction."""
+    feature_lr: Annotated[float | None, flag("F", default=RECIPE)] = None
+    """Both of them: --lr-sh-dc F --lr-sh-rest F/20, as in the reference."""
+    source_path: Annotated[Path | None, flag("CAPTURE", "-s")] = None
+    """The reference's way to name the capture."""
+    quiet: Annotated[bool, switch("-q")] = False
+    """No progress, only the result."""
+
+    def run(self) -> int:
+        """Gives the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
+        if self.output is None:
+            raise UserError("train needs a folder for the result; add -o OUT")
+        if self.resume and self.overwrite:
+            raise UserError("--resume and --overwrite exclude each other; leave one out")
+        out = OutputFolder(self.output)
+        out.check_free(resume=self.resume, overwrite=self.overwrite)
+        if not self.resume and self._capture_path() is None:
+            raise UserError(
+                "train needs a capture; name the folder of the photos and their cameras"
+            )
+
+        from snowsplat import ops
+        from snowsplat.trainer import Trainer
+
+        if self.threads is not None:
+            if self.threads < 1:
+                raise UserError(f"--threads is {self.threads}; it must be at least 1")
+            ops.set_num_threads(self.threads)
+        start = self._checkpoint(out) if self.resume else None
+        if start is None:
+            settings, config = self._capture_settings(None), self._config()
+            recipe = self.recipe or "default"
+        else:
+            settings = self._capture_settings(CaptureSettings(**start.meta["capture"]))
+            config, recipe = self._resumed_config(start), start.meta["recipe"]
+        capture = settings.load()
+        trainer = Trainer(capture, config)
+        if start is None:
+            out.begin(capture, settings, config)
+        else:
+            trainer.load_state(start.tensors)
+            out.write_config(settings, config)
+        self._describe(capture, config, start)
+        return _Run(self, out, settings, recipe, trainer).run()
+
+    # Flags -> settings
+
+    def _capture_path(self) -> Path | None:
+        if self.capture is not None and self.source_path is not None:
+            raise UserError("the capture is named twice; leave out -s or the other")
+        return self.capture or self.source_path
+
+    def _capture_settings(self, before: CaptureSettings | None) -> CaptureSettings:
+        """From the flags; what they leave open is as it was ``before``."""
+        path = self._capture_path()
+        settings = before or CaptureSettings(path="")
+        changes: dict[str, Any] = {
+            "path": None if path is None else str(path.absolute()),
+            "images": self.images,
+            "resolution": self.resolution,
+            "hold_out": 8 if self.eval or self.test_list is not None else None,
+            "test_list": None if self.test_list is None else str(self.test_list.absolute()),
+        }
+        return replace(settings, **{k: v for k, v in changes.items() if v is not None})
+
+    def _knobs(self) -> dict[str, Any]:
+        knobs = {name: getattr(self, name) for name in _KNOBS}
+        if self.white_background:
+            if self.background not in (None, "white"):
+                raise UserError("-w and --background name different colours; leave one out")
+            knobs["background"] = "white"
+        if self.feature_lr is not None:
+            knobs["lr_sh_dc"] = self.feature_lr if self.lr_sh_dc is None else self.lr_sh_dc
+            rest = self.feature_lr / 20 if self.lr_sh_rest is None else self.lr_sh_rest
+            knobs["lr_sh_rest"] = rest
+        if self.test_iterations is not None:
+            knobs["test_iterations"] = tuple(step for step in self.test_iterations if step > 0)
+        return {name: value for name, value in knobs.items() if value is not None}
+
+    def _config(self) -> TrainConfig:
+        from snowsplat.recipes import recipe
+
+        return recipe(self.recipe or "default", **self._knobs())
+
+    def _checkpoint(self, out: OutputFolder) -> Checkpoint | None:
+        from snowsplat import checkpoint
+
+        newest = checkpoint.latest(out.checkpoints)
+        if newest is not None:
+            return newest
+        if self._capture_path() is None:
+            raise UserError(
+                f"{out.path}: holds no whole checkpoint to resume; name the capture to begin anew"
+            )
+        if out.scenes() and not self.overwrite:
+            raise UserError(
+                f"{out.path}: holds a scene but no whole checkpoint to resume; add --overwrite "
+                "instead of --resume to begin anew"
+            )
+        self._say(f"{out.path}: no checkpoint yet; beginning at step 0")
+        return None
+
+    def _resumed_config(self, start: Checkpoint) -> TrainConfig:
+        """The checkpoint's own; flags may change only what leaves the steps so far as they were."""
+        from snowsplat.config import changed, config_from_json
+
+        config = config_from_json(start.meta["training"])
+        if self.recipe not in (None, start.meta["recipe"]):
+            raise UserError(
+                f"{start.path}: is of the recipe {start.meta['recipe']}; leave out --recipe"
+            )
+        resumed = changed(config, **self._knobs())
+        same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
+        if same != config:
+            raise UserError(
+                f"{start.path}: was made with other settings; resume without flags that change the "
+                "training (--iterations, --test-iterations, --checkpoint-every may change)"
+            )
+        return resumed
+
+    # Words
+
+    def _describe(self, capture: Capture, config: TrainConfig, start: Checkpoint | None) -> None:
+        camera = capture.train[0].camera
+        points = "no points" if capture.points is None else f"{len(capture.points):,} points"
+        self._say(
+            f"{capture.description}: {len(capture.train)} photos to train on, {len(capture.test)} "
+            f"held out, {camera.width}x{camera.height}, {points}"
+        )
+        if start is not None:
+            self._say(f"going on from {start.path}, step {start.step} of {config.iterations}")
+
+    def _say(self, line: str) -> None:
+        if not self.quiet:
+            print(line, flush=True)
+
+
+class _Run:
+    """The steps of one training and what is written on the way."""
+
+    def __init__(
+        self,
+        flags: Train,
+        out: OutputFolder,
+        settings: CaptureSettings,
+        recipe: str,
+        trainer: Trainer,
+    ) -> None:
+        self.flags, self.out, self.settings, self.recipe = flags, out, settings, recipe
+        self.trainer = trainer
+        self.config = trainer.config
+        self.progress = TrainingProgress(self.config.iterations, trainer.step)
+        self.evaluation: tuple[int, Evaluation] | None = None  # the newest, and its step
+
+    def run(self) -> int:
+        from contextlib import nullcontext
+
+        stopped = False
+        try:
+            with nullcontext() if self.flags.quiet else self.progress:
+                self.trainer.run(self._after_step)
+        except KeyboardInterrupt:
+            if self.trainer.step == 0:
+                self.out.discard()
+                raise
+            stopped = True
+        except BaseException:
+            self.out.discard()
+            raise
+        return self._stopped() if stopped else self._finished()
+
+    def _after_step(self, progress: Progress) -> None:
+        if progress.metrics is not None and progress.metrics.views:
+            self.evaluation = (progress.step, progress.metrics)
+        if not self.flags.quiet:
+            self.progress(progress)
+        every = self.config.checkpoint_every
+        if every and progress.step % every == 0:
+            self._save_checkpoint()
+        if progress.step in self.flags.save_iterations:
+            self.out.write_scene(progress.step, self.trainer.gaussians)
+
+    def _save_checkpoint(self) -> Path:
+        from dataclasses import asdict
+
+        from snowsplat import checkpoint
+        from snowsplat.config import config_to_json
+
+        meta = {
+            "capture": asdict(self.settings),
+            "recipe": self.recipe,
+            "training": config_to_json(self.config),
+        }
+        return checkpoint.save(
+            self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta
+        )
+
+    def _stopped(self) -> int:
+        path = self.out.write_scene(self.trainer.step, self.trainer.gaussians)
+        self._save_checkpoint()
+        print(f"stopped after step {self.trainer.step}: {path}")
+        print(f"go on with: snowsplat train -o {self.out.path} --resume")
+        return 130
+
+    def _finished(self) -> int:
+        step = self.trainer.step
+        path = self.out.write_scene(step, self.trainer.gaussians)
+        time = duration(self.progress.seconds)
+        print(f"{path}: {len(self.trainer.gaussians):,} Gaussians, {step} steps in {time}", end="")
+        print(f", at most {peak_bytes() / 1e6:.0f} MB")
+        if self.trainer.capture.test:
+            if self.evaluation is None or self.evaluation[0] != step:
+                self.evaluation = (step, self.trainer.evaluate())
+            self.out.write_metrics(step, "test", self.evaluation[1])
+            print(held_out_line(*self.evaluation))
+        return 0
