@@ -1,0 +1,56 @@
+"""The README's examples are what the program does."""
+
+import re
+import runpy
+import shlex
+from pathlib import Path
+
+import pytest
+
+from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat.cli import main as cli
+from snowsplat.formats import read_gaussians
+
+README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def test_python_example_runs(tmp_path, monkeypatch, capsys):
+    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len(example.split("\n\n")[1].splitlines()) == 5  # "in five lines"
+    monkeypatch.chdir(tmp_path)
+    write_synthetic_capture(tmp_path / "garden", n_views=9, width=48, height=36, n_points=300)
+    quick, changes = re.subn("iterations=[0-9]+", "iterations=40", example)
+    assert changes == 1
+    (tmp_path / "example.py").write_text(quick)
+    runpy.run_path("example.py")
+    psnr, count = capsys.readouterr().out.split()
+    assert float(psnr) > 15
+    assert len(read_gaussians(tmp_path / "garden.ply")) == int(count)
+
+
+def commands() -> list[str]:
+    shown = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+    lines = [line for block in shown for line in block.splitlines()]
+    lines += re.findall(r"`(snowsplat (?:train|render|evaluate) [^`]+)`", README)
+    return lines
+
+
+@pytest.mark.parametrize("command", commands())
+def test_command_is_understood(command):
+    program, *arguments = shlex.split(command)
+    assert program == "snowsplat"
+    assert type(cli._parse(arguments)) is cli.VERBS[arguments[0]]
+
+
+def test_flags_named_exist(capsys):
+    with pytest.raises(SystemExit):
+        cli._parse(["train", "--help"])
+    known = capsys.readouterr().out
+    for flag in set(re.findall(r"`(-[-a-zA-Z_]+)", README)):
+        assert flag.replace("_", "-") in known, flag
+
+
+def test_files_named_exist():
+    root = Path(__file__).resolve().parents[1]
+    for link in re.findall(r"\]\(([^):]+)\)", README):
+        assert (root / link).exists(), link
