@@ -244,10 +244,10 @@ def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise cursor.damaged("it is cut short")
     cursor.offset = start
     cursor.finish()
-    octets = np.frombuffer(data, np.uint8)
-    xyz = octets[starts[:, None] + np.arange(8, 32)].view("<f8")
-    rgb = octets[starts[:, None] + np.arange(32, 35)]
-    return xyz, rgb
+    # A view with a record at every byte, of which those at the starts are taken.
+    record = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    records = np.ndarray(max(0, size - record.itemsize + 1), record, data, strides=(1,))[starts]
+    return records["xyz"], records["rgb"]
 
 
 # Text
@@ -263,7 +263,8 @@ def _lines(path: Path) -> Iterator[str]:
 
 def _warn_if_fewer(path: Path, kind: str, count: int) -> None:
     # COLMAP notes the number in a comment, which may be stale where a person edited the file.
-    head = _read(path)[:1000].decode("utf-8", errors="replace")
+    with open(path, encoding="utf-8", errors="replace") as file:
+        head = file.read(1000)
     noted = re.search(rf"^#.*Number of {kind}: (\d{{1,12}})\b", head, re.MULTILINE)
     if noted and int(noted[1]) > count:
         logger.warning(
