@@ -2,4 +2,4 @@
 
 
 class UserError(Exception):
-    """One line: what is wrong, and what to do about it. The command line prints it and exits with 2."""
+    """One line: what is wrong, and what to do about it. The command line exits with 2 after it."""
