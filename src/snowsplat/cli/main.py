@@ -75,19 +75,27 @@ def _parse(arguments: list[str]) -> Any:
 
 
 def _fail(message: str, code: int) -> int:
-    line = " ".join(message.split())
-    print(f"snowsplat: {line}", file=sys.stderr)
+    _tell(message)
     return code
+
+
+def _tell(message: str) -> None:
+    print("snowsplat:", " ".join(message.split()), file=sys.stderr)
+
+
+class _Notes(logging.Handler):
+    """What the program logs, as lines of the same kind."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        _tell(record.getMessage())
 
 
 def _say_notes_and_warnings_in_one_line() -> None:
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        _fail(f"warning: {message}", 0)
+        _tell(f"warning: {message}")
 
     warnings.showwarning = show
     logger = logging.getLogger("snowsplat")
     if not logger.handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("snowsplat: %(message)s"))
-        logger.addHandler(handler)
+        logger.addHandler(_Notes())
         logger.setLevel(logging.INFO)

@@ -27,7 +27,8 @@ class TrainingProgress:
         self.total = total
         self.stream = stream or sys.stdout
         self._start_step = start
-        self._start_time = self._last_line = self._last_time = time.monotonic()
+        self._start_time = self._last_time = time.monotonic()
+        self._last_line = self._start_time - _LINE_SECONDS + 1.0  # the first one comes soon
         self._last_step = start
         self._rate = 0.0  # steps a second
         self._loss = math.nan

@@ -257,6 +257,11 @@ class Train:
                 f"{start.path}: was made with other settings; resume without flags that change the "
                 "training (--iterations, --test-iterations, --checkpoint-every may change)"
             )
+        if resumed.iterations < start.step:
+            raise UserError(
+                f"{start.path}: is of step {start.step}, beyond --iterations {resumed.iterations}; "
+                "name more"
+            )
         return resumed
 
     # Words
@@ -290,6 +295,7 @@ class _Run:
         self.flags, self.out, self.settings, self.recipe = flags, out, settings, recipe
         self.trainer = trainer
         self.config = trainer.config
+        self.first_step = trainer.step
         self.progress = TrainingProgress(self.config.iterations, trainer.step)
         self.evaluation: tuple[int, Evaluation] | None = None  # the newest, and its step
 
@@ -346,9 +352,11 @@ class _Run:
     def _finished(self) -> int:
         step = self.trainer.step
         path = self.out.write_scene(step, self.trainer.gaussians)
-        time = duration(self.progress.seconds)
-        print(f"{path}: {len(self.trainer.gaussians):,} Gaussians, {step} steps in {time}", end="")
-        print(f", at most {peak_bytes() / 1e6:.0f} MB")
+        steps = f"{step - self.first_step} more steps" if self.first_step else f"{step} steps"
+        print(
+            f"{path}: {len(self.trainer.gaussians):,} Gaussians, {steps} in "
+            f"{duration(self.progress.seconds)}, at most {peak_bytes() / 1e6:.0f} MB"
+        )
         if self.trainer.capture.test:
             if self.evaluation is None or self.evaluation[0] != step:
                 self.evaluation = (step, self.trainer.evaluate())

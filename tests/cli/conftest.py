@@ -1,0 +1,77 @@
+"""A small capture, and the command line called in this process or as a process of its own."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import snowsplat
+from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat.cli.main import main
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
+
+
+@dataclass
+class Result:
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory) -> Path:
+    """9 views, 48×36; not to be changed."""
+    root = tmp_path_factory.mktemp("cli")
+    return write_synthetic_capture(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
+
+
+@pytest.fixture
+def run(capsys) -> Callable[..., Result]:
+    """Call the command with some arguments."""
+
+    def run(*arguments: object) -> Result:
+        capsys.readouterr()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as leaving:  # tyro: help, or a mistake in the flags
+            code = int(leaving.code or 0)
+        captured = capsys.readouterr()
+        return Result(code, captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture
+def refused(run) -> Callable[..., str]:
+    """Call the command with a mistake in the input; gives its one line."""
+
+    def refused(*arguments: object) -> str:
+        result = run(*arguments)
+        assert result.code == 2
+        lines = result.err.splitlines()
+        assert len(lines) == 1, result.err
+        assert lines[0].startswith("snowsplat: ")
+        return lines[0]
+
+    return refused
+
+
+@pytest.fixture
+def start() -> Callable[..., subprocess.Popen]:
+    """Start the command as a process of its own."""
+
+    def start(*arguments: object) -> subprocess.Popen:
+        return subprocess.Popen(
+            [sys.executable, "-m", "snowsplat", *map(str, arguments)],
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    return start

@@ -1,0 +1,175 @@
+"""What is done with a scene afterwards: `render`, `evaluate`, `info`."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.cli.main import main
+from snowsplat.formats import read_gaussians, write_gaussians
+
+
+@pytest.fixture(scope="module")
+def trained(capture, tmp_path_factory) -> Path:
+    """An output folder with two scenes; renders and metrics come and go."""
+    out = tmp_path_factory.mktemp("trained") / "out"
+    flags = ["--iterations", "60", "--save-iterations", "30", "--eval", "--quiet"]
+    assert main(["train", str(capture), "-o", str(out), *flags]) == 0
+    return out
+
+
+def picture(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path)).astype(np.float64)
+
+
+def test_render_beside_the_photos(run, trained, capture):
+    result = run("render", trained)
+    assert result.code == 0, result.err
+    for split, names in (("test", [0, 8]), ("train", [1, 2, 3, 4, 5, 6, 7])):
+        folder = trained / split / "ours_60"
+        expected = [f"{i:05d}.png" for i in range(len(names))]
+        for kind in ("renders", "gt"):
+            assert sorted(p.name for p in (folder / kind).iterdir()) == expected
+        for i, name in enumerate(names):
+            photo = picture(capture / f"images/view_{name:02d}.png")
+            np.testing.assert_array_equal(picture(folder / f"gt/{i:05d}.png"), photo)
+    # The pictures are what was measured, but for rounding to 8 bits.
+    metrics = json.loads((trained / "metrics.json").read_text())
+    render, photo = (picture(trained / f"test/ours_60/{k}/00001.png") for k in ("renders", "gt"))
+    psnr = -10 * np.log10(np.mean(((render - photo) / 255) ** 2))
+    assert psnr == pytest.approx(metrics["views"]["view_08.png"]["psnr"], abs=0.02)
+
+
+def test_render_depth(run, trained):
+    flags = ("--split", "test", "--iteration", 30)
+    assert run("render", trained, *flags, "--depth", "16bit").code == 0
+    folder = trained / "test/ours_30/depth"
+    steps = json.loads((folder / "world_units_per_step.json").read_text())
+    depth = Image.open(folder / "00000.png")
+    assert depth.mode.startswith("I")
+    units = np.asarray(depth).astype(np.float64) * steps["00000.png"]
+    # The cameras are 3 from the middle, the surroundings at most 9 away.
+    assert 1.5 < np.median(units[units > 0]) < 9.5
+    assert run("render", "-m", trained, *flags, "--skip_train", "--depth", "color").code == 0
+    assert Image.open(folder / "00000.png").mode == "RGB"
+    assert not (trained / "train/ours_30").exists()
+
+
+def test_evaluate_repeats_what_training_measured(run, trained):
+    before = json.loads((trained / "metrics.json").read_text())
+    result = run("evaluate", trained)
+    assert result.code == 0, result.err
+    assert json.loads((trained / "metrics.json").read_text()) == before
+    assert f"{before['psnr']:6.3f}" in result.out
+    assert "LPIPS was not measured" in result.out
+    assert run("evaluate", "-m", trained, "--split", "train", "--iteration", 30).code == 0
+    other = json.loads((trained / "metrics.json").read_text())
+    assert (other["iteration"], other["split"], len(other["views"])) == (30, "train", 7)
+    assert run("evaluate", trained).code == 0
+
+
+def test_evaluate_with_lpips(run, refused, trained, tmp_path):
+    torch.manual_seed(0)
+    shapes = [(64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3)]
+    state = {}
+    for k, (index, (o, i, s)) in enumerate(zip((0, 3, 6, 8, 10), shapes, strict=True)):
+        state[f"features.{index}.weight"] = torch.randn(o, i, s, s) / (i * s * s) ** 0.5
+        state[f"features.{index}.bias"] = torch.zeros(o)
+        state[f"lin{k}.model.1.weight"] = torch.rand(1, o, 1, 1)
+    torch.save(state, tmp_path / "alex.pth")
+    result = run("evaluate", trained, "--lpips", tmp_path / "alex.pth")
+    assert result.code == 0, result.err
+    assert "LPIPS (alex)" in result.out
+    assert json.loads((trained / "metrics.json").read_text())["lpips"] > 0
+    assert "cannot be read" in refused("evaluate", trained, "--lpips", tmp_path / "absent.pth")
+    assert run("evaluate", trained).code == 0
+
+
+def test_a_folder_that_the_reference_made(run, trained, capture, tmp_path):
+    """It has cfg_args and no config.json; nothing in it is executed."""
+    theirs = tmp_path / "theirs"
+    shutil.copytree(trained / "point_cloud", theirs / "point_cloud")
+    (theirs / "cfg_args").write_text(
+        f"Namespace(sh_degree=3, source_path='{capture}', model_path='x', images='images', "
+        "resolution=-1, white_background=False, data_device='cuda', eval=True)"
+    )
+    assert run("evaluate", theirs).code == 0
+    ours = json.loads((trained / "metrics.json").read_text())
+    assert json.loads((theirs / "metrics.json").read_text()) == ours
+    (theirs / "cfg_args").write_text("__import__('os').system('echo executed')")
+    result = run("evaluate", theirs)
+    assert result.code == 2
+    assert "executed" not in result.out
+
+
+def test_a_capture_that_has_moved(run, refused, trained, capture, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(trained, moved)
+    config = json.loads((moved / "config.json").read_text())
+    config["capture"]["path"] = "/nowhere"
+    (moved / "config.json").write_text(json.dumps(config))
+    assert "/nowhere" in refused("evaluate", moved)
+    assert run("evaluate", moved, "-s", capture).code == 0
+
+
+def test_refused(refused, trained, tmp_path):
+    assert "no such folder" in refused("render", tmp_path / "absent")
+    assert "not the output folder" in refused("evaluate", tmp_path)
+    assert "there are 30, 60" in refused("render", trained, "--iteration", 7)
+    assert "once" in refused("render", trained, "-m", trained)
+    assert "no views" in refused("render", trained, "--skip-train", "--skip-test")
+    damaged = tmp_path / "damaged"
+    shutil.copytree(trained, damaged)
+    scene = damaged / "point_cloud/iteration_60/point_cloud.ply"
+    scene.write_bytes(scene.read_bytes()[:-1])
+    assert "ends before its last row" in refused("evaluate", damaged)
+    for content in ("{", "[]", '{"capture": 1}', '{"capture": {"path": 1, "x": 2}}'):
+        (damaged / "config.json").write_text(content)
+        assert "config.json: damaged" in refused("evaluate", damaged)
+    shutil.rmtree(damaged / "point_cloud")
+    shutil.copy(trained / "config.json", damaged)
+    assert "holds no scene" in refused("evaluate", damaged)
+
+
+def test_info(run, refused, trained, capture, tmp_path):
+    def facts(path: Path) -> dict:
+        assert run("info", path).code == 0  # for people
+        result = run("info", path, "--json")
+        assert result.code == 0, result.err
+        return json.loads(result.out)
+
+    scene = facts(trained / "point_cloud/iteration_60/point_cloud.ply")
+    gaussians = read_gaussians(trained / "point_cloud/iteration_60/point_cloud.ply")
+    assert (scene["kind"], scene["sh_degree"]) == ("scene", 3)
+    assert scene["gaussians"] == len(gaussians)
+    assert scene["opacity"]["p50"] == pytest.approx(float(gaussians.opacities.median()), rel=0.05)
+    assert facts(trained / "input.ply")["points"] == 300
+    out = facts(trained)
+    assert out["scenes"] == [30, 60]
+    assert out["capture"] == str(capture)
+    assert out["metrics"]["psnr"] > 10
+    assert out["last_scene"]["gaussians"] == len(gaussians)
+    photos = facts(capture)
+    assert (photos["photos"], photos["held_out_with_eval"], photos["points"]) == (9, 2, 300)
+    assert photos["sizes"] == {"48x36": 9}
+    gaussians.means[3, 1] = float("nan")
+    write_gaussians(tmp_path / "nan.ply", gaussians)
+    assert facts(tmp_path / "nan.ply")["not_finite"] == 1
+    write_gaussians(tmp_path / "none.ply", gaussians.select(torch.zeros(0, dtype=torch.int64)))
+    assert facts(tmp_path / "none.ply")["gaussians"] == 0
+    assert "no such file" in refused("info", tmp_path / "absent.ply")
+    assert "no camera poses" in refused("info", tmp_path)
+
+
+def test_info_of_a_checkpoint(run, capture, tmp_path):
+    flags = ("--iterations", 4, "--checkpoint-every", 4, "-q")
+    assert run("train", capture, "-o", tmp_path / "out", *flags).code == 0
+    result = run("info", tmp_path / "out/checkpoints/step_000004.safetensors", "--json")
+    values = json.loads(result.out)
+    assert (values["kind"], values["step"]) == ("checkpoint", 4)
+    assert values["tensors"]["gaussians.means"] == [300, 3]
+    assert run("info", tmp_path / "out").code == 0

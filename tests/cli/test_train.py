@@ -1,0 +1,265 @@
+"""`snowsplat train`, from flags to files: what is written, what is refused, what a stop leaves."""
+
+import json
+import shutil
+import signal
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from snowsplat.cli.train import _KNOBS, Train
+from snowsplat.recipes import RECIPES, recipe
+
+QUICK = ("--iterations", 30, "--threads", 1)
+
+
+def scene(out: Path, iteration: int = 30) -> bytes:
+    return (out / f"point_cloud/iteration_{iteration}/point_cloud.ply").read_bytes()
+
+
+def files(folder: Path) -> set[str]:
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+
+
+def test_the_output_folder(run, capture, tmp_path):
+    out = tmp_path / "new" / "out"
+    result = run("train", capture, "-o", out, *QUICK, "--eval", "--save-iterations", 10, 20)
+    assert result.code == 0, result.err
+    assert result.err == ""
+    assert files(out) == {
+        *("cfg_args", "cameras.json", "input.ply", "config.json", "metrics.json"),
+        *(f"point_cloud/iteration_{n}/point_cloud.ply" for n in (10, 20, 30)),
+    }
+    assert (out / "cfg_args").read_text().startswith("Namespace(data_device='cpu', eval=True, ")
+    cameras = json.loads((out / "cameras.json").read_text())
+    assert len(cameras) == 9
+    assert cameras[0].keys() == {
+        *("id", "img_name", "width", "height", "position", "rotation", "fx", "fy"),
+    }
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["iteration"] == 30
+    assert metrics["split"] == "test"
+    assert metrics["psnr"] > 12
+    assert set(metrics["views"]) == {"view_00.png", "view_08.png"}
+    assert b"element vertex 300" in (out / "input.ply").read_bytes()[:200]
+    # Piped into a file: whole lines, the last of them the result.
+    lines = result.out.splitlines()
+    assert "7 photos to train on, 2 held out, 48x36, 300 points" in lines[0]
+    assert any(line.startswith("step 30/30 (100%)") and "it/s" in line for line in lines)
+    assert lines[-1].startswith("step 30: 2 views  PSNR")
+
+
+def test_the_reference_spelling_of_flags(run, capture, tmp_path):
+    out = tmp_path / "out"
+    result = run(
+        *("train", "-s", capture, "-m", out, "-i", "images", "-r", 2, "--eval", "-w", "--quiet"),
+        *("--iterations", 20, "--sh_degree", 1, "--densify_grad_threshold", 0.0004),
+        *("--densification_interval", 7, "--densify_from_iter", 3, "--densify_until_iter", 15),
+        *("--opacity_reset_interval", 9, "--percent_dense", 0.02, "--lambda_dssim", 0.3),
+        *("--position_lr_init", 1e-4, "--position_lr_final", 1e-6, "--position_lr_max_steps", 40),
+        *("--feature_lr", 0.002, "--opacity_lr", 0.03, "--scaling_lr", 0.004),
+        *("--rotation_lr", 0.005, "--test_iterations", -1, "--save_iterations", 10),
+    )
+    assert result.code == 0, result.err
+    config = json.loads((out / "config.json").read_text())
+    assert config["capture"] == {
+        "path": str(capture),
+        "images": "images",
+        "resolution": 2,
+        "hold_out": 8,
+        "test_list": None,
+    }
+    training = config["training"]
+    assert training["background"] == "white"
+    assert (training["iterations"], training["sh_degree"], training["ssim_weight"]) == (20, 1, 0.3)
+    assert training["test_iterations"] == []
+    density = training["density"]
+    assert density["grad_threshold"] == 0.0004
+    assert (density["densify_interval"], density["densify_from"]) == (7, 3)
+    assert (density["densify_until"], density["opacity_reset_interval"]) == (15, 9)
+    assert density["percent_dense"] == 0.02
+    assert training["learning_rates"] == {
+        "means": 1e-4,
+        "means_final": 1e-6,
+        "means_steps": 40,
+        "log_scales": 0.004,
+        "quats": 0.005,
+        "opacity_logits": 0.03,
+        "sh_dc": 0.002,
+        "sh_rest": 0.0001,
+    }
+    cameras = json.loads((out / "cameras.json").read_text())
+    assert (cameras[0]["width"], cameras[0]["height"]) == (24, 18)
+    assert "white_background=True" in (out / "cfg_args").read_text()
+    assert b"f_rest_8\n" in scene(out, 20)
+    assert b"f_rest_9\n" not in scene(out, 20)
+
+
+def test_every_knob_is_a_flag_and_a_knob_of_some_recipe():
+    flags = {field.name for field in fields(Train)}
+    for name in _KNOBS:
+        assert name in flags
+        value: object = (5,) if name == "test_iterations" else 1
+        value = "white" if name == "background" else value
+        recipe("default", **{name: value})
+    assert set(RECIPES) == {"default", "paper", "mcmc"}
+
+
+def test_a_knob_that_the_recipe_does_not_have(refused, capture, tmp_path):
+    line = refused(
+        "train", capture, "-o", tmp_path / "out", "--recipe", "mcmc", "--percent-dense", 0.1
+    )
+    assert "--percent-dense" in line
+    assert not (tmp_path / "out").exists()
+
+
+# Repeatable, resumable
+
+
+def test_seed_threads_checkpoints_and_quiet_do_not_matter(run, capture, tmp_path):
+    a, b, c = (tmp_path / name for name in "abc")
+    assert run("train", capture, "-o", a, *QUICK).code == 0
+    flags = ("--threads", 2, "--checkpoint-every", 7, "--quiet")
+    assert run("train", capture, "-o", b, "--iterations", 30, *flags).code == 0
+    assert run("train", capture, "-o", c, *QUICK, "--seed", 1).code == 0
+    assert scene(a) == scene(b) != scene(c)
+    assert {p.name for p in (b / "checkpoints").iterdir()} == {
+        "step_000021.safetensors",
+        "step_000028.safetensors",
+    }
+
+
+def wait_for(path: Path, process) -> None:
+    deadline = time.monotonic() + 60
+    while not path.exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+def test_kill_9_and_resume_give_the_same_scene(run, start, capture, tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    flags = ("--iterations", 120, "--threads", 1, "--checkpoint-every", 20, "--eval", "-q")
+    assert run("train", capture, "-o", whole, *flags).code == 0
+    process = start("train", capture, "-o", killed, *flags)
+    wait_for(killed / "checkpoints/step_000060.safetensors", process)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    # The newest one may rot as well: the one before it will do.
+    newest = max((killed / "checkpoints").iterdir())
+    newest.write_bytes(newest.read_bytes()[:1000])
+    result = run("train", "-o", killed, "--resume")
+    assert result.code == 0, result.err
+    assert "damaged" in result.err
+    assert len(result.err.splitlines()) == 1
+    assert "going on from" in result.out
+    assert scene(killed, 120) == scene(whole, 120)
+    assert (killed / "metrics.json").read_bytes() == (whole / "metrics.json").read_bytes()
+
+
+def test_ctrl_c_saves_and_resumes(run, start, capture, tmp_path):
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    process = start("train", capture, "-o", stopped, "--iterations", 100_000, "--threads", 1)
+    deadline = time.monotonic() + 60
+    while "step" not in (process.stdout.readline() if process.poll() is None else "step"):
+        assert time.monotonic() < deadline
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, (out, err)
+    assert err == ""
+    assert f"go on with: snowsplat train -o {stopped} --resume" in out
+    checkpoints = list((stopped / "checkpoints").iterdir())
+    assert len(checkpoints) == 1
+    step = int(checkpoints[0].stem.removeprefix("step_"))
+    assert len(scene(stopped, step)) > 1000
+    more = step + 5
+    assert run("train", "-o", stopped, "--resume", "--iterations", more).code == 0
+    assert len(scene(stopped, more)) > 1000
+    assert not whole.exists()
+
+
+def test_resume_refuses_another_training(refused, run, capture, tmp_path):
+    out = tmp_path / "out"
+    assert run("train", capture, "-o", out, *QUICK, "--checkpoint-every", 30).code == 0
+    assert "other settings" in refused("train", "-o", out, "--resume", "--seed", 5)
+    assert "recipe" in refused("train", "-o", out, "--resume", "--recipe", "paper")
+    assert "beyond" in refused("train", "-o", out, "--resume", "--iterations", 10)
+    assert "exclude" in refused("train", capture, "-o", out, "--resume", "--overwrite")
+    before = scene(out)
+    assert run("train", "-o", out, "--resume").code == 0  # all is done: the same again
+    assert scene(out) == before
+
+
+def test_resume_where_nothing_is(refused, run, capture, tmp_path):
+    out = tmp_path / "out"
+    assert "no whole checkpoint" in refused("train", "-o", out, "--resume")
+    assert not out.exists()
+    result = run("train", capture, "-o", out, "--resume", *QUICK)
+    assert result.code == 0
+    assert "no checkpoint yet" in result.out
+    assert "--overwrite" in refused("train", capture, "-o", out, "--resume")
+
+
+# Refused
+
+
+def test_places_that_are_taken(refused, run, capture, tmp_path):
+    out = tmp_path / "out"
+    out.write_text("a file")
+    assert "is a file" in refused("train", capture, "-o", out, *QUICK)
+    out.unlink()
+    out.mkdir()
+    (out / "thesis.txt").write_text("mine")
+    assert "holds other files" in refused("train", capture, "-o", out, *QUICK)
+    assert "holds other files" in refused("train", capture, "-o", out, *QUICK, "--overwrite")
+    assert files(out) == {"thesis.txt"}
+    (out / "thesis.txt").unlink()
+    assert run("train", capture, "-o", out, *QUICK, "--checkpoint-every", 10).code == 0
+    before = scene(out)
+    assert "--resume" in refused("train", capture, "-o", out, *QUICK)
+    assert scene(out) == before
+    (out / "notes.txt").write_text("mine")
+    assert run("train", capture, "-o", out, "--iterations", 20, "--overwrite").code == 0
+    assert not (out / "checkpoints").exists()
+    assert [p.name for p in (out / "point_cloud").iterdir()] == ["iteration_20"]
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (["--iterations", 0], "--iterations"),
+        (["--sh-degree", 4], "--sh-degree"),
+        (["--threads", 0], "--threads"),
+        (["--background", "black", "-w"], "different colours"),
+        (["-s", "elsewhere"], "twice"),
+        (["--test-list", "absent.txt"], "absent.txt"),
+    ],
+)
+def test_flags_that_make_no_sense(refused, capture, tmp_path, flags, expected):
+    assert expected in refused("train", capture, "-o", tmp_path / "out", *flags)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_captures_write_nothing(refused, capture, tmp_path):
+    out = tmp_path / "out"
+    assert "no such folder" in refused("train", tmp_path / "absent", "-o", out)
+    (tmp_path / "empty").mkdir()
+    refused("train", tmp_path / "empty", "-o", out)
+    damaged = tmp_path / "damaged"
+    shutil.copytree(capture, damaged)
+    (damaged / "images/view_03.png").write_bytes(b"not an image")
+    assert "view_03.png" in refused("train", damaged, "-o", out)
+    # A whole header, then nothing: found out only when the photo's turn comes.
+    photo = (capture / "images/view_03.png").read_bytes()
+    (damaged / "images/view_03.png").write_bytes(photo[: len(photo) // 2])
+    assert "view_03.png" in refused("train", damaged, "-o", out, *QUICK, "-q")
+    assert not out.exists()
+    model = damaged / "sparse/0/images.bin"
+    model.write_bytes(model.read_bytes()[:100])
+    refused("train", damaged, "-o", out)
+    assert "needs a capture" in refused("train", "-o", out)
+    assert "add -o" in refused("train", capture)
+    assert not out.exists()
