@@ -67,7 +67,8 @@ class ImageLoader:
         """
         with self._lock:
             self._queue = deque(self._key(view, downscale) for view in order)
-            self._ahead.clear()
+            wanted = set(self._queue)
+            self._ahead = {key: size for key, size in self._ahead.items() if key in wanted}
             self._pump()
 
     def get(self, view: View, downscale: int | None = None) -> LoadedImage:
