@@ -58,6 +58,8 @@ def describe(path: Path) -> dict[str, Any]:
         return _ply(path)
     if path.suffix == ".safetensors":
         return _checkpoint(path)
+    if path.is_file() and path.suffix != ".json":
+        raise UserError(f"{path}: not a kind of file that I know (.ply, .safetensors, .json)")
     folder = OutputFolder(path)
     if folder.is_one() or folder.scenes():
         return _output(folder)
