@@ -74,7 +74,7 @@ types: $(ENVIRONMENT)
 	mypy
 
 layers: $(ENVIRONMENT)
-	lint-imports
+	lint-imports --no-logo
 
 # All tests on the best instruction set, then those of the ops on each of the others.
 pytest: native
