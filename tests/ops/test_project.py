@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -24,6 +25,7 @@ from .scenes import (
     one_line,
     random_scene,
     smooth_scene,
+    tilted_pose,
     view_of,
     world_points,
 )
@@ -217,12 +219,15 @@ def test_harmonics_are_those_of_the_books() -> None:
 
 
 def test_harmonics_of_degree_one_point_along_the_axes(variant: Variant) -> None:
-    """The three coefficients weigh −y, z, −x of the direction of view, by √(3/4π)."""
+    """The coefficients weigh −y, z, −x, by √(3/4π), of the world direction from the camera."""
     scene = single((0.4, -0.3, 2.0))
     scene.params["sh_dc"].zero_()
     scene.params["sh_rest"] = torch.eye(3, dtype=torch.float64)[None]  # each its own channel
+    scene = replace(scene, cam_from_world=tilted_pose())
+    R, t = scene.cam_from_world[:, :3], scene.cam_from_world[:, 3]
+    direction = scene.params["means"][0] - torch.linalg.solve(R, -t)
+    x, y, z = (direction / direction.norm()).tolist()
     splats = scene.to(variant.dtype).project(variant.ops, sh_degree=1)
-    x, y, z = (torch.tensor([0.4, -0.3, 2.0]) / math.sqrt(0.4**2 + 0.3**2 + 4)).tolist()
     expected = 0.5 + math.sqrt(3 / (4 * math.pi)) * torch.tensor([[-y, z, -x]])
     assert_close(splats.colors, expected, 1e-6)
 
