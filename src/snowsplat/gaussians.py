@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
+from snowsplat.ops.scratch import take_rows
 
 #: The constant basis function of the spherical harmonics, Y_00 = 1 / (2 sqrt(pi)).
 SH_C0 = 0.28209479177387814
@@ -127,7 +128,7 @@ class Gaussians:
 
     def select(self, index: Tensor) -> Gaussians:
         """The rows ``index``: (M,) integers in any order, or an (N,) bool mask."""
-        return self.map(lambda tensor: tensor[index])
+        return self.map(lambda tensor: take_rows(tensor, index))
 
     def append(self, other: Gaussians) -> Gaussians:
         """This set's rows, then the other's."""

@@ -15,6 +15,7 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.camera import Camera
 from snowsplat.gaussians import Gaussians
+from snowsplat.ops.scratch import take_rows
 from snowsplat.ops.splats import Splats2D
 
 #: A moment of the training: an int is that step, a float that fraction of all iterations.
@@ -134,7 +135,7 @@ class Adam:
         """
         for moments in (self.exp_avg, self.exp_avg_sq):
             for name, moment in moments.items():
-                moments[name] = moment[index]
+                moments[name] = take_rows(moment, index)
                 moments[name][fresh] = 0.0
 
     def zero(self, name: str) -> None:

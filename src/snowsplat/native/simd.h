@@ -497,31 +497,30 @@ struct RowMover<Simd<float, 8>> {
 };
 #endif
 
-// W rows of K columns → K vectors; K known at compile time so that they stay in registers.
-template <int K, class V>
-SNOW_INLINE void gather_rows(const typename V::Scalar* const* rows, V* out) {
-#pragma GCC unroll 12
-  for (int c = 0; c < K; c += 4) RowMover<V>::gather4(rows, c, K - c < 4 ? K - c : 4, out + c);
-}
-template <int K, class V>
-SNOW_INLINE void scatter_rows(typename V::Scalar* const* rows, const V* in, int count) {
-#pragma GCC unroll 12
-  for (int c = 0; c < K; c += 4)
-    RowMover<V>::scatter4(rows, c, K - c < 4 ? K - c : 4, in + c, count);
-}
-// The same for a column count known only at run time (SH coefficients).
+// W rows of `columns` columns ⇄ `columns` vectors. Calls, not inlined: a kernel moves a dozen tensors,
+// and unrolled they would not fit the instruction cache.
 template <class V>
-SNOW_INLINE void gather_rows_n(const typename V::Scalar* const* rows, int columns, V* out) {
+__attribute__((noinline)) void gather_rows(const typename V::Scalar* base, int64_t stride,
+                                           const int64_t* row, int columns, V* out) {
+  const typename V::Scalar* rows[V::width];
+  for (int l = 0; l < V::width; l++) rows[l] = base + row[l] * stride;
   int c = 0;
   for (; c + 4 <= columns; c += 4) RowMover<V>::gather4(rows, c, 4, out + c);
-  if (c < columns) RowMover<V>::gather4(rows, c, columns - c, out + c);
+  if (columns - c == 3) RowMover<V>::gather4(rows, c, 3, out + c);
+  if (columns - c == 2) RowMover<V>::gather4(rows, c, 2, out + c);
+  if (columns - c == 1) RowMover<V>::gather4(rows, c, 1, out + c);
 }
 template <class V>
-SNOW_INLINE void scatter_rows_n(typename V::Scalar* const* rows, int columns, const V* in,
-                                int count) {
+__attribute__((noinline)) void scatter_rows(typename V::Scalar* base, int64_t stride,
+                                            const int64_t* row, int count, int columns,
+                                            const V* in) {
+  typename V::Scalar* rows[V::width];
+  for (int l = 0; l < V::width; l++) rows[l] = base + row[l] * stride;
   int c = 0;
   for (; c + 4 <= columns; c += 4) RowMover<V>::scatter4(rows, c, 4, in + c, count);
-  if (c < columns) RowMover<V>::scatter4(rows, c, columns - c, in + c, count);
+  if (columns - c == 3) RowMover<V>::scatter4(rows, c, 3, in + c, count);
+  if (columns - c == 2) RowMover<V>::scatter4(rows, c, 2, in + c, count);
+  if (columns - c == 1) RowMover<V>::scatter4(rows, c, 1, in + c, count);
 }
 
 // ---- sums over lanes ----------------------------------------------------------------------------

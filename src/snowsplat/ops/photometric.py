@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, variant
 from snowsplat.ops.native import launch
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """(1 − λ) · mean |a − b| + λ · (1 − SSIM), a scalar (Kerbl et al. 2023, eq. 7; λ `ssim_weight`).
+    """(1 − λ) · mean |a − b| + λ · (1 − SSIM), a scalar; λ is `ssim_weight` (the paper, eq. 7).
 
     image (H, W, 3) float, target (H, W, 3) of the same dtype or uint8 (then divided by 255), both
     best of planar storage: `planar.permute(1, 2, 0)`. The gradient flows to `image` alone; it is
@@ -62,7 +63,7 @@ class _Photometric(torch.autograd.Function):
         op: str,
     ) -> Tensor:
         planes, goal = _planar(op, image.detach(), target)
-        grad = torch.empty_like(planes) if ctx.needs_input_grad[0] else None
+        grad = scratch.empty(tuple(planes.shape), planes.dtype) if ctx.needs_input_grad[0] else None
         means = torch.empty(2, dtype=torch.float64)
         name = "photometric_u8" if goal.dtype == torch.uint8 else "photometric"
         channels, height, width = planes.shape

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
 from snowsplat.ops.splats import Splats2D, packed_width
@@ -118,11 +119,11 @@ class _Project(torch.autograd.Function):
         parameters = tuple(p.detach().contiguous() for p in parameters)
         means, sh_rest = parameters[0], parameters[5]
         camera = (cam_from_world, *intrinsics)
-        ids = torch.empty(len(means), dtype=torch.int32)
+        ids = scratch.empty((len(means),), torch.int32)
         cull = variant("project_cull", means)
         visible = launch(cull, len(means), *parameters[:4], *camera, ids)
-        ids = ids[:visible].clone()
-        packed = means.new_empty(visible, packed_width(3))
+        ids = ids[:visible]
+        packed = scratch.empty((visible, packed_width(3)), means.dtype)
         shape = (sh_rest.shape[1], sh_degree)
         launch(variant("project_fwd", means), visible, ids, *parameters, *shape, *camera, packed)
         ctx.mark_non_differentiable(ids)

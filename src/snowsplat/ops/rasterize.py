@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.scratch import Lease
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
 
 TILE = 16
@@ -56,11 +56,9 @@ class _Frame:
         count, stride = packed.shape
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         self.size, self.tiles = (width, height), tiles_x * tiles_y
-        self.lease = Lease()  # what the backward pass needs
-        passing = Lease()  # what is done with when this returns
         integers = torch.int32
-        keys = passing.empty(count, integers if packed.dtype == torch.float32 else torch.int64)
-        self.records = self.lease.empty(count * _RECORD_BYTES[packed.dtype], torch.uint8)
+        keys = scratch.empty((count,), integers if packed.dtype == torch.float32 else torch.int64)
+        self.records = scratch.empty((count * _RECORD_BYTES[packed.dtype],), torch.uint8)
         launch(
             variant("splats_prepare", packed),
             count,
@@ -72,20 +70,20 @@ class _Frame:
             self.records,
             keys,
         )
-        order = passing.empty(count, integers)
+        order = scratch.empty((count,), integers)
         launch(
             variant("splats_sort", packed),
             count,
             keys,
-            passing.empty(count, keys.dtype),
+            scratch.empty((count,), keys.dtype),
             order,
-            passing.empty(count, integers),
+            scratch.empty((count,), integers),
         )
         parts = launch("tiles_parts", count)
-        counts = passing.empty(parts * self.tiles, integers)
-        spans = passing.empty(count, torch.int64)
-        part_slots = passing.empty(parts, integers)
-        self.tile_start = self.lease.empty(self.tiles + 1, integers)
+        counts = scratch.empty((parts * self.tiles,), integers)
+        spans = scratch.empty((count,), torch.int64)
+        part_slots = scratch.empty((parts,), integers)
+        self.tile_start = scratch.empty((self.tiles + 1,), integers)
         binning = (order, self.records, tiles_x, tiles_y, parts, counts)
         self.instances = launch(
             variant("tiles_count", packed),
@@ -95,9 +93,9 @@ class _Frame:
             spans,
             part_slots,
         )
-        self.instance_splat = self.lease.empty(self.instances, integers)
-        self.instance_slot = self.lease.empty(self.instances, integers)
-        self.slot_range = self.lease.empty(2 * count, integers)
+        self.instance_splat = scratch.empty((self.instances,), integers)
+        self.instance_slot = scratch.empty((self.instances,), integers)
+        self.slot_range = scratch.empty((2 * count,), integers)
         launch(
             variant("tiles_fill", packed),
             count,
@@ -109,8 +107,8 @@ class _Frame:
             self.slot_range,
         )
         block_bytes = launch(variant("blend_block_bytes", packed), 0)
-        self.instance_blocks = self.lease.empty(self.instances * block_bytes, torch.uint8)
-        self.tile_end = self.lease.empty(self.tiles, integers)
+        self.instance_blocks = scratch.empty((self.instances * block_bytes,), torch.uint8)
+        self.tile_end = scratch.empty((self.tiles,), integers)
 
     def blend_args(self) -> tuple[int | Tensor, ...]:
         return (
@@ -149,8 +147,8 @@ class _Rasterize(torch.autograd.Function):
         groups = _channel_groups(channels, with_depth)
         count = channels + with_depth
         behind = torch.cat([background.detach(), packed.new_zeros(1)])  # nothing is behind depth
-        planes = packed.new_empty(count, height, width)
-        alpha = packed.new_empty(height, width)
+        planes = scratch.empty((count, height, width), packed.dtype)
+        alpha = scratch.empty((height, width), packed.dtype)
         frame = _Frame(packed, width, height, groups[0][1])
         for first, columns in groups:
             if first > 0:
@@ -176,14 +174,13 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, grad_planes: Tensor | None, grad_alpha: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         packed, planes, alpha = ctx.saved_tensors
-        frame, (count, height, width) = ctx.frame, planes.shape
+        frame, count = ctx.frame, len(planes)
         if grad_planes is None:
             grad_planes = torch.zeros_like(planes)
         grad_planes = grad_planes.contiguous()
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-        grad_packed = torch.empty_like(packed)
-        lease = Lease()
-        slots = lease.empty(frame.instances * _SLOT, packed.dtype)
+        grad_packed = scratch.empty(tuple(packed.shape), packed.dtype)
+        slots = scratch.empty((frame.instances, _SLOT), packed.dtype)
         for first, columns in ctx.groups:
             if len(ctx.groups) > 1:
                 _recolor(frame, packed, columns)

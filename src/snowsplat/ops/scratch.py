@@ -1,48 +1,89 @@
-"""Scratch memory that is used again.
+"""Memory that is used again: `empty` hands out tensors from a pool of blocks.
 
-A frame needs the same few large arrays every time. Fresh memory from the operating system costs a
-page fault every 4 kB, at 1080p more than the sorting it is for, so blocks are kept and handed out
-again as soon as nothing refers to the lease they went out with.
+Every frame needs the same few large arrays. Fresh memory from the operating system costs a page
+fault every 4 kB, in sum more than the sorting it is for, so a block goes back to the pool when the
+last tensor that uses it is gone, and serves the next frame. Large blocks ask for huge pages.
 """
 
 from __future__ import annotations
 
+import mmap
 import threading
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-_free: list[Tensor] = []
+_HUGE = 2 << 20  # bytes of a huge page
+_PAGE = 4096
+_KEEP = 24  # free blocks; more than a frame forward and backward needs
+# Blocks begin at different places of a page. Where a value and its moments lie a multiple of 4 kB
+# apart, a load has to wait for a store that only looks like the same address.
+_STAGGER = 17 * 64
+
+_free: list[np.ndarray] = []
+_made = 0  # blocks so far
 _lock = threading.Lock()
-_KEEP = 16  # free blocks; more than one frame in flight needs at once
 
 
-class Lease:
-    """A set of scratch tensors; they go back to the pool when the lease is dropped."""
+class _Loan(np.ndarray):
+    """A block on loan to a tensor, which holds a reference to this; returns it when dropped."""
 
-    def __init__(self) -> None:
-        self._blocks: list[Tensor] = []
+    block: np.ndarray | None = None
 
-    def empty(self, count: int, dtype: torch.dtype) -> Tensor:
-        """An uninitialised 1-D tensor of `count` elements, 64-byte aligned."""
-        size = count * dtype.itemsize
-        block = _take(size)
-        self._blocks.append(block)
-        return block[:size].view(dtype)
+    def __array_finalize__(self, source: Any) -> None:
+        self.block = None  # a view of a loan is not a loan
 
     def __del__(self) -> None:
+        if self.block is None:
+            return
         with _lock:
-            _free.extend(self._blocks)
+            _free.append(self.block)
             _free.sort(key=len)
             # The smallest go first: they are the cheapest to make again.
             del _free[: max(0, len(_free) - _KEEP)]
 
 
-def _take(size: int) -> Tensor:
+def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """An uninitialised contiguous CPU tensor, 64-byte aligned."""
+    size = dtype.itemsize
+    for extent in shape:
+        size *= extent
+    if size < _PAGE:
+        return torch.empty(shape, dtype=dtype)
+    block = _take(size)
+    loan = block[:size].view(_Loan)
+    loan.block = block
+    return torch.from_numpy(loan).view(dtype).view(shape)
+
+
+def _take(size: int) -> np.ndarray:
     """The smallest free block that holds `size` bytes and is not several times too large."""
     with _lock:
         for i, block in enumerate(_free):
-            if size <= len(block) <= 4 * size + 4096:
+            if size <= len(block) <= 4 * size + _HUGE:
                 return _free.pop(i)
     # A quarter more than asked for, so that a growing scene does not need a new block every frame.
-    return torch.empty(size + size // 4 + 4096, dtype=torch.uint8)
+    return _make(size + size // 4)
+
+
+def _make(size: int) -> np.ndarray:
+    """A new block of at least `size` bytes."""
+    global _made
+    _made += 1
+    unit = _PAGE if size < _HUGE else _HUGE
+    pages = mmap.mmap(-1, -(-(size + _PAGE) // unit) * unit + unit)
+    if unit == _HUGE and hasattr(mmap, "MADV_HUGEPAGE"):
+        pages.madvise(mmap.MADV_HUGEPAGE)
+    memory = np.frombuffer(pages, dtype=np.uint8)
+    start = -memory.ctypes.data % unit + _made * _STAGGER % _PAGE
+    return memory[start : len(memory) - _PAGE]
+
+
+def take_rows(tensor: Tensor, index: Tensor) -> Tensor:
+    """`tensor[index]` along the first dimension, in a block of this pool."""
+    if tensor.requires_grad or tensor.device.type != "cpu" or index.dtype == torch.bool:
+        return tensor[index]
+    rows = empty((len(index), *tensor.shape[1:]), tensor.dtype)
+    return torch.index_select(tensor, 0, index, out=rows)

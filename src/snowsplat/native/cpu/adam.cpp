@@ -35,31 +35,29 @@ struct AdamRule {
   }
 };
 
-// K columns (few) of W rows, in lanes.
-template <int K, class V, class T = typename V::Scalar>
-SNOW_INLINE void update_lanes(const AdamRule<V>& rule, const AdamTensor<T>& t,
-                              const RowIndex<V::width>& rows, V* g) {
-  T *value[V::width], *pm[V::width], *pv[V::width];
-  V p[K + 3], m[K + 3], v[K + 3];
-  rows.pointers(t.value, K, value), gather_rows<K>(value, p);
-  rows.pointers(t.m, K, pm), gather_rows<K>(pm, m);
-  rows.pointers(t.v, K, pv), gather_rows<K>(pv, v);
+// A few columns (at most four) of W rows, in lanes.
+template <class V, class T = typename V::Scalar>
+__attribute__((noinline)) void update_lanes(const AdamRule<V>& rule, const AdamTensor<T>& t,
+                                            const RowIndex<V::width>& rows, V* g) {
+  const int columns = int(t.stride);
+  V p[4], m[4], v[4], extra[4];
+  gather_rows(t.value, t.stride, rows.row, columns, p);
+  gather_rows(t.m, t.stride, rows.row, columns, m);
+  gather_rows(t.v, t.stride, rows.row, columns, v);
   if (t.extra) {
-    const T* pe[V::width];
-    V e[K + 3];
-    rows.pointers(t.extra, K, pe), gather_rows<K>(pe, e);
-    for (int k = 0; k < K; k++) g[k] += e[k];
+    gather_rows(t.extra, t.stride, rows.row, columns, extra);
+    for (int k = 0; k < columns; k++) g[k] += extra[k];
   }
-  for (int k = 0; k < K; k++) rule.step(g[k], m[k], v[k], p[k], V(t.rate));
-  scatter_rows<K>(value, p, rows.count);
-  scatter_rows<K>(pm, m, rows.count);
-  scatter_rows<K>(pv, v, rows.count);
+  for (int k = 0; k < columns; k++) rule.step(g[k], m[k], v[k], p[k], V(t.rate));
+  scatter_rows(t.value, t.stride, rows.row, rows.count, columns, p);
+  scatter_rows(t.m, t.stride, rows.row, rows.count, columns, m);
+  scatter_rows(t.v, t.stride, rows.row, rows.count, columns, v);
 }
 
 // `columns` (many) of one row, contiguous; g may be null (zero gradient).
 template <class V, class T = typename V::Scalar>
-SNOW_INLINE void update_row(const AdamRule<V>& rule, const AdamTensor<T>& t, int64_t row,
-                            int columns, const T* g) {
+__attribute__((noinline)) void update_row(const AdamRule<V>& rule, const AdamTensor<T>& t,
+                                          int64_t row, int columns, const T* g) {
   T *value = t.value + row * t.stride, *m = t.m + row * t.stride, *v = t.v + row * t.stride;
   const T* extra = t.extra ? t.extra + row * t.stride : nullptr;
   for (int c = 0; c < columns; c += V::width) {
@@ -79,12 +77,27 @@ SNOW_INLINE void update_row(const AdamRule<V>& rule, const AdamTensor<T>& t, int
   }
 }
 
+// Visible rows have gaps between them that the hardware does not foresee.
+template <int W, class T>
+__attribute__((noinline)) void prefetch_rows(const RowIndex<W>& rows, const AdamTensor<T>* t,
+                                             int rest_columns) {
+  for (int l = 0; l < rows.count; l++) {
+    for (int k = 0; k < 5; k++) {
+      const int64_t at = rows.row[l] * t[k].stride;
+      prefetch(t[k].value + at), prefetch(t[k].m + at), prefetch(t[k].v + at);
+    }
+    const int64_t at = rows.row[l] * t[5].stride;
+    for (int c = 0; c < rest_columns; c += 16)
+      prefetch(t[5].value + at + c), prefetch(t[5].m + at + c), prefetch(t[5].v + at + c);
+  }
+}
+
 template <class V, class T = typename V::Scalar>
 void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, int degree,
           const PinholeCamera<T>& cam, const T* grad_packed, const AdamTensor<T>* t,
           const AdamRule<V>& rule, bool visible_only) {
   constexpr int W = V::width;
-  const int sh_columns = 3 * ((degree + 1) * (degree + 1) - 1);
+  const int rest_columns = sh_columns(degree);
   // Tasks are ranges of Gaussians, each with the splats that came from it: ids ascend.
   const int64_t units = visible_only ? m : n;
   parallel_for((units + kBlock - 1) / kBlock, [&](int64_t block) {
@@ -97,22 +110,23 @@ void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& te
     for (int64_t i = first; i < last; i += W) {
       GaussianGroup<V> g;
       g.rows = RowIndex<W>::of(ids, i, last);
-      g.load_shape(tensors);
-      g.load_sh(tensors, degree);
+      g.load(tensors, degree);
+      if (i + W < last) prefetch_rows(RowIndex<W>::of(ids, i + W, last), t, rest_columns);
       GaussianGroupGradient<V> d;
       group_vjp<V>(g, cam, degree, grad_packed, i, last, d, nullptr, nullptr);
-      update_lanes<3>(rule, t[0], g.rows, d.shape.mean);
-      update_lanes<3>(rule, t[1], g.rows, d.shape.log_scale);
-      update_lanes<4>(rule, t[2], g.rows, d.shape.quat);
-      update_lanes<1>(rule, t[3], g.rows, &d.shape.opacity_logit);
-      update_lanes<3>(rule, t[4], g.rows, d.dc);
+      V* small[5] = {d.shape.mean, d.shape.log_scale, d.shape.quat, &d.shape.opacity_logit, d.dc};
+      for (int k = 0; k < 5; k++) update_lanes(rule, t[k], g.rows, small[k]);
       if (degree > 0) {
-        alignas(64) T by_row[W][48] = {};
-        T* p[W];
-        for (int l = 0; l < W; l++) p[l] = by_row[l];
-        scatter_rows_n(p, sh_columns, d.rest, W);
-        for (int l = 0; l < g.rows.count; l++)
-          update_row(rule, t[5], g.rows.row[l], sh_columns, by_row[l]);
+        alignas(64) T by_row[W][48];
+        int64_t lane[W];
+        for (int l = 0; l < W; l++) lane[l] = l;
+        scatter_rows(by_row[0], 48, lane, W, rest_columns, d.rest);
+        // Not in order: a row's masked last store overlaps the first load of the row after it, which
+        // would wait for the store to reach the cache.
+        for (int k = 0; k < W; k++) {
+          const int l = k * 5 % W;
+          if (l < g.rows.count) update_row(rule, t[5], g.rows.row[l], rest_columns, by_row[l]);
+        }
       }
     }
     if (visible_only) return;
@@ -122,7 +136,7 @@ void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& te
         continue;
       }
       for (int k = 0; k < 5; k++) update_row(rule, t[k], row, int(t[k].stride), (const T*)nullptr);
-      if (degree > 0) update_row(rule, t[5], row, sh_columns, (const T*)nullptr);
+      if (degree > 0) update_row(rule, t[5], row, rest_columns, (const T*)nullptr);
     }
   });
 }

@@ -34,11 +34,11 @@ struct RowIndex {
     }
     return r;
   }
-  template <class P>
-  SNOW_INLINE void pointers(P* base, int64_t stride, P** out) const {
-    for (int l = 0; l < W; l++) out[l] = base + row[l] * stride;
-  }
+  static RowIndex contiguous(int64_t first, int64_t end) { return of(nullptr, first, end); }
 };
+
+// Active columns of sh_rest.
+SNOW_INLINE int sh_columns(int degree) { return 3 * ((degree + 1) * (degree + 1) - 1); }
 
 template <class V>
 struct GaussianGroup {
@@ -48,20 +48,18 @@ struct GaussianGroup {
   GaussianShape<V> shape;
   V dc[3], rest[3 * (kMaxShCoefficients - 1) + 1];
 
-  SNOW_INLINE void load_shape(const GaussianTensors<T>& g) {
-    const T* p[W];
-    rows.pointers(g.means, 3, p), gather_rows<3>(p, shape.mean);
-    rows.pointers(g.log_scales, 3, p), gather_rows<3>(p, shape.log_scale);
-    rows.pointers(g.quats, 4, p), gather_rows<4>(p, shape.quat);
-    rows.pointers(g.opacity_logits, 1, p), gather_rows<1>(p, &shape.opacity_logit);
+  SNOW_INLINE void load_position(const GaussianTensors<T>& g) {
+    gather_rows(g.means, 3, rows.row, 3, shape.mean);
+    gather_rows(g.log_scales, 3, rows.row, 3, shape.log_scale);
   }
-  SNOW_INLINE void load_sh(const GaussianTensors<T>& g, int degree) {
-    const T* p[W];
-    rows.pointers(g.sh_dc, 3, p), gather_rows<3>(p, dc);
-    if (degree > 0) {
-      rows.pointers(g.sh_rest, 3 * g.sh_rest_rows, p);
-      gather_rows_n(p, 3 * ((degree + 1) * (degree + 1) - 1), rest);
-    }
+  SNOW_INLINE void load_orientation(const GaussianTensors<T>& g) {
+    gather_rows(g.quats, 4, rows.row, 4, shape.quat);
+    gather_rows(g.opacity_logits, 1, rows.row, 1, &shape.opacity_logit);
+  }
+  SNOW_INLINE void load(const GaussianTensors<T>& g, int degree) {
+    load_position(g), load_orientation(g);
+    gather_rows(g.sh_dc, 3, rows.row, 3, dc);
+    gather_rows(g.sh_rest, 3 * g.sh_rest_rows, rows.row, sh_columns(degree), rest);
   }
 };
 
@@ -77,10 +75,9 @@ template <class V, class T = typename V::Scalar>
 SNOW_INLINE void group_vjp(const GaussianGroup<V>& g, const PinholeCamera<T>& cam, int degree,
                            const T* grad_packed, int64_t first, int64_t end,
                            GaussianGroupGradient<V>& out, PoseGradient<V>* pose, V* position) {
-  const T* p[V::width];
-  RowIndex<V::width>::of(nullptr, first, end).pointers(grad_packed, kPackedStride, p);
   V column[12], d_mean[3];
-  gather_rows<12>(p, column);
+  const auto splats = RowIndex<V::width>::contiguous(first, end);
+  gather_rows(grad_packed, kPackedStride, splats.row, 12, column);
   const SplatGradient<V> d = {
       {column[0], column[1]}, {column[2], column[3], column[4]}, column[5], column[6]};
   ProjectedGaussian<V> projected;

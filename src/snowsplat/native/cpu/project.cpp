@@ -55,13 +55,10 @@ int64_t cull(int64_t n, const GaussianTensors<T>& tensors, const PinholeCamera<T
     int32_t* out = ids + begin;
     for (int64_t i = begin; i < end; i += W) {
       GaussianGroup<V> g;
-      g.rows = RowIndex<W>::of(nullptr, i, end);
-      const T* p[W];
-      g.rows.pointers(tensors.means, 3, p), gather_rows<3>(p, g.shape.mean);
-      g.rows.pointers(tensors.log_scales, 3, p), gather_rows<3>(p, g.shape.log_scale);
+      g.rows = RowIndex<W>::contiguous(i, end);
+      g.load_position(tensors);
       if (!V::bits(may_touch_image(g.shape, cam))) continue;
-      g.rows.pointers(tensors.quats, 4, p), gather_rows<4>(p, g.shape.quat);
-      g.rows.pointers(tensors.opacity_logits, 1, p), gather_rows<1>(p, &g.shape.opacity_logit);
+      g.load_orientation(tensors);
       ProjectedGaussian<V> projected;
       project_gaussian(g.shape, cam, projected);
       uint32_t bits = V::bits(is_visible(projected, cam) & V::first(g.rows.count));
@@ -86,8 +83,7 @@ void forward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, i
     for (int64_t i = begin; i < end; i += W) {
       GaussianGroup<V> g;
       g.rows = RowIndex<W>::of(ids, i, end);
-      g.load_shape(tensors);
-      g.load_sh(tensors, degree);
+      g.load(tensors, degree);
       ProjectedGaussian<V> p;
       project_gaussian(g.shape, cam, p);
       V column[kPackedStride], *color = column + kPackedHeader;
@@ -100,9 +96,8 @@ void forward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, i
       column[7] = V(3.f) * sqrt(mid + sqrt(dif * dif + p.cov_xy * p.cov_xy));
       for (int k = 0; k < 3; k++) color[k] = max(color[k], V(0.f));
       for (int k = kPackedHeader + 3; k < kPackedStride; k++) column[k] = V(0.f);
-      T* out[W];
-      RowIndex<W>::of(nullptr, i, end).pointers(packed, kPackedStride, out);
-      scatter_rows<kPackedStride>(out, column, g.rows.count);
+      const auto splats = RowIndex<W>::contiguous(i, end);
+      scatter_rows(packed, kPackedStride, splats.row, splats.count, kPackedStride, column);
     }
   });
 }
@@ -124,25 +119,20 @@ void backward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, 
     for (int64_t i = begin; i < end; i += W) {
       GaussianGroup<V> g;
       g.rows = RowIndex<W>::of(ids, i, end);
-      g.load_shape(tensors);
-      g.load_sh(tensors, degree);
+      g.load(tensors, degree);
       GaussianGroupGradient<V> d;
       PoseGradient<V> dpose;
       V dposition[3];
       group_vjp(g, cam, degree, grad_packed, i, end, d, pose ? &dpose : nullptr,
                 pose ? dposition : nullptr);
-      T* p[W];
+      const int64_t* row = g.rows.row;
       const int count = g.rows.count;
-      g.rows.pointers(grads.means, 3, p), scatter_rows<3>(p, d.shape.mean, count);
-      g.rows.pointers(grads.log_scales, 3, p), scatter_rows<3>(p, d.shape.log_scale, count);
-      g.rows.pointers(grads.quats, 4, p), scatter_rows<4>(p, d.shape.quat, count);
-      g.rows.pointers(grads.opacity_logits, 1, p);
-      scatter_rows<1>(p, &d.shape.opacity_logit, count);
-      g.rows.pointers(grads.sh_dc, 3, p), scatter_rows<3>(p, d.dc, count);
-      if (degree > 0) {
-        g.rows.pointers(grads.sh_rest, 3 * tensors.sh_rest_rows, p);
-        scatter_rows_n(p, 3 * ((degree + 1) * (degree + 1) - 1), d.rest, count);
-      }
+      scatter_rows(grads.means, 3, row, count, 3, d.shape.mean);
+      scatter_rows(grads.log_scales, 3, row, count, 3, d.shape.log_scale);
+      scatter_rows(grads.quats, 4, row, count, 4, d.shape.quat);
+      scatter_rows(grads.opacity_logits, 1, row, count, 1, &d.shape.opacity_logit);
+      scatter_rows(grads.sh_dc, 3, row, count, 3, d.dc);
+      scatter_rows(grads.sh_rest, 3 * tensors.sh_rest_rows, row, count, sh_columns(degree), d.rest);
       if (pose) {
         for (int l = 0; l < count; l++) {
           for (int k = 0; k < 9; k++) sums[k] += double(dpose.rotation[k].v[l]);

@@ -54,10 +54,10 @@ void prepare(int64_t m, const T* packed, int64_t stride, double width, double he
     const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
     for (int64_t i = begin; i < end; i += W) {
       const int count = end - i < W ? int(end - i) : W;
-      const T* p[W];
-      for (int l = 0; l < W; l++) p[l] = packed + (i + (l < count ? l : count - 1)) * stride;
+      int64_t row[W];
+      for (int l = 0; l < W; l++) row[l] = i + (l < count ? l : count - 1);
       V c[8];
-      gather_rows<7>(p, c);
+      gather_rows(packed, stride, row, 7, c);
       c[7] = V(0.f);
       const V det = c[2] * c[4] - c[3] * c[3];
       const V k2 = V(2 * kLn2) * (log2(c[5]) - V(kLog2MinAlpha));
@@ -70,20 +70,19 @@ void prepare(int64_t m, const T* packed, int64_t stride, double width, double he
           V::bits((k2 >= V(0.f)) & (det > V(0.f)) & (c[2] > V(0.f)) & (x1 >= x0) & (y1 >= y0));
       const SplatTerms<V> t = splat_terms(c[0], c[1], c + 2, c[5]);
       V terms[8] = {t.mean_x, t.mean_y, t.A, t.B, t.C, t.log2_opacity, t.slope_x, t.slope_y};
-      T* out[W];
-      for (int l = 0; l < W; l++) out[l] = (T*)(records + i + (l < count ? l : 0));
-      scatter_rows<8>(out, terms, count);
+      constexpr int64_t record = sizeof(SplatRecord<T>) / sizeof(T);
+      scatter_rows((T*)records, record, row, count, 8, terms);
       alignas(64) T rect[4][W];
       x0.store(rect[0]), y0.store(rect[1]), x1.store(rect[2]), y1.store(rect[3]);
       for (int l = 0; l < count; l++) {
         SplatRecord<T>& r = records[i + l];
-        set_colors(r, p[l], columns);
+        set_colors(r, packed + (i + l) * stride, columns);
         const bool on = seen >> l & 1;
         r.tile_x0 = on ? uint16_t(int(rect[0][l]) / kTile) : 1;
         r.tile_y0 = on ? uint16_t(int(rect[1][l]) / kTile) : 1;
         r.tile_x1 = on ? uint16_t(int(rect[2][l]) / kTile) : 0;
         r.tile_y1 = on ? uint16_t(int(rect[3][l]) / kTile) : 0;
-        keys[i + l] = ordered_bits(p[l][6]);
+        keys[i + l] = ordered_bits(packed[(i + l) * stride + 6]);
       }
     }
   });
@@ -298,7 +297,10 @@ void reduce(int64_t m, const T* slots, const uint32_t* slot_range, const T* pack
   parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
     const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
     for (int64_t i = begin; i < end; i++) {
-      if (i + 8 < end) prefetch(slots + int64_t(slot_range[2 * (i + 8)]) * kSlotWidth);
+      if (i + 8 < end) {
+        const T* next = slots + int64_t(slot_range[2 * (i + 8)]) * kSlotWidth;
+        for (int k = 0; k < 4; k++) prefetch(next + k * kSlotWidth);
+      }
       V sum[kVectors];
       for (int k = 0; k < kVectors; k++) sum[k] = V(0.f);
       for (int64_t s = slot_range[2 * i]; s < slot_range[2 * i + 1]; s++)
@@ -307,20 +309,16 @@ void reduce(int64_t m, const T* slots, const uint32_t* slot_range, const T* pack
       for (int k = 0; k < kVectors; k++) sum[k].store(total + k * W);
       const T *row = packed + i * stride, *q = total + base;
       T* g = grad + i * stride;
-      T d_mean[2], d_conic[3], d_opacity = 0;
-      const bool drawn = slot_range[2 * i] < slot_range[2 * i + 1];
-      splat_terms_vjp<T>(row + 2, drawn ? row[5] : T(1), {q[0], q[1], q[2], q[3], q[4], q[5]},
-                         d_mean, d_conic, d_opacity);
-      if (!add) {
-        for (int64_t k = 0; k < stride; k++) g[k] = 0;
-      }
-      if (drawn) {
-        g[0] += d_mean[0], g[1] += d_mean[1];
-        for (int k = 0; k < 3; k++) g[2 + k] += d_conic[k];
-        g[5] += d_opacity;
-        for (int k = 0; k < channels; k++)
-          if (columns[k] >= 0) g[columns[k]] += total[k];
-      }
+      if (!add)
+        for (int64_t k = 0; k < stride; k += W) V(0.f).store(g + k);
+      if (slot_range[2 * i] == slot_range[2 * i + 1]) continue;
+      T d_mean[2], d_conic[3], d_opacity;
+      splat_terms_vjp<T>(row + 2, row[5], {q[0], q[1], q[2], q[3], q[4], q[5]}, d_mean, d_conic,
+                         d_opacity);
+      g[0] += d_mean[0], g[1] += d_mean[1];
+      g[2] += d_conic[0], g[3] += d_conic[1], g[4] += d_conic[2];
+      g[5] += d_opacity;
+      for (int k = 0; k < channels; k++) g[columns[k]] += total[k];
     }
   });
 }
