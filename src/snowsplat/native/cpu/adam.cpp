@@ -78,17 +78,12 @@ __attribute__((noinline)) void update_row(const AdamRule<V>& rule, const AdamTen
 }
 
 // Visible rows have gaps between them that the hardware does not foresee.
-template <int W, class T>
-__attribute__((noinline)) void prefetch_rows(const RowIndex<W>& rows, const AdamTensor<T>* t,
-                                             int rest_columns) {
-  for (int l = 0; l < rows.count; l++) {
-    for (int k = 0; k < 5; k++) {
-      const int64_t at = rows.row[l] * t[k].stride;
-      prefetch(t[k].value + at), prefetch(t[k].m + at), prefetch(t[k].v + at);
-    }
-    const int64_t at = rows.row[l] * t[5].stride;
-    for (int c = 0; c < rest_columns; c += 16)
-      prefetch(t[5].value + at + c), prefetch(t[5].m + at + c), prefetch(t[5].v + at + c);
+template <class T>
+SNOW_INLINE void prefetch_row(int64_t row, const AdamTensor<T>* t, int rest_columns) {
+  for (int k = 0; k < kParameters; k++) {
+    const int64_t at = row * t[k].stride;
+    for (int c = 0; c < (k < 5 ? 1 : rest_columns); c += 16)
+      prefetch(t[k].value + at + c), prefetch(t[k].m + at + c), prefetch(t[k].v + at + c);
   }
 }
 
@@ -111,22 +106,17 @@ void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& te
       GaussianGroup<V> g;
       g.rows = RowIndex<W>::of(ids, i, last);
       g.load(tensors, degree);
-      if (i + W < last) prefetch_rows(RowIndex<W>::of(ids, i + W, last), t, rest_columns);
       GaussianGroupGradient<V> d;
       group_vjp<V>(g, cam, degree, grad_packed, i, last, d, nullptr, nullptr);
       V* small[5] = {d.shape.mean, d.shape.log_scale, d.shape.quat, &d.shape.opacity_logit, d.dc};
       for (int k = 0; k < 5; k++) update_lanes(rule, t[k], g.rows, small[k]);
-      if (degree > 0) {
-        alignas(64) T by_row[W][48];
-        int64_t lane[W];
-        for (int l = 0; l < W; l++) lane[l] = l;
-        scatter_rows(by_row[0], 48, lane, W, rest_columns, d.rest);
-        // Not in order: a row's masked last store overlaps the first load of the row after it, which
-        // would wait for the store to reach the cache.
-        for (int k = 0; k < W; k++) {
-          const int l = k * 5 % W;
-          if (l < g.rows.count) update_row(rule, t[5], g.rows.row[l], rest_columns, by_row[l]);
-        }
+      alignas(64) T by_row[W][48];
+      int64_t lane[W];
+      for (int l = 0; l < W; l++) lane[l] = l;
+      scatter_rows(by_row[0], 48, lane, W, rest_columns, d.rest);
+      for (int k = 0; k < g.rows.count; k++) {
+        if (i + W + k < last) prefetch_row(ids[i + W + k], t, rest_columns);
+        if (degree > 0) update_row(rule, t[5], g.rows.row[k], rest_columns, by_row[k]);
       }
     }
     if (visible_only) return;
