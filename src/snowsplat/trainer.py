@@ -20,9 +20,9 @@ from snowsplat.errors import UserError
 from snowsplat.evaluate import Evaluation, evaluate_views
 from snowsplat.gaussians import Gaussians
 from snowsplat.losses import view_loss
-from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam
 from snowsplat.process import interrupts_between_steps, single_threaded
+from snowsplat.render import project
 
 __all__ = ["Progress", "TrainConfig", "Trainer"]
 
@@ -145,7 +145,7 @@ class Trainer:
                 background = torch.rand(3, generator=self._generators["background"])
             sh_degree = self.config.sh_degree_at(step)
 
-            splats = self._project(camera, sh_degree)
+            splats = project(self.gaussians, camera, sh_degree)
             with torch.enable_grad():  # of the splats; the optimiser carries it on to the Gaussians
                 splats.packed.requires_grad_()
                 image, _, _ = ops.rasterize(splats, camera.width, camera.height, background)
@@ -183,19 +183,6 @@ class Trainer:
 
     def _prefetch(self, downscale: int) -> None:
         self._images.prefetch([self.capture.train[i] for i in self._order], downscale)
-
-    def _project(self, camera: Camera, sh_degree: int) -> Splats2D:
-        return ops.project(
-            **self.gaussians.parameters(),
-            cam_from_world=camera.cam_from_world,
-            width=camera.width,
-            height=camera.height,
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
-            sh_degree=sh_degree,
-        )
 
     def state_tensors(self) -> dict[str, Tensor]:
         """All that the steps to come depend on, beside capture and config. Not copied."""

@@ -11,7 +11,7 @@ FLOATS = (torch.float32, torch.float64)
 def check_tensor(
     op: str, name: str, tensor: Tensor, shape: tuple[int | None, ...], like: Tensor
 ) -> None:
-    """Raises ValueError unless `tensor` has `shape` (None: any) and the dtype and device of `like`."""
+    """Raises ValueError unless `tensor` has `shape` (None: any), and dtype and device of `like`."""
     if tensor.dim() != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, tensor.shape, strict=True)
     ):

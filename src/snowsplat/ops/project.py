@@ -118,7 +118,7 @@ class _Project(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         parameters = tuple(p.detach().contiguous() for p in parameters)
         means, sh_rest = parameters[0], parameters[5]
-        camera = (cam_from_world, *intrinsics)
+        camera: tuple[Tensor | float, ...] = (cam_from_world, *intrinsics)
         ids = scratch.empty((len(means),), torch.int32)
         cull = variant("project_cull", means)
         visible = launch(cull, len(means), *parameters[:4], *camera, ids)
