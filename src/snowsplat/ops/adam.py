@@ -65,7 +65,9 @@ def adam_step(
         if missing:
             raise ValueError(f"adam_step: {what} lacks {', '.join(missing)}")
     tensors = [params[name] for name in PARAMETERS]
-    check_parameters("adam_step", **dict(zip(PARAMETERS, tensors, strict=True)), sh_degree=sh_degree)
+    check_parameters(
+        "adam_step", **dict(zip(PARAMETERS, tensors, strict=True)), sh_degree=sh_degree
+    )
     means = tensors[0]
     check_tensor("adam_step", "packed_grad", packed_grad, (len(ids), packed_width(3)), means)
     if ids.dtype != torch.int32 or ids.device != means.device:
