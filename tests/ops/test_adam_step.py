@@ -154,7 +154,7 @@ def test_native_is_the_twin(
         assert_close(change, wanted_change, native.backward, f"change of {name}")
 
 
-@pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 17, 33, 300])
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 17, 33, 300, 5000])
 def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
     states = [Optimised(v, random_scene(50 + count, count)) for v in (TWIN, native)]
     before = states[0].copy()
@@ -224,6 +224,19 @@ def test_rows_of_inactive_degrees_are_left_alone(variant: Variant, degree: int) 
         tensor = state.tensors()[name]
         assert torch.equal(tensor[:, active:], before[name][:, active:]), name
         assert active == 0 or not torch.equal(tensor[:, :active], before[name][:, :active])
+
+
+def test_gradient_of_a_regulariser_is_added(variant: Variant) -> None:
+    """Alone, it moves every value by its rate against its sign, visible or not."""
+    state = Optimised(variant, random_scene(8, 20), fresh=True)
+    before = state.copy()
+    for p in state.params.values():
+        p.grad = normal(generator(3), *p.shape).to(p)
+    state.step(torch.zeros(len(state.visible()), 16))
+    for name, p in state.params.items():
+        assert p.grad is not None
+        assert_close(p - before[name], -RATES[name] * p.grad.sign(), 1e-4, name)
+        assert_close(state.m[name], 0.1 * p.grad, 1e-6, name)
 
 
 def test_nothing_visible(variant: Variant) -> None:

@@ -65,12 +65,13 @@ def test_project(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize("channels", [3, 5])
-def test_rasterize(dtype: torch.dtype, channels: int) -> None:
+@pytest.mark.parametrize(("channels", "count"), [(3, 3000), (5, 3000), (3, 60_000)])
+def test_rasterize(dtype: torch.dtype, channels: int, count: int) -> None:
     results = []
     for threads in THREADS:
         ops.set_num_threads(threads)
-        splats = leaf_splats(random_splats(2, 3000, WIDTH, HEIGHT, channels), dtype)
+        made = random_splats(2, count, WIDTH, HEIGHT, channels, pixels=1.0)
+        splats = leaf_splats(made, dtype)
         background = uniform(generator(3), 0, 1, channels).to(dtype).requires_grad_()
         image, alpha, depth = ops.rasterize(splats, WIDTH, HEIGHT, background, with_depth=True)
         outputs = {"image": image, "alpha": alpha, "depth": depth}

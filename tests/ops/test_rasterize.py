@@ -323,6 +323,13 @@ def test_native_is_the_twin_for_needles(native: Variant) -> None:
     compare(native, splats, 40, 40)
 
 
+def test_native_is_the_twin_for_tens_of_thousands(native: Variant) -> None:
+    """So many that they are sorted in parallel; some depths are equal."""
+    splats = random_splats(14, 60_000, 128, 96, pixels=0.4)
+    assert len(splats.depths.unique()) < 60_000
+    compare(native, splats, 128, 96, with_depth=False)
+
+
 def test_native_is_the_twin_from_gaussian_to_pixel(native: Variant) -> None:
     scene = random_scene(21, 120)
     background = torch.tensor([0.1, 0.9, 0.4], dtype=torch.float64)
