@@ -109,6 +109,27 @@ struct BlockLists {
   }
   SNOW_INLINE void finish() {}
 };
+#if defined(__AVX2__)
+template <>
+struct BlockLists<Simd<float, 8>> {
+  uint64_t list[32];
+  alignas(32) uint8_t plane[4][kChunk] = {};  // byte p of the block bits of each splat
+  SNOW_INLINE void add(int splat, uint64_t blocks) {
+    for (int p = 0; p < 4; p++) plane[p][splat] = uint8_t(blocks >> (8 * p));
+  }
+  SNOW_INLINE void finish() {
+    for (int p = 0; p < 4; p++) {
+      __m256i low = _mm256_load_si256((const __m256i*)plane[p]);
+      __m256i high = _mm256_load_si256((const __m256i*)(plane[p] + 32));
+      for (int bit = 7; bit >= 0; bit--) {  // the top bit of each byte, then shift
+        list[8 * p + bit] = uint64_t(uint32_t(_mm256_movemask_epi8(low))) |
+                            uint64_t(uint32_t(_mm256_movemask_epi8(high))) << 32;
+        low = _mm256_add_epi8(low, low), high = _mm256_add_epi8(high, high);
+      }
+    }
+  }
+};
+#endif
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 template <>
 struct BlockLists<Simd<float, 16>> {
