@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import torch
 
 from snowsplat import __version__
 from snowsplat.ops import native
@@ -59,10 +60,10 @@ def test_wheel_works_out_of_the_checkout(wheel, tmp_path):
         "import snowsplat; from snowsplat.ops import native; native.set_num_threads(1);"
         "print(snowsplat.__file__, snowsplat.__version__, native.isa())"
     )
+    # Without -S the environment's editable install of the checkout would come first.
     clean = {k: v for k, v in os.environ.items() if not k.startswith("SNOWSPLAT_")}
-    result = run(
-        sys.executable, "-c", code, cwd=tmp_path, env=clean | {"PYTHONPATH": str(tmp_path)}
-    )
+    clean["PYTHONPATH"] = os.pathsep.join(map(str, (tmp_path, Path(torch.__file__).parents[1])))
+    result = run(sys.executable, "-S", "-c", code, cwd=tmp_path, env=clean)
     file = tmp_path / "snowsplat" / "__init__.py"
     assert result.stdout.split() == [str(file), __version__, native.available_isas()[-1]]
 
