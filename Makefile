@@ -79,10 +79,9 @@ layers: $(ENVIRONMENT)
 # All tests on the best instruction set, then those of the ops on each of the others.
 pytest: native
 	$(PYTHON) -m pytest
-	@$(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])' \
-	    | tr ' ' '\n' | while read -r isa; do \
-	        test -z "$$isa" && continue; \
-	        echo "SNOWSPLAT_ISA=$$isa pytest tests/ops"; \
+	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
+	    for isa in $$isas; do \
+	        echo "SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops"; \
 	        SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops || exit 1; \
 	    done
 
