@@ -93,7 +93,9 @@ void forward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, i
       column[5] = p.opacity, column[6] = p.z;
       // Larger eigenvalue of Σ': mean of the diagonal + sqrt(half difference² + off-diagonal²).
       V mid = V(0.5f) * (p.cov_xx + p.cov_yy), dif = V(0.5f) * (p.cov_xx - p.cov_yy);
-      column[7] = V(3.f) * sqrt(mid + sqrt(dif * dif + p.cov_xy * p.cov_xy));
+      dif = dif / mid;  // relative to the mean, since the squares would overflow
+      V off = p.cov_xy / mid;
+      column[7] = V(3.f) * sqrt(mid + mid * sqrt(dif * dif + off * off));
       for (int k = 0; k < 3; k++) color[k] = max(color[k], V(0.f));
       for (int k = kPackedHeader + 3; k < kPackedStride; k++) column[k] = V(0.f);
       const auto splats = RowIndex<W>::contiguous(i, end);
