@@ -1,0 +1,190 @@
+"""One training iteration under the stopwatch, launch by launch.
+
+The steps are those of `Trainer.step_once`, on a workload that stays as it is: learning rates are 0,
+so every repeat does the same work on the same numbers.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+from workloads import Workload
+
+from snowsplat import ops
+from snowsplat.density import AdaptiveDensity
+from snowsplat.ops import native, reference
+from snowsplat.ops.adam import PARAMETERS
+from snowsplat.process import single_threaded
+
+#: Native functions by the stage that they are. One that is not here appears under its own name.
+STAGES = {
+    "project_cull": "project: cull",
+    "project_fwd": "project: forward",
+    "splats_prepare": "prepare",
+    "splats_sort": "sort",
+    "tiles_count": "tiles: count",
+    "tiles_fill": "tiles: fill",
+    "blend_fwd": "blend forward",
+    "photometric_u8": "photometric",
+    "blend_bwd": "blend backward",
+    "splats_reduce": "reduce",
+    "statistic": "density statistic",
+    "adam_step": "adam step",
+}
+#: Everything between the stages: Python, autograd, memory.
+REST = "rest (Python)"
+TOTAL = "total"
+#: These answer a question about sizes at once: part of the rest.
+QUERIES = ("tiles_parts", "blend_block_bytes")
+
+
+class Stopwatch:
+    """Wall and processor seconds by stage; those of all threads of the process together."""
+
+    def __init__(self) -> None:
+        self.wall: dict[str, float] = {}
+        self.cpu: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+        self.wall[name] = self.wall.get(name, 0.0) + wall
+        self.cpu[name] = self.cpu.get(name, 0.0) + cpu
+
+    @contextmanager
+    def on_launches(self) -> Iterator[None]:
+        """Time each `launch` of the op modules, which hold the name that is replaced here."""
+
+        def timed(name: str, n: int, *args: Any) -> int:
+            if name in QUERIES:
+                return native.launch(name, n, *args)
+            with self.stage(STAGES.get(name, name)):
+                return native.launch(name, n, *args)
+
+        holders = [
+            module
+            for name, module in list(sys.modules.items())
+            if name.startswith("snowsplat.ops.")
+            and module is not native
+            and getattr(module, "launch", None) is native.launch
+        ]
+        for module in holders:
+            module.launch = timed  # type: ignore[attr-defined]
+        try:
+            yield
+        finally:
+            for module in holders:
+                module.launch = native.launch  # type: ignore[attr-defined]
+
+
+class Iteration:
+    """The training iteration of one workload. ``twin``: with the ops of `ops.reference`."""
+
+    def __init__(self, workload: Workload, *, visible_only: bool = False, twin: bool = False):
+        self.workload = workload
+        self.visible_only = visible_only
+        self.twin = twin
+        self.ops = reference if twin else ops
+        self.parameters = workload.gaussians.parameters()
+        self.exp_avg = {name: torch.zeros_like(p) for name, p in self.parameters.items()}
+        self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in self.parameters.items()}
+        self.rates = dict.fromkeys(PARAMETERS, 0.0)
+        count = len(workload.gaussians)
+        self.density = AdaptiveDensity().control(
+            count, iterations=30_000, extent=1.0, generator=torch.Generator()
+        )
+        camera = workload.camera
+        self.intrinsics = {
+            name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")
+        }
+        self.background = torch.zeros(3)
+        self.target = self._photo()
+
+    @torch.no_grad()
+    def _photo(self) -> Tensor:
+        """(H, W, 3) uint8: what the camera sees, with noise, so that every pixel has a gradient."""
+        splats = self._project(ops)
+        height, width = self.workload.camera.height, self.workload.camera.width
+        image, _, _ = ops.rasterize(splats, width, height, self.background)
+        noise = torch.randn(3, height, width, generator=torch.Generator().manual_seed(0))
+        planes = 255 * image.permute(2, 0, 1) + 10 * noise
+        return planes.clamp(0, 255).to(torch.uint8).permute(1, 2, 0)
+
+    def _project(self, module: Any) -> ops.Splats2D:
+        pose = self.workload.camera.cam_from_world
+        return module.project(
+            **self.parameters, cam_from_world=pose, **self.intrinsics, sh_degree=3
+        )
+
+    @torch.no_grad()
+    def run(
+        self,
+        watch: Stopwatch,
+        look: Callable[[ops.Splats2D, Tensor], None] | None = None,
+    ) -> None:
+        """One iteration. ``look`` is given the splats and the image, before the backward pass."""
+        step, camera, module = 1000, self.workload.camera, self.ops
+        splats = self._project(module)
+        with torch.enable_grad():
+            splats.packed.requires_grad_()
+            image, _, _ = module.rasterize(splats, camera.width, camera.height, self.background)
+            if look is not None:
+                look(splats, image)
+            loss = module.photometric_loss(image, self.target)
+            loss.backward()
+        assert splats.ids is not None
+        assert splats.packed.grad is not None
+        with watch.stage(STAGES["statistic"]):
+            self.density.after_backward(
+                step, self.workload.gaussians, splats, camera.width, camera.height
+            )
+        module.adam_step(
+            self.parameters,
+            self.exp_avg,
+            self.exp_avg_sq,
+            splats.ids,
+            splats.packed.grad,
+            camera.cam_from_world,
+            **self.intrinsics,
+            sh_degree=3,
+            lr=self.rates,
+            step=step,
+            visible_only=self.visible_only,
+        )
+
+    def measure(self, repeats: int, threads: int) -> dict[str, dict[str, list[float]]]:
+        """{"wall": {stage: [seconds of each repeat]}, "cpu": the same}; cpu over all threads."""
+        # Modules that hold `launch` must be there before it is replaced.
+        importlib.import_module("snowsplat.ops")
+        ops.set_num_threads(threads)
+        laps = [self._lap(threads) for _ in range(repeats)]
+        return {
+            clock: {name: [lap[clock][name] for lap in laps] for name in laps[0][clock]}
+            for clock in ("wall", "cpu")
+        }
+
+    def _lap(self, threads: int) -> dict[str, dict[str, float]]:
+        watch, whole = Stopwatch(), Stopwatch()
+        if self.twin:
+            torch.set_num_threads(threads)
+            with whole.stage(TOTAL):
+                self.run(watch)
+            return {"wall": whole.wall, "cpu": whole.cpu}
+        with single_threaded(), watch.on_launches(), whole.stage(TOTAL):
+            self.run(watch)
+        lap = {}
+        for clock, stages, total in (
+            ("wall", watch.wall, whole.wall[TOTAL]),
+            ("cpu", watch.cpu, whole.cpu[TOTAL]),
+        ):
+            lap[clock] = stages | {REST: total - sum(stages.values()), TOTAL: total}
+        return lap

@@ -1,0 +1,321 @@
+"""Where the time of a training iteration goes, stage by stage.
+
+    python benchmarks/stages.py                                 50k, the best instruction set
+    python benchmarks/stages.py --size 50k 200k 1m small --isa all --threads 1 2
+    python benchmarks/stages.py --twin                          beside plain PyTorch
+    python benchmarks/stages.py --versus avx2                   two instruction sets, in turns
+    python benchmarks/stages.py --versus ../before/src          two builds, in turns
+
+What the columns mean, and how to read them on a busy machine: benchmarks/README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from floor import OPERATIONS, OPERATIONS_A_CLOCK, floor_ns, system_ghz
+from iteration import REST, STAGES, TOTAL
+from workloads import SIZES
+
+from snowsplat.errors import UserError
+from snowsplat.ops import native
+
+Measured = dict[str, Any]
+BLEND = ("blend forward", "blend backward")
+
+
+class Worker:
+    """A process with one library: an instruction set, and optionally another source tree."""
+
+    def __init__(self, isa: str, source: Path | None = None) -> None:
+        environment = os.environ | {"SNOWSPLAT_ISA": isa}
+        if source is not None:
+            environment["PYTHONPATH"] = str(source.resolve())
+        script = Path(__file__).with_name("worker.py")
+        self._process = subprocess.Popen(
+            [sys.executable, str(script)],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def ask(
+        self,
+        size: str,
+        threads: int,
+        repeats: int,
+        *,
+        visible_only: bool = False,
+        twin: bool = False,
+        count: bool = False,
+    ) -> Measured:
+        """See worker.py. Raises UserError where it cannot."""
+        request = {
+            "size": size,
+            "threads": threads,
+            "repeats": repeats,
+            "visible_only": visible_only,
+            "twin": twin,
+            "count": count,
+        }
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(request) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise UserError("the measuring process died; what it said is above")
+        answer: Measured = json.loads(line)
+        if "error" in answer:
+            raise UserError(answer["error"])
+        return answer
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.wait()
+        self._process.stdout.close()
+
+
+def main() -> None:
+    flags = _flags()
+    available = native.available_isas()
+    isas = list(reversed(available)) if flags.isa == ["all"] else flags.isa or [available[-1]]
+    for isa in isas:
+        if isa not in available:
+            raise UserError(f"--isa {isa} does not run here; there are {', '.join(available)}")
+    ghz = flags.ghz or system_ghz()
+    print(_machine(ghz))
+    results: list[Measured] = []
+    for size in flags.size:
+        if flags.versus is not None:
+            results += _paired(flags, size, isas[0])
+        else:
+            results += _absolute(flags, size, isas, ghz)
+    if flags.twin:
+        results += _beside_twin(flags, isas[0])
+    if flags.json is not None:
+        flags.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+
+
+# ------------------------------------------------------------------------------------- the tables
+
+
+def _absolute(flags: argparse.Namespace, size: str, isas: list[str], ghz: float) -> list[Measured]:
+    results: list[Measured] = []
+    pairs = 0  # the same with every library
+    for isa in isas:
+        columns: list[Measured] = []
+        with Worker(isa) as worker:
+            for threads in flags.threads:
+                found = worker.ask(
+                    size,
+                    threads,
+                    flags.repeats,
+                    visible_only=flags.visible_only,
+                    count=not pairs,
+                )
+                pairs = found["counts"].setdefault("pairs", pairs)
+                columns.append(found)
+        if not results:
+            _print_counts(size, columns[0])
+        _print_stages(columns, ghz)
+        results += columns
+    best = results[0]
+    for found in results:
+        if found["threads"] == best["threads"] and found is not best:
+            ratio = _least(found, TOTAL)[2] / _least(best, TOTAL)[2]
+            print(f"{found['isa']} takes {ratio:.2f}x the processor time of {best['isa']}")
+    return results
+
+
+def _print_stages(columns: list[Measured], ghz: float) -> None:
+    """One instruction set, a group of columns for each number of threads."""
+    print()
+    print(_row("", [f"{found['isa']} x{found['threads']}".rjust(23) for found in columns]))
+    print(_row("ms", [f"{'min':>7}{'median':>8}{'cpu':>8}" for _ in columns]))
+    for name in _ordered({name: None for found in columns for name in found["wall"]}):
+        print(_row(name, [_cells(_least(found, name), 1e3) for found in columns]))
+    for found in columns:
+        n = found["counts"]
+        found["lane_use"] = n["pairs"] / max(1, n["lanes"] * n["steps"])
+        found["floor_ns"] = floor_ns(n["lanes"], max(found["lane_use"], 1e-9), ghz)
+        found["pair_ns"] = [1e9 * t / max(1, n["pairs"]) for t in _blend_core_seconds(found)]
+    print("blend forward + backward")
+    print(_row("  ns a pair and core", [_cells(found["pair_ns"]) for found in columns]))
+    shares = [[found["floor_ns"] / ns for ns in found["pair_ns"]] for found in columns]
+    print(_row("  share of the floor", [_cells(share) for share in shares]))
+    print(_row("  floor, ns", [f"{found['floor_ns']:>7.2f}{'':16}" for found in columns]))
+    print(_row("  lane use", [f"{found['lane_use']:>7.2f}{'':16}" for found in columns]))
+
+
+def _print_counts(size: str, found: Measured) -> None:
+    count, width, height = SIZES[size]
+    n = found["counts"]
+    per_splat, per_pixel = n["instances"] / max(1, n["splats"]), n["pairs"] / (width * height)
+    print(
+        f"\n{size}: {count:,} Gaussians from {found['source']}, {width}x{height}\n"
+        f"{n['splats']:,} splats seen, {n['instances']:,} instances ({per_splat:.1f} a splat, "
+        f"{n['visited'] / max(1, n['instances']):.0%} visited), {n['pairs']:,} blended pairs "
+        f"({per_pixel:.0f} a pixel)"
+    )
+
+
+def _paired(flags: argparse.Namespace, size: str, isa: str) -> list[Measured]:
+    """A and B in turns: what the machine does to one, it does to the other a moment later."""
+    clock = "cpu" if flags.cpu_time else "wall"
+    if flags.versus in native.ISAS:
+        other, source, label = flags.versus, None, flags.versus
+    else:
+        other, source, label = isa, Path(flags.versus), flags.versus
+        if not (source / "snowsplat").is_dir():
+            raise UserError(
+                f"--versus {flags.versus} is neither an instruction set nor a folder that holds "
+                "the package snowsplat"
+            )
+    results: list[Measured] = []
+    with Worker(isa) as a, Worker(other, source) as b:
+        for threads in flags.threads:
+            rounds: dict[str, list[float]] = {}
+            for i in range(flags.repeats):
+                order = ("a", "b") if i % 2 == 0 else ("b", "a")
+                sides = {"a": a, "b": b}
+                least = {}
+                for side in order:
+                    found = sides[side].ask(size, threads, 3, visible_only=flags.visible_only)
+                    least[side] = {name: min(times) for name, times in found[clock].items()}
+                for name in least["a"].keys() & least["b"].keys():
+                    ratio = least["b"][name] / least["a"][name] if least["a"][name] > 0 else 1.0
+                    rounds.setdefault(name, []).append(ratio)
+            print(f"\n{size} x{threads}: {clock} time of {label} / {isa} (A is {isa}), by rounds")
+            print(_row("ratio", [f"{'median':>8}{'quartiles':>16}"]))
+            for name in _ordered(rounds):
+                low, middle, high = _quartiles(rounds[name])
+                print(_row(name, [f"{middle:>8.3f}{f'{low:.3f} … {high:.3f}':>16}"]))
+            results.append(
+                {"size": size, "threads": threads, "a": isa, "b": label, "ratios": rounds}
+            )
+    return results
+
+
+def _beside_twin(flags: argparse.Namespace, isa: str) -> list[Measured]:
+    results = []
+    print(f"\n{flags.twin}: plain PyTorch (ops.reference, float32) beside {isa}, a whole iteration")
+    print(_row("ms, least", [f"{'twin':>9}{'native':>9}{'ratio':>8}{'cpu':>8}"]))
+    with Worker(isa) as worker:
+        for threads in flags.threads:
+            own = worker.ask(flags.twin, threads, flags.repeats)
+            # It takes seconds an iteration, so a few must do.
+            twin = worker.ask(flags.twin, threads, min(3, flags.repeats), twin=True)
+            (theirs, _, their_cpu), (ours, _, our_cpu) = (_least(f, TOTAL) for f in (twin, own))
+            cells = f"{1e3 * theirs:>9.0f}{1e3 * ours:>9.2f}{theirs / ours:>7.0f}x"
+            cells += f"{their_cpu / our_cpu:>7.0f}x"
+            print(_row(f"{threads} thread{'s' * (threads > 1)}", [cells]))
+            results.append(
+                {
+                    "size": flags.twin,
+                    "threads": threads,
+                    "twin": twin["wall"],
+                    "native": own["wall"],
+                }
+            )
+    return results
+
+
+# ------------------------------------------------------------------------------------------ cells
+
+
+def _least(found: Measured, name: str) -> list[float]:
+    """Seconds: least and median wall time, least processor time of one of the threads."""
+    wall, cpu = found["wall"].get(name, [0.0]), found["cpu"].get(name, [0.0])
+    return [min(wall), statistics.median(wall), min(cpu) / found["threads"]]
+
+
+def _blend_core_seconds(found: Measured) -> list[float]:
+    """As `_least`, of blending in both directions, times the cores that it occupies."""
+    wall, cpu = (
+        [sum(times) for times in zip(*(found[clock][name] for name in BLEND), strict=True)]
+        for clock in ("wall", "cpu")
+    )
+    threads = found["threads"]
+    return [threads * min(wall), threads * statistics.median(wall), min(cpu)]
+
+
+def _cells(values: list[float], scale: float = 1.0) -> str:
+    least, middle, cpu = (scale * value for value in values)
+    return f"{least:>7.2f}{middle:>8.2f}{cpu:>8.2f}"
+
+
+def _row(name: str, cells: list[str]) -> str:
+    return f"{name:<21}" + "  ".join(cells).rstrip()
+
+
+def _ordered(names: dict[str, Any]) -> list[str]:
+    known = [name for name in STAGES.values() if name in names]
+    others = [name for name in names if name not in (*known, REST, TOTAL)]
+    return [*known, *others, REST, TOTAL]
+
+
+def _quartiles(values: list[float]) -> tuple[float, float, float]:
+    if len(values) < 2:
+        return values[0], values[0], values[0]
+    low, middle, high = statistics.quantiles(values, n=4, method="inclusive")
+    return low, middle, high
+
+
+def _machine(ghz: float) -> str:
+    model = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            named = [line.split(":")[1].strip() for line in file if line.startswith("model name")]
+        model = named[0] if named else model
+    except OSError:
+        pass
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    line = (
+        f"{model}, {cores} cores, {', '.join(native.available_isas())}; floor: {OPERATIONS} vector "
+        f"operations a step, {OPERATIONS_A_CLOCK:g} a clock, {ghz:.2f} GHz"
+    )
+    if hasattr(os, "getloadavg") and os.getloadavg()[0] > 0.5:
+        line += f"\nload average {os.getloadavg()[0]:.1f}: others compute here too; trust ratios"
+    return line
+
+
+def _flags() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--size", nargs="+", default=["50k"], choices=SIZES)
+    parser.add_argument("--isa", nargs="+", default=[], help="or: all; the best by default")
+    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=10, help="iterations; rounds of --versus")
+    parser.add_argument("--cpu-time", action="store_true", help="--versus compares processor time")
+    parser.add_argument("--visible-only", action="store_true", help="Adam of visible ones alone")
+    parser.add_argument("--versus", metavar="ISA|SRC", help="in turns with it, as a ratio")
+    parser.add_argument("--twin", nargs="?", const="10k", choices=SIZES, metavar="SIZE")
+    parser.add_argument("--ghz", type=float, help="the clock for the floor; else the system's")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="all that was measured")
+    flags = parser.parse_args()
+    if flags.repeats < 1 or min(flags.threads) < 1:
+        parser.error("--repeats and --threads must be 1 or more")
+    return flags
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except UserError as error:
+        sys.exit(f"stages: {error}")

@@ -1,0 +1,72 @@
+"""The process that `stages.py` measures in: one library, chosen at load, stays for its lifetime.
+
+A request is a line of JSON on the standard input, the answer one on the standard output:
+{"size", "threads", "repeats", "visible_only", "twin", "count"} →
+{"size", "threads", "isa", "source", "gaussians", "wall", "cpu", "counts"}, or {"error"}.
+Between requests it sleeps.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+from iteration import Iteration, Stopwatch
+from pairs import LANES, count_pairs, count_steps, frame_of
+from torch import Tensor
+from workloads import workload
+
+from snowsplat.errors import UserError
+from snowsplat.ops import Splats2D, native
+from snowsplat.process import single_threaded
+
+
+def counts(iteration: Iteration, with_pairs: bool) -> dict[str, int]:
+    """Splats, instances, visited ones and steps; pairs on request, for they take seconds."""
+    found: dict[str, int] = {}
+    camera = iteration.workload.camera
+
+    def look(splats: Splats2D, image: Tensor) -> None:
+        frame = frame_of(image)
+        found.update(splats=len(splats), lanes=LANES[native.isa()], **count_steps(frame))
+        if with_pairs:
+            found["pairs"] = count_pairs(splats, frame, camera.width, camera.height)
+
+    with single_threaded():
+        iteration.run(Stopwatch(), look)
+    return found
+
+
+def main() -> None:
+    key, iteration = None, None
+    for line in sys.stdin:
+        request: dict[str, Any] = json.loads(line)
+        try:
+            wanted = (request["size"], request["visible_only"], request["twin"])
+            if iteration is None or key != wanted:
+                iteration = None  # the old one's memory goes first
+                scene = workload(request["size"])
+                key = wanted
+                iteration = Iteration(
+                    scene, visible_only=request["visible_only"], twin=request["twin"]
+                )
+                if not request["twin"]:
+                    iteration.measure(2, request["threads"])  # buffers, caches
+            answer: dict[str, Any] = {
+                "isa": native.isa(),
+                "size": request["size"],
+                "threads": request["threads"],
+                "source": iteration.workload.source,
+                "gaussians": len(iteration.workload.gaussians),
+                **iteration.measure(request["repeats"], request["threads"]),
+            }
+            if not request["twin"]:
+                answer["counts"] = counts(iteration, request["count"])
+        except UserError as error:
+            answer = {"error": str(error)}
+        print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    main()
