@@ -246,7 +246,10 @@ def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
     cursor.finish()
     # A view with a record at every byte, of which those at the starts are taken.
     record = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
-    records = np.ndarray(max(0, size - record.itemsize + 1), record, data, strides=(1,))[starts]
+    everywhere: np.ndarray = np.ndarray(
+        max(0, size - record.itemsize + 1), record, data, strides=(1,)
+    )
+    records = everywhere[starts]
     return records["xyz"], records["rgb"]
 
 
