@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from snowsplat import ops
 from snowsplat.density.rows import finite_rows, morton_order
 from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import rotation_from_quat
@@ -23,7 +24,7 @@ from snowsplat.optim import Adam, When, at_step
 SPLIT_SHRINK = 1.6
 #: What the opacity reset leaves at most.
 RESET_OPACITY = 0.01
-#: Steps that a scene needs to recover from an opacity reset before densification may end.
+#: Steps that a scene needs to recover from an opacity reset.
 RESET_RECOVERY = 500
 
 
@@ -45,9 +46,10 @@ class AdaptiveDensity:
         prune_screen_size: those with a larger 3σ radius, in pixels, are removed; 0 is off.
             Pruning by either size begins after the first opacity reset.
         opacity_reset_interval: steps between opacity resets; 0 is none. The last is at least 500
-            steps before densification or the training ends.
-        reset_at_start: also reset opacity at ``densify_from``: clears the fog that white
-            backgrounds breed.
+            steps before densification ends.
+        reset_at_start: also reset opacity at ``densify_from``, unless fewer than 500 steps are left.
+            It clears the fog that random initial points and white backgrounds breed: without it
+            100,000 random points can end as a white cloud.
         max_gaussians: hard cap; where it leaves too little room, the largest gradients go first. 0
             is none.
     """
@@ -72,6 +74,7 @@ class AdaptiveDensity:
             knobs=self,
             first=at_step(self.densify_from, iterations),
             last=min(at_step(self.densify_until, iterations), iterations),
+            end=iterations,
             extent=extent,
             generator=generator,
             grad_sum=torch.zeros(count),
@@ -86,6 +89,7 @@ class AdaptiveDensityControl:
 
     Attributes:
         first, last: the steps that may densify.
+        end: the last step of all.
         grad_sum: (N,) sum over views of the norm of the position gradient, in half image sizes.
         views: (N,) number of views in that sum: those in which the Gaussian was visible.
         max_radii: (N,) largest 3σ radius seen, in pixels.
@@ -94,6 +98,7 @@ class AdaptiveDensityControl:
     knobs: AdaptiveDensity
     first: int
     last: int
+    end: int
     extent: float
     generator: torch.Generator
     grad_sum: Tensor
@@ -108,14 +113,11 @@ class AdaptiveDensityControl:
             return
         assert splats.ids is not None
         assert splats.packed.grad is not None
-        # d loss / d (position in half image sizes), for which the paper's threshold is stated: as
-        # when the screen spans [-1, 1]. A row is one Gaussian, so no index repeats.
-        ids, grad = splats.ids, splats.packed.grad
-        norm = torch.hypot(grad[:, 0] * (0.5 * width), grad[:, 1] * (0.5 * height))
-        self.grad_sum.index_add_(0, ids, norm)
-        self.views.index_add_(0, ids, torch.ones_like(norm))
+        ops.accumulate_screen_gradients(
+            splats.ids, splats.packed.grad, width, height, self.grad_sum, self.views
+        )
         if self.knobs.prune_screen_size > 0:
-            rows = ids.long()
+            rows = splats.ids.long()
             self.max_radii[rows] = torch.maximum(self.max_radii[rows], splats.radii.detach())
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
@@ -130,11 +132,10 @@ class AdaptiveDensityControl:
         return gaussians
 
     def _resets_at(self, step: int) -> bool:
-        if step > self.last - RESET_RECOVERY:
-            return False
+        if self.knobs.reset_at_start and step == self.first:
+            return step <= self.end - RESET_RECOVERY
         every = self.knobs.opacity_reset_interval
-        periodic = every > 0 and step % every == 0
-        return periodic or (self.knobs.reset_at_start and step == self.first)
+        return every > 0 and step % every == 0 and step <= self.last - RESET_RECOVERY
 
     def _refine(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         knobs = self.knobs

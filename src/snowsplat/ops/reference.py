@@ -351,6 +351,22 @@ def neighbours(points: Tensor, k: int = 3) -> Tensor:
     return found
 
 
+# ------------------------------------------------------------------- accumulate_screen_gradients
+
+
+@torch.no_grad()
+def accumulate_screen_gradients(
+    ids: Tensor, packed_grad: Tensor, width: int, height: int, norm_sum: Tensor, views: Tensor
+) -> None:
+    """Adds one view to the densification statistic (section 5.2) of the Gaussians that it sees.
+
+    The gradient of the position (M, 2) is stated for a screen that spans [-1, 1] in x and y.
+    """
+    half_size = packed_grad.new_tensor([width / 2, height / 2])
+    norm_sum[ids.long()] += (packed_grad[:, :2] * half_size).norm(dim=1)
+    views[ids.long()] += 1
+
+
 # ------------------------------------------------------------------------------------- adam_step
 
 

@@ -16,7 +16,7 @@ namespace snow {
 namespace {
 
 constexpr int64_t kBlock = 2048;
-constexpr int64_t kSerialBelow = 50000;  // splats; under this one part is faster than several
+constexpr int64_t kSerialBelow = 8000;  // splats; under this one part is faster than several
 
 int64_t part_count(int64_t m) { return m < kSerialBelow ? 1 : pool_size(); }
 
