@@ -149,8 +149,13 @@ class ImageLoader:
                 size = _estimated_bytes(key)
                 if self._ahead and sum(self._ahead.values()) + size > self.budget_bytes // 2:
                     break
+                try:
+                    future = self._pool.submit(self._decode, key)
+                except RuntimeError:  # closed, or the program is ending: nothing will be asked for
+                    self._queue.clear()
+                    break
                 self._ahead[key] = size
-                self._running[key] = future = self._pool.submit(self._decode, key)
+                self._running[key] = future
                 future.add_done_callback(partial(self._finished, key))
             self._queue.popleft()
         self._pumping = False
