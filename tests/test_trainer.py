@@ -62,7 +62,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return Capture(views[1:], views[:1], Points(xyz, rgb), extent=3.5)
 
 
-#: Everything happens within 60 steps: densification, a reset, coarse to fine, higher degrees.
+#: Everything happens within 60 steps: densification, coarse to fine, higher degrees.
 BUSY = TrainConfig(
     iterations=60,
     background="random",
@@ -74,7 +74,6 @@ BUSY = TrainConfig(
         densify_until=50,
         densify_interval=10,
         opacity_reset_interval=0,
-        reset_at_start=True,
         max_gaussians=150,
     ),
     test_iterations=(),
@@ -181,8 +180,7 @@ def test_a_checkpoint_of_something_else_is_refused(capture):
 def test_refinement_waits_for_the_next_step(capture):
     """What is evaluated and saved after step 20, which densifies, is the scene before that."""
     counts = []
-    config = replace(BUSY, density=replace(BUSY.density, reset_at_start=False))
-    Trainer(capture, config).run(lambda progress: counts.append(progress.gaussians), until=21)
+    Trainer(capture, BUSY).run(lambda progress: counts.append(progress.gaussians), until=21)
     assert counts[19] == counts[10]
     assert counts[20] > counts[19]
 

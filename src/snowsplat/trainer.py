@@ -83,6 +83,7 @@ class Trainer:
             len(self.gaussians),
             iterations=config.iterations,
             extent=capture.extent,
+            random_start=capture.points is None,
             generator=self._generators["density"],
         )
 

@@ -38,11 +38,14 @@ def names(gaussians: Gaussians) -> list[int]:
     return sorted(int(name) for name in gaussians.sh_dc[:, 0, 0])
 
 
-def set_up(gaussians: Gaussians, **knobs: object) -> tuple[AdaptiveDensityControl, Adam]:
+def set_up(
+    gaussians: Gaussians, iterations: int = 30_000, random_start: bool = False, **knobs: object
+) -> tuple[AdaptiveDensityControl, Adam]:
     control = AdaptiveDensity(**knobs).control(  # type: ignore[arg-type]
         len(gaussians),
-        iterations=30_000,
+        iterations=iterations,
         extent=EXTENT,
+        random_start=random_start,
         generator=torch.Generator().manual_seed(0),
     )
     adam = Adam(gaussians, LearningRates(), iterations=30_000, extent=EXTENT)
@@ -207,7 +210,9 @@ def test_when_opacity_is_reset():
 
     every_hundred = range(0, 30_001, 100)
     assert resets(every_hundred[1:]) == [3000, 6000, 9000, 12_000]
-    assert resets(every_hundred[1:], reset_at_start=True)[0] == 500
+    assert resets(every_hundred[1:], random_start=True)[:2] == [500, 3000]
+    assert resets(every_hundred[1:], random_start=True, reset_random_start=False)[0] == 3000
+    assert resets(every_hundred[1:], random_start=True, iterations=900) == []
     assert resets(every_hundred[1:], densify_until=6400) == [3000]
     assert resets(every_hundred[1:], opacity_reset_interval=0) == []
 
@@ -225,9 +230,8 @@ def test_rows_are_kept_in_morton_order():
 
 
 def test_fractions_scale_with_the_training_and_steps_do_not():
-    knobs = AdaptiveDensity(densify_from=100, densify_until=0.5)
-    generator = torch.Generator()
-    control = knobs.control(1, iterations=3000, extent=1.0, generator=generator)
+    gaussians = gaussians_of([0.05])
+    control, _ = set_up(gaussians, iterations=3000, densify_from=100, densify_until=0.5)
     assert (control.first, control.last) == (100, 1500)
-    control = AdaptiveDensity().control(1, iterations=7000, extent=1.0, generator=generator)
+    control, _ = set_up(gaussians, iterations=7000)
     assert (control.first, control.last) == (500, 7000)

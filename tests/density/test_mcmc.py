@@ -27,7 +27,11 @@ def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
 
 def set_up(gaussians: Gaussians, **knobs: object) -> tuple[McmcDensityControl, Adam]:
     control = McmcDensity(**knobs).control(  # type: ignore[arg-type]
-        len(gaussians), iterations=30_000, extent=1.0, generator=torch.Generator().manual_seed(0)
+        len(gaussians),
+        iterations=30_000,
+        extent=1.0,
+        random_start=False,
+        generator=torch.Generator().manual_seed(0),
     )
     adam = Adam(gaussians, LearningRates(means_steps=1.0), iterations=30_000, extent=1.0)
     for moments in (adam.exp_avg, adam.exp_avg_sq):

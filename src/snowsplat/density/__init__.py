@@ -61,7 +61,16 @@ class DensityConfig(Protocol):
         ...
 
     def control(
-        self, count: int, *, iterations: int, extent: float, generator: torch.Generator
+        self,
+        count: int,
+        *,
+        iterations: int,
+        extent: float,
+        random_start: bool,
+        generator: torch.Generator,
     ) -> DensityControl:
-        """Fresh state for ``count`` Gaussians in a scene of ``extent`` world units."""
+        """Fresh state for ``count`` Gaussians in a scene of ``extent`` world units.
+
+        ``random_start``: they are random points, not those of a capture.
+        """
         ...

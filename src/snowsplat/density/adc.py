@@ -47,9 +47,10 @@ class AdaptiveDensity:
             Pruning by either size begins after the first opacity reset.
         opacity_reset_interval: steps between opacity resets; 0 is none. The last is at least 500
             steps before densification ends.
-        reset_at_start: also reset opacity at ``densify_from``, unless fewer than 500 steps are left.
-            It clears the fog that random initial points and white backgrounds breed: without it
-            100,000 random points can end as a white cloud.
+        reset_random_start: where training began with random points, also reset opacity at
+            ``densify_from``, unless fewer than 500 steps are left. Most random points lie in empty
+            space, where they learn to look like the background rather than to vanish: without the
+            reset 100,000 of them can end as a cloud of its colour.
         max_gaussians: hard cap; where it leaves too little room, the largest gradients go first. 0
             is none.
     """
@@ -63,17 +64,24 @@ class AdaptiveDensity:
     prune_world_size: float = 0.1
     prune_screen_size: float = 20.0
     opacity_reset_interval: int = 3000
-    reset_at_start: bool = False
+    reset_random_start: bool = True
     max_gaussians: int = 0
 
     def control(
-        self, count: int, *, iterations: int, extent: float, generator: torch.Generator
+        self,
+        count: int,
+        *,
+        iterations: int,
+        extent: float,
+        random_start: bool,
+        generator: torch.Generator,
     ) -> AdaptiveDensityControl:
         """Fresh state for ``count`` Gaussians in a scene of ``extent`` world units."""
         return AdaptiveDensityControl(
             knobs=self,
             first=at_step(self.densify_from, iterations),
             last=min(at_step(self.densify_until, iterations), iterations),
+            first_reset=self.reset_random_start and random_start,
             end=iterations,
             extent=extent,
             generator=generator,
@@ -89,6 +97,7 @@ class AdaptiveDensityControl:
 
     Attributes:
         first, last: the steps that may densify.
+        first_reset: whether ``first`` resets opacity too.
         end: the last step of all.
         grad_sum: (N,) sum over views of the norm of the position gradient, in half image sizes.
         views: (N,) number of views in that sum: those in which the Gaussian was visible.
@@ -98,6 +107,7 @@ class AdaptiveDensityControl:
     knobs: AdaptiveDensity
     first: int
     last: int
+    first_reset: bool
     end: int
     extent: float
     generator: torch.Generator
@@ -132,7 +142,7 @@ class AdaptiveDensityControl:
         return gaussians
 
     def _resets_at(self, step: int) -> bool:
-        if self.knobs.reset_at_start and step == self.first:
+        if self.first_reset and step == self.first:
             return step <= self.end - RESET_RECOVERY
         every = self.knobs.opacity_reset_interval
         return every > 0 and step % every == 0 and step <= self.last - RESET_RECOVERY

@@ -58,9 +58,15 @@ class McmcDensity:
     scale_regularizer: float = 0.01
 
     def control(
-        self, count: int, *, iterations: int, extent: float, generator: torch.Generator
+        self,
+        count: int,
+        *,
+        iterations: int,
+        extent: float,
+        random_start: bool,
+        generator: torch.Generator,
     ) -> McmcDensityControl:
-        """Fresh state; MCMC keeps no statistics, so it needs neither ``count`` nor ``extent``."""
+        """Fresh state, which depends on ``iterations`` and ``generator`` alone."""
         if self.max_gaussians <= 0:
             raise UserError(
                 "MCMC density control needs a cap: give --max-gaussians a positive number"
