@@ -18,9 +18,9 @@ from torch import Tensor
 from workloads import Workload
 
 from snowsplat import ops
-from snowsplat.density import AdaptiveDensity
 from snowsplat.ops import native, reference
 from snowsplat.ops.adam import PARAMETERS
+from snowsplat.ops.scratch import take_rows
 from snowsplat.process import single_threaded
 
 #: Native functions by the stage that they are. One that is not here appears under its own name.
@@ -35,7 +35,7 @@ STAGES = {
     "photometric_u8": "photometric",
     "blend_bwd": "blend backward",
     "splats_reduce": "reduce",
-    "statistic": "density statistic",
+    "accumulate_screen_statistics": "density statistics",
     "adam_step": "adam step",
 }
 #: Everything between the stages: Python, autograd, memory.
@@ -95,13 +95,15 @@ class Iteration:
         self.twin = twin
         self.ops = reference if twin else ops
         self.parameters = workload.gaussians.parameters()
-        self.exp_avg = {name: torch.zeros_like(p) for name, p in self.parameters.items()}
-        self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in self.parameters.items()}
-        self.rates = dict.fromkeys(PARAMETERS, 0.0)
         count = len(workload.gaussians)
-        self.density = AdaptiveDensity().control(
-            count, iterations=30_000, extent=1.0, generator=torch.Generator()
+        # Rows taken from zeros: in the memory in which density control leaves them in a training.
+        rows = torch.arange(count)
+        self.exp_avg, self.exp_avg_sq = (
+            {name: take_rows(torch.zeros_like(p), rows) for name, p in self.parameters.items()}
+            for _ in range(2)
         )
+        self.rates = dict.fromkeys(PARAMETERS, 0.0)
+        self.statistics = torch.zeros(3, count)
         camera = workload.camera
         self.intrinsics = {
             name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")
@@ -143,10 +145,7 @@ class Iteration:
             loss.backward()
         assert splats.ids is not None
         assert splats.packed.grad is not None
-        with watch.stage(STAGES["statistic"]):
-            self.density.after_backward(
-                step, self.workload.gaussians, splats, camera.width, camera.height
-            )
+        module.accumulate_screen_statistics(splats, camera.width, camera.height, *self.statistics)
         module.adam_step(
             self.parameters,
             self.exp_avg,

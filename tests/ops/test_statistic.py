@@ -1,49 +1,68 @@
-"""The densification statistic: a closed form, the twin, any number of threads, wrong input."""
+"""The densification statistics: a closed form, the twin, any number of threads, wrong input."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops import reference
+from snowsplat.ops import Splats2D, reference
 
 from .scenes import Variant, assert_close
 
 pytestmark = pytest.mark.isa
 
 
+def splats_of(ids: Tensor, packed: Tensor, grad: Tensor) -> Splats2D:
+    packed = packed.clone().requires_grad_()
+    packed.grad = grad
+    return Splats2D(packed, ids.to(torch.int32), 3)
+
+
 def test_one_gaussian(variant: Variant) -> None:
     """A gradient of (3, 4) on a 2×2 screen has norm 5; rows that are not seen stay as they are."""
     norm_sum = torch.tensor([1.0, 2.0, 3.0], dtype=variant.dtype)
     views = torch.tensor([0.0, 7.0, 0.0], dtype=variant.dtype)
-    grad = torch.zeros(1, 16, dtype=variant.dtype)
+    radii = torch.tensor([1.0, 1.0, 9.0], dtype=variant.dtype)
+    packed, grad = torch.zeros(2, 1, 16, dtype=variant.dtype)
+    packed[0, 7] = 6.0
     grad[0, :2] = torch.tensor([3.0, 4.0])
-    ids = torch.tensor([1], dtype=torch.int32)
-    variant.ops.accumulate_screen_gradients(ids, grad, 2, 2, norm_sum, views)
+    splats = splats_of(torch.tensor([1]), packed, grad)
+    variant.ops.accumulate_screen_statistics(splats, 2, 2, norm_sum, views, radii)
     assert norm_sum.tolist() == [1.0, 7.0, 3.0]
     assert views.tolist() == [0.0, 8.0, 0.0]
+    assert radii.tolist() == [1.0, 6.0, 9.0]
 
 
-def test_native_is_the_twin(native: Variant) -> None:
+@pytest.mark.parametrize("with_radii", [True, False])
+def test_native_is_the_twin(native: Variant, with_radii: bool) -> None:
     generator = torch.Generator().manual_seed(1)
-    ids = torch.randperm(20_000, generator=generator)[:9_000].sort().values.to(torch.int32)
-    grad = torch.randn(9_000, 16, generator=generator, dtype=torch.float64)
-    expected = torch.zeros(20_000, dtype=torch.float64), torch.zeros(20_000, dtype=torch.float64)
-    reference.accumulate_screen_gradients(ids, grad, 640, 360, *expected)
+    ids = torch.randperm(20_000, generator=generator)[:9_000].sort().values
+    packed, grad = torch.randn(2, 9_000, 16, generator=generator, dtype=torch.float64)
+
+    def accumulate(implementation: Variant, dtype: torch.dtype) -> Tensor:
+        sums = torch.zeros(3, 20_000, dtype=dtype)
+        splats = splats_of(ids, packed.to(dtype), grad.to(dtype))
+        radii = sums[2] if with_radii else None
+        implementation.accumulate_screen_statistics(splats, 640, 360, sums[0], sums[1], radii)
+        return sums
+
+    expected = accumulate(reference, torch.float64)
     for threads in (1, 3):
         ops.set_num_threads(threads)
-        found = torch.zeros(20_000, dtype=native.dtype), torch.zeros(20_000, dtype=native.dtype)
-        native.ops.accumulate_screen_gradients(ids, grad.to(native.dtype), 640, 360, *found)
-        assert_close(found[0], expected[0], 1e-6)
-        assert torch.equal(found[1].double(), expected[1])
+        found = accumulate(native.ops, native.dtype)
+        for row in range(3):
+            assert_close(found[row].double(), expected[row], 1e-6)
 
 
 def test_wrong_input() -> None:
-    ids, grad, sums = torch.zeros(2, dtype=torch.int32), torch.zeros(2, 16), torch.zeros(5)
-    with pytest.raises(ValueError, match="packed_grad"):
-        ops.accumulate_screen_gradients(ids, grad[:1], 4, 4, sums, sums.clone())
+    splats = splats_of(torch.tensor([0, 1]), torch.zeros(2, 16), torch.zeros(2, 16))
+    sums = torch.zeros(5)
     with pytest.raises(ValueError, match="views"):
-        ops.accumulate_screen_gradients(ids, grad, 4, 4, sums, sums[:4])
-    with pytest.raises(ValueError, match="ids"):
-        ops.accumulate_screen_gradients(ids.long(), grad, 4, 4, sums, sums.clone())
+        ops.accumulate_screen_statistics(splats, 4, 4, sums, sums[:4])
+    with pytest.raises(ValueError, match="max_radii"):
+        ops.accumulate_screen_statistics(splats, 4, 4, sums, sums.clone(), sums.double())
+    splats.packed.grad = None
+    with pytest.raises(ValueError, match="gradient"):
+        ops.accumulate_screen_statistics(splats, 4, 4, sums, sums.clone())

@@ -121,14 +121,8 @@ class AdaptiveDensityControl:
         """Accumulate the statistics of the Gaussians that this view sees."""
         if step > self.last:
             return
-        assert splats.ids is not None
-        assert splats.packed.grad is not None
-        ops.accumulate_screen_gradients(
-            splats.ids, splats.packed.grad, width, height, self.grad_sum, self.views
-        )
-        if self.knobs.prune_screen_size > 0:
-            rows = splats.ids.long()
-            self.max_radii[rows] = torch.maximum(self.max_radii[rows], splats.radii.detach())
+        radii = self.max_radii if self.knobs.prune_screen_size > 0 else None
+        ops.accumulate_screen_statistics(splats, width, height, self.grad_sum, self.views, radii)
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         """Densify, prune and reset where this step is one that does."""

@@ -10,11 +10,11 @@ from snowsplat.ops.photometric import photometric_loss, ssim
 from snowsplat.ops.project import project
 from snowsplat.ops.rasterize import rasterize
 from snowsplat.ops.splats import Splats2D
-from snowsplat.ops.statistic import accumulate_screen_gradients
+from snowsplat.ops.statistic import accumulate_screen_statistics
 
 __all__ = [
     "Splats2D",
-    "accumulate_screen_gradients",
+    "accumulate_screen_statistics",
     "adam_step",
     "get_num_threads",
     "neighbours",

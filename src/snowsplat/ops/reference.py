@@ -351,20 +351,29 @@ def neighbours(points: Tensor, k: int = 3) -> Tensor:
     return found
 
 
-# ------------------------------------------------------------------- accumulate_screen_gradients
+# ------------------------------------------------------------------ accumulate_screen_statistics
 
 
 @torch.no_grad()
-def accumulate_screen_gradients(
-    ids: Tensor, packed_grad: Tensor, width: int, height: int, norm_sum: Tensor, views: Tensor
+def accumulate_screen_statistics(
+    splats: Splats2D,
+    width: int,
+    height: int,
+    norm_sum: Tensor,
+    views: Tensor,
+    max_radii: Tensor | None = None,
 ) -> None:
-    """Adds one view to the densification statistic (section 5.2) of the Gaussians that it sees.
+    """Adds one view to what density control (section 5.2) knows of the Gaussians that it sees.
 
     The gradient of the position (M, 2) is stated for a screen that spans [-1, 1] in x and y.
     """
-    half_size = packed_grad.new_tensor([width / 2, height / 2])
-    norm_sum[ids.long()] += (packed_grad[:, :2] * half_size).norm(dim=1)
-    views[ids.long()] += 1
+    assert splats.ids is not None
+    assert splats.packed.grad is not None
+    rows, grad = splats.ids.long(), splats.packed.grad
+    norm_sum[rows] += (grad[:, :2] * grad.new_tensor([width / 2, height / 2])).norm(dim=1)
+    views[rows] += 1
+    if max_radii is not None:
+        max_radii[rows] = torch.maximum(max_radii[rows], splats.radii)
 
 
 # ------------------------------------------------------------------------------------- adam_step

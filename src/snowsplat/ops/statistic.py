@@ -1,4 +1,4 @@
-"""`accumulate_screen_gradients`: how hard each Gaussian is pulled about on the screen."""
+"""`accumulate_screen_statistics`: what density control has to know of the splats of a view."""
 
 from __future__ import annotations
 
@@ -7,37 +7,47 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
+from snowsplat.ops.splats import Splats2D
 
 
 @torch.no_grad()
-def accumulate_screen_gradients(
-    ids: Tensor, packed_grad: Tensor, width: int, height: int, norm_sum: Tensor, views: Tensor
+def accumulate_screen_statistics(
+    splats: Splats2D,
+    width: int,
+    height: int,
+    norm_sum: Tensor,
+    views: Tensor,
+    max_radii: Tensor | None = None,
 ) -> None:
-    """Adds one view to the densification statistic of the Gaussians it sees, in place.
+    """Adds one view to the statistics of the N Gaussians, at the rows that it sees, in place.
 
-    norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)| and views (N,) += 1 at the rows `ids` (M,)
-    int32, distinct, of `packed_grad` (M, columns), the gradient of `Splats2D.packed`. The factor
-    states the gradient for a screen that spans [-1, 1], as the paper's threshold is (section 5.2).
+    With the gradient in `splats.packed.grad` and distinct `splats.ids`:
+    norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|, views (N,) += 1, and
+    max_radii (N,) = max(max_radii, `splats.radii`) unless None. The factor states the gradient for
+    a screen that spans [-1, 1], as the paper's threshold is (section 5.2).
 
-    Raises ValueError where shapes or dtypes do not fit.
+    Raises ValueError where there is no gradient, no ids, or shapes or dtypes do not fit.
     """
-    op = "accumulate_screen_gradients"
-    check_float(op, "packed_grad", packed_grad)
+    op = "accumulate_screen_statistics"
+    packed, grad, ids = splats.packed, splats.packed.grad, splats.ids
+    if grad is None or ids is None:
+        raise ValueError(f"{op}: splats must have ids and a gradient")
+    check_float(op, "splats", packed)
     check_size(op, width, height)
-    check_tensor(op, "packed_grad", packed_grad, (len(ids), None), packed_grad)
-    check_tensor(op, "norm_sum", norm_sum, (None,), packed_grad)
-    check_tensor(op, "views", views, (len(norm_sum),), packed_grad)
-    if ids.dtype != torch.int32:
-        raise ValueError(f"{op}: ids must be torch.int32, got {ids.dtype}")
-    grad = packed_grad.contiguous()
+    check_tensor(op, "norm_sum", norm_sum, (None,), packed)
+    check_tensor(op, "views", views, (len(norm_sum),), packed)
+    if max_radii is not None:
+        check_tensor(op, "max_radii", max_radii, (len(norm_sum),), packed)
     launch(
-        variant(op, grad),
-        len(ids),
+        variant(op, packed),
+        len(packed),
         ids,
-        grad,
-        grad.shape[1],
+        packed.detach().contiguous(),
+        grad.contiguous(),
+        packed.shape[1],
         float(width),
         float(height),
         norm_sum,
         views,
+        max_radii,
     )
