@@ -1,7 +1,7 @@
 // Simd<T, W>: W lanes of T with the few operations the kernels need.
 //
 // The primary template rests on compiler vectors and serves every target (SSE2 and NEON at W = 4,
-// and double); AVX2 and AVX-512 have specialisations below it with the same members, written in
+// and double); simd_avx2.h and simd_avx512.h have specialisations with the same members, written in
 // intrinsics only where the compiler's choice is poor. Arithmetic is left to the operators, so that
 // the compiler contracts multiply-adds.
 #pragma once
@@ -142,256 +142,6 @@ struct Simd {
   }
 };
 
-#if defined(__AVX2__) && defined(__FMA__)
-template <>
-struct Simd<float, 8> {
-  using Scalar = float;
-  using Int = int32_t;
-  static constexpr int width = 8;
-  typedef __m256 Vec;
-  typedef __m256i IVec;
-
-  struct Mask {
-    __m256 m;
-    SNOW_INLINE friend Mask operator&(Mask a, Mask b) { return {_mm256_and_ps(a.m, b.m)}; }
-    SNOW_INLINE friend Mask operator|(Mask a, Mask b) { return {_mm256_or_ps(a.m, b.m)}; }
-  };
-
-  Vec v;
-
-  Simd() = default;
-  SNOW_INLINE Simd(Vec x) : v(x) {}
-  template <class S, IfNumber<S> = 0>
-  SNOW_INLINE Simd(S s) : v(_mm256_set1_ps(float(s))) {}
-
-  SNOW_INLINE friend Simd operator+(Simd a, Simd b) { return a.v + b.v; }
-  SNOW_INLINE friend Simd operator-(Simd a, Simd b) { return a.v - b.v; }
-  SNOW_INLINE friend Simd operator*(Simd a, Simd b) { return a.v * b.v; }
-  SNOW_INLINE friend Simd operator/(Simd a, Simd b) { return a.v / b.v; }
-  SNOW_INLINE friend Simd operator-(Simd a) { return -a.v; }
-  SNOW_INLINE Simd& operator+=(Simd b) { return v += b.v, *this; }
-  SNOW_INLINE Simd& operator-=(Simd b) { return v -= b.v, *this; }
-  SNOW_INLINE Simd& operator*=(Simd b) { return v *= b.v, *this; }
-  SNOW_INLINE friend Mask operator>=(Simd a, Simd b) {
-    return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)};
-  }
-  SNOW_INLINE friend Mask operator>(Simd a, Simd b) {
-    return {_mm256_cmp_ps(a.v, b.v, _CMP_GT_OQ)};
-  }
-  SNOW_INLINE friend Mask operator<(Simd a, Simd b) {
-    return {_mm256_cmp_ps(a.v, b.v, _CMP_LT_OQ)};
-  }
-
-  SNOW_INLINE static Simd load(const float* p) { return _mm256_loadu_ps(p); }
-  SNOW_INLINE void store(float* p) const { _mm256_storeu_ps(p, v); }
-  SNOW_INLINE static __m256i first_lanes(int n) {
-    return _mm256_cmpgt_epi32(_mm256_set1_epi32(n), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
-  }
-  SNOW_INLINE static Simd load_first(const float* p, int n) {
-    return _mm256_maskload_ps(p, first_lanes(n));
-  }
-  SNOW_INLINE void store_first(float* p, int n) const { _mm256_maskstore_ps(p, first_lanes(n), v); }
-  SNOW_INLINE static Simd load_bytes(const uint8_t* p) {
-    return _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i*)p)));
-  }
-  SNOW_INLINE static Simd iota() { return _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7); }
-  SNOW_INLINE static Mask first(int n) { return {_mm256_castsi256_ps(first_lanes(n))}; }
-  SNOW_INLINE static uint32_t bits(Mask m) { return uint32_t(_mm256_movemask_ps(m.m)); }
-  SNOW_INLINE static Mask from_bits(uint32_t b) {
-    const __m256i lane = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
-    __m256i x = _mm256_and_si256(_mm256_set1_epi32(int(b)), lane);
-    return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(x, lane))};
-  }
-
-  SNOW_INLINE friend Simd select(Mask m, Simd a, Simd b) { return _mm256_blendv_ps(b.v, a.v, m.m); }
-  SNOW_INLINE friend Simd zero_unless(Mask m, Simd a) { return _mm256_and_ps(m.m, a.v); }
-  SNOW_INLINE friend Simd min(Simd a, Simd b) { return _mm256_min_ps(a.v, b.v); }
-  SNOW_INLINE friend Simd max(Simd a, Simd b) { return _mm256_max_ps(a.v, b.v); }
-  SNOW_INLINE friend Simd sqrt(Simd a) { return _mm256_sqrt_ps(a.v); }
-  SNOW_INLINE friend Simd reciprocal(Simd a) {  // 12-bit estimate and one Newton step: 2^-23
-    Simd r = _mm256_rcp_ps(a.v);
-    return r * (Simd(2.f) - a * r);
-  }
-  SNOW_INLINE friend Simd reciprocal_estimate(Simd a) { return reciprocal(a); }
-  SNOW_INLINE friend Simd rsqrt(Simd a) {
-    Simd r = _mm256_rsqrt_ps(a.v);
-    return r * (Simd(1.5f) - Simd(0.5f) * a * r * r);
-  }
-  SNOW_INLINE static void split(Simd x, Simd& f, IVec& whole) {
-    __m256 fl = _mm256_floor_ps(x.v);
-    f = x.v - fl;
-    whole = _mm256_cvtps_epi32(fl);
-  }
-  SNOW_INLINE static Simd scale_by_pow2(Simd a, IVec whole) {
-    return _mm256_castsi256_ps(
-        _mm256_add_epi32(_mm256_castps_si256(a.v), _mm256_slli_epi32(whole, 23)));
-  }
-  SNOW_INLINE static void split_log2(Simd x, Simd& mantissa_part, Simd& exponent) {
-    __m256i i = _mm256_castps_si256(x.v);
-    __m256i e = _mm256_srai_epi32(_mm256_sub_epi32(i, _mm256_set1_epi32(0x3f3504f3)), 23);
-    mantissa_part = _mm256_castsi256_ps(_mm256_sub_epi32(i, _mm256_slli_epi32(e, 23)));
-    exponent = _mm256_cvtepi32_ps(e);
-  }
-};
-#endif
-
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-template <>
-struct Simd<float, 16> {
-  using Scalar = float;
-  using Int = int32_t;
-  static constexpr int width = 16;
-  typedef __m512 Vec;
-  typedef __m512 IVec;  // split() keeps x itself: vscalefps does floor and scale in one
-
-  struct Mask {
-    __mmask16 m;
-    SNOW_INLINE friend Mask operator&(Mask a, Mask b) { return {__mmask16(a.m & b.m)}; }
-    SNOW_INLINE friend Mask operator|(Mask a, Mask b) { return {__mmask16(a.m | b.m)}; }
-  };
-
-  Vec v;
-
-  Simd() = default;
-  SNOW_INLINE Simd(Vec x) : v(x) {}
-  template <class S, IfNumber<S> = 0>
-  SNOW_INLINE Simd(S s) : v(_mm512_set1_ps(float(s))) {}
-
-  SNOW_INLINE friend Simd operator+(Simd a, Simd b) { return a.v + b.v; }
-  SNOW_INLINE friend Simd operator-(Simd a, Simd b) { return a.v - b.v; }
-  SNOW_INLINE friend Simd operator*(Simd a, Simd b) { return a.v * b.v; }
-  SNOW_INLINE friend Simd operator/(Simd a, Simd b) { return a.v / b.v; }
-  SNOW_INLINE friend Simd operator-(Simd a) { return -a.v; }
-  SNOW_INLINE Simd& operator+=(Simd b) { return v += b.v, *this; }
-  SNOW_INLINE Simd& operator-=(Simd b) { return v -= b.v, *this; }
-  SNOW_INLINE Simd& operator*=(Simd b) { return v *= b.v, *this; }
-  SNOW_INLINE friend Mask operator>=(Simd a, Simd b) {
-    return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)};
-  }
-  SNOW_INLINE friend Mask operator>(Simd a, Simd b) {
-    return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)};
-  }
-  SNOW_INLINE friend Mask operator<(Simd a, Simd b) {
-    return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)};
-  }
-
-  SNOW_INLINE static Simd load(const float* p) { return _mm512_loadu_ps(p); }
-  SNOW_INLINE void store(float* p) const { _mm512_storeu_ps(p, v); }
-  SNOW_INLINE static __mmask16 first_lanes(int n) {
-    return __mmask16(n >= 16 ? 0xffff : (1u << n) - 1);
-  }
-  SNOW_INLINE static Simd load_first(const float* p, int n) {
-    return _mm512_maskz_loadu_ps(first_lanes(n), p);
-  }
-  SNOW_INLINE void store_first(float* p, int n) const {
-    _mm512_mask_storeu_ps(p, first_lanes(n), v);
-  }
-  SNOW_INLINE static Simd load_bytes(const uint8_t* p) {
-    return _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(_mm_loadu_si128((const __m128i*)p)));
-  }
-  SNOW_INLINE static Simd iota() {
-    return _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-  }
-  SNOW_INLINE static Mask first(int n) { return {first_lanes(n)}; }
-  SNOW_INLINE static uint32_t bits(Mask m) { return m.m; }
-  SNOW_INLINE static Mask from_bits(uint32_t b) { return {__mmask16(b)}; }
-
-  SNOW_INLINE friend Simd select(Mask m, Simd a, Simd b) {
-    return _mm512_mask_blend_ps(m.m, b.v, a.v);
-  }
-  SNOW_INLINE friend Simd zero_unless(Mask m, Simd a) { return _mm512_maskz_mov_ps(m.m, a.v); }
-  SNOW_INLINE friend Simd min(Simd a, Simd b) { return _mm512_min_ps(a.v, b.v); }
-  SNOW_INLINE friend Simd max(Simd a, Simd b) { return _mm512_max_ps(a.v, b.v); }
-  SNOW_INLINE friend Simd sqrt(Simd a) { return _mm512_sqrt_ps(a.v); }
-  SNOW_INLINE friend Simd reciprocal(Simd a) {  // 14-bit estimate and one Newton step
-    Simd r = _mm512_rcp14_ps(a.v);
-    return r * (Simd(2.f) - a * r);
-  }
-  SNOW_INLINE friend Simd reciprocal_estimate(Simd a) { return _mm512_rcp14_ps(a.v); }
-  SNOW_INLINE friend Simd rsqrt(Simd a) {
-    Simd r = _mm512_rsqrt14_ps(a.v);
-    return r * (Simd(1.5f) - Simd(0.5f) * a * r * r);
-  }
-  SNOW_INLINE static void split(Simd x, Simd& f, IVec& whole) {
-    f = _mm512_reduce_ps(x.v, 1);  // x - floor(x)
-    whole = x.v;
-  }
-  SNOW_INLINE static Simd scale_by_pow2(Simd a, IVec whole) { return _mm512_scalef_ps(a.v, whole); }
-  SNOW_INLINE static void split_log2(Simd x, Simd& mantissa_part, Simd& exponent) {
-    __m512i i = _mm512_castps_si512(x.v);
-    __m512i e = _mm512_srai_epi32(_mm512_sub_epi32(i, _mm512_set1_epi32(0x3f3504f3)), 23);
-    mantissa_part = _mm512_castsi512_ps(_mm512_sub_epi32(i, _mm512_slli_epi32(e, 23)));
-    exponent = _mm512_cvtepi32_ps(e);
-  }
-};
-#endif
-
-// The native vector of this build, and the one in which the double-precision checks run.
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-using VecF = Simd<float, 16>;
-#elif defined(__AVX2__) && defined(__FMA__)
-using VecF = Simd<float, 8>;
-#else
-using VecF = Simd<float, 4>;
-#endif
-using VecD = Simd<double, 4>;
-
-// ---- transcendental functions -------------------------------------------------------------------
-
-template <class V>
-SNOW_INLINE V map_lanes(V x, double (*f)(double)) {
-  for (int l = 0; l < V::width; l++) x.v[l] = f(x.v[l]);
-  return x;
-}
-
-// 2^x for blending, x in about [-30, 1]: minimax quartic on [0, 1), relative error 2.6e-6.
-// Lanes far outside give garbage; the caller masks them.
-template <int W>
-SNOW_INLINE Simd<float, W> exp2_blend(Simd<float, W> x) {
-  using V = Simd<float, W>;
-  V f;
-  typename V::IVec whole;
-  V::split(x, f, whole);
-  V p = f * V(0.013676527f) + V(0.051690261f);
-  p = p * f + V(0.24168065f);
-  p = p * f + V(0.69294637f);
-  p = p * f + V(1.0000026f);
-  return V::scale_by_pow2(p, whole);
-}
-SNOW_INLINE VecD exp2_blend(VecD x) { return map_lanes(x, std::exp2); }
-
-// e^x, clamped to e^±80: degree 6 on [0, 1), relative error 2e-7.
-template <int W>
-SNOW_INLINE Simd<float, W> exp(Simd<float, W> x) {
-  using V = Simd<float, W>;
-  x = max(min(x * V(kLog2E), V(115.f)), V(-115.f));
-  V f;
-  typename V::IVec whole;
-  V::split(x, f, whole);
-  V p = f * V(2.1702255e-4f) + V(1.2439688e-3f);
-  p = p * f + V(9.6788410e-3f);
-  p = p * f + V(5.5483342e-2f);
-  p = p * f + V(2.4022984e-1f);
-  p = p * f + V(6.9314698e-1f);
-  p = p * f + V(1.0f);
-  return V::scale_by_pow2(p, whole);
-}
-SNOW_INLINE VecD exp(VecD x) { return map_lanes(x, std::exp); }
-
-template <int W>
-SNOW_INLINE Simd<float, W> log2(Simd<float, W> x) {
-  using V = Simd<float, W>;
-  V m, e;
-  V::split_log2(x, m, e);
-  V t = (m - V(1.f)) / (m + V(1.f)), t2 = t * t;
-  V p = t2 * V(0.3206f) + V(0.41219858f);
-  p = p * t2 + V(0.57707802f);
-  p = p * t2 + V(0.96179669f);
-  p = p * t2 + V(2.88539008f);
-  return e + t * p;
-}
-SNOW_INLINE VecD log2(VecD x) { return map_lanes(x, std::log2); }
-
 // ---- rows ⇄ lanes -------------------------------------------------------------------------------
 // Parameters are stored a Gaussian a row, (N, K); the kernels want a Gaussian a lane. These move W
 // rows of K columns between the two, four columns at a time as 4×4 transposes inside 128-bit lanes.
@@ -432,70 +182,37 @@ struct RowMover {
   }
 };
 
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-template <>
-struct RowMover<Simd<float, 16>> {
-  using V = Simd<float, 16>;
-  SNOW_INLINE static void transpose4(__m512 (&r)[4]) {
-    __m512 a = _mm512_unpacklo_ps(r[0], r[1]), b = _mm512_unpacklo_ps(r[2], r[3]);
-    __m512 c = _mm512_unpackhi_ps(r[0], r[1]), d = _mm512_unpackhi_ps(r[2], r[3]);
-    r[0] = _mm512_shuffle_ps(a, b, 0x44), r[1] = _mm512_shuffle_ps(a, b, 0xEE);
-    r[2] = _mm512_shuffle_ps(c, d, 0x44), r[3] = _mm512_shuffle_ps(c, d, 0xEE);
+// ---- sums over lanes ----------------------------------------------------------------------------
+// out[k] = sum of the lanes of in[k], k < K <= 16; out has room for 16.
+template <int K, class V>
+SNOW_INLINE void sum_lanes(const V* in, typename V::Scalar* out) {
+  for (int k = 0; k < K; k++) {
+    typename V::Scalar s = 0;
+    for (int l = 0; l < V::width; l++) s += in[k].v[l];
+    out[k] = s;
   }
-  SNOW_INLINE static void gather4(const float* const* rows, int column, int n, V* out) {
-    __m512 r[4];
-    for (int j = 0; j < 4; j++) {
-      __m512 x = _mm512_castps128_ps512(load_quad(rows[j] + column, n));
-      x = _mm512_insertf32x4(x, load_quad(rows[j + 4] + column, n), 1);
-      x = _mm512_insertf32x4(x, load_quad(rows[j + 8] + column, n), 2);
-      r[j] = _mm512_insertf32x4(x, load_quad(rows[j + 12] + column, n), 3);
-    }
-    transpose4(r);
-    for (int k = 0; k < n; k++) out[k] = r[k];
-  }
-  SNOW_INLINE static void scatter4(float* const* rows, int column, int n, const V* in, int count) {
-    __m512 r[4];
-    for (int k = 0; k < 4; k++) r[k] = k < n ? in[k].v : _mm512_setzero_ps();
-    transpose4(r);
-    for (int j = 0; j < 4; j++) {
-      if (j < count) store_quad(rows[j] + column, _mm512_castps512_ps128(r[j]), n);
-      if (j + 4 < count) store_quad(rows[j + 4] + column, _mm512_extractf32x4_ps(r[j], 1), n);
-      if (j + 8 < count) store_quad(rows[j + 8] + column, _mm512_extractf32x4_ps(r[j], 2), n);
-      if (j + 12 < count) store_quad(rows[j + 12] + column, _mm512_extractf32x4_ps(r[j], 3), n);
-    }
-  }
-};
-#endif
+}
+
+}  // namespace snow
 
 #if defined(__AVX2__) && defined(__FMA__)
-template <>
-struct RowMover<Simd<float, 8>> {
-  using V = Simd<float, 8>;
-  SNOW_INLINE static void transpose4(__m256 (&r)[4]) {
-    __m256 a = _mm256_unpacklo_ps(r[0], r[1]), b = _mm256_unpacklo_ps(r[2], r[3]);
-    __m256 c = _mm256_unpackhi_ps(r[0], r[1]), d = _mm256_unpackhi_ps(r[2], r[3]);
-    r[0] = _mm256_shuffle_ps(a, b, 0x44), r[1] = _mm256_shuffle_ps(a, b, 0xEE);
-    r[2] = _mm256_shuffle_ps(c, d, 0x44), r[3] = _mm256_shuffle_ps(c, d, 0xEE);
-  }
-  SNOW_INLINE static void gather4(const float* const* rows, int column, int n, V* out) {
-    __m256 r[4];
-    for (int j = 0; j < 4; j++)
-      r[j] = _mm256_insertf128_ps(_mm256_castps128_ps256(load_quad(rows[j] + column, n)),
-                                  load_quad(rows[j + 4] + column, n), 1);
-    transpose4(r);
-    for (int k = 0; k < n; k++) out[k] = r[k];
-  }
-  SNOW_INLINE static void scatter4(float* const* rows, int column, int n, const V* in, int count) {
-    __m256 r[4];
-    for (int k = 0; k < 4; k++) r[k] = k < n ? in[k].v : _mm256_setzero_ps();
-    transpose4(r);
-    for (int j = 0; j < 4; j++) {
-      if (j < count) store_quad(rows[j] + column, _mm256_castps256_ps128(r[j]), n);
-      if (j + 4 < count) store_quad(rows[j + 4] + column, _mm256_extractf128_ps(r[j], 1), n);
-    }
-  }
-};
+#include "simd_avx2.h"
 #endif
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+#include "simd_avx512.h"
+#endif
+
+namespace snow {
+
+// The native vector of this build, and the one in which the double-precision checks run.
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+using VecF = Simd<float, 16>;
+#elif defined(__AVX2__) && defined(__FMA__)
+using VecF = Simd<float, 8>;
+#else
+using VecF = Simd<float, 4>;
+#endif
+using VecD = Simd<double, 4>;
 
 // W rows of `columns` columns ⇄ `columns` vectors. Calls, not inlined: a kernel moves a dozen tensors,
 // and unrolled they would not fit the instruction cache.
@@ -523,60 +240,6 @@ __attribute__((noinline)) void scatter_rows(typename V::Scalar* base, int64_t st
   if (columns - c == 1) RowMover<V>::scatter4(rows, c, 1, in + c, count);
 }
 
-// ---- sums over lanes ----------------------------------------------------------------------------
-// out[k] = sum of the lanes of in[k], k < K <= 16; out has room for 16.
-template <int K, class V>
-SNOW_INLINE void sum_lanes(const V* in, typename V::Scalar* out) {
-  for (int k = 0; k < K; k++) {
-    typename V::Scalar s = 0;
-    for (int l = 0; l < V::width; l++) s += in[k].v[l];
-    out[k] = s;
-  }
-}
-
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-template <int K>
-SNOW_INLINE void sum_lanes(const Simd<float, 16>* in, float* out) {
-  const __m512 zero = _mm512_setzero_ps();
-  auto vec = [&](int k) { return k < K ? in[k].v : zero; };
-  auto halves = [](__m512 a, __m512 b) {  // [a.lo + a.hi | b.lo + b.hi]
-    return _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xEE));
-  };
-  __m512 quad[4];
-#pragma GCC unroll 4
-  for (int q = 0; q < 4; q++) {  // quad[q]: 128-bit lane j holds 4 partial sums of in[4q + j]
-    if (4 * q >= K) {
-      quad[q] = zero;
-      continue;
-    }
-    __m512 ab = halves(vec(4 * q), vec(4 * q + 1)), cd = halves(vec(4 * q + 2), vec(4 * q + 3));
-    quad[q] = _mm512_add_ps(_mm512_shuffle_f32x4(ab, cd, 0x88), _mm512_shuffle_f32x4(ab, cd, 0xDD));
-  }
-  __m512 u =
-      _mm512_add_ps(_mm512_unpacklo_ps(quad[0], quad[1]), _mm512_unpackhi_ps(quad[0], quad[1]));
-  __m512 w =
-      _mm512_add_ps(_mm512_unpacklo_ps(quad[2], quad[3]), _mm512_unpackhi_ps(quad[2], quad[3]));
-  __m512 r = _mm512_add_ps(_mm512_shuffle_ps(u, w, 0x44), _mm512_shuffle_ps(u, w, 0xEE));
-  // lane 4j + q now holds the sum of in[4q + j]
-  const __m512i order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-  _mm512_storeu_ps(out, _mm512_permutexvar_ps(order, r));
-}
-#endif
-
-#if defined(__AVX2__) && defined(__FMA__)
-template <int K>
-SNOW_INLINE void sum_lanes(const Simd<float, 8>* in, float* out) {
-  const __m256 zero = _mm256_setzero_ps();
-  auto vec = [&](int k) { return k < K ? in[k].v : zero; };
-#pragma GCC unroll 4
-  for (int q = 0; q < (K + 3) / 4; q++) {
-    __m256 s = _mm256_hadd_ps(_mm256_hadd_ps(vec(4 * q), vec(4 * q + 1)),
-                              _mm256_hadd_ps(vec(4 * q + 2), vec(4 * q + 3)));
-    _mm_storeu_ps(out + 4 * q, _mm_add_ps(_mm256_castps256_ps128(s), _mm256_extractf128_ps(s, 1)));
-  }
-}
-#endif
-
 SNOW_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
 
 // Denormals cost 1.7× in blending: every kernel turns them off on each of its threads, and restores
@@ -597,3 +260,5 @@ struct FlushDenormals {
 };
 
 }  // namespace snow
+
+#include "simd_math.h"
