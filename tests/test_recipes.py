@@ -39,7 +39,7 @@ def test_the_short_one_scales_with_its_length():
         1,
         1,
     ]
-    assert config.learning_rates.at(1000, 1000, 1.0)["means"] == pytest.approx(1.6e-6)
+    assert config.learning_rates.at(1000, 1000, 1.0)["means"] == pytest.approx(1.6e-5)
     assert config.density.opacity_reset_interval == 0
     assert config.density.prune_world_size == 0
 
@@ -93,3 +93,14 @@ def test_a_configuration_of_another_version():
         config_from_json(values | {"gravity": 9.81})
     with pytest.raises(UserError, match="another version"):
         config_from_json({})
+
+
+def test_the_cap_follows_the_size_of_the_photos():
+    config = recipe("default")
+    assert config.gaussians_per_pixel > 0
+    small = config.capped(1000).density.max_gaussians
+    assert small == round(1000 * config.gaussians_per_pixel)
+    assert config.capped(10**9) == config
+    # A cap that is asked for is the cap.
+    assert recipe("default", max_gaussians=200_000).capped(1000).density.max_gaussians == 200_000
+    assert recipe("paper").capped(1000).density.max_gaussians == 0

@@ -29,6 +29,8 @@ class TrainConfig:
         initial_opacity: of every Gaussian at the start.
         initial_scale: of every Gaussian at the start, in mean distances to its 3 neighbours.
         learning_rates, density: see there.
+        gaussians_per_pixel: together with ``density.max_gaussians``, a cap that follows the size of
+            the photos: small ones show no more. 0 is none.
         visible_only: Gaussians that a view does not see skip the optimiser in its step. The paper
             lets their momentum carry them on; this is faster and loses nothing measurable.
         coarse_to_fine: the last moments at a quarter and at a half of the resolution. 0 is never.
@@ -49,6 +51,7 @@ class TrainConfig:
     initial_scale: float = 1.0
     learning_rates: LearningRates = field(default_factory=LearningRates)
     density: DensityConfig = field(default_factory=AdaptiveDensity)
+    gaussians_per_pixel: float = 0.0
     visible_only: bool = False
     coarse_to_fine: tuple[When, When] = (0, 0)
     image_memory: int = 0
@@ -60,6 +63,15 @@ class TrainConfig:
             raise UserError(f"--iterations is {self.iterations}; it must be at least 1")
         if self.sh_degree not in (0, 1, 2, 3):
             raise UserError(f"--sh-degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
+
+    def capped(self, pixels: int) -> TrainConfig:
+        """This configuration with the cap that ``gaussians_per_pixel`` means for such photos."""
+        if self.gaussians_per_pixel <= 0:
+            return self
+        cap = max(1, round(self.gaussians_per_pixel * pixels))
+        if self.density.max_gaussians > 0:
+            cap = min(cap, self.density.max_gaussians)
+        return replace(self, density=replace(self.density, max_gaussians=cap))
 
     def downscale_at(self, step: int) -> int:
         """1, 2 or 4: by what the images of this step are reduced."""
@@ -82,6 +94,8 @@ def changed(config: TrainConfig, **knobs: Any) -> TrainConfig:
         UserError: a knob that this configuration does not have.
     """
     given = {name: value for name, value in knobs.items() if value is not None}
+    if "max_gaussians" in given:
+        given.setdefault("gaussians_per_pixel", 0.0)
     whole = {f.name for f in fields(config)} & given.keys()
     config = replace(config, **{name: given.pop(name) for name in whole})
     density = {f.name for f in fields(config.density)} & given.keys()

@@ -57,7 +57,8 @@ class Trainer:
         if not capture.train:
             raise UserError("the capture has no training views; check its folder and its split")
         self.capture = capture
-        self.config = config
+        sizes = sorted(view.camera.width * view.camera.height for view in capture.train)
+        self.config = config = config.capped(sizes[len(sizes) // 2])
         self.step = 0
         # One generator for each kind of choice, so that one kind does not disturb another.
         self._generators = {
