@@ -54,10 +54,14 @@ def default() -> TrainConfig:
 def paper() -> TrainConfig:
     """The paper's schedule, complete: 30,000 steps.
 
-    Its moments are steps, as in the paper: a shorter training with it is the beginning of the long
-    one, learning rate included.
+    Where the paper's moment is the end of something (densification at 15,000, the rate of the means
+    at 30,000) it is a half or the whole of the training here: the same at 30,000 steps, and a
+    shorter training comes to an end too. The other moments stay steps.
     """
-    return TrainConfig()
+    return TrainConfig(
+        learning_rates=LearningRates(means_steps=1.0),
+        density=AdaptiveDensity(densify_until=0.5),
+    )
 
 
 def mcmc() -> TrainConfig:
