@@ -29,6 +29,7 @@ def default() -> TrainConfig:
     return TrainConfig(
         iterations=3000,
         sh_interval=100,
+        initial_points=20_000,
         learning_rates=replace(
             LearningRates().scaled(3.0),
             means_final=1.6e-5,
