@@ -57,8 +57,8 @@ def paper() -> TrainConfig:
 
     Where the paper's moment is the end of something (densification at 15,000, the rate of the means
     at 30,000) it is a half or the whole of the training here: the same at 30,000 steps, and a
-    shorter training comes to an end too. The other moments stay steps. Pruning by size on the screen
-    is off: in pixels it depends on the resolution, and at 270×480 it costs half a dB.
+    shorter training comes to an end too. The other moments stay steps. Pruning by screen size is
+    off: in pixels it depends on the resolution, and at 270×480 it costs half a dB.
     """
     return TrainConfig(
         learning_rates=LearningRates(means_steps=1.0),
