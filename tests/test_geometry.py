@@ -1,16 +1,19 @@
-"""Rotations and rigid transforms: round trips, the hard half turns, gradients, conventions."""
+"""Rotations, rigid transforms, similarities: round trips, half turns, gradients, conventions."""
 
+import json
 import math
 
 import pytest
 import torch
 
 from snowsplat.geometry import (
+    Similarity,
     compose_rigid,
     invert_rigid,
     look_at,
     quat_from_rotation,
     rotation_from_quat,
+    similarity_from_points,
     transform_points,
 )
 
@@ -115,3 +118,111 @@ def test_look_at_along_up_and_onto_itself():
     assert torch.allclose(pose[:, :3] @ pose[:, :3].T, torch.eye(3, dtype=F64))
     with pytest.raises(ValueError, match="same point"):
         look_at(up, up, up)
+
+
+def random_points(n: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=F64)
+
+
+def similarity() -> Similarity:
+    rotation = rotation_from_quat(random_quats(1, 8))[0]
+    return Similarity(2.5, rotation, torch.tensor([1.0, -2.0, 3.0], dtype=F64))
+
+
+def test_similarity_scales_then_turns_then_moves():
+    quarter_about_z = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=F64)
+    new_from_old = Similarity(2.0, quarter_about_z, torch.tensor([10.0, 0, 0], dtype=F64))
+    points = torch.tensor([[1.0, 0, 0], [0, 1, 5]], dtype=F64)
+    expected = torch.tensor([[10.0, 2, 0], [8, 0, 10]], dtype=F64)
+    assert torch.allclose(new_from_old.apply(points), expected)
+    assert new_from_old.apply(points.float()).dtype == torch.float32
+
+
+def test_similarity_and_its_inverse_cancel():
+    points = random_points(20).reshape(2, 10, 3)
+    there = similarity()
+    assert torch.allclose(there.inverse().apply(there.apply(points)), points, atol=1e-13)
+    assert torch.allclose(there.apply(there.inverse().apply(points)), points, atol=1e-13)
+    assert torch.equal(Similarity.identity().apply(points), points)
+
+
+def test_similarity_leaves_what_cameras_see_as_it_is():
+    poses, points, there = rigid(4), random_points(6, 5), similarity()
+    moved = there.apply_to_poses(poses)
+    in_camera = transform_points(poses, points)
+    assert torch.allclose(transform_points(moved, there.apply(points)), 2.5 * in_camera)
+    assert torch.allclose(moved[:, :, :3] @ moved[:, :, :3].mT, torch.eye(3, dtype=F64))
+    centres = invert_rigid(poses)[:, :, 3]
+    assert torch.allclose(invert_rigid(moved)[:, :, 3], there.apply(centres))
+
+
+def test_similarity_survives_json():
+    there = similarity()
+    back = Similarity.from_json(json.loads(json.dumps(there.to_json())))
+    assert back.scale == there.scale
+    assert torch.equal(back.rotation, there.rotation)
+    assert torch.equal(back.translation, there.translation)
+
+
+@pytest.mark.parametrize(
+    ("scale", "rotation", "translation", "message"),
+    [
+        (0.0, torch.eye(3), torch.zeros(3), "scale"),
+        (math.nan, torch.eye(3), torch.zeros(3), "scale"),
+        (1.0, 2 * torch.eye(3), torch.zeros(3), "not a rotation"),
+        (1.0, torch.diag(torch.tensor([1.0, 1, -1])), torch.zeros(3), "not a rotation"),
+        (1.0, torch.eye(4), torch.zeros(3), r"\(3, 3\)"),
+    ],
+)
+def test_what_is_no_similarity_is_refused(scale, rotation, translation, message):
+    with pytest.raises(ValueError, match=message):
+        Similarity(scale, rotation, translation)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_similarity_is_found_from_pairs(flat):
+    source, there = random_points(12), similarity()
+    if flat:  # four photos on a table top: one singular value is 0
+        source[:, 2] = 0
+    found = similarity_from_points(source, there.apply(source))
+    assert found.scale == pytest.approx(there.scale)
+    assert torch.allclose(found.rotation, there.rotation)
+    assert torch.allclose(found.translation, there.translation)
+
+
+def test_similarity_of_noisy_pairs_is_the_best_one():
+    source = random_points(30)
+    target = similarity().apply(source) + 0.1 * random_points(30, 1)
+
+    def loss(s: Similarity) -> float:
+        return float((s.apply(source) - target).square().sum())
+
+    found = similarity_from_points(source, target)
+    for seed in range(20):
+        nudge = torch.cat([torch.ones(1, dtype=F64), 1e-3 * random_points(1, seed)[0]])
+        other = Similarity(
+            found.scale * (1 + 1e-3 * (seed % 3 - 1)),
+            rotation_from_quat(nudge) @ found.rotation,
+            found.translation + 1e-3 * random_points(1, seed + 50)[0],
+        )
+        assert loss(other) > loss(found)
+
+
+def test_similarity_is_never_a_reflection():
+    source = random_points(10)
+    found = similarity_from_points(source, source * torch.tensor([1.0, 1, -1], dtype=F64))
+    assert float(torch.linalg.det(found.rotation)) == pytest.approx(1)
+
+
+def test_similarity_of_too_little_is_refused():
+    points = random_points(5)
+    with pytest.raises(ValueError, match="three"):
+        similarity_from_points(points[:2], points[:2])
+    line = torch.arange(5, dtype=F64)[:, None] * points[0] + points[1]
+    for source, target in ((line, points), (points, line), (points, torch.ones(5, 3))):
+        with pytest.raises(ValueError, match="line"):
+            similarity_from_points(source, target)
+    with pytest.raises(ValueError, match="finite"):
+        similarity_from_points(points, points / 0)
+    with pytest.raises(ValueError, match="N, 3"):
+        similarity_from_points(points, points[:4])

@@ -2,7 +2,15 @@
 
 A rigid transform ``a_from_b`` is a (..., 3, 4) matrix [R | t] with x_a = R x_b + t; names compose
 like units: ``compose_rigid(a_from_b, b_from_c)`` is ``a_from_c``. Quaternions are wxyz (Hamilton).
+`Similarity` also changes the unit of length: it takes one world frame to another.
 """
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -97,3 +105,109 @@ def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack([right, down, forward], -2)
     return torch.cat([rotation, -rotation @ position.unsqueeze(-1)], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """A change of the world frame, old to new: x_new = scale · R · x_old + t.
+
+    Raises:
+        ValueError: shapes that are not these, a scale that is not positive, or an R that is no
+            rotation.
+    """
+
+    scale: float
+    rotation: Tensor  # (3, 3) float64
+    translation: Tensor  # (3,) float64, in units of the new frame
+
+    def __post_init__(self) -> None:
+        shapes = tuple(self.rotation.shape), tuple(self.translation.shape)
+        if shapes != ((3, 3), (3,)):
+            raise ValueError(f"a similarity has (3, 3) and (3,), not {shapes[0]} and {shapes[1]}")
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"the scale of a similarity is positive, not {self.scale}")
+        # In place of the fields as given, so that all arithmetic below is in double precision.
+        object.__setattr__(self, "scale", float(self.scale))
+        object.__setattr__(self, "rotation", self.rotation.to(torch.float64))
+        object.__setattr__(self, "translation", self.translation.to(torch.float64))
+        error = self.rotation @ self.rotation.T - torch.eye(3, dtype=torch.float64)
+        if not (float(error.abs().max()) < 1e-5 and float(torch.linalg.det(self.rotation)) > 0):
+            raise ValueError("the rotation of a similarity is not a rotation")
+
+    @classmethod
+    def identity(cls) -> Similarity:
+        """The change that changes nothing."""
+        return cls(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+    def inverse(self) -> Similarity:
+        """New to old."""
+        back = self.rotation.T / self.scale
+        return Similarity(1.0 / self.scale, self.rotation.T, -back @ self.translation)
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Points (..., 3) of the old frame, in the new one."""
+        scaled = self.scale * self.rotation.to(points.dtype)
+        return points @ scaled.T + self.translation.to(points.dtype)
+
+    def apply_to_poses(self, cam_from_old: Tensor) -> Tensor:
+        """``cam_from_new`` (..., 3, 4) of rigid poses ``cam_from_old`` (..., 3, 4).
+
+        Rigid again: the unit of length of the cameras' own frames becomes the new one, so depths
+        grow by ``scale`` and every picture stays the same.
+        """
+        rotation = cam_from_old[..., :3] @ self.rotation.to(cam_from_old.dtype).T
+        shift = rotation @ self.translation.to(cam_from_old.dtype)
+        translation = self.scale * cam_from_old[..., 3] - shift
+        return torch.cat([rotation, translation[..., None]], -1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers and lists; `from_json` reads them back exactly."""
+        return {
+            "scale": self.scale,
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Similarity:
+        """The inverse of `to_json`."""
+        rotation, translation = value["rotation"], value["translation"]
+        return cls(
+            float(value["scale"]),
+            torch.tensor(rotation, dtype=torch.float64),
+            torch.tensor(translation, dtype=torch.float64),
+        )
+
+
+def similarity_from_points(source: Tensor, target: Tensor) -> Similarity:
+    """The similarity that takes points ``source`` (N, 3) closest to ``target`` (N, 3).
+
+    Least squares over all pairs, in closed form: S. Umeyama, "Least-squares estimation of
+    transformation parameters between two point patterns", PAMI 13(4), 1991. Reflections are never
+    returned.
+
+    Raises:
+        ValueError: fewer than three pairs, values that are not finite, or points that all lie on
+            one line (any turn about it would do).
+    """
+    if source.ndim != 2 or source.shape[1] != 3 or source.shape != target.shape:
+        shapes = f"{tuple(source.shape)} and {tuple(target.shape)}"
+        raise ValueError(f"points to align are (N, 3) and (N, 3), not {shapes}")
+    if len(source) < 3:
+        raise ValueError(f"{len(source)} pairs of points do not tell a similarity; it takes three")
+    source, target = source.to(torch.float64), target.to(torch.float64)
+    if not bool(torch.isfinite(source).all() and torch.isfinite(target).all()):
+        raise ValueError("points to align are not finite")
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    x, y = source - source_mean, target - target_mean
+    for points in (x, y):
+        # What is narrower than 1e-7 of its length is rounding.
+        widths = torch.linalg.svdvals(points)
+        if not float(widths[1]) > 1e-7 * float(widths[0]):
+            raise ValueError("points to align all lie on one line, which leaves a turn about it")
+    u, singular, vt = torch.linalg.svd(y.T @ x / len(x))
+    signs = torch.ones(3, dtype=torch.float64)
+    signs[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vt))
+    rotation = u * signs @ vt
+    scale = float((singular * signs).sum() / (x * x).sum(1).mean())
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
