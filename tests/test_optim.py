@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from snowsplat.gaussians import Gaussians
-from snowsplat.optim import Adam, LearningRates, at_step
+from snowsplat.optim import Adam, LearningRates
+from snowsplat.schedule import Schedule
 
 
 def some_gaussians(n: int = 5, rest: int = 3) -> Gaussians:
@@ -17,10 +18,15 @@ def some_gaussians(n: int = 5, rest: int = 3) -> Gaussians:
 
 def test_the_papers_rates():
     rates = LearningRates()
-    first, last = rates.at(0, 30_000, extent=2.0), rates.at(30_000, 30_000, extent=2.0)
+    first, last = (
+        rates.at(0, Schedule(30_000), extent=2.0),
+        rates.at(30_000, Schedule(30_000), extent=2.0),
+    )
     assert first["means"] == pytest.approx(2 * 1.6e-4)
     assert last["means"] == pytest.approx(2 * 1.6e-6)
-    assert rates.at(15_000, 30_000, extent=2.0)["means"] == pytest.approx(2 * 1.6e-5)  # log-linear
+    assert rates.at(15_000, Schedule(30_000), extent=2.0)["means"] == pytest.approx(
+        2 * 1.6e-5
+    )  # log-linear
     assert {name: rate for name, rate in first.items() if name != "means"} == {
         "log_scales": 5e-3,
         "quats": 1e-3,
@@ -32,11 +38,11 @@ def test_the_papers_rates():
 
 def test_the_means_rate_ends_at_its_own_step_and_stays():
     absolute = LearningRates(means_steps=1000)
-    assert absolute.at(1000, 4000, 1.0)["means"] == pytest.approx(1.6e-6)
-    assert absolute.at(4000, 4000, 1.0)["means"] == pytest.approx(1.6e-6)
+    assert absolute.at(1000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-6)
+    assert absolute.at(4000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-6)
     relative = LearningRates(means_steps=0.5)
-    assert relative.at(1000, 4000, 1.0)["means"] == pytest.approx(1.6e-5)
-    assert relative.at(2000, 4000, 1.0)["means"] == pytest.approx(1.6e-6)
+    assert relative.at(1000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-5)
+    assert relative.at(2000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-6)
 
 
 def test_scaled_spares_the_final_rate():
@@ -47,16 +53,9 @@ def test_scaled_spares_the_final_rate():
     assert rates.means_steps == 30_000
 
 
-def test_at_step():
-    assert at_step(500, 7000) == 500
-    assert at_step(0.5, 7000) == 3500
-    assert at_step(1.0, 7000) == 7000
-    assert at_step(1, 7000) == 1
-
-
 def test_moments_follow_the_rows_and_new_rows_start_at_zero():
     gaussians = some_gaussians()
-    adam = Adam(gaussians, LearningRates(), iterations=10, extent=1.0)
+    adam = Adam(gaussians, LearningRates(), schedule=Schedule(10), extent=1.0)
     for moments in (adam.exp_avg, adam.exp_avg_sq):
         for name, parameter in gaussians.parameters().items():
             moments[name] = (
@@ -74,7 +73,7 @@ def test_moments_follow_the_rows_and_new_rows_start_at_zero():
 
 def test_zero_forgets_one_parameter_alone():
     gaussians = some_gaussians()
-    adam = Adam(gaussians, LearningRates(), iterations=10, extent=1.0)
+    adam = Adam(gaussians, LearningRates(), schedule=Schedule(10), extent=1.0)
     for moments in (adam.exp_avg, adam.exp_avg_sq):
         for moment in moments.values():
             moment.fill_(1.0)
@@ -85,11 +84,11 @@ def test_zero_forgets_one_parameter_alone():
 
 
 def test_state_comes_back_as_copies():
-    adam = Adam(some_gaussians(5), LearningRates(), iterations=10, extent=1.0)
+    adam = Adam(some_gaussians(5), LearningRates(), schedule=Schedule(10), extent=1.0)
     adam.exp_avg["means"].normal_()
     state = adam.state_tensors()
     assert len(state) == 12
-    other = Adam(some_gaussians(3), LearningRates(), iterations=10, extent=1.0)
+    other = Adam(some_gaussians(3), LearningRates(), schedule=Schedule(10), extent=1.0)
     other.load_state(state)
     assert torch.equal(other.exp_avg["means"], adam.exp_avg["means"])
     adam.exp_avg["means"].zero_()
@@ -97,6 +96,8 @@ def test_state_comes_back_as_copies():
 
 
 def test_rates_reach_the_end_of_the_training():
-    adam = Adam(some_gaussians(), LearningRates(means_steps=1.0), iterations=200, extent=5.0)
+    adam = Adam(
+        some_gaussians(), LearningRates(means_steps=1.0), schedule=Schedule(200), extent=5.0
+    )
     assert adam.rates_at(200)["means"] == pytest.approx(5 * 1.6e-6)
     assert math.log10(adam.rates_at(100)["means"] / 5) == pytest.approx(math.log10(1.6e-5))

@@ -8,30 +8,31 @@ import pytest
 from snowsplat.config import TrainConfig, changed, config_from_json, config_to_json
 from snowsplat.density import AdaptiveDensity, McmcDensity
 from snowsplat.errors import UserError
-from snowsplat.optim import at_step
 from snowsplat.recipes import RECIPES, recipe
+from snowsplat.schedule import Schedule
 
 
 def test_the_paper_comes_to_its_end_at_any_length():
     for iterations in (7000, 30_000):
         config = recipe("paper", iterations=iterations)
-        density = config.density
+        density, schedule = config.density, Schedule(iterations)
         assert isinstance(density, AdaptiveDensity)
         assert config.sh_interval == 1000
         assert config.ssim_weight == 0.2
         assert not config.visible_only
-        assert config.downscale_at(1) == 1
-        assert at_step(density.densify_from, iterations) == 500
-        assert at_step(density.densify_until, iterations) == iterations // 2
-        assert at_step(config.learning_rates.means_steps, iterations) == iterations
+        assert config.downscale_at(1, schedule) == 1
+        assert schedule.step_of(density.densify_from) == 500
+        assert schedule.step_of(density.densify_until) == iterations // 2
+        assert schedule.step_of(config.learning_rates.means_steps) == iterations
         assert (density.densify_interval, density.opacity_reset_interval) == (100, 3000)
         assert (density.grad_threshold, density.prune_opacity) == (2e-4, 0.005)
 
 
 def test_the_short_one_scales_with_its_length():
     config = recipe("default", iterations=1000)
-    assert at_step(config.density.densify_until, config.iterations) == 500
-    assert [config.downscale_at(step) for step in (1, 150, 151, 400, 401, 1000)] == [
+    schedule = Schedule(config.iterations)
+    assert schedule.step_of(config.density.densify_until) == 500
+    assert [config.downscale_at(step, schedule) for step in (1, 150, 151, 400, 401, 1000)] == [
         4,
         4,
         2,
@@ -39,7 +40,7 @@ def test_the_short_one_scales_with_its_length():
         1,
         1,
     ]
-    assert config.learning_rates.at(1000, 1000, 1.0)["means"] == pytest.approx(1.6e-5)
+    assert config.learning_rates.at(1000, schedule, 1.0)["means"] == pytest.approx(1.6e-5)
     assert config.density.opacity_reset_interval == 0
     assert config.density.prune_world_size == 0
 

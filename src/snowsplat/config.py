@@ -7,7 +7,8 @@ from typing import Any, Literal
 
 from snowsplat.density import AdaptiveDensity, DensityConfig, McmcDensity
 from snowsplat.errors import UserError
-from snowsplat.optim import LearningRates, When, at_step
+from snowsplat.optim import LearningRates
+from snowsplat.schedule import Schedule, When
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,9 @@ class TrainConfig:
             cap = min(cap, self.density.max_gaussians)
         return replace(self, density=replace(self.density, max_gaussians=cap))
 
-    def downscale_at(self, step: int) -> int:
+    def downscale_at(self, step: int, schedule: Schedule) -> int:
         """1, 2 or 4: by what the images of this step are reduced."""
-        quarter, half = (at_step(when, self.iterations) for when in self.coarse_to_fine)
+        quarter, half = (schedule.step_of(when) for when in self.coarse_to_fine)
         return 4 if step <= quarter else 2 if step <= half else 1
 
     def sh_degree_at(self, step: int) -> int:

@@ -17,14 +17,7 @@ from snowsplat.camera import Camera
 from snowsplat.gaussians import Gaussians
 from snowsplat.ops.scratch import take_rows
 from snowsplat.ops.splats import Splats2D
-
-#: A moment of the training: an int is that step, a float that fraction of all iterations.
-When = int | float
-
-
-def at_step(when: When, iterations: int) -> int:
-    """The step that ``when`` means in a training of so many iterations."""
-    return round(when * iterations) if isinstance(when, float) else when
+from snowsplat.schedule import Schedule, When
 
 
 @dataclass(frozen=True)
@@ -51,9 +44,9 @@ class LearningRates:
         rates = [f.name for f in fields(self) if f.name not in ("means_final", "means_steps")]
         return replace(self, **{name: factor * getattr(self, name) for name in rates})
 
-    def at(self, step: int, iterations: int, extent: float) -> dict[str, float]:
+    def at(self, step: int, schedule: Schedule, extent: float) -> dict[str, float]:
         """The rates of one step, by parameter; the one of the means in world units."""
-        t = min(1.0, step / max(1, at_step(self.means_steps, iterations)))
+        t = schedule.share(step, self.means_steps)
         means = math.exp((1.0 - t) * math.log(self.means) + t * math.log(self.means_final))
         return {
             "means": means * extent,
@@ -77,13 +70,13 @@ class Adam:
         gaussians: Gaussians,
         rates: LearningRates,
         *,
-        iterations: int,
+        schedule: Schedule,
         extent: float,
         visible_only: bool = False,
     ) -> None:
         """``visible_only``: a step leaves the Gaussians that its view does not see as they are."""
         self.rates = rates
-        self.iterations = iterations
+        self.schedule = schedule
         self.extent = extent
         self.visible_only = visible_only
         parameters = gaussians.parameters()
@@ -92,7 +85,7 @@ class Adam:
 
     def rates_at(self, step: int) -> dict[str, float]:
         """Learning rate by parameter at ``step``, counted from 1."""
-        return self.rates.at(step, self.iterations, self.extent)
+        return self.rates.at(step, self.schedule, self.extent)
 
     def step(
         self, gaussians: Gaussians, splats: Splats2D, camera: Camera, sh_degree: int, step: int

@@ -23,6 +23,7 @@ from snowsplat.losses import view_loss
 from snowsplat.optim import Adam
 from snowsplat.process import interrupts_between_steps, single_threaded
 from snowsplat.render import project
+from snowsplat.schedule import Schedule
 
 __all__ = ["Progress", "TrainConfig", "Trainer"]
 
@@ -37,6 +38,7 @@ class Progress:
     step: int
     loss: float
     gaussians: int
+    iterations: int
     downscale: int
     metrics: Evaluation | None = None
 
@@ -49,16 +51,23 @@ class Trainer:
         trainer.gaussians
 
     Between two steps everything is in `state_tensors`: a trainer that loads them goes on bitwise as
-    this one would have.
+    this one would have. Between two steps ``schedule`` may be stretched, too.
     """
 
-    def __init__(self, capture: Capture, config: TrainConfig) -> None:
-        """Raises: UserError: a capture without training views."""
+    def __init__(
+        self, capture: Capture, config: TrainConfig, schedule: Schedule | None = None
+    ) -> None:
+        """``schedule``: of a training that goes on and was stretched, or ``config.iterations``.
+
+        Raises:
+            UserError: a capture without training views.
+        """
         if not capture.train:
             raise UserError("the capture has no training views; check its folder and its split")
         self.capture = capture
         sizes = sorted(view.camera.width * view.camera.height for view in capture.train)
         self.config = config = config.capped(sizes[len(sizes) // 2])
+        self.schedule = schedule or Schedule(config.iterations)
         self.step = 0
         # One generator for each kind of choice, so that one kind does not disturb another.
         self._generators = {
@@ -76,13 +85,13 @@ class Trainer:
         self._optimizer = Adam(
             self.gaussians,
             config.learning_rates,
-            iterations=config.iterations,
+            schedule=self.schedule,
             extent=capture.extent,
             visible_only=config.visible_only,
         )
         self._density = config.density.control(
             len(self.gaussians),
-            iterations=config.iterations,
+            schedule=self.schedule,
             extent=capture.extent,
             random_start=capture.points is None,
             generator=self._generators["density"],
@@ -115,15 +124,15 @@ class Trainer:
             KeyboardInterrupt: Ctrl-C, after the step that it fell into: the state is whole.
             UserError: the loss is no longer finite.
         """
-        until = self.config.iterations if until is None else min(until, self.config.iterations)
+        last = math.inf if until is None else until
         with interrupts_between_steps() as let_interrupt:
-            while self.step < until:
+            while self.step < min(last, self.schedule.iterations):
                 loss = self.step_once()
                 metrics = self.evaluate() if self.step in self.config.test_iterations else None
                 if on_progress is not None:
-                    downscale = self.config.downscale_at(self.step)
+                    iterations, downscale = self.schedule.iterations, self._downscale(self.step)
                     count = len(self.gaussians)
-                    on_progress(Progress(self.step, loss, count, downscale, metrics))
+                    on_progress(Progress(self.step, loss, count, iterations, downscale, metrics))
                 let_interrupt()
 
     @torch.no_grad()
@@ -172,22 +181,25 @@ class Trainer:
 
     def _next_view(self, step: int) -> tuple[Camera, LoadedImage]:
         """The next of endlessly shuffled views, and its photo at this step's resolution."""
-        downscale = self.config.downscale_at(step)
+        downscale = self._downscale(step)
         if len(self._order) <= LOOKAHEAD:
             while len(self._order) <= LOOKAHEAD:
                 count = len(self.capture.train)
                 self._order += torch.randperm(count, generator=self._generators["views"]).tolist()
             self._prefetch(downscale)
-        elif downscale != self.config.downscale_at(step - 1):
+        elif downscale != self._downscale(step - 1):
             self._prefetch(downscale)
         view = self.capture.train[self._order.pop(0)]
         return view.camera.downscaled(downscale), self._images.get(view, downscale)
+
+    def _downscale(self, step: int) -> int:
+        return self.config.downscale_at(step, self.schedule)
 
     def _prefetch(self, downscale: int) -> None:
         self._images.prefetch([self.capture.train[i] for i in self._order], downscale)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """All that the steps to come depend on, beside capture and config. Not copied."""
+        """All that the steps to come depend on, beside capture, config, schedule. Not copied."""
         parts = {
             "gaussians": self.gaussians.parameters(),
             "optimizer": self._optimizer.state_tensors(),
@@ -199,7 +211,8 @@ class Trainer:
         return tensors | {"step": torch.tensor(self.step), "order": order}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Take over (copy) what `state_tensors` of a trainer with equal capture and config gave.
+        """Take over (copy) what `state_tensors` gave in a trainer whose capture, config and schedule
+        are equal.
 
         Raises:
             UserError: it is of another density control, SH degree or capture.
@@ -223,4 +236,4 @@ class Trainer:
             random.set_state(parts["random"][name])
         self.step = int(tensors["step"])
         self._order = tensors["order"].tolist()
-        self._prefetch(self.config.downscale_at(self.step + 1))
+        self._prefetch(self._downscale(self.step + 1))

@@ -15,6 +15,7 @@ from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import rotation_from_quat
 from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam, LearningRates
+from snowsplat.schedule import Schedule
 
 EXTENT = 10.0  # with percent_dense = 0.01: clone up to a scale of 0.1, split beyond
 
@@ -43,12 +44,12 @@ def set_up(
 ) -> tuple[AdaptiveDensityControl, Adam]:
     control = AdaptiveDensity(**knobs).control(  # type: ignore[arg-type]
         len(gaussians),
-        iterations=iterations,
+        schedule=Schedule(iterations),
         extent=EXTENT,
         random_start=random_start,
         generator=torch.Generator().manual_seed(0),
     )
-    adam = Adam(gaussians, LearningRates(), iterations=30_000, extent=EXTENT)
+    adam = Adam(gaussians, LearningRates(), schedule=Schedule(30_000), extent=EXTENT)
     for moments in (adam.exp_avg, adam.exp_avg_sq):
         for moment in moments.values():
             moment.fill_(1.0)

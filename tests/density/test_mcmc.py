@@ -11,6 +11,7 @@ from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import rotation_from_quat
 from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam, LearningRates
+from snowsplat.schedule import Schedule
 
 
 def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
@@ -28,12 +29,12 @@ def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
 def set_up(gaussians: Gaussians, **knobs: object) -> tuple[McmcDensityControl, Adam]:
     control = McmcDensity(**knobs).control(  # type: ignore[arg-type]
         len(gaussians),
-        iterations=30_000,
+        schedule=Schedule(30_000),
         extent=1.0,
         random_start=False,
         generator=torch.Generator().manual_seed(0),
     )
-    adam = Adam(gaussians, LearningRates(means_steps=1.0), iterations=30_000, extent=1.0)
+    adam = Adam(gaussians, LearningRates(means_steps=1.0), schedule=Schedule(30_000), extent=1.0)
     for moments in (adam.exp_avg, adam.exp_avg_sq):
         for moment in moments.values():
             moment.fill_(1.0)

@@ -18,6 +18,7 @@ from snowsplat.density.mcmc import McmcDensity
 from snowsplat.gaussians import Gaussians
 from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam
+from snowsplat.schedule import Schedule
 
 __all__ = ["AdaptiveDensity", "DensityConfig", "DensityControl", "McmcDensity"]
 
@@ -64,7 +65,7 @@ class DensityConfig(Protocol):
         self,
         count: int,
         *,
-        iterations: int,
+        schedule: Schedule,
         extent: float,
         random_start: bool,
         generator: torch.Generator,

@@ -18,7 +18,8 @@ from snowsplat.density.rows import finite_rows, morton_order
 from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import rotation_from_quat
 from snowsplat.ops.splats import Splats2D
-from snowsplat.optim import Adam, When, at_step
+from snowsplat.optim import Adam
+from snowsplat.schedule import Schedule, When
 
 #: A split child is smaller than its parent by this (the paper's φ, found by experiment).
 SPLIT_SHRINK = 1.6
@@ -71,7 +72,7 @@ class AdaptiveDensity:
         self,
         count: int,
         *,
-        iterations: int,
+        schedule: Schedule,
         extent: float,
         random_start: bool,
         generator: torch.Generator,
@@ -79,10 +80,8 @@ class AdaptiveDensity:
         """Fresh state for ``count`` Gaussians in a scene of ``extent`` world units."""
         return AdaptiveDensityControl(
             knobs=self,
-            first=at_step(self.densify_from, iterations),
-            last=min(at_step(self.densify_until, iterations), iterations),
+            schedule=schedule,
             first_reset=self.reset_random_start and random_start,
-            end=iterations,
             extent=extent,
             generator=generator,
             grad_sum=torch.zeros(count),
@@ -96,24 +95,30 @@ class AdaptiveDensityControl:
     """State of adaptive density control.
 
     Attributes:
-        first, last: the steps that may densify.
         first_reset: whether ``first`` resets opacity too.
-        end: the last step of all.
         grad_sum: (N,) sum over views of the norm of the position gradient, in half image sizes.
         views: (N,) number of views in that sum: those in which the Gaussian was visible.
         max_radii: (N,) largest 3σ radius seen, in pixels.
     """
 
     knobs: AdaptiveDensity
-    first: int
-    last: int
+    schedule: Schedule
     first_reset: bool
-    end: int
     extent: float
     generator: torch.Generator
     grad_sum: Tensor
     views: Tensor
     max_radii: Tensor
+
+    @property
+    def first(self) -> int:
+        """The first step that may densify."""
+        return self.schedule.step_of(self.knobs.densify_from)
+
+    @property
+    def last(self) -> int:
+        """The last step that may densify."""
+        return min(self.schedule.step_of(self.knobs.densify_until), self.schedule.iterations)
 
     def after_backward(
         self, step: int, gaussians: Gaussians, splats: Splats2D, width: int, height: int
@@ -137,7 +142,7 @@ class AdaptiveDensityControl:
 
     def _resets_at(self, step: int) -> bool:
         if self.first_reset and step == self.first:
-            return step <= self.end - RESET_RECOVERY
+            return step <= self.schedule.iterations - RESET_RECOVERY
         every = self.knobs.opacity_reset_interval
         return every > 0 and step % every == 0 and step <= self.last - RESET_RECOVERY
 

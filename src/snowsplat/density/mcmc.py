@@ -21,7 +21,8 @@ from snowsplat.errors import UserError
 from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import rotation_from_quat
 from snowsplat.ops.splats import Splats2D
-from snowsplat.optim import Adam, When, at_step
+from snowsplat.optim import Adam
+from snowsplat.schedule import Schedule, When
 
 #: Copies of one Gaussian that a relocation reckons with; more are rare.
 MAX_COPIES = 51
@@ -61,22 +62,17 @@ class McmcDensity:
         self,
         count: int,
         *,
-        iterations: int,
+        schedule: Schedule,
         extent: float,
         random_start: bool,
         generator: torch.Generator,
     ) -> McmcDensityControl:
-        """Fresh state, which depends on ``iterations`` and ``generator`` alone."""
+        """Fresh state, which depends on ``schedule`` and ``generator`` alone."""
         if self.max_gaussians <= 0:
             raise UserError(
                 "MCMC density control needs a cap: give --max-gaussians a positive number"
             )
-        return McmcDensityControl(
-            knobs=self,
-            first=at_step(self.densify_from, iterations),
-            last=min(at_step(self.densify_until, iterations), iterations),
-            generator=generator,
-        )
+        return McmcDensityControl(self, schedule, generator)
 
 
 @dataclass
@@ -84,9 +80,18 @@ class McmcDensityControl:
     """State of MCMC density control: its random numbers, which the trainer saves. No statistics."""
 
     knobs: McmcDensity
-    first: int
-    last: int
+    schedule: Schedule
     generator: torch.Generator
+
+    @property
+    def first(self) -> int:
+        """The first step that may relocate."""
+        return self.schedule.step_of(self.knobs.densify_from)
+
+    @property
+    def last(self) -> int:
+        """The last step that may relocate."""
+        return min(self.schedule.step_of(self.knobs.densify_until), self.schedule.iterations)
 
     def after_backward(
         self, step: int, gaussians: Gaussians, splats: Splats2D, width: int, height: int
