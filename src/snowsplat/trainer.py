@@ -211,8 +211,8 @@ class Trainer:
         return tensors | {"step": torch.tensor(self.step), "order": order}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Take over (copy) what `state_tensors` gave in a trainer whose capture, config and schedule
-        are equal.
+        """Take over (copy) what `state_tensors` gave in a trainer whose capture, config and
+        schedule are equal.
 
         Raises:
             UserError: it is of another density control, SH degree or capture.
