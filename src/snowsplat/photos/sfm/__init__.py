@@ -1,0 +1,13 @@
+"""Structure from motion: photos -> where each was taken, the cameras' lenses, points of the scene.
+
+child        runs the rest in a process of its own and tells how that ended
+worker       that process
+reconstruct  the tries, one after another, until enough photos are placed
+features, pairs, retrieval, mapping   the steps of a try, on COLMAP's `database`
+diagnosis    why a photo, or none, could be placed
+"""
+
+from snowsplat.photos.sfm.child import estimate_poses
+from snowsplat.photos.sfm.options import SfmOptions, SfmResult
+
+__all__ = ["SfmOptions", "SfmResult", "estimate_poses"]

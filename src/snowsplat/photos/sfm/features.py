@@ -1,0 +1,146 @@
+"""Features of the photos, and which of them match: what goes into the database."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from sqlite3 import OperationalError
+
+import pycolmap
+
+from snowsplat.photos.photo import Photo
+from snowsplat.photos.progress import Report
+from snowsplat.photos.sfm.database import count_rows, set_names
+from snowsplat.photos.sfm.options import Effort
+
+# Pairs that are compared before they are written: what a kill loses, and how often progress shows.
+_BLOCK = 64
+_POLL_SECONDS = 0.5
+
+SEED = 1
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Where the parts of a capture lie."""
+
+    capture: Path
+
+    @property
+    def images(self) -> Path:
+        return self.capture / "input"
+
+    @property
+    def distorted(self) -> Path:
+        return self.capture / "distorted"
+
+    @property
+    def masks(self) -> Path:
+        return self.distorted / "masks"
+
+    @property
+    def database(self) -> Path:
+        return self.distorted / "database.db"
+
+    @property
+    def sparse(self) -> Path:
+        return self.distorted / "sparse"
+
+
+def extract_features(
+    folders: Folders,
+    database: Path,
+    photos: list[Photo],
+    effort: Effort,
+    threads: int,
+    report: Report,
+) -> None:
+    """Find the features of photos that have none yet in ``database``."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = effort.image_size
+    options.num_threads = threads
+    options.use_gpu = False
+    options.sift.max_num_features = effort.features
+    options.sift.first_octave = effort.first_octave
+    with _counting(lambda: count_rows(database, "keypoints"), len(photos), "features", report):
+        # COLMAP skips a photo whose mask it does not find, so those without go by themselves.
+        for masked in (False, True):
+            names = [photo.name for photo in photos if photo.mask == masked]
+            reader = pycolmap.ImageReaderOptions()
+            if masked:
+                reader.mask_path = folders.masks
+            if names:
+                pycolmap.extract_features(
+                    database,
+                    folders.images,
+                    image_names=names,
+                    camera_mode=pycolmap.CameraMode.PER_IMAGE,
+                    reader_options=reader,
+                    extraction_options=options,
+                    device=pycolmap.Device.cpu,
+                )
+
+
+def match_pairs(
+    database: Path,
+    photos: list[Photo],
+    pairs: list[tuple[int, int]],
+    max_error: float,
+    threads: int,
+    report: Report,
+) -> None:
+    """Match the features of those of ``pairs`` (indices of photos) that are not in the database.
+
+    ``max_error`` is how far a match may be from the motion of its pair, in pixels.
+    """
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = threads
+    options.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.max_error = max_error
+    verification.ransac.random_seed = SEED
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.block_size = _BLOCK
+    pairing.match_list_path = database.with_suffix(".pairs")
+    # A blank ends a name in COLMAP's list of pairs: the images go by their numbers meanwhile.
+    set_names(database, [str(i) for i in range(len(photos))])
+    Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
+    before = count_rows(database, "two_view_geometries")
+    count = lambda: count_rows(database, "two_view_geometries") - before  # noqa: E731
+    try:
+        with _counting(count, len(pairs), "pairs", report):
+            pycolmap.match_image_pairs(
+                database,
+                matching_options=options,
+                pairing_options=pairing,
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+    finally:
+        os.remove(pairing.match_list_path)
+        set_names(database, [photo.name for photo in photos])
+
+
+@contextmanager
+def _counting(count: Callable[[], int], total: int, what: str, report: Report) -> Iterator[None]:
+    """Report, while the block runs, what ``count`` gives of ``total``."""
+    ended = threading.Event()
+
+    def poll() -> None:
+        while not ended.wait(_POLL_SECONDS):
+            with suppress(OperationalError):  # COLMAP is writing: the next time
+                report(min(count(), total), total, what)
+
+    report(0, total, what)
+    thread = threading.Thread(target=poll, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+    report(total, total, what)

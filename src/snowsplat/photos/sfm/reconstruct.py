@@ -1,0 +1,175 @@
+"""Photos -> poses, in as many tries as it takes: the first as asked, then with more of everything.
+
+A try that places 90% of the photos is the last. Otherwise the others follow, unless what was found
+says that none of them can help:
+
+    1  features, pairs and mapper as asked
+    2  the same features, more pairs, weaker matches allowed
+    3  twice the features, from larger photos; about 4 times the work of the first
+    4  the other mapper, on the matches that are there
+
+The one with most photos placed is kept.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snowsplat.photos.photo import Photo
+from snowsplat.photos.progress import Report
+from snowsplat.photos.sfm.database import fingerprint_of, open_database, read_descriptors
+from snowsplat.photos.sfm.diagnosis import Evidence, explain, failure, gather_evidence
+from snowsplat.photos.sfm.features import Folders, extract_features, match_pairs
+from snowsplat.photos.sfm.mapping import map_photos, write_models
+from snowsplat.photos.sfm.options import Effort, Mapper, SfmOptions, SfmResult
+from snowsplat.photos.sfm.pairs import PairChoice, choose_pairs
+from snowsplat.photos.sfm.retrieval import FEATURES, similarity
+
+_ENOUGH = 0.9  # of the photos
+_MAX_ERROR = 4.0  # pixels at which features are looked for
+
+
+@dataclass(frozen=True)
+class Matched:
+    """A database with features and matches."""
+
+    database: Path
+    effort: Effort
+    choice: PairChoice
+    scale: float  # pixels of a photo to one at which its features were looked for
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a try came to."""
+
+    matched: Matched
+    models: list[pycolmap.Reconstruction]
+
+    @property
+    def placed(self) -> int:
+        return self.models[0].num_reg_images() if self.models else 0
+
+
+class Reconstruction:
+    """The tries on one set of photos. `run` makes them and writes what is best."""
+
+    def __init__(
+        self,
+        folders: Folders,
+        photos: list[Photo],
+        options: SfmOptions,
+        threads: int,
+        report: Report,
+    ) -> None:
+        self.folders, self.photos, self.options = folders, photos, options
+        self.threads, self.report = threads, report
+        self.attempts: list[str] = []
+        self.trials: list[Trial] = []
+
+    def run(self, effort: Effort) -> SfmResult:
+        """Make the tries, the first with ``effort``; write ``sparse/`` and the database.
+
+        Raises:
+            UserError: no camera positions were found.
+        """
+        first, second = self.folders.database, self.folders.distorted / "database_strong.db"
+        mapper = self.options.mapper
+        matched = self._match(first, effort, effort)
+        self._try("as asked", matched, mapper)
+        evidence = self._evidence(matched)
+        if not self._enough() and not evidence.hopeless:
+            more = self._match(first, effort, effort.stronger())
+            self._try("with more pairs and weaker matches", more, "incremental", relaxed=True)
+            if not self._enough():
+                strong = effort.stronger()
+                more = self._match(second, strong, strong)
+                self._try("with more features, from larger photos", more, mapper, relaxed=True)
+            if not self._enough():
+                other: Mapper = "incremental" if mapper == "global" else "global"
+                self._try("with the other mapper", more, other, relaxed=True)
+            evidence = self._evidence(more)
+        best = max(self.trials, key=lambda trial: trial.placed)
+        if not best.models:
+            second.unlink(missing_ok=True)
+            raise failure(evidence)
+        write_models(best.models, self.folders.sparse)
+        result = self._result(best, self._evidence(best.matched))
+        if best.matched.database == second:
+            os.replace(second, first)
+        second.unlink(missing_ok=True)
+        return result
+
+    def _match(self, database: Path, effort: Effort, pairing: Effort) -> Matched:
+        fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
+        open_database(database, self.photos, self.options.camera_model, fingerprint)
+        extract_features(self.folders, database, self.photos, effort, self.threads, self.report)
+        choice = choose_pairs(self.photos, pairing, self._alike(database))
+        sizes = [max(photo.width, photo.height) for photo in self.photos]
+        scale = max(1.0, float(np.median(sizes)) / effort.image_size)
+        match_pairs(
+            database, self.photos, choice.pairs, _MAX_ERROR * scale, self.threads, self.report
+        )
+        return Matched(database, effort, choice, scale)
+
+    def _alike(self, database: Path) -> Callable[[], NDArray[np.floating]]:
+        indices = range(len(self.photos))
+        return lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices])
+
+    def _try(self, how: str, matched: Matched, mapper: Mapper, relaxed: bool = False) -> None:
+        models = map_photos(
+            matched.database,
+            self.folders.images,
+            mapper,
+            matched.scale,
+            relaxed,
+            self.threads,
+            self.report,
+        )
+        trial = Trial(matched, models)
+        self.trials.append(trial)
+        effort = matched.effort
+        self.attempts.append(
+            f"{how}: {effort.features} features at {effort.image_size} pixels, "
+            f"{matched.choice.words}, {mapper} mapping: {trial.placed} of {len(self.photos)} placed"
+        )
+
+    def _enough(self) -> bool:
+        return any(trial.placed >= _ENOUGH * len(self.photos) for trial in self.trials)
+
+    def _evidence(self, matched: Matched) -> Evidence:
+        return gather_evidence(matched.database, self.photos, len(matched.choice.pairs))
+
+    def _result(self, best: Trial, evidence: Evidence) -> SfmResult:
+        model = best.models[0]
+        names = [{m.image(i).name for i in m.reg_image_ids()} for m in best.models]
+        return SfmResult(
+            registered=sorted(names[0]),
+            unregistered=explain(self.photos, evidence, names),
+            points=model.num_points3D(),
+            observations=model.compute_num_observations(),
+            reprojection_error=model.compute_mean_reprojection_error(),
+            sub_models=[m.num_reg_images() for m in best.models],
+            cameras=[_camera_facts(model, camera_id) for camera_id in sorted(model.cameras)],
+            pairs=best.matched.choice.words,
+            attempts=self.attempts,
+        )
+
+
+def _camera_facts(model: pycolmap.Reconstruction, camera_id: int) -> dict[str, object]:
+    camera = model.camera(camera_id)
+    return {
+        "model": camera.model_name,
+        "width": camera.width,
+        "height": camera.height,
+        "params": [float(value) for value in camera.params],
+        "focal_from": "exif" if camera.has_prior_focal_length else "guessed",
+        "images": sum(model.image(i).camera_id == camera_id for i in model.reg_image_ids()),
+    }

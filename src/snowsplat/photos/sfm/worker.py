@@ -1,0 +1,75 @@
+"""The child process in which COLMAP runs: it may crash, hang or be killed without us.
+
+    python -m snowsplat.photos.sfm.worker
+
+One line of JSON on stdin is the job; lines of JSON on stdout are progress, and then the result or
+the user's error. Stdin stays open as long as the parent lives: at its end the child ends at once.
+Ctrl-C is the parent's affair. What COLMAP prints goes to stderr, which the parent puts into a log.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TextIO
+
+from snowsplat.errors import UserError
+from snowsplat.photos.photo import Photo
+from snowsplat.photos.sfm.features import SEED, Folders
+from snowsplat.photos.sfm.options import EFFORTS, SfmOptions, thread_count
+from snowsplat.photos.sfm.reconstruct import Reconstruction
+
+
+def main() -> None:
+    """Do the one job that stdin names."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    answers = _own_stdout()
+    job = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    lock = threading.Lock()
+
+    def say(**line: Any) -> None:
+        with lock:
+            answers.write(json.dumps(line) + "\n")
+            answers.flush()
+
+    try:
+        say(result=asdict(_work(job, lambda *counts: say(progress=counts))))
+    except UserError as error:
+        say(user_error=str(error))
+
+
+def _own_stdout() -> TextIO:
+    # Whatever C++ code prints must not fall between our lines.
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return answers
+
+
+def _end_with_parent() -> None:
+    sys.stdin.read()
+    os._exit(1)
+
+
+def _work(job: dict[str, Any], report: Any) -> Any:
+    import pycolmap
+
+    pycolmap.set_random_seed(SEED)
+    pycolmap.logging.alsologtostderr = False
+    pycolmap.logging.logtostderr = True
+    options = SfmOptions(**job["options"])
+    effort, threads = EFFORTS[options.effort], thread_count(options.threads)
+    if job["gentle"]:
+        effort, threads = effort.gentler(), 1
+    photos = [Photo(**photo) for photo in job["photos"]]
+    folders = Folders(Path(job["capture"]))
+    return Reconstruction(folders, photos, options, threads, report).run(effort)
+
+
+if __name__ == "__main__":
+    main()
