@@ -9,5 +9,6 @@ diagnosis    why a photo, or none, could be placed
 
 from snowsplat.photos.sfm.child import estimate_poses
 from snowsplat.photos.sfm.options import SfmOptions, SfmResult
+from snowsplat.photos.sfm.result import describe_model
 
-__all__ = ["SfmOptions", "SfmResult", "estimate_poses"]
+__all__ = ["SfmOptions", "SfmResult", "describe_model", "estimate_poses"]

@@ -45,8 +45,8 @@ def estimate_poses(
 
     Writes ``distorted/sparse/N`` (0 has most photos), in the photos' own cameras, at an arbitrary
     scale and orientation, and ``distorted/database.db``; ``distorted/colmap.log`` is what COLMAP
-    said. Features and matches of an interrupted run are used again. The same photos, settings and number of
-    threads give the same pairs and matches; poses then differ by rounding alone.
+    said. Features and matches of an interrupted run are used again. The same photos and settings
+    give the same pairs and matches; poses then differ by rounding alone.
 
     Raises:
         UserError: fewer than 3 photos, no poses to be found (the message says why), or COLMAP

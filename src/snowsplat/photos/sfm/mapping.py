@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
@@ -20,124 +23,143 @@ _KEPT_ERROR = 3.0
 _MIN_ANGLE = 1.5  # degrees between the rays of a point
 
 
-def map_photos(
-    database: Path,
-    images: Path,
-    mapper: Mapper,
-    scale: float,
-    relaxed: bool,
-    threads: int,
-    report: Report,
-) -> list[pycolmap.Reconstruction]:
-    """Find cameras and points; the models found, the one with most photos first.
+@dataclass(frozen=True)
+class Mapping:
+    """What is mapped, and with what means."""
 
-    Args:
-        scale: pixels of a photo to one at which its features were looked for (1 or more).
-        relaxed: start and go on with weaker matches than is usual.
-    """
-    output = database.with_suffix(".models")
-    shutil.rmtree(output, ignore_errors=True)
-    output.mkdir()
-    try:
+    database: Path
+    images: Path
+    scale: float  # pixels of a photo to one at which its features were looked for (1 or more)
+    threads: int
+    report: Report
+
+    def run(self, mapper: Mapper, relaxed: bool = False) -> list[pycolmap.Reconstruction]:
+        """Find cameras and points; the models found, the one with most photos first.
+
+        ``relaxed``: start and go on with weaker matches than is usual (incremental only).
+        """
         if mapper == "global":
-            found = _map_globally(database, images, output, scale, threads)
+            models = self._map_globally()
         else:
-            found = _map_incrementally(database, images, output, scale, relaxed, threads, report)
-    finally:
+            models = self._map_incrementally(self._options(relaxed), start=None)
+        return _usable([self._refine(model) for model in models])
+
+    def extend(self, models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+        """Add photos to the first of ``models`` by weaker matches than is usual, where that helps.
+
+        Photos of the others are among them: what was apart may come together.
+        """
+        grown = self._map_incrementally(self._options(relaxed=True), start=models[0])
+        refined = [self._refine(model) for model in grown]
+        if not refined or refined[0].num_reg_images() <= models[0].num_reg_images():
+            return models
+        return _usable([refined[0], *models[1:]])
+
+    def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = self.threads
+        options.random_seed = SEED
+        options.min_model_size = MIN_PHOTOS
+        mapper, triangulation = options.mapper, options.triangulation
+        mapper.init_max_error *= self.scale
+        mapper.abs_pose_max_error *= self.scale
+        mapper.filter_max_reproj_error *= self.scale
+        triangulation.merge_max_reproj_error *= self.scale
+        triangulation.complete_max_reproj_error *= self.scale
+        if relaxed:
+            options.min_num_matches = 10
+            mapper.init_min_num_inliers = 40
+            mapper.init_min_tri_angle = 6.0
+            mapper.abs_pose_min_num_inliers = 15
+            mapper.abs_pose_min_inlier_ratio = 0.15
+            mapper.max_reg_trials = 6
+        return options
+
+    def _map_incrementally(
+        self,
+        options: pycolmap.IncrementalPipelineOptions,
+        start: pycolmap.Reconstruction | None,
+    ) -> list[pycolmap.Reconstruction]:
+        total = count_rows(self.database, "images")
+        placed = 0
+
+        def begin() -> None:
+            nonlocal placed
+            placed = 2 if start is None else start.num_reg_images()
+            self.report(placed, total, "photos placed")
+
+        def step() -> None:
+            nonlocal placed
+            placed += 1
+            self.report(min(placed, total), total, "photos placed")
+
+        with self._output() as output:
+            begun = ""
+            if start is not None:
+                begun = str(output / "start")
+                (output / "start").mkdir()
+                start.write(begun)
+            models = pycolmap.incremental_mapping(
+                self.database,
+                self.images,
+                output,
+                options,
+                input_path=begun,
+                initial_image_pair_callback=begin,
+                next_image_callback=step,
+            )
+        return list(models.values())
+
+    def _map_globally(self) -> list[pycolmap.Reconstruction]:
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads = self.threads
+        options.random_seed = SEED
+        options.min_model_size = MIN_PHOTOS
+        options.mapper.num_threads = self.threads
+        options.mapper.random_seed = SEED
+        options.mapper.max_normalized_reproj_error *= self.scale
+        self.report(0, 0, "photos placed")
+        with self._output() as output:
+            models = pycolmap.global_mapping(self.database, self.images, output, options)
+        return list(models.values())
+
+    @contextmanager
+    def _output(self) -> Iterator[Path]:
+        # COLMAP writes each model as it is found. We write them ourselves, all at once.
+        output = self.database.with_suffix(".models")
         shutil.rmtree(output, ignore_errors=True)
-    return _usable([_refine(model, scale, threads) for model in found])
+        output.mkdir()
+        try:
+            yield output
+        finally:
+            shutil.rmtree(output, ignore_errors=True)
 
-
-def _map_incrementally(
-    database: Path,
-    images: Path,
-    output: Path,
-    scale: float,
-    relaxed: bool,
-    threads: int,
-    report: Report,
-) -> list[pycolmap.Reconstruction]:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = threads
-    options.random_seed = SEED
-    options.min_model_size = MIN_PHOTOS
-    mapper, triangulation = options.mapper, options.triangulation
-    mapper.init_max_error *= scale
-    mapper.abs_pose_max_error *= scale
-    mapper.filter_max_reproj_error *= scale
-    triangulation.merge_max_reproj_error *= scale
-    triangulation.complete_max_reproj_error *= scale
-    if relaxed:
-        options.min_num_matches = 10
-        mapper.init_min_num_inliers = 40
-        mapper.init_min_tri_angle = 6.0
-        mapper.abs_pose_min_num_inliers = 15
-        mapper.abs_pose_min_inlier_ratio = 0.15
-        mapper.max_reg_trials = 6
-    total = count_rows(database, "images")
-    placed = 0
-
-    def begin() -> None:
-        nonlocal placed
-        placed = 2
-        report(placed, total, "photos placed")
-
-    def step() -> None:
-        nonlocal placed
-        placed += 1
-        report(min(placed, total), total, "photos placed")
-
-    report(0, total, "photos placed")
-    models = pycolmap.incremental_mapping(
-        database,
-        images,
-        output,
-        options,
-        initial_image_pair_callback=begin,
-        next_image_callback=step,
-    )
-    return list(models.values())
-
-
-def _map_globally(
-    database: Path, images: Path, output: Path, scale: float, threads: int
-) -> list[pycolmap.Reconstruction]:
-    options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = threads
-    options.random_seed = SEED
-    options.min_model_size = MIN_PHOTOS
-    options.mapper.num_threads = threads
-    options.mapper.random_seed = SEED
-    options.mapper.max_normalized_reproj_error *= scale
-    return list(pycolmap.global_mapping(database, images, output, options).values())
-
-
-def _refine(model: pycolmap.Reconstruction, scale: float, threads: int) -> pycolmap.Reconstruction:
-    """Leave out what fits badly, adjust all once more, and drop cameras that nothing holds."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.solver_options.num_threads = threads
-    observations = pycolmap.ObservationManager(model)
-    for _ in range(2):
-        observations.filter_all_points3D(_KEPT_ERROR * scale, _MIN_ANGLE)
-        for image_id in list(model.reg_image_ids()):
-            image = model.image(image_id)
-            if image.num_points3D < MIN_POINTS:
-                observations.deregister_frame(image.frame_id)
-        if model.num_reg_images() < MIN_PHOTOS:
-            return model
-        pycolmap.bundle_adjustment(model, options)
-    model.update_point_3d_errors()
-    return model
+    def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """Leave out what fits badly, adjust all once more, and drop cameras that nothing holds."""
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary = False
+        options.ceres.solver_options.num_threads = self.threads
+        observations = pycolmap.ObservationManager(model)
+        for _ in range(2):
+            observations.filter_all_points3D(_KEPT_ERROR * self.scale, _MIN_ANGLE)
+            for image_id in list(model.reg_image_ids()):
+                image = model.image(image_id)
+                if image.num_points3D < MIN_POINTS:
+                    observations.deregister_frame(image.frame_id)
+            if model.num_reg_images() < MIN_PHOTOS:
+                break
+            pycolmap.bundle_adjustment(model, options)
+        model.update_point_3d_errors()
+        return model
 
 
 def _usable(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    # Largest first; one whose photos are all in a larger one says nothing new.
+    # Largest first; one whose photos are all in larger ones says nothing new.
     kept: list[pycolmap.Reconstruction] = []
     placed: set[int] = set()
     for model in sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D())):
         photos = set(model.reg_image_ids())
-        if len(photos) >= MIN_PHOTOS and len(photos - placed) > 0:
+        if len(photos) >= MIN_PHOTOS and photos - placed:
             kept.append(model)
             placed |= photos
     return kept

@@ -27,9 +27,10 @@ from snowsplat.photos.progress import Report
 from snowsplat.photos.sfm.database import fingerprint_of, open_database, read_descriptors
 from snowsplat.photos.sfm.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.photos.sfm.features import Folders, extract_features, match_pairs
-from snowsplat.photos.sfm.mapping import map_photos, write_models
+from snowsplat.photos.sfm.mapping import Mapping, write_models
 from snowsplat.photos.sfm.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.photos.sfm.pairs import PairChoice, choose_pairs
+from snowsplat.photos.sfm.result import names_in, result_of
 from snowsplat.photos.sfm.retrieval import FEATURES, similarity
 
 _ENOUGH = 0.9  # of the photos
@@ -86,8 +87,9 @@ class Reconstruction:
         self._try("as asked", matched, mapper)
         evidence = self._evidence(matched)
         if not self._enough() and not evidence.hopeless:
-            more = self._match(first, effort, effort.stronger())
-            self._try("with more pairs and weaker matches", more, "incremental", relaxed=True)
+            if not (self.trials[0].models and evidence.compared_all):
+                more = self._match(first, effort, effort.stronger())
+                self._try("with more pairs and weaker matches", more, "incremental", relaxed=True)
             if not self._enough():
                 strong = effort.stronger()
                 more = self._match(second, strong, strong)
@@ -101,7 +103,12 @@ class Reconstruction:
             second.unlink(missing_ok=True)
             raise failure(evidence)
         write_models(best.models, self.folders.sparse)
-        result = self._result(best, self._evidence(best.matched))
+        reasons = explain(
+            self.photos, self._evidence(best.matched), [names_in(model) for model in best.models]
+        )
+        result = result_of(
+            best.models, self.photos, reasons, best.matched.choice.words, self.attempts
+        )
         if best.matched.database == second:
             os.replace(second, first)
         second.unlink(missing_ok=True)
@@ -124,21 +131,23 @@ class Reconstruction:
         return lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices])
 
     def _try(self, how: str, matched: Matched, mapper: Mapper, relaxed: bool = False) -> None:
-        models = map_photos(
-            matched.database,
-            self.folders.images,
-            mapper,
-            matched.scale,
-            relaxed,
-            self.threads,
-            self.report,
+        mapping = Mapping(
+            matched.database, self.folders.images, matched.scale, self.threads, self.report
         )
+        models = mapping.run(mapper, relaxed)
+        weak = ""
+        if models and models[0].num_reg_images() < len(self.photos):
+            before = models[0].num_reg_images()
+            models = mapping.extend(models)
+            added = models[0].num_reg_images() - before
+            weak = f", {added} of them by weak matches" if added else ""
         trial = Trial(matched, models)
         self.trials.append(trial)
         effort = matched.effort
         self.attempts.append(
-            f"{how}: {effort.features} features at {effort.image_size} pixels, "
-            f"{matched.choice.words}, {mapper} mapping: {trial.placed} of {len(self.photos)} placed"
+            f"{how}: {effort.features} features a photo at {effort.image_size} pixels, "
+            f"{matched.choice.words}, {mapper} mapping: "
+            f"{trial.placed} of {len(self.photos)} placed{weak}"
         )
 
     def _enough(self) -> bool:
@@ -146,30 +155,3 @@ class Reconstruction:
 
     def _evidence(self, matched: Matched) -> Evidence:
         return gather_evidence(matched.database, self.photos, len(matched.choice.pairs))
-
-    def _result(self, best: Trial, evidence: Evidence) -> SfmResult:
-        model = best.models[0]
-        names = [{m.image(i).name for i in m.reg_image_ids()} for m in best.models]
-        return SfmResult(
-            registered=sorted(names[0]),
-            unregistered=explain(self.photos, evidence, names),
-            points=model.num_points3D(),
-            observations=model.compute_num_observations(),
-            reprojection_error=model.compute_mean_reprojection_error(),
-            sub_models=[m.num_reg_images() for m in best.models],
-            cameras=[_camera_facts(model, camera_id) for camera_id in sorted(model.cameras)],
-            pairs=best.matched.choice.words,
-            attempts=self.attempts,
-        )
-
-
-def _camera_facts(model: pycolmap.Reconstruction, camera_id: int) -> dict[str, object]:
-    camera = model.camera(camera_id)
-    return {
-        "model": camera.model_name,
-        "width": camera.width,
-        "height": camera.height,
-        "params": [float(value) for value in camera.params],
-        "focal_from": "exif" if camera.has_prior_focal_length else "guessed",
-        "images": sum(model.image(i).camera_id == camera_id for i in model.reg_image_ids()),
-    }
