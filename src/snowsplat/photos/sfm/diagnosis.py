@@ -10,8 +10,8 @@ from snowsplat.errors import UserError
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.sfm.database import (
     Pair,
+    displacement_of,
     feature_counts,
-    median_displacement,
     verified_pairs,
 )
 
@@ -28,7 +28,7 @@ class Evidence:
 
     features: list[int]
     pairs: list[Pair]
-    displacement: float | None  # of matches between photos, as a part of the longest side, median
+    displacement: float | None  # of matches from photo to photo, as a part of the longest side
     compared: int  # pairs that were
 
     @property
@@ -37,11 +37,10 @@ class Evidence:
         return self.compared >= count * (count - 1) // 2
 
     @property
-    def flat_share(self) -> float:
-        """Part of the matches in pairs that a plane or a turn of the camera explains."""
-        return sum(p.inliers for p in self.pairs if p.flat) / max(
-            1, sum(p.inliers for p in self.pairs)
-        )
+    def flat(self) -> bool:
+        """Whether one plane, or a camera that only turned, explains the matches."""
+        flat = sum(pair.inliers for pair in self.pairs if pair.flat)
+        return flat > 0 and flat >= _FLAT_SHARE * sum(pair.inliers for pair in self.pairs)
 
     @property
     def still(self) -> bool:
@@ -49,10 +48,10 @@ class Evidence:
 
     @property
     def hopeless(self) -> bool:
-        """Whether stronger settings would find nothing either."""
+        """Whether, where no model was found, stronger settings would find none either."""
         if sum(count >= _FEW_FEATURES for count in self.features) < 2:
             return True
-        if self.still:
+        if self.still or self.flat:
             return True
         rich = sorted(self.features)[len(self.features) // 2] >= _MANY_FEATURES
         return not self.pairs and self.compared_all and rich
@@ -64,7 +63,7 @@ def gather_evidence(database: Path, photos: Sequence[Photo], compared: int) -> E
     size = max(max(photo.width, photo.height) for photo in photos)
     # Some pairs tell; an even choice of them.
     some = pairs[:: max(1, len(pairs) // 100)]
-    displacement = median_displacement(database, some) / size if some else None
+    displacement = displacement_of(database, some) / size if some else None
     return Evidence(feature_counts(database, len(photos)), pairs, displacement, compared)
 
 
@@ -105,9 +104,8 @@ def failure(evidence: Evidence) -> UserError:
     paired = {i for pair in evidence.pairs for i in (pair.first, pair.second)}
     if usable < 3:
         return UserError(
-            f"{'none' if usable == 0 else f'only {usable}'} of the {count} photos "
-            f"{'has' if usable == 1 else 'have'} detail to go by: they are too dark, blurred or "
-            "plain; take sharp, well-lit photos of things with texture"
+            f"too few of the {count} photos have detail to go by ({usable}): the others are too "
+            "dark, blurred or plain; take sharp, well-lit photos of things with texture"
         )
     if len(paired) < 3:
         return UserError(
@@ -119,7 +117,7 @@ def failure(evidence: Evidence) -> UserError:
             "the camera hardly moved between the photos, so nothing tells how far things are; "
             "walk around the scene while you take them"
         )
-    if evidence.flat_share >= _FLAT_SHARE:
+    if evidence.flat:
         return UserError(
             "the camera only turned on the spot, or the photos show one flat thing, so nothing "
             "tells how far things are; walk around a scene that has depth"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +66,7 @@ def extract_features(
     options.use_gpu = False
     options.sift.max_num_features = effort.features
     options.sift.first_octave = effort.first_octave
-    with _counting(lambda: count_rows(database, "keypoints"), len(photos), "features", report):
+    with _counting(database, "keypoints", len(photos), "features", report):
         # COLMAP skips a photo whose mask it does not find, so those without go by themselves.
         for masked in (False, True):
             names = [photo.name for photo in photos if photo.mask == masked]
@@ -109,10 +109,8 @@ def match_pairs(
     # A blank ends a name in COLMAP's list of pairs: the images go by their numbers meanwhile.
     set_names(database, [str(i) for i in range(len(photos))])
     Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
-    before = count_rows(database, "two_view_geometries")
-    count = lambda: count_rows(database, "two_view_geometries") - before  # noqa: E731
     try:
-        with _counting(count, len(pairs), "pairs", report):
+        with _counting(database, "two_view_geometries", len(pairs), "pairs", report):
             pycolmap.match_image_pairs(
                 database,
                 matching_options=options,
@@ -126,16 +124,17 @@ def match_pairs(
 
 
 @contextmanager
-def _counting(count: Callable[[], int], total: int, what: str, report: Report) -> Iterator[None]:
-    """Report, while the block runs, what ``count`` gives of ``total``."""
+def _counting(database: Path, table: str, total: int, what: str, report: Report) -> Iterator[None]:
+    """Report, while the block runs, how many of ``total`` rows the table has."""
     ended = threading.Event()
 
     def poll() -> None:
-        while not ended.wait(_POLL_SECONDS):
+        while True:
             with suppress(OperationalError):  # COLMAP is writing: the next time
-                report(min(count(), total), total, what)
+                report(min(count_rows(database, table), total), total, what)
+            if ended.wait(_POLL_SECONDS):
+                return
 
-    report(0, total, what)
     thread = threading.Thread(target=poll, daemon=True)
     thread.start()
     try:

@@ -13,7 +13,6 @@ The one with most photos placed is kept.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,13 @@ from numpy.typing import NDArray
 
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.progress import Report
-from snowsplat.photos.sfm.database import fingerprint_of, open_database, read_descriptors
+from snowsplat.photos.sfm.database import (
+    fingerprint_of,
+    open_database,
+    read_descriptors,
+    remove_database,
+    replace_database,
+)
 from snowsplat.photos.sfm.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.photos.sfm.features import Folders, extract_features, match_pairs
 from snowsplat.photos.sfm.mapping import Mapping, write_models
@@ -84,9 +89,11 @@ class Reconstruction:
         first, second = self.folders.database, self.folders.distorted / "database_strong.db"
         mapper = self.options.mapper
         matched = self._match(first, effort, effort)
-        self._try("as asked", matched, mapper)
         evidence = self._evidence(matched)
-        if not self._enough() and not evidence.hopeless:
+        if evidence.flat:
+            mapper = "incremental"  # the global one finds depth even where there is none to see
+        self._try("as asked", matched, mapper)
+        if not self._enough() and (self.trials[0].models or not evidence.hopeless):
             if not (self.trials[0].models and evidence.compared_all):
                 more = self._match(first, effort, effort.stronger())
                 self._try("with more pairs and weaker matches", more, "incremental", relaxed=True)
@@ -94,13 +101,13 @@ class Reconstruction:
                 strong = effort.stronger()
                 more = self._match(second, strong, strong)
                 self._try("with more features, from larger photos", more, mapper, relaxed=True)
-            if not self._enough():
+            if not self._enough() and not evidence.flat:
                 other: Mapper = "incremental" if mapper == "global" else "global"
                 self._try("with the other mapper", more, other, relaxed=True)
             evidence = self._evidence(more)
         best = max(self.trials, key=lambda trial: trial.placed)
         if not best.models:
-            second.unlink(missing_ok=True)
+            remove_database(second)
             raise failure(evidence)
         write_models(best.models, self.folders.sparse)
         reasons = explain(
@@ -110,8 +117,8 @@ class Reconstruction:
             best.models, self.photos, reasons, best.matched.choice.words, self.attempts
         )
         if best.matched.database == second:
-            os.replace(second, first)
-        second.unlink(missing_ok=True)
+            replace_database(first, by=second)
+        remove_database(second)
         return result
 
     def _match(self, database: Path, effort: Effort, pairing: Effort) -> Matched:
