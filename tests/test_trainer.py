@@ -3,7 +3,7 @@
 import math
 import os
 import signal
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +22,7 @@ from snowsplat.geometry import look_at
 from snowsplat.ops import reference
 from snowsplat.optim import LearningRates
 from snowsplat.render import render
+from snowsplat.schedule import Schedule
 from snowsplat.trainer import Progress, Trainer
 
 WIDTH, HEIGHT, COUNT = 24, 20, 40
@@ -163,6 +164,36 @@ def test_resume_goes_on_to_the_same_bits(capture, config, stop, tmp_path):
     assert second.step == stop
     second.run()
     assert_identical(second.gaussians, whole)
+
+
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+def test_a_stretched_training_comes_to_its_end_and_resumes_to_the_same_bits(
+    capture, config, tmp_path
+):
+    """60 steps become 90 after step 20, and 45 after step 40."""
+    config = replace(config, coarse_to_fine=(0.2, 0.5))
+    reports: list[Progress] = []
+    first = Trainer(capture, config)
+
+    def stretch(progress: Progress) -> None:
+        reports.append(progress)
+        if progress.step == 20:
+            first.schedule.stretch(20, 90)
+        if progress.step == 40:
+            first.schedule.stretch(40, 45)
+            checkpoint.save(tmp_path, 40, first.state_tensors(), asdict(first.schedule))
+
+    first.run(stretch)
+    assert [report.iterations for report in reports] == 20 * [60] + 20 * [90] + 5 * [45]
+    assert [report.downscale for report in reports] == 12 * [4] + 26 * [2] + 7 * [1]
+    assert first._optimizer.rates_at(45) == Trainer(capture, config)._optimizer.rates_at(60)
+    saved = checkpoint.latest(tmp_path)
+    assert saved is not None
+    second = Trainer(capture, config, Schedule(**saved.meta))
+    second.load_state(saved.tensors)
+    second.run()
+    assert second.step == 45
+    assert_identical(second.gaussians, first.gaussians)
 
 
 def test_a_checkpoint_of_something_else_is_refused(capture):

@@ -1,6 +1,7 @@
 """`snowsplat train`, from flags to files: what is written, what is refused, what a stop leaves."""
 
 import json
+import re
 import shutil
 import signal
 import time
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from snowsplat import checkpoint
 from snowsplat.cli.train import _KNOBS, Train
 from snowsplat.recipes import RECIPES, recipe
 
@@ -202,6 +204,45 @@ def test_resume_where_nothing_is(refused, run, capture, tmp_path):
     assert "--overwrite" in refused("train", capture, "-o", out, "--resume")
 
 
+# In a given time
+
+
+def test_minutes(run, capture, tmp_path):
+    out = tmp_path / "out"
+    flags = ("--minutes", 0.05, "--eval", "--checkpoint-every", 40)
+    result = run("train", capture, "-o", out, *flags)
+    assert result.code == 0, result.err
+    lines = result.out.splitlines()
+    assert re.fullmatch(r"3.0 s on this machine: 48x36, at most 864 Gaussians, .*steps", lines[1])
+    assert re.fullmatch(r"\S+ s in all, of 3.0 s", lines[-1])
+    step = json.loads((out / "metrics.json").read_text())["iteration"]
+    assert len(scene(out, step)) > 1000
+    training = json.loads((out / "config.json").read_text())["training"]
+    assert training["iterations"] == step > 1
+    assert training["density"]["max_gaussians"] == 864
+
+    # It is finished, so there is nothing left to do; with --iterations it goes on by steps.
+    assert run("train", "-o", out, "--resume", "--iterations", step + 50).code == 0
+    assert len(scene(out, step + 50)) > 1000
+
+
+def test_a_stopped_training_keeps_to_its_time(start, run, capture, tmp_path):
+    """What was spent is known, and so is the schedule as it was stretched."""
+    out = tmp_path / "out"
+    process = start("train", capture, "-o", out, "--minutes", 2, "--checkpoint-every", 50)
+    wait_for(out / "checkpoints/step_000200.safetensors", process)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    newest = checkpoint.latest(out / "checkpoints")
+    assert newest.meta["time"]["seconds"] == 120
+    assert 0 < newest.meta["time"]["spent"] < 120
+    assert newest.meta["schedule"]["iterations"] > newest.step
+    result = run("train", "-o", out, "--resume", "--minutes", 0.03)
+    assert result.code == 0, result.err
+    assert f"step {newest.step} of {newest.meta['schedule']['iterations']}" in result.out
+    assert "in all, of 1.8 s" in result.out
+
+
 # Refused
 
 
@@ -233,6 +274,8 @@ def test_places_that_are_taken(refused, run, capture, tmp_path):
         (["--iterations", 0], "--iterations"),
         (["--sh-degree", 4], "--sh-degree"),
         (["--threads", 0], "--threads"),
+        (["--minutes", 0], "--minutes is 0"),
+        (["--minutes", 1, "--iterations", 100], "leave one out"),
         (["--background", "black", "-w"], "different colours"),
         (["-s", "elsewhere"], "twice"),
         (["--test-list", "absent.txt"], "absent.txt"),

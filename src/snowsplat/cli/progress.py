@@ -66,6 +66,7 @@ class TrainingProgress:
         self._loss = (
             progress.loss if weight == 1.0 else self._loss + weight * (progress.loss - self._loss)
         )
+        self.total = progress.iterations
         self._update_rate(progress.step, now)
         done = progress.step >= self.total
         if progress.metrics is not None and progress.metrics.views:
@@ -73,7 +74,9 @@ class TrainingProgress:
             self.say(held_out_line(progress.step, progress.metrics))
         if self._bar is not None:
             text = self._text(progress)
-            self._bar.update(self._task, completed=progress.step, description=text)
+            self._bar.update(
+                self._task, completed=progress.step, total=self.total, description=text
+            )
         elif done or now - self._last_line >= _LINE_SECONDS:
             self._last_line = now
             percent = 100 * progress.step // self.total

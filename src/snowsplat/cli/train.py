@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,15 +11,16 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.output import CaptureSettings, OutputFolder
-from snowsplat.cli.progress import TrainingProgress, duration, held_out_line, peak_bytes
+from snowsplat.cli.timed import TimeBudget
+from snowsplat.cli.training_run import TrainingRun
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
     from snowsplat.capture import Capture
     from snowsplat.checkpoint import Checkpoint
     from snowsplat.config import TrainConfig
-    from snowsplat.evaluate import Evaluation
-    from snowsplat.trainer import Progress, Trainer
+    from snowsplat.schedule import Schedule
+    from snowsplat.trainer import Trainer
 
 # Flags that are knobs of the configuration, under the same name.
 _KNOBS = (
@@ -42,6 +44,7 @@ class Train:
       snowsplat train garden -o out                   3000 steps, some minutes on a laptop
       snowsplat train garden -o out --eval            hold out every 8th photo, measure on them
       snowsplat train garden -o out -r 4              photos at a quarter of their size: quicker
+      snowsplat train garden -o out --minutes 5       the best that 5 minutes allow here
       snowsplat train garden -o out --recipe paper    the 30,000 steps of the paper
       snowsplat train garden -o out --checkpoint-every 1000
       snowsplat train -o out --resume                 go on after Ctrl-C, a crash, a power cut
@@ -63,6 +66,9 @@ class Train:
     of the paper, 30,000 steps; mcmc: 30,000 steps with a fixed number of Gaussians."""
     iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Training steps, one photo each."""
+    minutes: Annotated[float | None, flag("F", default="none")] = None
+    """End after this time, measuring and saving included: picks steps, size of photos and number of
+    Gaussians to fit, but for those that are named. With --resume: the time for what is left."""
     eval: Annotated[bool, switch()] = False
     """Hold out every 8th photo (or the capture's own test split) and measure on it at the end."""
     test_list: Annotated[Path | None, flag("FILE")] = None
@@ -146,13 +152,18 @@ class Train:
     """The reference's way to name the capture."""
     quiet: Annotated[bool, switch("-q")] = False
     """No progress, only the result."""
+    checkpoint_seconds: Annotated[float | None, tyro.conf.Suppress] = None
+    """For callers from Python: seconds between checkpoints, instead of steps."""
 
     def run(self) -> int:
         """Gives the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
+        started = time.monotonic()
         if self.output is None:
             raise UserError("train needs a folder for the result; add -o OUT")
         if self.resume and self.overwrite:
             raise UserError("--resume and --overwrite exclude each other; leave one out")
+        if self.minutes is not None and self.iterations is not None:
+            raise UserError("--minutes and --iterations both say when to end; leave one out")
         out = OutputFolder(self.output)
         out.check_free(resume=self.resume, overwrite=self.overwrite)
         if not self.resume and self._capture_path() is None:
@@ -168,6 +179,8 @@ class Train:
                 raise UserError(f"--threads is {self.threads}; it must be at least 1")
             ops.set_num_threads(self.threads)
         start = self._checkpoint(out) if self.resume else None
+        budget, schedule = self._length(start, started)
+        slowness = 1.0
         if start is None:
             settings, config = self._capture_settings(None), self._config()
             recipe = self.recipe or "default"
@@ -175,16 +188,51 @@ class Train:
             settings = self._capture_settings(CaptureSettings(**start.meta["capture"]))
             config, recipe = self._resumed_config(start), start.meta["recipe"]
         capture = settings.load()
-        trainer = Trainer(capture, config)
+        if budget is not None and start is None:
+            plan = budget.plan(
+                *(capture, config),
+                resize=self.resolution is None,
+                more_gaussians=self.max_gaussians is None,
+            )
+            config, slowness = plan.config, plan.slowness
+            if plan.resolution is not None:
+                settings = replace(settings, resolution=plan.resolution)
+                capture = settings.load()
+        trainer = Trainer(capture, config, schedule)
         if start is None:
             out.begin(capture, settings, config)
         else:
             trainer.load_state(start.tensors)
             out.write_config(settings, config)
-        self._describe(capture, config, start)
-        return _Run(self, out, settings, recipe, trainer).run()
+        self._describe(capture, trainer, start)
+        if budget is not None and start is None:
+            self._say(budget.described(plan))
+        pace = None if budget is None else budget.pace(trainer, slowness)
+        return TrainingRun(
+            *(out, settings, recipe, trainer, budget, pace),
+            save_iterations=self.save_iterations,
+            checkpoint_seconds=self.checkpoint_seconds,
+            quiet=self.quiet,
+        ).run()
 
     # Flags -> settings
+
+    def _length(
+        self, start: Checkpoint | None, started: float
+    ) -> tuple[TimeBudget | None, Schedule | None]:
+        """The time that there is, and the schedule of a training that goes on.
+
+        --iterations, given anew, takes the place of both.
+        """
+        from snowsplat.schedule import Schedule
+
+        if start is None or self.iterations is not None:
+            return TimeBudget.of(self.minutes, None, started), None
+        schedule = start.meta.get("schedule")
+        return (
+            TimeBudget.of(self.minutes, start.meta.get("time"), started),
+            None if schedule is None else Schedule(**schedule),
+        )
 
     def _capture_path(self) -> Path | None:
         if self.capture is not None and self.source_path is not None:
@@ -266,7 +314,7 @@ class Train:
 
     # Words
 
-    def _describe(self, capture: Capture, config: TrainConfig, start: Checkpoint | None) -> None:
+    def _describe(self, capture: Capture, trainer: Trainer, start: Checkpoint | None) -> None:
         camera = capture.train[0].camera
         points = "no points" if capture.points is None else f"{len(capture.points):,} points"
         self._say(
@@ -274,92 +322,10 @@ class Train:
             f"held out, {camera.width}x{camera.height}, {points}"
         )
         if start is not None:
-            self._say(f"going on from {start.path}, step {start.step} of {config.iterations}")
+            self._say(
+                f"going on from {start.path}, step {start.step} of {trainer.schedule.iterations}"
+            )
 
     def _say(self, line: str) -> None:
         if not self.quiet:
             print(line, flush=True)
-
-
-class _Run:
-    """The steps of one training and what is written on the way."""
-
-    def __init__(
-        self,
-        flags: Train,
-        out: OutputFolder,
-        settings: CaptureSettings,
-        recipe: str,
-        trainer: Trainer,
-    ) -> None:
-        self.flags, self.out, self.settings, self.recipe = flags, out, settings, recipe
-        self.trainer = trainer
-        self.config = trainer.config
-        self.first_step = trainer.step
-        self.progress = TrainingProgress(self.config.iterations, trainer.step)
-        self.evaluation: tuple[int, Evaluation] | None = None  # the newest, and its step
-
-    def run(self) -> int:
-        from contextlib import nullcontext
-
-        stopped = False
-        try:
-            with nullcontext() if self.flags.quiet else self.progress:
-                self.trainer.run(self._after_step)
-        except KeyboardInterrupt:
-            if self.trainer.step == 0:
-                self.out.discard()
-                raise
-            stopped = True
-        except BaseException:
-            self.out.discard()
-            raise
-        return self._stopped() if stopped else self._finished()
-
-    def _after_step(self, progress: Progress) -> None:
-        if progress.metrics is not None and progress.metrics.views:
-            self.evaluation = (progress.step, progress.metrics)
-        if not self.flags.quiet:
-            self.progress(progress)
-        every = self.config.checkpoint_every
-        if every and progress.step % every == 0:
-            self._save_checkpoint()
-        if progress.step in self.flags.save_iterations:
-            self.out.write_scene(progress.step, self.trainer.gaussians)
-
-    def _save_checkpoint(self) -> Path:
-        from dataclasses import asdict
-
-        from snowsplat import checkpoint
-        from snowsplat.config import config_to_json
-
-        meta = {
-            "capture": asdict(self.settings),
-            "recipe": self.recipe,
-            "training": config_to_json(self.config),
-        }
-        return checkpoint.save(
-            self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta
-        )
-
-    def _stopped(self) -> int:
-        path = self.out.write_scene(self.trainer.step, self.trainer.gaussians)
-        self._save_checkpoint()
-        print(f"stopped after step {self.trainer.step}: {path}")
-        print(f"go on with: snowsplat train -o {self.out.path} --resume")
-        return 130
-
-    def _finished(self) -> int:
-        step = self.trainer.step
-        path = self.out.write_scene(step, self.trainer.gaussians)
-        steps = f"{step - self.first_step} more steps" if self.first_step else f"{step} steps"
-        print(
-            f"{path}: {len(self.trainer.gaussians):,} Gaussians, {steps} in "
-            f"{duration(self.progress.seconds)}, at most {peak_bytes() / 1e6:.0f} MB"
-        )
-        if self.trainer.capture.test:
-            if self.evaluation is None or self.evaluation[0] != step:
-                self.evaluation = (step, self.trainer.evaluate())
-            self.out.write_metrics(step, "test", self.evaluation[1])
-            print(held_out_line(*self.evaluation))
-        return 0

@@ -18,7 +18,7 @@ from snowsplat.density.mcmc import McmcDensity
 from snowsplat.gaussians import Gaussians
 from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam
-from snowsplat.schedule import Schedule
+from snowsplat.schedule import Schedule, When
 
 __all__ = ["AdaptiveDensity", "DensityConfig", "DensityControl", "McmcDensity"]
 
@@ -59,6 +59,16 @@ class DensityConfig(Protocol):
     @property
     def max_gaussians(self) -> int:
         """Hard cap of their number; 0 is none. The initial ones keep to it too."""
+        ...
+
+    @property
+    def densify_until(self) -> When:
+        """The last moment that may add Gaussians."""
+        ...
+
+    @property
+    def densify_interval(self) -> int:
+        """Steps between two such moments."""
         ...
 
     def control(

@@ -1,0 +1,130 @@
+"""The steps of one training and what is written on the way: the work of `snowsplat train`."""
+
+from __future__ import annotations
+
+import time
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.cli.output import CaptureSettings, OutputFolder
+from snowsplat.cli.progress import TrainingProgress, duration, held_out_line, peak_bytes
+from snowsplat.cli.timed import TimeBudget
+
+if TYPE_CHECKING:
+    from snowsplat.evaluate import Evaluation
+    from snowsplat.pace import Pace
+    from snowsplat.trainer import Progress, Trainer
+
+
+@dataclass
+class TrainingRun:
+    """One training, to its end or to Ctrl-C.
+
+    Attributes:
+        settings, recipe: as they are written down.
+        budget, pace: of a training with a time.
+        save_iterations: steps after which the scene is written too.
+        checkpoint_seconds: between checkpoints, where the configuration names no steps.
+    """
+
+    out: OutputFolder
+    settings: CaptureSettings
+    recipe: str
+    trainer: Trainer
+    budget: TimeBudget | None
+    pace: Pace | None
+    save_iterations: tuple[int, ...] = ()
+    checkpoint_seconds: float | None = None
+    quiet: bool = False
+
+    def __post_init__(self) -> None:
+        self.config = self.trainer.config
+        self.first_step = self.trainer.step
+        self.progress = TrainingProgress(self.trainer.schedule.iterations, self.trainer.step)
+        self.last_checkpoint = time.monotonic()
+        self.evaluation: tuple[int, Evaluation] | None = None  # the newest, and its step
+
+    def run(self) -> int:
+        """Gives the exit code: 0, or 130 after Ctrl-C."""
+        stopped = False
+        try:
+            with nullcontext() if self.quiet else self.progress:
+                self.trainer.run(self._after_step)
+        except KeyboardInterrupt:
+            if self.trainer.step == 0:
+                self.out.discard()
+                raise
+            stopped = True
+        except BaseException:
+            self.out.discard()
+            raise
+        return self._stopped() if stopped else self._finished()
+
+    def _after_step(self, progress: Progress) -> None:
+        if progress.metrics is not None and progress.metrics.views:
+            self.evaluation = (progress.step, progress.metrics)
+        if not self.quiet:
+            self.progress(progress)
+        if self._checkpoint_is_due(progress.step):
+            self._save_checkpoint()
+        if progress.step in self.save_iterations:
+            self.out.write_scene(progress.step, self.trainer.gaussians)
+        if self.pace is not None:
+            schedule = self.trainer.schedule
+            length = self.pace.iterations_after(
+                schedule, progress.step, progress.downscale, progress.gaussians
+            )
+            if length is not None:
+                schedule.stretch(progress.step, length)
+
+    def _checkpoint_is_due(self, step: int) -> bool:
+        every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
+        if every:
+            return step % every == 0
+        return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
+
+    def _save_checkpoint(self) -> Path:
+        from snowsplat import checkpoint
+        from snowsplat.config import config_to_json
+
+        meta = {
+            "capture": asdict(self.settings),
+            "recipe": self.recipe,
+            "training": config_to_json(self.config),
+        }
+        if self.budget is not None:
+            meta["time"] = self.budget.as_json()
+            meta["schedule"] = asdict(self.trainer.schedule)
+        path = checkpoint.save(
+            self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta
+        )
+        self.last_checkpoint = time.monotonic()
+        return path
+
+    def _stopped(self) -> int:
+        path = self.out.write_scene(self.trainer.step, self.trainer.gaussians)
+        self._save_checkpoint()
+        print(f"stopped after step {self.trainer.step}: {path}")
+        print(f"go on with: snowsplat train -o {self.out.path} --resume")
+        return 130
+
+    def _finished(self) -> int:
+        step = self.trainer.step
+        path = self.out.write_scene(step, self.trainer.gaussians)
+        steps = f"{step - self.first_step} more steps" if self.first_step else f"{step} steps"
+        print(
+            f"{path}: {len(self.trainer.gaussians):,} Gaussians, {steps} in "
+            f"{duration(self.progress.seconds)}, at most {peak_bytes() / 1e6:.0f} MB"
+        )
+        if self.trainer.capture.test:
+            if self.evaluation is None or self.evaluation[0] != step:
+                self.evaluation = (step, self.trainer.evaluate())
+            self.out.write_metrics(step, "test", self.evaluation[1])
+            print(held_out_line(*self.evaluation))
+        if self.budget is not None:
+            self.out.write_config(self.settings, replace(self.config, iterations=step))
+            spent = self.budget.as_json()["spent"]
+            print(f"{duration(spent)} in all, of {duration(self.budget.seconds)}")
+        return 0

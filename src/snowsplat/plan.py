@@ -1,0 +1,156 @@
+"""What to train in a given time on this machine: how large photos, how many Gaussians and steps.
+
+More steps first, then larger photos, then more Gaussians: see "Training in a given time" in
+docs/performance.md.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from dataclasses import dataclass, replace
+
+from snowsplat.capture.capture import Capture, Points
+from snowsplat.config import TrainConfig, changed
+from snowsplat.pace import Work
+from snowsplat.schedule import Schedule
+from snowsplat.trainer import Trainer
+
+# As many steps as the largest photos are worth: so many, and so many looks at each photo.
+_STEPS, _LOOKS = 1500, 10
+# The longer side of photos, in pixels.
+_SMALLEST, _LARGEST = 400, 1600
+# Where there is time for so many steps with the recipe's cap, it may rise, so far.
+_STEPS_TO_SPARE, _RISE = 4500, 2.0
+# How the speed is measured: seconds at most, steps, photos, points.
+_SECONDS, _SAMPLE_STEPS, _PHOTOS, _POINTS = 1.0, 12, 2, 20_000
+# Time to load the photos of the first steps and to set up, in seconds.
+_SETTING_UP = 0.5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What `make_plan` chose.
+
+    Attributes:
+        resolution: width of the photos, as -r takes it; None: as they are.
+        width, height: of a photo at that resolution, in pixels.
+        config: the configuration with the number of steps and the cap.
+        slowness: how many times as long as reckoned a step takes here, see `pace.Work`.
+        seconds: of a step, the mean.
+    """
+
+    resolution: int | None
+    width: int
+    height: int
+    config: TrainConfig
+    slowness: float
+    seconds: float
+
+    def __str__(self) -> str:
+        cap = self.config.density.max_gaussians
+        gaussians = f"at most {cap:,} Gaussians" if cap else "no limit of Gaussians"
+        return (
+            f"{self.width}x{self.height}, {gaussians}, about {_rounded(self.config.iterations):,} "
+            "steps"
+        )
+
+
+def make_plan(
+    capture: Capture,
+    config: TrainConfig,
+    seconds: float,
+    slowness: float,
+    *,
+    resize: bool = True,
+    more_gaussians: bool = True,
+) -> Plan:
+    """The best training of ``capture`` (at full resolution) that fits into ``seconds``.
+
+    Args:
+        config: of the recipe; its ``iterations`` are replaced.
+        slowness: from `measure_slowness`.
+        resize: choose the size of the photos, or leave it.
+        more_gaussians: whether the cap may rise.
+    """
+    camera = max((view.camera for view in capture.train), key=lambda c: c.width * c.height)
+    longer = max(camera.width, camera.height)
+    wanted = max(_STEPS, _LOOKS * len(capture.train))
+
+    def plan(side: int, rise: float = 1.0) -> Plan:
+        width = camera.width if side >= longer else max(1, round(camera.width * side / longer))
+        height = round(camera.height * width / camera.width)
+        sized = _capped(config, width * height, rise)
+        work = Work(sized, width * height, len(capture.test))
+        start = config.initial_points if capture.points is None else len(capture.points)
+        start = min(start, sized.density.max_gaussians or start)
+        steps, mean = _steps(work, seconds - _SETTING_UP, slowness, start)
+        resolution = None if width == camera.width else width
+        return Plan(resolution, width, height, replace(sized, iterations=steps), slowness, mean)
+
+    side = longer
+    if resize:
+        side, smallest = min(longer, _LARGEST), min(longer, _SMALLEST)
+        while side > smallest and plan(side).config.iterations < wanted:
+            side = max(smallest, min(side - 8, round(0.97 * side)))
+    best = plan(side)
+    if more_gaussians and best.config.iterations > _STEPS_TO_SPARE:
+        rise = min(_RISE, best.config.iterations / _STEPS_TO_SPARE)
+        best = plan(side, rise)
+    return best
+
+
+def measure_slowness(capture: Capture, config: TrainConfig) -> float:
+    """How many times as long as reckoned a step takes on this machine, by a few real ones."""
+    camera = capture.train[0].camera
+    downscale = 1 if camera.width * camera.height < 500_000 else 2
+    points = capture.points
+    if points is not None and len(points) > _POINTS:
+        every = math.ceil(len(points) / _POINTS)
+        points = Points(points.xyz[::every], points.rgb[::every])
+    trainer = Trainer(
+        replace(capture, train=capture.train[:_PHOTOS], test=[], points=points),
+        replace(
+            config,
+            initial_points=min(config.initial_points, _POINTS),
+            iterations=_SAMPLE_STEPS,
+            coarse_to_fine=(0, 0) if downscale == 1 else (0, 1.0),
+            sh_interval=0,
+            test_iterations=(),
+        ),
+    )
+    work = Work(trainer.config, camera.width * camera.height, 0)
+    end = time.monotonic() + _SECONDS
+    ratios: list[float] = []
+    while trainer.step < _SAMPLE_STEPS and (len(ratios) < 3 or time.monotonic() < end):
+        start = time.monotonic()
+        trainer.step_once()
+        reckoned = work.seconds(downscale, len(trainer.gaussians))
+        ratios.append((time.monotonic() - start) / reckoned)
+    return statistics.median(ratios[1:])  # the first one waits for its photo
+
+
+def _capped(config: TrainConfig, pixels: int, rise: float) -> TrainConfig:
+    cap = config.density.max_gaussians
+    if rise > 1.0 and cap:
+        config = replace(config, density=changed(config, max_gaussians=round(rise * cap)).density)
+    return config.capped(pixels)
+
+
+def _steps(work: Work, seconds: float, slowness: float, gaussians: int) -> tuple[int, float]:
+    """How many steps fit, and the seconds of one."""
+    steps = work.config.iterations
+    mean = 0.0
+    for _ in range(5):  # what a step takes depends on how many there are
+        parts = work.parts_ahead(Schedule(steps), 0, gaussians)
+        mean = slowness * sum(work.seconds(*part) for part in parts) / len(parts)
+        left = seconds - work.seconds_after(slowness * work.seconds(1, parts[-1][1]), parts[-1][1])
+        steps = max(1, round(left / mean))
+    return steps, mean
+
+
+def _rounded(count: int) -> int:
+    """To two digits."""
+    digits = max(0, len(str(count)) - 2)
+    return round(count / 10**digits) * 10**digits
