@@ -37,6 +37,16 @@ class Evidence:
         return self.compared >= count * (count - 1) // 2
 
     @property
+    def hopeful(self) -> int:
+        """How many photos could be placed at all: they have detail, and it is not all their own."""
+        paired = {i for pair in self.pairs for i in (pair.first, pair.second)}
+        alone = _MANY_FEATURES if self.compared_all else float("inf")
+        return sum(
+            count >= _FEW_FEATURES and (i in paired or count < alone)
+            for i, count in enumerate(self.features)
+        )
+
+    @property
     def flat(self) -> bool:
         """Whether one plane, or a camera that only turned, explains the matches."""
         flat = sum(pair.inliers for pair in self.pairs if pair.flat)
@@ -49,12 +59,9 @@ class Evidence:
     @property
     def hopeless(self) -> bool:
         """Whether, where no model was found, stronger settings would find none either."""
-        if sum(count >= _FEW_FEATURES for count in self.features) < 2:
-            return True
         if self.still or self.flat:
             return True
-        rich = sorted(self.features)[len(self.features) // 2] >= _MANY_FEATURES
-        return not self.pairs and self.compared_all and rich
+        return self.hopeful < 3
 
 
 def gather_evidence(database: Path, photos: Sequence[Photo], compared: int) -> Evidence:

@@ -1,6 +1,6 @@
 """Photos -> poses, in as many tries as it takes: the first as asked, then with more of everything.
 
-A try that places 90% of the photos is the last. Otherwise the others follow, unless what was found
+A try that places 90% of the photos that have detail and matches is the last. Otherwise the others follow, unless what was found
 says that none of them can help:
 
     1  features, pairs and mapper as asked
@@ -38,7 +38,7 @@ from snowsplat.photos.sfm.pairs import PairChoice, choose_pairs
 from snowsplat.photos.sfm.result import names_in, result_of
 from snowsplat.photos.sfm.retrieval import FEATURES, similarity
 
-_ENOUGH = 0.9  # of the photos
+_ENOUGH = 0.9  # of the photos that could be placed
 _MAX_ERROR = 4.0  # pixels at which features are looked for
 
 
@@ -93,15 +93,15 @@ class Reconstruction:
         if evidence.flat:
             mapper = "incremental"  # the global one finds depth even where there is none to see
         self._try("as asked", matched, mapper)
-        if not self._enough() and (self.trials[0].models or not evidence.hopeless):
+        if not self._enough(evidence) and (self.trials[0].models or not evidence.hopeless):
             if not (self.trials[0].models and evidence.compared_all):
                 more = self._match(first, effort, effort.stronger())
                 self._try("with more pairs and weaker matches", more, "incremental", relaxed=True)
-            if not self._enough():
+            if not self._enough(evidence):
                 strong = effort.stronger()
                 more = self._match(second, strong, strong)
                 self._try("with more features, from larger photos", more, mapper, relaxed=True)
-            if not self._enough() and not evidence.flat:
+            if not self._enough(evidence) and not evidence.flat:
                 other: Mapper = "incremental" if mapper == "global" else "global"
                 self._try("with the other mapper", more, other, relaxed=True)
             evidence = self._evidence(more)
@@ -157,8 +157,9 @@ class Reconstruction:
             f"{trial.placed} of {len(self.photos)} placed{weak}"
         )
 
-    def _enough(self) -> bool:
-        return any(trial.placed >= _ENOUGH * len(self.photos) for trial in self.trials)
+    def _enough(self, evidence: Evidence) -> bool:
+        placed = max(trial.placed for trial in self.trials)
+        return placed > 0 and placed >= _ENOUGH * evidence.hopeful
 
     def _evidence(self, matched: Matched) -> Evidence:
         return gather_evidence(matched.database, self.photos, len(matched.choice.pairs))
