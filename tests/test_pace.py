@@ -99,7 +99,7 @@ def test_other_recipes(name):
 
 def test_the_length_settles():
     machine = Machine(recipe("default"), usual)
-    machine.train(120.0, 10_000)
+    machine.train(120.0, 10_000, slowness=1.5)
     later = machine.lengths[len(machine.lengths) // 2 :]
     assert max(later) < 1.1 * min(later)
     assert machine.downscales.count(4) / machine.iterations == pytest.approx(0.15, abs=0.03)

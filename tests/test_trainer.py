@@ -171,7 +171,8 @@ def test_a_stretched_training_comes_to_its_end_and_resumes_to_the_same_bits(
     capture, config, tmp_path
 ):
     """60 steps become 90 after step 20, and 45 after step 40."""
-    config = replace(config, coarse_to_fine=(0.2, 0.5))
+    rates = LearningRates(means_steps=1.0)
+    config = replace(config, coarse_to_fine=(0.2, 0.5), learning_rates=rates)
     reports: list[Progress] = []
     first = Trainer(capture, config)
 

@@ -25,6 +25,8 @@ _A_MILLION_GAUSSIANS = 0.07
 # What a densification makes of the number of Gaussians, where the cap leaves room.
 _GROWTH = 1.25
 
+# How much of the memory the guess fills at first.
+_TRUST = 0.3
 # A step that seems so many times slower than the others was held up by something that will pass.
 _OUTLIER = 5.0
 # How long measurements are remembered, as a part of the time given and at least; and the seconds
@@ -100,12 +102,13 @@ class StepCost:
         """
         self._work = work
         self._memory = memory
-        # By downscale: seconds measured and seconds reckoned, the older the less. The guess counts
-        # as much as half a second of measurements.
+        # By downscale: seconds measured and seconds reckoned, the older the less. A stage begins
+        # with what is known from the one before, which is to outweigh that its photos have to be
+        # decoded first.
         self._measured: dict[int, float] = {}
         self._reckoned: dict[int, float] = {}
         self._slowness = slowness
-        self._guess = 0.5 / slowness
+        self._guess = _TRUST * memory / slowness
 
     def observe(self, seconds: float, downscale: int, gaussians: int) -> None:
         """A step took so long."""
