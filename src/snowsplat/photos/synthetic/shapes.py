@@ -14,11 +14,13 @@ import numpy as np
 
 _FAR = np.float32(np.inf)
 
+Sizes = tuple[tuple[float, float], ...]
+
 
 class Shape(Protocol):
     centre: np.ndarray  # (3, 1) float32, of a ball that holds the shape
     radius: float  # of that ball; infinite: never skip it
-    sizes: tuple[tuple[float, float], ...]  # of each face, along u and v, metres (about)
+    sizes: Sizes  # of each face, along u and v, metres (about)
     wraps: tuple[bool, ...]  # of each face: whether u = 1 is u = 0 again
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -64,8 +66,8 @@ class Box:
         cos, sin = math.cos(angle), math.sin(angle)
         self._own_from_world = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]], np.float32)
         x, y, z = size
-        self.sizes = ((y, z), (y, z), (x, z), (x, z), (x, y), (x, y))
-        self.wraps = (False,) * 6
+        self.sizes: Sizes = ((y, z), (y, z), (x, z), (x, z), (x, y), (x, y))
+        self.wraps: tuple[bool, ...] = (False,) * 6
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         # The ray is within each of three pairs of planes between two distances (slabs).
@@ -111,8 +113,8 @@ class Ellipsoid:
         self.centre = _column(*centre)
         self.radii = _column(*radii)
         self.radius = max(radii)
-        self.sizes = ((2 * math.pi * max(radii[:2]), math.pi * radii[2]),)
-        self.wraps = (True,)
+        self.sizes: Sizes = ((2 * math.pi * max(radii[:2]), math.pi * radii[2]),)
+        self.wraps: tuple[bool, ...] = (True,)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         # In units of the radii it is the unit ball. The distance of the line from the middle
@@ -159,12 +161,12 @@ class Frustum:
         self.slope = (top - bottom) / height
         self.centre = self.base + _column(0, 0, height / 2)
         self.radius = math.hypot(height / 2, max(bottom, top))
-        self.sizes = (
+        self.sizes: Sizes = (
             (2 * math.pi * max(bottom, top), math.hypot(height, top - bottom)),
             (2 * top, 2 * top),
             (2 * bottom, 2 * bottom),
         )
-        self.wraps = (True, False, False)
+        self.wraps: tuple[bool, ...] = (True, False, False)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         x, y, z = np.broadcast_to(origins - self.base, directions.shape)
@@ -245,8 +247,8 @@ class Ring:
         self.centre = _column(*centre)
         self.ring, self.tube = ring, tube
         self.radius = ring + tube
-        self.sizes = ((2 * math.pi * (ring + tube), 2 * math.pi * tube),)
-        self.wraps = (True,)
+        self.sizes: Sizes = ((2 * math.pi * (ring + tube), 2 * math.pi * tube),)
+        self.wraps: tuple[bool, ...] = (True,)
         cos, sin = math.cos(angle), math.sin(angle)
         rows = [[-sin, cos, 0], [0, 0, 1], [cos, sin, 0]] if upright else np.eye(3)
         self._own_from_world = np.array(rows, np.float32)

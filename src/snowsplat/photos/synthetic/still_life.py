@@ -10,12 +10,13 @@ import math
 import numpy as np
 
 from snowsplat.photos.synthetic import textures as paint
-from snowsplat.photos.synthetic.scene import Lamp, Scene, Thing
+from snowsplat.photos.synthetic.light import Lamp
+from snowsplat.photos.synthetic.scene import Scene, Thing
 from snowsplat.photos.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
 _FLOOR, _CEILING = -0.72, 2.0
 _ROOM = (5.2, 4.8)
-_LAMP = Lamp(middle=(0.5, -0.4, 1.95), size=(1.1, 0.8), power=1.9, around=0.42)
+_LAMP = Lamp(middle=(0.5, -0.4, 1.95), size=(1.1, 0.8), power=2.5, around=0.60)
 _OAK, _PINE, _DARK = (0.62, 0.45, 0.29), (0.78, 0.62, 0.42), (0.42, 0.28, 0.19)
 
 
@@ -119,7 +120,7 @@ def _on_the_table(random: np.random.Generator) -> list[Thing]:
     top = paint.wood((960, 960), 7, _OAK, random)
     sheets = [paint.printed((210, 290), random, lines=18) for _ in range(3)]
     for sheet, middle, angle in zip(
-        sheets, ((0.62, 0.80), (0.14, 0.50), (0.76, 0.17)), (20, -75, 130), strict=True
+        sheets, ((0.62, 0.80), (0.14, 0.50), (0.76, 0.17)), (20.0, -75.0, 130.0), strict=True
     ):
         top = paint.paste(top, sheet, middle, 0.16, angle)
     rim = paint.wood((1536, 16), 1, _DARK, random)

@@ -14,7 +14,21 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 Size = tuple[int, int]
-Colour = Sequence[float]
+Colour = Sequence[float]  # sRGB, 0 to 1
+Ink = tuple[int, int, int]  # sRGB, 0 to 255
+
+_LIGHT: Sequence[Ink] = ((238, 228, 205), (222, 212, 190), (205, 218, 220), (236, 214, 170))
+_DARK: Sequence[Ink] = ((38, 42, 54), (74, 32, 34), (28, 60, 62), (52, 40, 34), (40, 48, 92))
+_BRIGHT: Sequence[Ink] = (
+    (196, 62, 46),
+    (224, 140, 44),
+    (232, 190, 76),
+    (112, 142, 62),
+    (46, 120, 128),
+    (58, 92, 160),
+    (150, 84, 120),
+    (210, 200, 178),
+)
 
 
 def noise(
@@ -60,7 +74,9 @@ def _mix(a: np.ndarray, b: Colour | np.ndarray, share: np.ndarray) -> np.ndarray
     return a * (1 - share) + np.asarray(b, np.float32) * share
 
 
-def plain(size: Size, colour: Colour, random: np.random.Generator, stains: float = 0.25):
+def plain(
+    size: Size, colour: Colour, random: np.random.Generator, stains: float = 0.25
+) -> np.ndarray:
     """Plaster, paint, glaze: one colour with stains and specks."""
     base = _shade(colour, stains * noise(size, (4, 4), 5, random))
     specks = noise(size, (size[0] / 10, size[1] / 10), 2, random)
@@ -81,7 +97,7 @@ def wood(size: Size, planks: int, colour: Colour, random: np.random.Generator) -
     rings = np.sin(2 * np.pi * (2.2 * across + drift + 1.3 * wave + 0.7 * u))
     grain = noise(size, (10, 14 * planks), 3, random)
     blotches = noise(size, (12, 3 * planks), 4, random)
-    result = _shade(colour, tone + 0.13 * rings + 0.20 * grain + 0.25 * blotches)
+    result = _shade(colour, tone + 0.12 * rings + 0.20 * grain + 0.18 * blotches)
     height, width = size[1], size[0]
     joint = np.minimum(across, 1 - across) * (height / planks) < 1.2
     end = np.abs((u - cuts) * 2 - np.round((u - cuts) * 2)) * (width / 2) < 1.2
@@ -119,14 +135,19 @@ def woven(
     cloth = np.repeat(picked[stripe][:, None], width, axis=1)
     cell = max(4, width // 48)
     figures = random.random((height // cell + 1, width // cell + 1)) < 0.32
-    figures = np.kron(figures, np.ones((cell, cell)))[:height, :width]
+    drawn = np.kron(figures, np.ones((cell, cell)))[:height, :width]
     other = np.asarray(colours, np.float32)[random.integers(0, len(colours), stripes)][stripe]
-    cloth = _mix(cloth, other[:, None], figures)
+    cloth = _mix(cloth, other[:, None], drawn)
     return (cloth * (1 + 0.3 * noise(size, (24, 24), 4, random))[..., None]).clip(0, 1)
 
 
 def _glyph(
-    draw: ImageDraw.ImageDraw, x: float, y: float, size: float, ink, random: np.random.Generator
+    draw: ImageDraw.ImageDraw,
+    x: float,
+    y: float,
+    size: float,
+    ink: Ink,
+    random: np.random.Generator,
 ) -> None:
     """A letter of no alphabet: a few strokes between the points of a 3 x 3 grid."""
     corners = random.integers(0, 3, (random.integers(3, 6), 2)) * (size * np.array([0.32, 0.45]))
@@ -134,9 +155,11 @@ def _glyph(
     draw.line(points, fill=ink, width=max(1, round(size * 0.17)), joint="curve")
 
 
-def _ink(random: np.random.Generator, dark: bool) -> tuple[int, int, int]:
-    low, high = (10, 90) if dark else (170, 250)
-    return tuple(int(value) for value in random.integers(low, high, 3))  # type: ignore[return-value]
+def _ink(random: np.random.Generator, inks: Sequence[Ink]) -> Ink:
+    """One of the inks, a little lighter or darker, as prints of different age are."""
+    red, green, blue = inks[random.integers(len(inks))]
+    change = random.uniform(0.8, 1.15)
+    return min(255, int(red * change)), min(255, int(green * change)), min(255, int(blue * change))
 
 
 def printed(size: Size, random: np.random.Generator, lines: int = 12) -> np.ndarray:
@@ -144,13 +167,13 @@ def printed(size: Size, random: np.random.Generator, lines: int = 12) -> np.ndar
     scale = 2  # drawn twice as large, then reduced: smooth edges
     width, height = size[0] * scale, size[1] * scale
     light_paper = random.random() < 0.6
-    paper = _ink(random, dark=not light_paper)
+    paper = _ink(random, _LIGHT if light_paper else _DARK)
     image = Image.new("RGB", (width, height), paper)
     draw = ImageDraw.Draw(image)
     for _ in range(random.integers(9, 16)):
         x, y = random.uniform(0, width), random.uniform(0, height)
         r = random.uniform(0.06, 0.22) * min(width, height)
-        ink = tuple(int(value) for value in random.integers(20, 240, 3))
+        ink = _ink(random, _BRIGHT)
         kind = random.integers(0, 4)
         if kind == 0:
             draw.ellipse((x - r, y - r, x + r, y + r), fill=ink)
@@ -162,7 +185,7 @@ def printed(size: Size, random: np.random.Generator, lines: int = 12) -> np.ndar
         else:
             line = max(2, round(0.25 * r))
             draw.ellipse((x - r, y - r, x + r, y + r), outline=ink, width=line)
-    ink = _ink(random, dark=light_paper)
+    ink = _ink(random, _DARK if light_paper else _LIGHT)
     pitch = height / (lines + 2)
     title = min(2.2 * pitch, width / 4)
     for i in range(int(0.9 * width / title)):
@@ -190,9 +213,10 @@ def spines(size: Size, shelves: int, random: np.random.Generator) -> np.ndarray:
             thick = random.uniform(0.10, 0.24) * shelf
             top = bottom - random.uniform(0.62, 0.88) * shelf
             if random.random() < 0.93:  # else a gap
-                base = random.integers(25, 215, 3)
-                ink = tuple(int(value) for value in (base + 128) % 256)
-                draw.rectangle((x, top, x + thick - 2, bottom), fill=tuple(map(int, base)))
+                dark_cover = random.random() < 0.5
+                cover = _ink(random, _DARK if dark_cover else _BRIGHT)
+                ink = _ink(random, _LIGHT if dark_cover else _DARK)
+                draw.rectangle((x, top, x + thick - 2, bottom), fill=cover)
                 for band in random.uniform(0.05, 0.95, 2):
                     y = top + band * (bottom - top)
                     draw.rectangle((x, y, x + thick - 2, y + 0.02 * shelf), fill=ink)
