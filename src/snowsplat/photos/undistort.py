@@ -1,0 +1,281 @@
+"""Photos and the model of SfM -> photos without lens distortion and a model of pinhole cameras.
+
+    distorted/sparse/0, input/, distorted/masks/  ->  sparse/0, images/, masks/, images_2/ …
+
+The layout that training reads. The new model is in the scene's frame (see `orient`).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from snowsplat.capture.decode import resize_area
+from snowsplat.capture.images import available_memory
+from snowsplat.errors import UserError
+from snowsplat.files import atomic_path
+from snowsplat.photos.pinhole import Pinhole, pinhole_of
+from snowsplat.photos.resample import undistort_image, undistort_mask
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from snowsplat.geometry import Similarity
+    from snowsplat.photos.photo import Photo
+    from snowsplat.photos.progress import Report
+
+logger = logging.getLogger(__name__)
+
+_DIVISORS = (2, 4, 8)
+_BYTES_PER_PIXEL = 40  # at the worst moment of a photo, which is when it is made smaller
+# How each format is written: as good as loses nothing that training could see.
+_SAVING: dict[str, dict[str, Any]] = {
+    "JPEG": {"quality": 95, "subsampling": 0},
+    "PNG": {"compress_level": 3},
+    "WEBP": {"lossless": True},
+    "TIFF": {"compression": "tiff_deflate"},
+    "BMP": {},
+    "PPM": {},
+}
+
+
+@dataclass(frozen=True)
+class Undistorted:
+    """What was made. All of it fits JSON."""
+
+    images: int
+    masks: int
+    sizes: list[tuple[int, int, int]]  # width, height, and how many images have it
+    folders: list[str]  # of images, in the capture
+    resampled: bool  # False where no photo had distortion: then images are copies
+
+
+@dataclass(frozen=True)
+class _Job:
+    name: str  # of the photo, relative
+    camera_size: tuple[int, int]
+    pinhole: Pinhole
+    mask: bool
+
+
+def undistort(
+    capture: Path,
+    photos: Sequence[Photo],
+    scene_from_sfm: Similarity,
+    resize: bool,
+    report: Report,
+    threads: int | None = None,
+) -> Undistorted:
+    """Make ``images/``, ``masks/`` and ``sparse/0`` of a capture whose poses are found.
+
+    Photos without a pose are left out. Files keep their names and formats: JPEG at quality 95
+    without chroma subsampling, all others without loss; transparency stays. Where the camera has
+    no distortion, photos are copied. Masks are made for photos that have one, unless they are
+    transparent, which says the same in finer steps. The model is written last.
+
+    Args:
+        photos: what is known of those in ``input/``.
+        resize: also make ``images_2``, ``images_4`` and ``images_8``.
+        threads: that work at once; None takes one a core, at most 4. Fewer where the photos are
+            so large that memory is short.
+
+    Raises:
+        UserError: a photo that is absent, damaged or changed; a calibration that makes no sense.
+        OSError: the disk is full.
+    """
+    import pycolmap
+
+    model = pycolmap.Reconstruction(capture / "distorted" / "sparse" / "0")
+    pinholes = {number: _pinhole(camera) for number, camera in model.cameras.items()}
+    known = {photo.name: photo for photo in photos}
+    jobs = []
+    for number in model.reg_image_ids():
+        image = model.images[number]
+        photo, camera = known.get(image.name), model.cameras[image.camera_id]
+        masked = photo is not None and photo.mask and not photo.alpha
+        size = (camera.width, camera.height)
+        jobs.append(_Job(image.name, size, pinholes[image.camera_id], masked))
+    jobs.sort(key=lambda job: job.name)
+    divisors = _DIVISORS if resize else ()
+    folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
+    for folder, job in [(f, j) for j in jobs for f in folders] + [
+        ("masks", j) for j in jobs if j.mask
+    ]:
+        (capture / folder / job.name).parent.mkdir(parents=True, exist_ok=True)
+    pixels = max(p.width * p.height for p in pinholes.values())
+    threads = min(
+        threads or min(4, os.cpu_count() or 1),
+        max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
+    )
+    _run([partial(_undistort_photo, capture, job, divisors) for job in jobs], report, threads)
+    _write_model(model, pinholes, scene_from_sfm, capture)
+    sizes = Counter((job.pinhole.width, job.pinhole.height) for job in jobs)
+    return Undistorted(
+        images=len(jobs),
+        masks=sum(job.mask for job in jobs),
+        sizes=[(*size, count) for size, count in sizes.most_common()],
+        folders=folders,
+        resampled=any(job.pinhole.nodes is not None for job in jobs),
+    )
+
+
+def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+    found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
+    try:
+        pinhole = pinhole_of(camera)
+    except ValueError as error:
+        raise UserError(
+            f"the lens distortion found ({found}) makes no sense: {error}; take more photos, from "
+            "more sides, or try another --camera-model"
+        ) from None
+    if pinhole.cropped:
+        logger.warning(
+            "the lens distortion found (%s) is sound only near the middle of the photos: images "
+            "show less than them; another --camera-model may keep more",
+            found,
+        )
+    return pinhole
+
+
+def _run(jobs: Sequence[Callable[[], None]], report: Report, threads: int) -> None:
+    """Run jobs in threads. The first error, and Ctrl-C, ends it after those that are under way."""
+    report(0, len(jobs), "photos")
+    # Pillow and torch let go of the interpreter while they work; torch itself on one thread each.
+    pool = ThreadPoolExecutor(threads, "snowsplat-undistort", torch.set_num_threads, (1,))
+    try:
+        running = [pool.submit(job) for job in jobs]
+        for done, future in enumerate(as_completed(running), 1):
+            future.result()
+            report(done, len(jobs), "photos")
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+# One photo
+
+
+def _undistort_photo(capture: Path, job: _Job, divisors: Sequence[int]) -> None:
+    source, target = capture / "input" / job.name, capture / "images" / job.name
+    with _opened(source, job) as opened:
+        form = "JPEG" if opened.format == "MPO" else str(opened.format)
+        if job.pinhole.nodes is None:
+            with atomic_path(target) as temporary:
+                shutil.copyfile(source, temporary)
+        if job.pinhole.nodes is not None or divisors:
+            profile = opened.info.get("icc_profile")
+            image = undistort_image(_eight_bit(_decoded(opened, source)), job.pinhole)
+            if job.pinhole.nodes is not None:
+                _save(image, target, form, profile)
+            for divisor in divisors:
+                folder = capture / f"images_{divisor}"
+                _save(_divided(image, divisor), folder / job.name, form, profile)
+    if job.mask:
+        name = f"{job.name}.png"
+        with _opened(capture / "distorted" / "masks" / name, job) as opened:
+            mask = _decoded(opened, source).convert("L")
+        _save(undistort_mask(mask, job.pinhole), capture / "masks" / name, "PNG")
+
+
+def _opened(path: Path, job: _Job) -> Image.Image:
+    try:
+        image = Image.open(path, formats=list(_SAVING))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such image; its pose was found before it went away") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error}); replace it") from None
+    if image.size != job.camera_size:
+        image.close()
+        raise UserError(
+            f"{path}: is {image.width}x{image.height}, but its pose was found for "
+            f"{job.camera_size[0]}x{job.camera_size[1]}; put the old image back or start again"
+        )
+    return image
+
+
+def _decoded(opened: Image.Image, path: Path) -> Image.Image:
+    try:
+        opened.load()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be decoded ({error}); replace it") from None
+    return opened
+
+
+def _eight_bit(image: Image.Image) -> Image.Image:
+    """L, RGB or, where anything may be transparent, RGBA."""
+    if image.mode.startswith("I"):  # 16-bit grey, which convert() would clip rather than scale
+        grey = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255).astype(np.uint8)
+        return Image.fromarray(grey)
+    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+        return image.convert("RGBA")
+    return image if image.mode in ("L", "RGB") else image.convert("RGB")
+
+
+def _divided(image: Image.Image, divisor: int) -> Image.Image:
+    """1/divisor of the size, rounded as the loader of captures does; means over areas."""
+    width, height = (max(1, round(side / divisor)) for side in image.size)
+    # With colours multiplied by alpha, so that what is transparent does not bleed.
+    mode = "RGBa" if image.mode == "RGBA" else image.mode
+    pixels = np.asarray(image.convert(mode)).reshape(image.height, image.width, -1)
+    planes = resize_area(np.ascontiguousarray(pixels.transpose(2, 0, 1)), width, height)
+    small = np.ascontiguousarray(planes.transpose(1, 2, 0))
+    return Image.frombytes(mode, (width, height), small.tobytes()).convert(image.mode)
+
+
+def _save(image: Image.Image, path: Path, form: str, profile: bytes | None = None) -> None:
+    """No metadata but the colour profile, without which the colours are others."""
+    with atomic_path(path) as temporary:
+        image.save(temporary, form, icc_profile=profile, **_SAVING[form])
+
+
+# The model
+
+
+def _write_model(
+    model: pycolmap.Reconstruction,
+    pinholes: dict[int, Pinhole],
+    scene_from_sfm: Similarity,
+    capture: Path,
+) -> None:
+    """Turn the model into that of the images, and write it as a whole."""
+    import pycolmap
+
+    scale, rotation = scene_from_sfm.scale, scene_from_sfm.rotation.numpy()
+    shift = scene_from_sfm.translation.numpy()[:, None]
+    model.transform(pycolmap.Sim3d(np.concatenate([scale * rotation, shift], axis=1)))
+    for image in model.images.values():
+        _undistort_keypoints(image, model.cameras[image.camera_id], pinholes[image.camera_id])
+    for number, pinhole in pinholes.items():
+        camera = model.cameras[number]
+        camera.model = pycolmap.CameraModelId.PINHOLE
+        camera.width, camera.height = pinhole.width, pinhole.height
+        camera.params = list(pinhole.params)
+    new = capture / ".sparse.new"
+    shutil.rmtree(new, ignore_errors=True)
+    (new / "0").mkdir(parents=True)
+    model.write(new / "0")
+    model.export_PLY(new / "0" / "points3D.ply")
+    shutil.rmtree(capture / "sparse", ignore_errors=True)
+    new.rename(capture / "sparse")
+
+
+def _undistort_keypoints(image: Any, camera: pycolmap.Camera, pinhole: Pinhole) -> None:
+    points = image.points2D
+    if not len(points):
+        return
+    fx, fy, cx, cy = pinhole.params
+    pixels = camera.cam_from_img(np.array([point.xy for point in points])) * (fx, fy) + (cx, cy)
+    for point, xy in zip(points, pixels, strict=True):
+        # Near the rim the lens model may have no inverse; readers want numbers all the same.
+        point.xy = xy if np.isfinite(xy).all() else (-1.0, -1.0)
