@@ -6,9 +6,12 @@ import contextlib
 import dataclasses
 import json
 import os
+import queue
 import signal
+import sqlite3
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +22,7 @@ from snowsplat.photos.progress import Report
 from snowsplat.photos.sfm.options import SfmOptions, SfmResult, thread_count
 
 _MODULE = "snowsplat.photos.sfm.worker"
+_POLL_SECONDS = 0.5
 
 
 class Crashed(Exception):
@@ -73,17 +77,21 @@ def estimate_poses(
     try:
         result = _run({**job, "gentle": True}, log, 1, report)
     except Crashed as crash:
+        advice = (
+            "use fewer or smaller photos, or a lower quality" if crash.code < 0 else "report it"
+        )
         raise UserError(
-            f"finding the camera positions failed twice: {crash.how}; use fewer or smaller "
-            f"photos, or a lower quality ({log} has the details)"
+            f"finding the camera positions failed twice: {crash.how}; {advice} "
+            f"({log} has the details)"
         ) from None
     note = f"as asked: {first.how}; what follows was done with smaller photos and one thread"
     return dataclasses.replace(result, attempts=[note, *result.attempts])
 
 
 def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmResult:
-    with open(log, "ab") as log_file:
-        child = subprocess.Popen(
+    with (
+        open(log, "ab") as log_file,
+        subprocess.Popen(
             [sys.executable, "-m", _MODULE],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -91,34 +99,66 @@ def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmRes
             env=_environment(threads),
             text=True,
             encoding="utf-8",
-        )
-    assert child.stdin is not None
-    assert child.stdout is not None
-    answer: dict[str, Any] = {}
-    try:
-        # A child that is dead already shows by its status.
+        ) as child,
+    ):
         try:
-            child.stdin.write(json.dumps(job) + "\n")
-            child.stdin.flush()
-        except BrokenPipeError:
-            raise Crashed(child.wait()) from None
-        for line in child.stdout:
-            answer = json.loads(line)
-            if "progress" in answer:
-                report(*answer["progress"])
-        code = child.wait()
-    finally:
-        child.kill()
-        child.wait()
-        child.stdout.close()
-        # Closing flushes, and the child may be gone with part of the job unread.
-        with contextlib.suppress(BrokenPipeError):
-            child.stdin.close()
+            answer = _converse(child, job, report)
+            code = child.wait()
+        finally:
+            child.kill()
     if "user_error" in answer:
         raise UserError(answer["user_error"])
     if "result" not in answer:
         raise Crashed(code)
     return SfmResult(**answer["result"])
+
+
+def _converse(child: subprocess.Popen[str], job: dict[str, Any], report: Report) -> dict[str, Any]:
+    """Send the job, report progress until the child ends, and give its last line.
+
+    All in this thread, so that Ctrl-C ends it and ``report`` needs no lock; another one listens.
+    """
+    lines: queue.Queue[str | None] = queue.Queue()
+
+    def listen() -> None:
+        assert child.stdout is not None
+        with child.stdout:
+            for line in child.stdout:
+                lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=listen, daemon=True).start()
+    assert child.stdin is not None
+    with contextlib.suppress(BrokenPipeError):  # its end shows below
+        child.stdin.write(json.dumps(job) + "\n")
+        child.stdin.flush()
+    answer: dict[str, Any] = {}
+    while True:
+        try:
+            line = lines.get(timeout=_POLL_SECONDS)
+        except queue.Empty:
+            if "watch" in answer:
+                _report_rows(report, *answer["watch"])
+            continue
+        if line is None or not line.endswith("\n"):  # it died in the middle of a word
+            break
+        answer = json.loads(line)
+        if "progress" in answer:
+            report(*answer["progress"])
+    # Open until here: at its end the child ends too.
+    with contextlib.suppress(BrokenPipeError):
+        child.stdin.close()
+    return answer
+
+
+def _report_rows(report: Report, database: str, table: str, total: int, what: str) -> None:
+    address = f"{Path(database).as_uri()}?mode=ro"
+    with (
+        contextlib.suppress(sqlite3.Error),  # it is being written: the next time
+        contextlib.closing(sqlite3.connect(address, uri=True)) as connection,
+    ):
+        (rows,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
+        report(min(rows, total), total, what)
 
 
 def _environment(threads: int) -> dict[str, str]:

@@ -171,8 +171,8 @@ def set_names(path: Path, names: list[str]) -> None:
 
 
 def count_rows(path: Path, table: str) -> int:
-    """Rows of a table, while COLMAP writes to it."""
-    with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
+    """Rows of a table."""
+    with closing(sqlite3.connect(path)) as connection:
         return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
 
 

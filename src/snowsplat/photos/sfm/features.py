@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from sqlite3 import OperationalError
 
 import pycolmap
 
@@ -19,7 +17,6 @@ from snowsplat.photos.sfm.options import Effort
 
 # Pairs that are compared before they are written: what a kill loses, and how often progress shows.
 _BLOCK = 64
-_POLL_SECONDS = 0.5
 
 SEED = 1
 
@@ -51,13 +48,25 @@ class Folders:
         return self.distorted / "sparse"
 
 
+@dataclass(frozen=True)
+class Teller:
+    """How progress gets to the parent process.
+
+    What COLMAP writes into its database is counted over there: two copies of SQLite in one process
+    (COLMAP has its own) break each other's locks on a database that both have open.
+    """
+
+    report: Report
+    watch: Callable[[str, str, int, str], None]  # database, table, rows in the end, what they are
+
+
 def extract_features(
     folders: Folders,
     database: Path,
     photos: list[Photo],
     effort: Effort,
     threads: int,
-    report: Report,
+    teller: Teller,
 ) -> None:
     """Find the features of photos that have none yet in ``database``."""
     options = pycolmap.FeatureExtractionOptions()
@@ -66,7 +75,7 @@ def extract_features(
     options.use_gpu = False
     options.sift.max_num_features = effort.features
     options.sift.first_octave = effort.first_octave
-    with _counting(database, "keypoints", len(photos), "features", report):
+    with _counted(database, "keypoints", len(photos), "features", teller):
         # COLMAP skips a photo whose mask it does not find, so those without go by themselves.
         for masked in (False, True):
             names = [photo.name for photo in photos if photo.mask == masked]
@@ -91,7 +100,7 @@ def match_pairs(
     pairs: list[tuple[int, int]],
     max_error: float,
     threads: int,
-    report: Report,
+    teller: Teller,
 ) -> None:
     """Match the features of those of ``pairs`` (indices of photos) that are not in the database.
 
@@ -110,7 +119,7 @@ def match_pairs(
     set_names(database, [str(i) for i in range(len(photos))])
     Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
     try:
-        with _counting(database, "two_view_geometries", len(pairs), "pairs", report):
+        with _counted(database, "two_view_geometries", len(pairs), "pairs", teller):
             pycolmap.match_image_pairs(
                 database,
                 matching_options=options,
@@ -124,22 +133,9 @@ def match_pairs(
 
 
 @contextmanager
-def _counting(database: Path, table: str, total: int, what: str, report: Report) -> Iterator[None]:
-    """Report, while the block runs, how many of ``total`` rows the table has."""
-    ended = threading.Event()
-
-    def poll() -> None:
-        while True:
-            with suppress(OperationalError):  # COLMAP is writing: the next time
-                report(min(count_rows(database, table), total), total, what)
-            if ended.wait(_POLL_SECONDS):
-                return
-
-    thread = threading.Thread(target=poll, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-    report(total, total, what)
+def _counted(database: Path, table: str, total: int, what: str, teller: Teller) -> Iterator[None]:
+    # While the block runs, COLMAP has the database open; see `Teller`.
+    teller.report(min(count_rows(database, table), total), total, what)
+    teller.watch(str(database), table, total, what)
+    yield
+    teller.report(total, total, what)

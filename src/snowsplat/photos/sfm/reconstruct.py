@@ -1,7 +1,7 @@
 """Photos -> poses, in as many tries as it takes: the first as asked, then with more of everything.
 
-A try that places 90% of the photos that have detail and matches is the last. Otherwise the others follow, unless what was found
-says that none of them can help:
+A try that places 90% of the photos that have detail and matches is the last. Otherwise the others
+follow, unless what was found says that none of them can help:
 
     1  features, pairs and mapper as asked
     2  the same features, more pairs, weaker matches allowed
@@ -22,7 +22,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.photos.photo import Photo
-from snowsplat.photos.progress import Report
 from snowsplat.photos.sfm.database import (
     fingerprint_of,
     open_database,
@@ -31,7 +30,7 @@ from snowsplat.photos.sfm.database import (
     replace_database,
 )
 from snowsplat.photos.sfm.diagnosis import Evidence, explain, failure, gather_evidence
-from snowsplat.photos.sfm.features import Folders, extract_features, match_pairs
+from snowsplat.photos.sfm.features import Folders, Teller, extract_features, match_pairs
 from snowsplat.photos.sfm.mapping import Mapping, write_models
 from snowsplat.photos.sfm.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.photos.sfm.pairs import PairChoice, choose_pairs
@@ -73,10 +72,10 @@ class Reconstruction:
         photos: list[Photo],
         options: SfmOptions,
         threads: int,
-        report: Report,
+        teller: Teller,
     ) -> None:
         self.folders, self.photos, self.options = folders, photos, options
-        self.threads, self.report = threads, report
+        self.threads, self.teller = threads, teller
         self.attempts: list[str] = []
         self.trials: list[Trial] = []
 
@@ -124,12 +123,12 @@ class Reconstruction:
     def _match(self, database: Path, effort: Effort, pairing: Effort) -> Matched:
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
         open_database(database, self.photos, self.options.camera_model, fingerprint)
-        extract_features(self.folders, database, self.photos, effort, self.threads, self.report)
+        extract_features(self.folders, database, self.photos, effort, self.threads, self.teller)
         choice = choose_pairs(self.photos, pairing, self._alike(database))
         sizes = [max(photo.width, photo.height) for photo in self.photos]
         scale = max(1.0, float(np.median(sizes)) / effort.image_size)
         match_pairs(
-            database, self.photos, choice.pairs, _MAX_ERROR * scale, self.threads, self.report
+            database, self.photos, choice.pairs, _MAX_ERROR * scale, self.threads, self.teller
         )
         return Matched(database, effort, choice, scale)
 
@@ -139,7 +138,7 @@ class Reconstruction:
 
     def _try(self, how: str, matched: Matched, mapper: Mapper, relaxed: bool = False) -> None:
         mapping = Mapping(
-            matched.database, self.folders.images, matched.scale, self.threads, self.report
+            matched.database, self.folders.images, matched.scale, self.threads, self.teller.report
         )
         models = mapping.run(mapper, relaxed)
         weak = ""

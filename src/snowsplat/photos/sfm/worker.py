@@ -2,9 +2,10 @@
 
     python -m snowsplat.photos.sfm.worker
 
-One line of JSON on stdin is the job; lines of JSON on stdout are progress, and then the result or
-the user's error. Stdin stays open as long as the parent lives: at its end the child ends at once.
-Ctrl-C is the parent's affair. What COLMAP prints goes to stderr, which the parent puts into a log.
+One line of JSON on stdin is the job. Lines of JSON on stdout are progress, tables of the database
+whose rows the parent may count meanwhile, and then the result or the user's error. Stdin stays open
+as long as the parent lives: at its end the child ends at once. Ctrl-C is the parent's affair. What
+COLMAP prints goes to stderr, which the parent puts into a log.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
 
+import pycolmap
+
 from snowsplat.errors import UserError
 from snowsplat.photos.photo import Photo
-from snowsplat.photos.sfm.features import SEED, Folders
-from snowsplat.photos.sfm.options import EFFORTS, SfmOptions, thread_count
+from snowsplat.photos.sfm.features import SEED, Folders, Teller
+from snowsplat.photos.sfm.options import EFFORTS, SfmOptions, SfmResult, thread_count
 from snowsplat.photos.sfm.reconstruct import Reconstruction
 
 
@@ -31,15 +34,16 @@ def main() -> None:
     answers = _own_stdout()
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    lock = threading.Lock()
 
     def say(**line: Any) -> None:
-        with lock:
-            answers.write(json.dumps(line) + "\n")
-            answers.flush()
+        answers.write(json.dumps(line) + "\n")
+        answers.flush()
 
     try:
-        say(result=asdict(_work(job, lambda *counts: say(progress=counts))))
+        teller = Teller(
+            report=lambda *counts: say(progress=counts), watch=lambda *table: say(watch=table)
+        )
+        say(result=asdict(_work(job, teller)))
     except UserError as error:
         say(user_error=str(error))
 
@@ -58,9 +62,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _work(job: dict[str, Any], report: Any) -> Any:
-    import pycolmap
-
+def _work(job: dict[str, Any], teller: Teller) -> SfmResult:
     pycolmap.set_random_seed(SEED)
     pycolmap.logging.alsologtostderr = False
     pycolmap.logging.logtostderr = True
@@ -70,7 +72,7 @@ def _work(job: dict[str, Any], report: Any) -> Any:
         effort, threads = effort.gentler(), 1
     photos = [Photo(**photo) for photo in job["photos"]]
     folders = Folders(Path(job["capture"]))
-    return Reconstruction(folders, photos, options, threads, report).run(effort)
+    return Reconstruction(folders, photos, options, threads, teller).run(effort)
 
 
 if __name__ == "__main__":
