@@ -258,10 +258,11 @@ class Ring:
         to_centre = np.broadcast_to(self.centre - origins, directions.shape)
         along = (to_centre * directions).sum(axis=0)
         near2 = (to_centre * to_centre).sum(axis=0) - along * along
-        live = np.flatnonzero((along > 0) & (near2 < self.radius**2))
+        live = np.flatnonzero((along > -self.radius) & (near2 < self.radius**2))
         start = self._own_from_world @ -to_centre[:, live]
         step = self._own_from_world @ directions[:, live]
-        distance = along[live] - self.radius  # where the ball around it begins
+        # From where the ball around it begins, or from within.
+        distance = np.maximum(along[live] - np.float32(self.radius), 0)
         for _ in range(self._STEPS):
             away = self._distance(start + distance * step)
             found = away < self._NEAR
