@@ -157,7 +157,7 @@ def _glyph(
 
 def _ink(random: np.random.Generator, inks: Sequence[Ink]) -> Ink:
     """One of the inks, a little lighter or darker, as prints of different age are."""
-    red, green, blue = inks[random.integers(len(inks))]
+    red, green, blue = inks[int(random.integers(len(inks)))]
     change = random.uniform(0.8, 1.15)
     return min(255, int(red * change)), min(255, int(green * change)), min(255, int(blue * change))
 
