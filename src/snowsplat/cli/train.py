@@ -154,6 +154,8 @@ class Train:
     """No progress, only the result."""
     checkpoint_seconds: Annotated[float | None, tyro.conf.Suppress] = None
     """For callers from Python: seconds between checkpoints, instead of steps."""
+    again: Annotated[str | None, tyro.conf.Suppress] = None
+    """For callers from Python: the command that goes on with a training that was stopped."""
 
     def run(self) -> int:
         """Gives the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
@@ -212,6 +214,7 @@ class Train:
             *(out, settings, recipe, trainer, budget, pace),
             save_iterations=self.save_iterations,
             checkpoint_seconds=self.checkpoint_seconds,
+            again=self.again or f"snowsplat train -o {self.output} --resume",
             quiet=self.quiet,
         ).run()
 

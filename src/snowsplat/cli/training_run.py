@@ -27,6 +27,7 @@ class TrainingRun:
         budget, pace: of a training with a time.
         save_iterations: steps after which the scene is written too.
         checkpoint_seconds: between checkpoints, where the configuration names no steps.
+        again: the command that goes on where Ctrl-C stopped.
     """
 
     out: OutputFolder
@@ -37,6 +38,7 @@ class TrainingRun:
     pace: Pace | None
     save_iterations: tuple[int, ...] = ()
     checkpoint_seconds: float | None = None
+    again: str = ""
     quiet: bool = False
 
     def __post_init__(self) -> None:
@@ -107,7 +109,7 @@ class TrainingRun:
         path = self.out.write_scene(self.trainer.step, self.trainer.gaussians)
         self._save_checkpoint()
         print(f"stopped after step {self.trainer.step}: {path}")
-        print(f"go on with: snowsplat train -o {self.out.path} --resume")
+        print(f"go on with: {self.again}")
         return 130
 
     def _finished(self) -> int:

@@ -1,0 +1,64 @@
+"""What `snowsplat make` does at each quality, and which effort a time allows for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+Quality = Literal["draft", "normal", "best"]
+
+#: Frames that a video counts for, before it has been looked at.
+FRAMES_OF_A_VIDEO = 100
+#: The part of a time that finding the cameras may take.
+SHARE_OF_CAMERAS = 0.5
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How much work a quality is. Sizes are those of the longer side, in pixels.
+
+    Attributes:
+        photos: size to which photos are reduced when they are read.
+        side: size at which they are trained on.
+        iterations: steps of the training.
+        max_gaussians: its cap; None is that of the recipe.
+        photo_seconds, pair_seconds: to find the cameras, on two cores: what each photo takes, and
+            each pair of photos that is compared.
+        pairs: with how many others a photo is compared, at most.
+    """
+
+    photos: int
+    side: int
+    iterations: int
+    max_gaussians: int | None
+    photo_seconds: float
+    pair_seconds: float
+    pairs: int
+
+    def camera_seconds(self, photos: int, threads: int) -> float:
+        """About how long it takes to find the cameras of so many photos."""
+        compared = photos * min((photos - 1) / 2, self.pairs)
+        seconds = self.photo_seconds * photos + self.pair_seconds * compared
+        return seconds * 2 / threads
+
+
+PRESETS: dict[Quality, Preset] = {
+    "draft": Preset(1600, 640, 1500, 60_000, 0.5, 0.012, 20),
+    "normal": Preset(2400, 1000, 3000, None, 1.3, 0.04, 35),
+    "best": Preset(3200, 1600, 10_000, 250_000, 4.0, 0.15, 60),
+}
+
+
+def quality_within(seconds: float, sources: Sequence[Path], threads: int) -> Quality:
+    """The best effort to find the cameras that leaves enough of the time for the training."""
+    from snowsplat.capture.decode import IMAGE_SUFFIXES
+
+    stills = sum(path.suffix.lower() in (*IMAGE_SUFFIXES, ".heic", ".heif") for path in sources)
+    photos = stills + FRAMES_OF_A_VIDEO * (len(sources) - stills)
+    choices: tuple[Quality, ...] = ("best", "normal")
+    for quality in choices:
+        if PRESETS[quality].camera_seconds(photos, threads) <= SHARE_OF_CAMERAS * seconds:
+            return quality
+    return "draft"
