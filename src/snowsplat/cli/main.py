@@ -15,16 +15,24 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from snowsplat.cli.capture import Capture
 from snowsplat.cli.evaluate import Evaluate
 from snowsplat.cli.info import Info
 from snowsplat.cli.render import Render
 from snowsplat.cli.train import Train
 from snowsplat.errors import UserError
 
-VERBS: dict[str, Any] = {"train": Train, "render": Render, "evaluate": Evaluate, "info": Info}
+VERBS: dict[str, Any] = {
+    "capture": Capture,
+    "train": Train,
+    "evaluate": Evaluate,
+    "render": Render,
+    "info": Info,
+}
 
 DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, shown in real time.
 
+  snowsplat capture PHOTOS -o CAPTURE       photos or a video -> photos with known cameras
   snowsplat train CAPTURE -o OUT --eval     photos with known cameras -> a scene in OUT
   snowsplat evaluate OUT                    PSNR, SSIM of the photos held out
   snowsplat render OUT                      pictures of the scene beside the photos

@@ -1,0 +1,94 @@
+"""The progress of a job of several stages: a line for each, with a bar in a terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from snowsplat.cli.progress import duration
+
+if TYPE_CHECKING:
+    from snowsplat.photos.progress import Report
+
+_LINE_SECONDS = 5.0
+_WIDTH = 10  # of the names of stages
+
+
+class StageProgress:
+    """Lines about stages on ``stream``; use it as a context, so that the terminal is left in order.
+
+    In a terminal a bar shows the stage that runs now; in a file a line comes every few seconds.
+    """
+
+    def __init__(self, quiet: bool = False, stream: TextIO | None = None) -> None:
+        self.quiet = quiet
+        self.stream = stream or sys.stdout
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+        self._stage = self._what = ""
+        self._start = self._last_line = time.monotonic()
+        if self.stream.isatty() and not quiet:
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=None),
+                TextColumn("{task.fields[text]}"),
+                console=Console(file=self.stream),
+                expand=True,
+                transient=True,
+                refresh_per_second=4,
+            )
+            self._task = self._bar.add_task("", total=None, visible=False, text="")
+
+    def __enter__(self) -> StageProgress:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def begin(self, stage: str) -> Report:
+        """A stage begins; gives what it reports to."""
+        self._stage, self._what = stage, ""
+        self._last_line = time.monotonic()
+        if self._bar is not None:
+            self._bar.reset(self._task, total=None, description=stage, visible=True, text="")
+        return self._report
+
+    def end(self, line: str, seconds: float, again: bool = False) -> None:
+        """The stage is finished: the line that stays."""
+        if self._bar is not None:
+            self._bar.update(self._task, visible=False)
+        took = "done before" if again else duration(seconds)
+        self.say(f"{self._stage:<{_WIDTH}}{line}  ({took})")
+
+    def say(self, line: str) -> None:
+        """A line that stays, above the bar."""
+        if self.quiet:
+            return
+        if self._bar is not None:
+            self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        else:
+            print(line, file=self.stream, flush=True)
+
+    def _report(self, done: int, total: int, what: str = "") -> None:
+        now = time.monotonic()
+        if what != self._what or done == 0:
+            self._what, self._start = what, now
+        elapsed = now - self._start
+        counted = f"{done}/{total} {what}" if total else f"{done or ''} {what}"
+        left = ""
+        if 0 < done < total and elapsed > 1.0:
+            left = f"  {duration(elapsed / done * (total - done))} left"
+        if self._bar is not None:
+            self._bar.update(
+                self._task, completed=done, total=total or None, text=f"{counted.strip()}{left}"
+            )
+        elif now - self._last_line >= _LINE_SECONDS:
+            self._last_line = now
+            self.say(f"{self._stage:<{_WIDTH}}{counted.strip()}{left}")

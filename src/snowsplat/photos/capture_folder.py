@@ -1,0 +1,298 @@
+"""The folder of a capture, from photos: gather, find the poses, undistort, report.
+
+    CAPTURE/input/                the photos or frames, upright
+    CAPTURE/distorted/            database and models of the photos as they are, log of COLMAP
+    CAPTURE/images/, sparse/0/    what training reads: photos without lens distortion, their cameras
+    CAPTURE/masks/                where there are masks
+    CAPTURE/images_2/, _4, _8     smaller copies, if asked for
+    CAPTURE/capture.json          what was done with which settings, and what came of it
+    CAPTURE/capture_report.html   the same for people, with a picture of cameras and points
+
+This is the layout of the reference implementation's convert.py. A run that was stopped goes on
+where it was, see `stages`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from snowsplat.errors import UserError
+from snowsplat.photos.inputs import GatherOptions, find_inputs, gather
+from snowsplat.photos.photo import Photo
+from snowsplat.photos.sfm import SfmOptions, describe_model, estimate_poses
+from snowsplat.photos.stages import Outcome, Stages
+
+if TYPE_CHECKING:
+    from snowsplat.photos.progress import Report
+
+STAGES = ("photos", "poses", "images", "report")
+RECORD, REPORT = "capture.json", "capture_report.html"
+_IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "masks", "sparse")
+_OURS = ("distorted", *_IMAGE_FOLDERS, RECORD, REPORT)
+
+
+@dataclass(frozen=True)
+class CaptureOptions:
+    """How photos become a capture.
+
+    Attributes:
+        gather: which frames of a video, and their size.
+        sfm: how the poses are found.
+        resize: also make images_2, images_4 and images_8.
+        skip_matching: take the model that is in distorted/sparse/0 rather than find the poses.
+    """
+
+    gather: GatherOptions = field(default_factory=GatherOptions)
+    sfm: SfmOptions = field(default_factory=SfmOptions)
+    resize: bool = False
+    skip_matching: bool = False
+
+
+class Watcher(Protocol):
+    """Is told what goes on."""
+
+    def begin(self, stage: str) -> Report:
+        """A stage begins, or a finished one is found; gives where it says how far it is."""
+
+    def end(self, stage: str, outcome: Outcome) -> None:
+        """The stage has come to an end."""
+
+    def note(self, line: str) -> None:
+        """Something that the user should know."""
+
+
+def make_capture(
+    inputs: Sequence[Path],
+    folder: Path,
+    options: CaptureOptions,
+    watcher: Watcher,
+    overwrite: bool = False,
+) -> dict[str, Outcome]:
+    """Make a capture in ``folder`` from folders of photos, photos and videos.
+
+    Stages that an earlier run with the same inputs and settings has finished are not done again.
+    ``folder / "input"`` may itself be the input; then it stays as it is.
+
+    Args:
+        overwrite: replace a capture of other inputs that is in ``folder``.
+
+    Returns:
+        the outcome of each stage: "photos" is a `Gathered`, "poses" an `SfmResult`, "images" an
+        `Undistorted`, as JSON values; "report" names the file.
+
+    Raises:
+        UserError: unusable photos, a folder that is taken, poses that cannot be found. What this
+            run began is removed.
+        OSError: the disk is full, a file cannot be read.
+    """
+    sources = find_inputs(inputs)
+    in_place = any(path.resolve() == (folder / "input").resolve() for path in inputs)
+    _check_free(folder, in_place, inputs, options, overwrite)
+    with _nothing_half_made(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        stages = Stages(folder / RECORD, STAGES)
+        stages.about = {"inputs": [str(path.absolute()) for path in inputs]}
+        stages.save()  # from here on the folder is known to be ours
+        return _run(stages, inputs, sources, folder, options, watcher, in_place)
+
+
+def _run(
+    stages: Stages,
+    inputs: Sequence[Path],
+    sources: Sequence[Path],
+    folder: Path,
+    options: CaptureOptions,
+    watcher: Watcher,
+    in_place: bool,
+) -> dict[str, Outcome]:
+    outcomes: dict[str, Outcome] = {}
+
+    def stage(name: str, settings: dict[str, Any], outputs: Sequence[str], work: Any) -> None:
+        report = watcher.begin(name)
+        outcomes[name] = stages.run(
+            name,
+            settings,
+            [folder / output for output in outputs],
+            lambda: work(report),
+            lambda reason: watcher.note(f"{name}: done again ({reason})"),
+        )
+        watcher.end(name, outcomes[name])
+
+    def gather_photos(report: Report) -> dict[str, Any]:
+        return _gather(inputs, folder, options.gather, report, in_place)
+
+    stage(
+        "photos",
+        {"input": _fingerprint(sources), **asdict(options.gather)},
+        ["input", "distorted/masks"],
+        gather_photos,
+    )
+    photos = [_photo(values) for values in outcomes["photos"].result["photos"]]
+
+    def find_poses(report: Report) -> dict[str, Any]:
+        if options.skip_matching:
+            return asdict(describe_model(folder, photos))
+        return asdict(estimate_poses(folder, photos, options.sfm, report))
+
+    settings = {k: v for k, v in asdict(options.sfm).items() if k != "threads"}
+    stage(
+        "poses",
+        settings | {"skip_matching": options.skip_matching},
+        ["distorted/sparse"],
+        find_poses,
+    )
+
+    def make_images(report: Report) -> dict[str, Any]:
+        return _undistort(folder, photos, options, report)
+
+    stage("images", {"resize": options.resize}, _IMAGE_FOLDERS, make_images)
+
+    def write(report: Report) -> dict[str, Any]:
+        from snowsplat.photos.report import write_report
+
+        facts = {
+            "inputs": stages.about["inputs"],
+            "settings": _plain(options),
+            "gathered": outcomes["photos"].result,
+            "sfm": outcomes["poses"].result,
+            "undistorted": outcomes["images"].result,
+            "seconds": {name: outcome.seconds for name, outcome in outcomes.items()},
+        }
+        return {"file": write_report(folder, facts).name}
+
+    stage("report", {}, [REPORT], write)
+    return outcomes
+
+
+# The stages
+
+
+def _gather(
+    inputs: Sequence[Path], folder: Path, options: GatherOptions, report: Report, in_place: bool
+) -> dict[str, Any]:
+    """Into a new folder first: an older `input/` is replaced by a whole one."""
+    masks = Path("distorted") / "masks"
+    if in_place:
+        shutil.rmtree(folder / masks, ignore_errors=True)
+        return asdict(gather(inputs, folder, options, report))
+    new = folder / ".new"
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir()
+    try:
+        gathered = gather(inputs, new, options, report)
+        for part in (Path("input"), masks):
+            shutil.rmtree(folder / part, ignore_errors=True)
+            if (new / part).exists():
+                (folder / part).parent.mkdir(parents=True, exist_ok=True)
+                (new / part).rename(folder / part)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    return asdict(gathered)
+
+
+def _undistort(
+    folder: Path, photos: list[Photo], options: CaptureOptions, report: Report
+) -> dict[str, Any]:
+    import pycolmap
+
+    from snowsplat.photos.orient import orientation
+    from snowsplat.photos.undistort import undistort
+
+    for name in _IMAGE_FOLDERS:
+        shutil.rmtree(folder / name, ignore_errors=True)
+    scene_from_sfm = orientation(pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0"))
+    made = undistort(
+        folder, photos, scene_from_sfm, options.resize, report, threads=options.sfm.threads
+    )
+    return asdict(made) | {"scene_from_sfm": scene_from_sfm.to_json()}
+
+
+# What the folder may hold
+
+
+def _check_free(
+    folder: Path,
+    in_place: bool,
+    inputs: Sequence[Path],
+    options: CaptureOptions,
+    overwrite: bool,
+) -> None:
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise UserError(f"{folder}: is a file; name a folder for the capture")
+    record = folder / RECORD
+    if record.is_file():
+        before = Stages(record, STAGES).about.get("inputs")
+        if before != [str(path.absolute()) for path in inputs] and not overwrite:
+            what = ", ".join(map(str, before)) if isinstance(before, list) else "something else"
+            raise UserError(
+                f"{folder}: holds a capture of {what}; name another folder, or add --overwrite"
+            )
+        return
+    allowed = {".new"}  # what a run that was killed in its first stage leaves
+    if in_place:
+        allowed |= {"input"} | ({"distorted"} if options.skip_matching else set())
+    others = sorted(entry.name for entry in folder.iterdir() if entry.name not in allowed)
+    if others:
+        raise UserError(
+            f"{folder}: holds other files ({', '.join(others[:3])}"
+            f"{', …' if len(others) > 3 else ''}); name a new or an empty folder"
+        )
+
+
+@contextmanager
+def _nothing_half_made(folder: Path) -> Iterator[None]:
+    """Take back what was begun in a new folder when it comes to nothing.
+
+    After Ctrl-C the stages that are finished stay: the same command goes on.
+    """
+    existed = folder.exists()
+    there = {entry.name for entry in folder.iterdir()} if existed else set()
+    try:
+        yield
+    except BaseException as error:
+        record = folder / RECORD
+        worth = record.is_file() and Stages(record, STAGES).is_finished("photos")
+        if RECORD not in there and not (worth and isinstance(error, KeyboardInterrupt)):
+            for name in {"input", ".new", *_OURS} - there:
+                _remove(folder / name)
+            if not existed and folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+        raise
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+# JSON
+
+
+def _fingerprint(files: Sequence[Path]) -> str:
+    """Of names, sizes and times: changes when a photo is added, taken away or edited."""
+    entries = []
+    for file in files:
+        status = file.stat()
+        entries.append([str(file.absolute()), status.st_size, status.st_mtime_ns])
+    return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
+
+
+def _photo(values: dict[str, Any]) -> Photo:
+    location = values["location"]
+    return Photo(**(values | {"location": None if location is None else tuple(location)}))
+
+
+def _plain(options: CaptureOptions) -> dict[str, Any]:
+    values = asdict(options)
+    return {**values.pop("gather"), **values.pop("sfm"), **values}
