@@ -1,0 +1,149 @@
+"""A video's file: what it says of itself, and its frames one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.errors import UserError
+from snowsplat.photos.sources import shown
+
+if TYPE_CHECKING:
+    from av import VideoFrame
+    from av.container import InputContainer
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What a video's packets tell, before anything is decoded."""
+
+    path: Path
+    packets: int  # frames, as far as the file is whole
+    promised: int  # frames that the file says it has, at least `packets`
+    start: float  # seconds
+    seconds: float  # from the first frame to the end of the last
+    width: int  # pixels, upright
+    height: int
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file has moving pictures in it, by its content."""
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            # FFmpeg takes any text for the art of old terminals, and single pictures for films.
+            still = container.format.name == "tty" or "image2" in container.format.name
+            return bool(container.streams.video) and not still
+    except (av.FFmpegError, OSError, ValueError):
+        return False
+
+
+def read_clip(path: Path) -> Clip:
+    """Length and size of a video; reads the file, but decodes the first frame only.
+
+    Raises:
+        UserError: nothing in it can be decoded.
+    """
+    import av
+
+    times: list[float] = []
+    promised = 0
+    try:
+        with open_video(path) as container:
+            stream = container.streams.video[0]
+            rate = float(stream.average_rate or 30)
+            # The header is trusted for this alone: to say how much of a damaged file is absent.
+            promised = stream.frames
+            with suppress(av.FFmpegError):
+                for packet in container.demux(stream):
+                    stamp = packet.pts if packet.pts is not None else packet.dts
+                    if packet.size:
+                        known = stamp is not None and packet.time_base is not None
+                        times.append(float(stamp * packet.time_base) if known else -1.0)
+        with open_video(path) as container:
+            first = next(decoded_frames(container), None)
+    except (av.FFmpegError, OSError, ValueError, IndexError) as error:
+        raise nothing_decodes(path, error) from None
+    if first is None or not times:
+        raise nothing_decodes(path, None)
+    if min(times) < 0 and -1.0 in times:  # a raw stream, without times
+        times = [i / rate for i in range(len(times))]
+    length = max(times) - min(times)
+    width, height = _upright_size(first)
+    return Clip(
+        path=path,
+        packets=len(times),
+        promised=max(promised, len(times)),
+        start=min(times),
+        seconds=length + length / max(1, len(times) - 1) if length > 0 else len(times) / rate,
+        width=width,
+        height=height,
+    )
+
+
+def frames_wanted(clip: Clip, fps: float | None, frames: int | None) -> int:
+    """Into how many windows a video is divided.
+
+    By default 2.5 a second: whoever films an object walks around it in 20 to 40 s, so neighbours
+    are some degrees apart, which SIFT matches safely. Of a short one at least 60, since it covers
+    as much; of a long one no more than 150, or one a second up to 300 if that is more: all that
+    follows costs time for each, on two cores about 2 s.
+    """
+    if frames is not None:
+        wanted = float(frames)
+    elif fps is not None:
+        wanted = clip.seconds * fps
+    else:
+        wanted = max(min(max(2.5 * clip.seconds, 60), 150), min(clip.seconds, 300))
+        wanted = min(wanted, clip.packets / 2)  # something to choose from
+    return max(1, min(round(wanted), clip.packets))
+
+
+def square_pixels(frame: VideoFrame) -> tuple[int, int]:
+    """Width and height of a frame, not turned; some camcorders' pixels are not square."""
+    aspect = getattr(frame, "sample_aspect_ratio", None)
+    return (round(frame.width * aspect) if aspect else frame.width), frame.height
+
+
+def _upright_size(frame: VideoFrame) -> tuple[int, int]:
+    width, height = square_pixels(frame)
+    return (height, width) if round(frame.rotation / 90) % 2 else (width, height)
+
+
+def open_video(path: Path) -> InputContainer:
+    import av
+
+    # Some tags of cameras are no UTF-8; they do not matter here.
+    return av.open(str(path), metadata_errors="replace")
+
+
+def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
+    """All frames that can be decoded: what is damaged is left out, and the file may just end."""
+    import av
+
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+        except av.FFmpegError:  # cut off
+            packet = None
+        decoded: list[VideoFrame] = []
+        with suppress(av.FFmpegError):
+            decoded = stream.codec_context.decode(packet)
+        yield from (frame for frame in decoded if not frame.is_corrupt)
+        if packet is None:
+            return
+
+
+def nothing_decodes(path: Path, error: Exception | None) -> UserError:
+    reason = f" ({getattr(error, 'strerror', None) or error})" if error else ""
+    return UserError(
+        f"{shown(path)}: no frame of this video can be decoded{reason}; it may be cut off or "
+        "damaged: copy it again, or save it as mp4 (H.264)"
+    )
