@@ -1,0 +1,104 @@
+"""What is planned for a time, on machines that are made up."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.camera import Camera
+from snowsplat.capture import load_capture
+from snowsplat.capture.capture import Capture, Points, View
+from snowsplat.capture.decode import ImageSource
+from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat.config import changed
+from snowsplat.plan import Plan, make_plan, measure_slowness
+from snowsplat.recipes import recipe
+
+POSE = torch.eye(4, dtype=torch.float64)[:3]
+
+
+def capture(width: int, height: int, photos: int = 50) -> Capture:
+    """Cameras alone: a plan looks at no photo."""
+    camera = Camera(width, height, 500.0, 500.0, width / 2, height / 2, POSE)
+    views = [
+        View(f"{i}.jpg", camera, ImageSource(Path(f"{i}.jpg"), width, height))
+        for i in range(photos)
+    ]
+    points = Points(torch.zeros(10_000, 3), torch.zeros(10_000, 3, dtype=torch.uint8))
+    return Capture(views[1:], views[:1], points, extent=1.0)
+
+
+def planned(seconds: float, width: int, height: int, slowness: float = 1.0, **how: bool) -> Plan:
+    return make_plan(capture(width, height), recipe("default"), seconds, slowness, **how)
+
+
+@pytest.mark.parametrize(("width", "height"), [(552, 986), (4032, 3024), (3024, 4032)])
+def test_more_time_never_gives_less(width, height):
+    plans = [planned(seconds, width, height) for seconds in (5, 20, 60, 180, 600, 3600)]
+    pixels = [plan.width * plan.height for plan in plans]
+    assert pixels == sorted(pixels)
+    caps = [plan.config.density.max_gaussians for plan in plans]
+    assert caps == sorted(caps)
+    # Where one size or cap gives way to the next, the number of steps may fall, but not far.
+    assert all(plan.config.iterations >= 1500 for plan in plans[2:])
+    assert plans[-1].config.iterations > 10_000
+
+
+def test_the_size_of_photos():
+    assert planned(3600, 4032, 3024).resolution == 1600  # no larger than that
+    assert planned(3600, 552, 986).resolution is None  # and never enlarged
+    little = planned(1, 552, 986)
+    assert (little.resolution, little.height) == (224, 400)  # no smaller
+    assert planned(1, 200, 150).resolution is None
+    fixed = planned(1, 4032, 3024, resize=False)
+    assert (fixed.resolution, fixed.width, fixed.height) == (None, 4032, 3024)
+    slow = planned(60, 552, 986, slowness=4.0)
+    assert slow.width < 552
+    assert planned(240, 552, 986, slowness=4.0).width > slow.width
+
+
+def test_the_time_is_used():
+    """Steps times what one takes is the time, but for what comes before and after."""
+    for seconds in (20.0, 300.0):
+        plan = planned(seconds, 552, 986, slowness=2.0)
+        assert 0.85 * seconds < plan.config.iterations * plan.seconds < seconds
+
+
+def test_the_number_of_gaussians():
+    assert planned(30, 552, 986).config.density.max_gaussians == 120_000
+    assert planned(3600, 552, 986).config.density.max_gaussians == 240_000
+    assert planned(3600, 270, 480).config.density.max_gaussians == 64_800  # one for two pixels
+    named = changed(recipe("default"), max_gaussians=50_000)
+    plan = make_plan(capture(552, 986), named, 3600, 1.0, more_gaussians=False)
+    assert plan.config.density.max_gaussians == 50_000
+
+
+def test_many_photos_are_all_looked_at():
+    config = recipe("default")
+    few, many = (make_plan(capture(1000, 750, n), config, 120, 2.0) for n in (40, 400))
+    assert many.width < few.width
+    assert many.config.iterations >= 10 * 399
+
+
+def test_other_recipes():
+    for name in ("paper", "mcmc"):
+        plan = make_plan(capture(552, 986), recipe(name), 600, 1.0)
+        assert plan.config.iterations > 1500
+    assert "no limit" in str(make_plan(capture(552, 986), recipe("paper"), 600, 1.0))
+
+
+def test_in_words():
+    plan = replace(planned(60, 552, 986), config=recipe("default", iterations=8964))
+    assert str(plan) == "552x986, at most 120,000 Gaussians, about 9,000 steps"
+
+
+def test_the_speed_of_this_machine(tmp_path):
+    """Positive, and it leaves the capture as it was."""
+    for format, points in (("colmap-bin", 300), ("blender", None)):
+        folder = tmp_path / format
+        write_synthetic_capture(folder, format, 9, 48, 36, n_points=300)
+        small = load_capture(folder)
+        assert 0.0 < measure_slowness(small, recipe("default")) < float("inf")
+        assert len(small.train) == 7
+        assert (small.points is None) if points is None else (len(small.points) == points)
