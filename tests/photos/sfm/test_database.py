@@ -15,6 +15,7 @@ from snowsplat.photos.sfm.database import (
     read_descriptors,
     replace_database,
     set_names,
+    trim_features,
     verified_pairs,
 )
 
@@ -125,6 +126,27 @@ def test_pairs_come_back_with_their_kind(path):
             database.write_two_view_geometry(1, other, geometry)
     pairs = {(p.first, p.second): (p.inliers, p.flat) for p in verified_pairs(path)}
     assert pairs == {(0, 1): (20, False), (0, 2): (20, True)}
+
+
+def test_the_largest_features_are_kept(path):
+    random = np.random.default_rng(0)
+    scale = random.permutation(30) + 1.0
+    keypoints = np.zeros((30, 6), np.float32)
+    keypoints[:, 0], keypoints[:, 2], keypoints[:, 5] = scale, scale, scale
+    with closing_database(path) as database:
+        for image_id, count in ((1, 30), (2, 8)):
+            database.write_keypoints(image_id, keypoints[:count])
+            data = np.repeat(scale[:count, None], 128, 1).astype(np.uint8)
+            sift = pycolmap.FeatureExtractorType.SIFT
+            database.write_descriptors(image_id, pycolmap.FeatureDescriptors(sift, data))
+    trim_features(path, 10)
+    assert feature_counts(path, len(PHOTOS))[:2] == [10, 8]
+    with closing_database(path) as database:
+        left = database.read_keypoints(1)
+        assert left.shape == (10, 6)
+        assert np.array_equal(left[:, 0], scale[scale > 20])
+        assert np.array_equal(database.read_descriptors(1).data[:, 5], left[:, 0].astype(np.uint8))
+    assert np.array_equal(read_descriptors(path, 0, 3)[:, 0], [30, 29, 28])
 
 
 def test_a_photo_without_features_has_no_descriptors(path):

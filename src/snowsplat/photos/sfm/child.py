@@ -77,9 +77,9 @@ def estimate_poses(
     try:
         result = _run({**job, "gentle": True}, log, 1, report)
     except Crashed as crash:
-        advice = (
-            "use fewer or smaller photos, or a lower quality" if crash.code < 0 else "report it"
-        )
+        advice = "report it"
+        if crash.code < 0:
+            advice = "use fewer or smaller photos, or a lower quality"
         raise UserError(
             f"finding the camera positions failed twice: {crash.how}; {advice} "
             f"({log} has the details)"

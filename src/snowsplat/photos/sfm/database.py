@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -202,6 +203,39 @@ def verified_pairs(path: Path) -> list[Pair]:
     return pairs
 
 
+def trim_features(path: Path, limit: int) -> None:
+    """Keep the ``limit`` largest features of each photo; matching takes time by their square.
+
+    COLMAP's own limit is a rough one: it takes whole octaves, up to four times as many.
+    """
+    with closing(sqlite3.connect(path)) as connection:
+        query = "SELECT image_id FROM keypoints WHERE rows > ?"
+        for (image_id,) in connection.execute(query, (limit,)).fetchall():
+            keypoints = _read_rows(connection, "keypoints", image_id, np.dtype(np.float32))
+            descriptors = _read_rows(connection, "descriptors", image_id, np.dtype(np.uint8))
+            kept = np.sort(_largest(keypoints, limit))
+            with connection:
+                for table, rows in (("keypoints", keypoints), ("descriptors", descriptors)):
+                    connection.execute(
+                        f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?",
+                        (len(kept), rows[kept].tobytes(), image_id),
+                    )
+
+
+def _read_rows(
+    connection: sqlite3.Connection, table: str, image_id: int, dtype: np.dtype[Any]
+) -> NDArray[Any]:
+    query = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
+    rows, columns, data = connection.execute(query, (image_id,)).fetchone()
+    return np.frombuffer(data, dtype).reshape(rows, columns)
+
+
+def _largest(keypoints: NDArray[np.float32], count: int) -> NDArray[np.intp]:
+    # The columns after x, y are an affine shape, whose determinant is the squared scale.
+    scale = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+    return np.argsort(-scale, kind="stable")[:count]
+
+
 def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
     """(≤ limit, 128) descriptors of a photo, those of the largest features."""
     with closing_database(path) as database:
@@ -211,9 +245,7 @@ def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
         descriptors = np.asarray(database.read_descriptors(index + 1).data, np.float32)
     if len(descriptors) == 0:
         return np.zeros((0, 128), np.float32)
-    # The columns after x, y are an affine shape, whose determinant is the squared scale.
-    scale = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
-    return descriptors[np.argsort(-scale, kind="stable")[:limit]]
+    return descriptors[_largest(keypoints, limit)]
 
 
 def displacement_of(path: Path, pairs: Sequence[Pair]) -> float:

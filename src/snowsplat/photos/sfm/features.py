@@ -12,11 +12,14 @@ import pycolmap
 
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.progress import Report
-from snowsplat.photos.sfm.database import count_rows, set_names
+from snowsplat.photos.sfm.database import count_rows, set_names, trim_features
 from snowsplat.photos.sfm.options import Effort
 
 # Pairs that are compared before they are written: what a kill loses, and how often progress shows.
 _BLOCK = 64
+
+# No photo has more than so many times the features that were asked for.
+_MOST = 2
 
 SEED = 1
 
@@ -92,6 +95,7 @@ def extract_features(
                     extraction_options=options,
                     device=pycolmap.Device.cpu,
                 )
+    trim_features(database, _MOST * effort.features)
 
 
 def match_pairs(
