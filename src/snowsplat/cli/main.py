@@ -18,11 +18,13 @@ import tyro
 from snowsplat.cli.capture import Capture
 from snowsplat.cli.evaluate import Evaluate
 from snowsplat.cli.info import Info
+from snowsplat.cli.make import Make
 from snowsplat.cli.render import Render
 from snowsplat.cli.train import Train
 from snowsplat.errors import UserError
 
 VERBS: dict[str, Any] = {
+    "make": Make,
     "capture": Capture,
     "train": Train,
     "evaluate": Evaluate,
@@ -32,6 +34,7 @@ VERBS: dict[str, Any] = {
 
 DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, shown in real time.
 
+  snowsplat make PHOTOS                     photos or a video -> a scene: all of what follows
   snowsplat capture PHOTOS -o CAPTURE       photos or a video -> photos with known cameras
   snowsplat train CAPTURE -o OUT --eval     photos with known cameras -> a scene in OUT
   snowsplat evaluate OUT                    PSNR, SSIM of the photos held out

@@ -12,7 +12,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.making import CAPTURE, STAGES, Making, TrainingStopped
-from snowsplat.cli.presets import Quality, quality_within
+from snowsplat.cli.presets import FRAMES_OF_A_VIDEO, Quality, quality_within
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
@@ -64,15 +64,16 @@ class Make:
             raise UserError(f"--threads is {self.threads}; it must be at least 1")
         _check_free(out)
 
-        from snowsplat.photos.inputs import find_inputs
+        from snowsplat.photos.sources import find_sources
         from snowsplat.photos.stages import Stages
 
-        sources = find_inputs(self.inputs)
+        kinds = [source.kind for source in find_sources(self.inputs).sources]
+        photos = kinds.count("photo") + FRAMES_OF_A_VIDEO * kinds.count("video")
         existed = out.exists()
         out.mkdir(parents=True, exist_ok=True)
         stages = Stages(out / RECORD, STAGES)
         try:
-            quality = self._quality(stages, sources)
+            quality = self._quality(stages, photos)
             stages.save()  # from here on the folder is known to be ours
             return Making(
                 *(self.inputs, name, out, quality, stages, self._command()),
@@ -100,17 +101,17 @@ class Make:
         name = (first.stem if first.is_file() else first.resolve().name) or "scene"
         return name, self.output or Path(f"{name}_scene")
 
-    def _quality(self, stages: Stages, sources: list[Path]) -> Quality:
+    def _quality(self, stages: Stages, photos: int) -> Quality:
         """As asked for, or what the time allows; decided once, as cameras depend on it."""
         if self.quality is not None or self.minutes is None:
             return self.quality or "normal"
         from snowsplat import ops
 
-        about = {"minutes": self.minutes, "files": len(sources)}
+        about = {"minutes": self.minutes, "photos": photos}
         before = stages.about.get("effort", {})
         if {word: before.get(word) for word in about} != about:
             threads = self.threads or ops.get_num_threads()
-            quality = quality_within(60.0 * self.minutes, sources, threads)
+            quality = quality_within(60.0 * self.minutes, photos, threads)
             stages.about["effort"] = about | {"quality": quality}
         chosen: Quality = stages.about["effort"]["quality"]
         return chosen

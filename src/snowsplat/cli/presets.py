@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 Quality = Literal["draft", "normal", "best"]
@@ -51,12 +49,8 @@ PRESETS: dict[Quality, Preset] = {
 }
 
 
-def quality_within(seconds: float, sources: Sequence[Path], threads: int) -> Quality:
+def quality_within(seconds: float, photos: int, threads: int) -> Quality:
     """The best effort to find the cameras that leaves enough of the time for the training."""
-    from snowsplat.capture.decode import IMAGE_SUFFIXES
-
-    stills = sum(path.suffix.lower() in (*IMAGE_SUFFIXES, ".heic", ".heif") for path in sources)
-    photos = stills + FRAMES_OF_A_VIDEO * (len(sources) - stills)
     choices: tuple[Quality, ...] = ("best", "normal")
     for quality in choices:
         if PRESETS[quality].camera_seconds(photos, threads) <= SHARE_OF_CAMERAS * seconds:
