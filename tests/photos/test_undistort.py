@@ -86,6 +86,22 @@ def make_capture_folder(root: Path, model_of, cameras: list[pycolmap.Camera]) ->
     return root
 
 
+def test_a_mask_of_a_transparent_photo(capture):
+    # Transparency is no mask in training, but a way to see nothing; a mask on top of it is one.
+    path = capture / "distorted" / "masks" / f"{NAMES[2]}.png"
+    alpha = np.asarray(Image.open(capture / "input" / NAMES[2]))[..., 3]
+    opaque = np.where(alpha > 0, 255, 0).astype(np.uint8)
+    Image.fromarray(opaque).save(path)
+    assert undistort(capture, PHOTOS, scene(), False, silent).masks == 1
+    assert files(capture / "masks") == [f"{NAMES[1]}.png"]
+    opaque[100:150, 100:200] = 0
+    Image.fromarray(opaque).save(path)
+    assert undistort(capture, PHOTOS, scene(), False, silent).masks == 2
+    left_out = np.asarray(Image.open(capture / "masks" / f"{NAMES[2]}.png")) == 0
+    assert 0.9 < left_out.sum() / 5000 < 1.1
+    assert left_out[125, 150]
+
+
 def scene() -> Similarity:
     rotation = rotation_from_quat(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=F64))
     return Similarity(1.7, rotation, torch.tensor([0.3, 0.2, -0.1], dtype=F64))
@@ -105,7 +121,8 @@ def test_a_capture_that_loads_comes_of_it(capture):
     assert json.loads(json.dumps(asdict(made)))["images"] == 6
     for folder in made.folders:
         assert files(capture / folder) == sorted(NAMES)
-    assert files(capture / "masks") == [f"{NAMES[1]}.png"]  # the cut-out has its alpha
+    assert made.masks == 2
+    assert files(capture / "masks") == sorted([f"{NAMES[1]}.png", f"{NAMES[2]}.png"])
     loaded = load_capture(capture, hold_out=None)
     assert len(loaded.train) == 6
     assert len(loaded.points.xyz) > 290  # those in two photos or more

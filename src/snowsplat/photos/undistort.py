@@ -13,6 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from snowsplat.capture.images import available_memory
 from snowsplat.errors import UserError
 from snowsplat.files import atomic_path
 from snowsplat.photos.pinhole import Pinhole, pinhole_of
+from snowsplat.photos.pinhole_model import write_model
 from snowsplat.photos.resample import undistort_image, undistort_mask
 
 if TYPE_CHECKING:
@@ -82,8 +84,8 @@ def undistort(
 
     Photos without a pose are left out. Files keep their names and formats: JPEG at quality 95
     without chroma subsampling, all others without loss; transparency stays. Where the camera has
-    no distortion, photos are copied. Masks are made for photos that have one, unless they are
-    transparent, which says the same in finer steps. The model is written last.
+    no distortion, photos are copied. Masks are made for photos that have one; where it leaves out
+    no more than what is transparent, the transparency says it already. The model is written last.
 
     Args:
         photos: what is known of those in ``input/``.
@@ -104,27 +106,25 @@ def undistort(
     for number in model.reg_image_ids():
         image = model.images[number]
         photo, camera = known.get(image.name), model.cameras[image.camera_id]
-        masked = photo is not None and photo.mask and not photo.alpha
+        masked = photo is not None and photo.mask
         size = (camera.width, camera.height)
         jobs.append(_Job(image.name, size, pinholes[image.camera_id], masked))
     jobs.sort(key=lambda job: job.name)
     divisors = _DIVISORS if resize else ()
     folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
-    for folder, job in [(f, j) for j in jobs for f in folders] + [
-        ("masks", j) for j in jobs if j.mask
-    ]:
-        (capture / folder / job.name).parent.mkdir(parents=True, exist_ok=True)
     pixels = max(p.width * p.height for p in pinholes.values())
     threads = min(
         threads or min(4, os.cpu_count() or 1),
         max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
     )
-    _run([partial(_undistort_photo, capture, job, divisors) for job in jobs], report, threads)
-    _write_model(model, pinholes, scene_from_sfm, capture)
+    masks = _run(
+        [partial(_undistort_photo, capture, job, divisors) for job in jobs], report, threads
+    )
+    write_model(model, pinholes, scene_from_sfm, capture / "sparse")
     sizes = Counter((job.pinhole.width, job.pinhole.height) for job in jobs)
     return Undistorted(
         images=len(jobs),
-        masks=sum(job.mask for job in jobs),
+        masks=sum(masks),
         sizes=[(*size, count) for size, count in sizes.most_common()],
         folders=folders,
         resampled=any(job.pinhole.nodes is not None for job in jobs),
@@ -149,16 +149,21 @@ def _pinhole(camera: pycolmap.Camera) -> Pinhole:
     return pinhole
 
 
-def _run(jobs: Sequence[Callable[[], None]], report: Report, threads: int) -> None:
-    """Run jobs in threads. The first error, and Ctrl-C, ends it after those that are under way."""
+def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> list[bool]:
+    """Run jobs in threads; what they give, in any order.
+
+    The first error, and Ctrl-C, ends it after those that are under way.
+    """
     report(0, len(jobs), "photos")
     # Pillow and torch let go of the interpreter while they work; torch itself on one thread each.
     pool = ThreadPoolExecutor(threads, "snowsplat-undistort", torch.set_num_threads, (1,))
     try:
+        results = []
         running = [pool.submit(job) for job in jobs]
         for done, future in enumerate(as_completed(running), 1):
-            future.result()
+            results.append(future.result())
             report(done, len(jobs), "photos")
+        return results
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -166,26 +171,42 @@ def _run(jobs: Sequence[Callable[[], None]], report: Report, threads: int) -> No
 # One photo
 
 
-def _undistort_photo(capture: Path, job: _Job, divisors: Sequence[int]) -> None:
+def _undistort_photo(capture: Path, job: _Job, divisors: Sequence[int]) -> bool:
+    """Write the image, its smaller copies, its mask; whether it has one."""
     source, target = capture / "input" / job.name, capture / "images" / job.name
+    opaque = None
     with _opened(source, job) as opened:
         form = "JPEG" if opened.format == "MPO" else str(opened.format)
         if job.pinhole.nodes is None:
-            with atomic_path(target) as temporary:
+            with _into(target) as temporary:
                 shutil.copyfile(source, temporary)
-        if job.pinhole.nodes is not None or divisors:
+        if job.pinhole.nodes is not None or divisors or job.mask:
             profile = opened.info.get("icc_profile")
-            image = undistort_image(_eight_bit(_decoded(opened, source)), job.pinhole)
+            photo = _eight_bit(_decoded(opened, source))
+            opaque = np.asarray(photo)[..., 3] > 0 if photo.mode == "RGBA" else None
+        if job.pinhole.nodes is not None or divisors:
+            image = undistort_image(photo, job.pinhole)
             if job.pinhole.nodes is not None:
                 _save(image, target, form, profile)
             for divisor in divisors:
                 folder = capture / f"images_{divisor}"
                 _save(_divided(image, divisor), folder / job.name, form, profile)
-    if job.mask:
-        name = f"{job.name}.png"
-        with _opened(capture / "distorted" / "masks" / name, job) as opened:
-            mask = _decoded(opened, source).convert("L")
-        _save(undistort_mask(mask, job.pinhole), capture / "masks" / name, "PNG")
+    return job.mask and _undistort_mask(capture, job, opaque)
+
+
+def _undistort_mask(capture: Path, job: _Job, opaque: np.ndarray | None) -> bool:
+    name = f"{job.name}.png"
+    path = capture / "distorted" / "masks" / name
+    with _opened(path, job) as opened:
+        mask = _decoded(opened, path).convert("L")
+    if opaque is not None:
+        # What is transparent was left out for SfM. In training it counts: as empty space.
+        counts = (np.asarray(mask) >= 128) | ~opaque
+        if counts.all():
+            return False
+        mask = Image.fromarray(counts.astype(np.uint8) * 255)
+    _save(undistort_mask(mask, job.pinhole), capture / "masks" / name, "PNG")
+    return True
 
 
 def _opened(path: Path, job: _Job) -> Image.Image:
@@ -233,49 +254,12 @@ def _divided(image: Image.Image, divisor: int) -> Image.Image:
     return Image.frombytes(mode, (width, height), small.tobytes()).convert(image.mode)
 
 
+def _into(path: Path) -> AbstractContextManager[Path]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return atomic_path(path)
+
+
 def _save(image: Image.Image, path: Path, form: str, profile: bytes | None = None) -> None:
     """No metadata but the colour profile, without which the colours are others."""
-    with atomic_path(path) as temporary:
+    with _into(path) as temporary:
         image.save(temporary, form, icc_profile=profile, **_SAVING[form])
-
-
-# The model
-
-
-def _write_model(
-    model: pycolmap.Reconstruction,
-    pinholes: dict[int, Pinhole],
-    scene_from_sfm: Similarity,
-    capture: Path,
-) -> None:
-    """Turn the model into that of the images, and write it as a whole."""
-    import pycolmap
-
-    scale, rotation = scene_from_sfm.scale, scene_from_sfm.rotation.numpy()
-    shift = scene_from_sfm.translation.numpy()[:, None]
-    model.transform(pycolmap.Sim3d(np.concatenate([scale * rotation, shift], axis=1)))
-    for image in model.images.values():
-        _undistort_keypoints(image, model.cameras[image.camera_id], pinholes[image.camera_id])
-    for number, pinhole in pinholes.items():
-        camera = model.cameras[number]
-        camera.model = pycolmap.CameraModelId.PINHOLE
-        camera.width, camera.height = pinhole.width, pinhole.height
-        camera.params = list(pinhole.params)
-    new = capture / ".sparse.new"
-    shutil.rmtree(new, ignore_errors=True)
-    (new / "0").mkdir(parents=True)
-    model.write(new / "0")
-    model.export_PLY(new / "0" / "points3D.ply")
-    shutil.rmtree(capture / "sparse", ignore_errors=True)
-    new.rename(capture / "sparse")
-
-
-def _undistort_keypoints(image: Any, camera: pycolmap.Camera, pinhole: Pinhole) -> None:
-    points = image.points2D
-    if not len(points):
-        return
-    fx, fy, cx, cy = pinhole.params
-    pixels = camera.cam_from_img(np.array([point.xy for point in points])) * (fx, fy) + (cx, cy)
-    for point, xy in zip(points, pixels, strict=True):
-        # Near the rim the lens model may have no inverse; readers want numbers all the same.
-        point.xy = xy if np.isfinite(xy).all() else (-1.0, -1.0)
