@@ -17,15 +17,16 @@ from snowsplat.capture.colmap_files import read_model
 from snowsplat.photos.compare import compare_poses
 from snowsplat.photos.synthetic import Truth, write_synthetic_photos
 
-_MINUTES = 2.3  # for all that `snowsplat make` does
+_MINUTES = 2.2  # for all that `snowsplat make` does
 _DEGREES, _SHARE = 0.1, 0.002  # what is demanded of each photo
 
 
 def take_photos(folder: Path) -> Truth:
     """Photos in ``folder``/photos; those that are there are kept. Their poses are kept aside."""
 
-    def report(done: int, total: int, what: str) -> None:
-        print(f"\r{what}: {done} of {total}", end="\n" if done == total else "", flush=True)
+    def report(done: int, total: int, what: str = "") -> None:
+        if sys.stdout.isatty() or done in (0, total):
+            print(f"\r{what}: {done} of {total}", end="\n" if done == total else "", flush=True)
 
     truth = write_synthetic_photos(folder / "photos", report=report)
     truth.write(folder / "truth")
@@ -59,15 +60,15 @@ The poses that were found, against the true ones ({len(errors.names)} of {len(tr
 def main(folder: Path) -> int:
     started = time.monotonic()
     truth = take_photos(folder)
-    snowsplat("make", folder / "photos", "-o", folder, "--minutes", str(_MINUTES))
-    near = compare(folder / "capture", truth)
+    made = folder / "made"
+    options = ("--quality", "normal", "--minutes", str(_MINUTES))
+    snowsplat("make", folder / "photos", "-o", made, *options)
+    near = compare(made / "capture", truth)
     print(
         f"""
-The photos:                                    {folder / "photos"}
-What was found in them, with a picture:        {folder / "capture" / "capture_report.html"}
-The scene, for any viewer of Gaussian splats:  {folder / "scene" / "point_cloud"}
-How near it is to photos that it never saw:    {folder / "scene" / "metrics.json"}
-Seconds from the first photo to here:          {time.monotonic() - started:.0f}
+The photos:      {folder / "photos"}
+The true poses:  {folder / "truth"}
+This took:       {time.monotonic() - started:.0f} s
 
 With photos or a video of your own: snowsplat make YOUR_FOLDER -o out/yours"""
     )

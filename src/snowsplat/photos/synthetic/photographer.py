@@ -27,7 +27,7 @@ _FOCAL_35MM = 28  # what EXIF says, as of the wide camera of a phone
 _FOCAL_TRUE = 1.013  # the true focal length is a little longer, as that of any phone
 _DISTORTION = (-0.062, 0.021, 0.00015, -0.0001)  # of COLMAP's model OPENCV: k1, k2, p1, p2
 _WALK_RADIUS, _WALK_HEIGHTS = 1.42, (0.46, 0.92)  # metres, around and above the table's middle
-_FULL_WELL = 6000.0  # electrons of a white pixel: the noise of light is their square root
+_FULL_WELL = 15000.0  # electrons of a white pixel: the noise of light is their square root
 _READ_NOISE = 6.0  # electrons
 _JPEG_QUALITY = 92
 
@@ -102,13 +102,13 @@ def walk(count: int, seed: int) -> list[Tensor]:
         radius = _WALK_RADIUS * (1 + random.normal(0, 0.03))
         height = _WALK_HEIGHTS[second] + random.normal(0, 0.025)
         position = np.array([radius * math.cos(angle), radius * math.sin(angle), height])
-        target = np.array([0, 0, 0.08]) + random.normal(0, 0.035, 3)
+        target = np.array([0, 0, 0.08]) + random.normal(0, 0.05, 3)
         pose = look_at(
             torch.from_numpy(position),
             torch.from_numpy(target),
             torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64),
         )
-        poses.append(_rolled(pose, random.normal(0, 0.03)))
+        poses.append(_rolled(pose, random.normal(0, 0.06)))
     return poses
 
 
