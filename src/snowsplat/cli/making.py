@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 CAPTURE, SCENE = "capture", "scene"
 STAGES = ("scene", "pictures")  # the capture keeps its own record
 HOLD_OUT = 8
+# What of a preset is about the training.
+_OF_TRAINING = ("side", "iterations", "max_gaussians")
 # What a kill may cost.
 _CHECKPOINT_SECONDS = 15.0
 # The shortest training that is worth it: seconds, and as a part of the time given.
@@ -67,10 +69,10 @@ class Making:
             KeyboardInterrupt: Ctrl-C; what is finished stays.
         """
         self._make_capture()
-        side = PRESETS[self.quality].side
         settings: dict[str, Any] = {"capture": _fingerprint(self.out / CAPTURE)}
         if self.minutes is None:
-            settings |= {"quality": self.quality, "longer_side": side}
+            preset = PRESETS[self.quality]
+            settings |= {word: getattr(preset, word) for word in _OF_TRAINING}
         else:
             settings |= {"minutes": self.minutes}
         folder = OutputFolder(self.out / SCENE)

@@ -1,0 +1,212 @@
+"""`snowsplat make`, from photos to files: what is made, what a kill leaves, what is done again."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from snowsplat.cli import making
+from snowsplat.cli.presets import PRESETS, quality_within
+from snowsplat.photos.synthetic import write_synthetic_photos
+
+QUICK = replace(PRESETS["draft"], iterations=120)
+#: The command with as short a training, and a checkpoint every moment, in a process of its own.
+PROGRAM = """
+import sys
+from dataclasses import replace
+from snowsplat.cli import making
+from snowsplat.cli.main import main
+making._CHECKPOINT_SECONDS = 0.2
+making.PRESETS["draft"] = replace(making.PRESETS["draft"], iterations=120)
+sys.exit(main())
+"""
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory) -> Path:
+    """20 photos, 320×240; not to be changed. The name is one that people use."""
+    folder = tmp_path_factory.mktemp("make") / "Häuser am See"
+    write_synthetic_photos(folder, n_views=20, width=320, height=240)
+    return folder
+
+
+@pytest.fixture
+def quick(monkeypatch) -> None:
+    monkeypatch.setitem(PRESETS, "draft", QUICK)
+
+
+def files(folder: Path) -> set[str]:
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+
+
+def state(out: Path) -> dict[str, int]:
+    """When each file was written, but for the records of what is done."""
+    made = (name for name in files(out) if Path(name).name not in ("make.json", "capture.json"))
+    return {name: (out / name).stat().st_mtime_ns for name in made}
+
+
+@pytest.mark.slow
+def test_from_photos_to_files_and_what_is_done_again(
+    run, refused, quick, photos, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    command = ("make", photos, "--quality", "draft", "--threads", 1)
+    result = run(*command)
+    assert result.code == 0, result.err
+    out = tmp_path / "Häuser am See_scene"
+    scene = out / "Häuser am See.ply"
+    original = out / "scene/point_cloud/iteration_120/point_cloud.ply"
+    assert scene.read_bytes() == original.read_bytes()
+    metrics = json.loads((out / "scene/metrics.json").read_text())
+    assert metrics["psnr"] > 12
+    made = files(out / "scene/test/ours_120")
+    assert made == {f"{kind}/{i:05d}.png" for kind in ("renders", "gt") for i in range(3)}
+    assert (out / "capture/capture_report.html").is_file()
+    assert not (out / "scene/checkpoints").exists()
+    summary = result.out[result.out.index("\nThe scene") :]
+    for part in (scene.name, "capture_report.html", "renders", f"PSNR {metrics['psnr']:.2f} dB"):
+        assert part in summary
+
+    # The same again: nothing is done.
+    before = state(out)
+    again = run(*command)
+    assert again.code == 0, again.err
+    assert again.out.count("done before") == 6
+    assert state(out) == before
+    assert f"PSNR {metrics['psnr']:.2f} dB" in again.out
+
+    # A file that is missing: that stage and the later ones.
+    shutil.rmtree(out / "scene/test")
+    again = run(*command)
+    assert "pictures: done again (files of it are missing)" in again.out
+    assert state(out).keys() == before.keys()
+    assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_120/point_cloud.ply"]
+
+    # Another setting of the training: the cameras stay.
+    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=60))
+    again = run(*command)
+    assert again.code == 0, again.err
+    assert "scene: done again (changed: iterations)" in again.out
+    assert again.out.count("done before") == 4
+    assert (out / "scene/test/ours_60").is_dir()
+    assert not (out / "scene/test/ours_120").exists()
+
+    # Other photos are not what is in there.
+    fewer = tmp_path / "fewer"
+    fewer.mkdir()
+    for photo in sorted(photos.iterdir())[:17]:
+        shutil.copy(photo, fewer)
+    before = state(out)
+    assert "--overwrite" in refused("make", fewer, "-o", out, "--quality", "draft")
+    assert state(out) == before
+
+
+@pytest.fixture
+def killed(photos, tmp_path) -> Callable[..., str]:
+    """Run the command as a process and kill it when a file is there; gives what it printed."""
+    environment = os.environ | {"PYTHONPATH": str(Path(making.__file__).parents[2])}
+
+    def killed(out: Path, when: Callable[[], bool], with_signal: int) -> str:
+        arguments = ["make", str(photos), "-o", str(out), "--quality", "draft", "--threads", "1"]
+        process = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, *arguments],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        deadline = time.monotonic() + 120
+        while not when() and process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        process.send_signal(with_signal)
+        text = process.communicate(timeout=60)[0]
+        assert process.returncode == (130 if with_signal == signal.SIGINT else -with_signal), text
+        return text
+
+    return killed
+
+
+@pytest.mark.slow
+def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
+    """Each time the same command goes on; what was finished is not done again."""
+    out = tmp_path / "out"
+
+    def recorded(stage: str) -> bool:
+        record = out / "capture/capture.json"
+        return record.is_file() and f'"{stage}"' in record.read_text()
+
+    killed(out, (out / "capture/distorted/database.db").exists, signal.SIGKILL)
+    killed(out, lambda: recorded("poses"), signal.SIGKILL)
+    killed(out, (out / "scene/config.json").exists, signal.SIGKILL)
+    text = killed(out, lambda: any(out.glob("scene/checkpoints/step*")), signal.SIGKILL)
+    assert text.count("done before") == 4
+    newest = max(out.glob("scene/checkpoints/step*"))
+    text = killed(
+        out,
+        lambda: max(out.glob("scene/checkpoints/step*"), default=newest) > newest,
+        signal.SIGINT,
+    )
+    assert f"going on from {newest}" in text
+    assert text.count("go on with: snowsplat make") == 1
+    result = run("make", photos, "-o", out, "--quality", "draft", "--threads", 1)
+    assert result.code == 0, result.err
+    assert "going on from" in result.out
+    assert (out / "Häuser am See.ply").is_file()
+    assert len(list(out.glob("scene/test/ours_120/renders/*.png"))) == 3
+    assert not list(out.rglob("*.tmp"))
+
+
+# Refused
+
+
+def test_places_that_are_taken(refused, capture, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.txt").write_text("mine")
+    assert "holds other files" in refused("make", capture / "images", "-o", out)
+    assert "is a file" in refused("make", capture / "images", "-o", out / "thesis.txt")
+    assert files(out) == {"thesis.txt"}
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ([], "needs photos"),
+        (["absent"], "absent"),
+        (["PHOTOS", "--minutes", 0], "--minutes is 0"),
+        (["PHOTOS", "--threads", 0], "--threads is 0"),
+    ],
+)
+def test_mistakes_write_nothing(refused, capture, tmp_path, flags, expected):
+    words = [capture / "images" if word == "PHOTOS" else word for word in flags]
+    assert expected in refused("make", *words, "-o", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_photos_leave_nothing(refused, capture, tmp_path):
+    two = tmp_path / "two"
+    two.mkdir()
+    for name in ("view_00.png", "view_01.png"):
+        shutil.copy(capture / "images" / name, two)
+    refused("make", two, "-o", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+# Times
+
+
+def test_the_effort_that_a_time_allows():
+    assert [quality_within(seconds, 50, 2) for seconds in (30, 60, 300, 3600)] == [
+        *("draft", "draft", "normal", "best"),
+    ]
+    assert quality_within(300, 50, 16) == "best"
+    assert quality_within(300, 1000, 2) == "draft"
