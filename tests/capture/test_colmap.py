@@ -104,7 +104,7 @@ def test_cameras_that_are_pinholes_by_another_name(capture_copy, model, params):
 def test_distorted_cameras_are_refused_with_the_fix(capture_copy, model, params):
     folder = capture_copy("colmap-bin")
     rewrite_cameras(folder, model, params)
-    with pytest.raises(UserError, match=f"{model}.*image_undistorter"):
+    with pytest.raises(UserError, match=f"{model}.*snowsplat capture -s NEW --skip-matching"):
         load_capture(folder)
 
 
