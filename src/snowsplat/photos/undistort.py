@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _DIVISORS = (2, 4, 8)
-_BYTES_PER_PIXEL = 40  # at the worst moment of a photo, which is when it is made smaller
+_BYTES_PER_PIXEL = 50  # at the worst moment of a photo, which is when it is made smaller
 # How each format is written: as good as loses nothing that training could see.
 _SAVING: dict[str, dict[str, Any]] = {
     "JPEG": {"quality": 95, "subsampling": 0},
