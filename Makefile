@@ -1,4 +1,4 @@
-# make demo     trains, evaluates and renders a small scene, and says where it all is
+# make demo     takes photos of a small scene and makes it anew from them, with `snowsplat make`
 # make test     all that must hold: format, lint, types, layers, tests on every instruction set
 # make dev      the environment to work in; then, quickly: make check, make format, make native
 #

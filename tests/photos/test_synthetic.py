@@ -99,8 +99,8 @@ def test_marks_are_where_the_poses_say(distortion):
     white = np.ones((16, 16, 3), np.float32)
     balls = [Thing(Ellipsoid(mark, (0.02,) * 3), [white], shines=True) for mark in marks]
     scene = Scene(balls, Lamp((0, 0, 9), (1, 1), 0.0, 0.0))
-    compared = 0
-    for pose in walk(6, seed=5):
+    errors = []
+    for pose in walk(12, seed=5):
         image = photograph(scene, lens, pose, np.random.default_rng(0))[..., 1]
         x_cam = transform_points(pose, torch.tensor(marks, dtype=torch.float64)).numpy().T
         spots = lens.project(x_cam)
@@ -113,10 +113,11 @@ def test_marks_are_where_the_poses_say(distortion):
             bright[bright < 0.05] = 0  # noise
             seen_x = (bright.sum(0) * (np.arange(columns.start, columns.stop) + 0.5)).sum()
             seen_y = (bright.sum(1) * (np.arange(rows.start, rows.stop) + 0.5)).sum()
-            assert seen_x / bright.sum() == pytest.approx(x, abs=0.12)
-            assert seen_y / bright.sum() == pytest.approx(y, abs=0.12)
-            compared += 1
-    assert compared > 12
+            errors.append((seen_x / bright.sum() - x, seen_y / bright.sum() - y))
+    # Four rays a pixel tell the middle of one spot to about a tenth of a pixel, and without a bias.
+    assert len(errors) > 24
+    assert np.abs(errors).max() < 0.15
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.02
 
 
 SHAPES = [

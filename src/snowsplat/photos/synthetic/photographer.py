@@ -96,8 +96,8 @@ def walk(count: int, seed: int) -> list[Tensor]:
     poses = []
     for i in range(count):
         second = 2 * i >= count
-        turns = 2 * i / count  # half a photo's step between the two walks, where the count is odd
-        angle = 2 * math.pi * turns + (math.pi / max(1, count // 2) if second else 0)
+        # The second walk's photos are between those of the first.
+        angle = 2 * math.pi * (2 * i + second) / count
         angle += random.normal(0, 0.02)
         radius = _WALK_RADIUS * (1 + random.normal(0, 0.03))
         height = _WALK_HEIGHTS[second] + random.normal(0, 0.025)

@@ -1,0 +1,36 @@
+"""What the demo says of poses is so; the demo itself is run by `make demo`."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.capture.colmap_files import ColmapCamera, ColmapImage, write_model
+from snowsplat.geometry import quat_from_rotation
+from snowsplat.photos.synthetic import Truth
+from snowsplat.photos.synthetic.lens import Lens
+from snowsplat.photos.synthetic.photographer import walk
+
+DEMO = Path(__file__).resolve().parents[1] / "examples" / "demo.py"
+TRUTH = Truth(
+    Lens(64, 48, 50.0, (0.0, 0.0, 0.0, 0.0)),
+    {f"IMG_{i:04d}.jpg": pose for i, pose in enumerate(walk(20, seed=0), 1)},
+)
+
+
+@pytest.mark.parametrize(
+    ("moved", "count", "near"), [(0.0, 20, True), (0.02, 20, False), (0.0, 19, False)]
+)
+def test_poses_that_are_off_or_missing_fail(tmp_path, capsys, moved, count, near):
+    images = []
+    for name, pose in list(TRUTH.poses.items())[:count]:
+        shift = pose[:, 3] + torch.tensor([moved * (not images), 0, 0])
+        quat = quat_from_rotation(pose[:, :3])
+        images.append(ColmapImage(name, 1, (*quat.tolist(), *shift.tolist())))
+    camera = ColmapCamera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
+    nothing = np.zeros((0, 3))
+    write_model(tmp_path / "sparse" / "0", {1: camera}, images, nothing, nothing.astype(np.uint8))
+    assert runpy.run_path(str(DEMO))["compare"](tmp_path, TRUTH) is near
+    assert f"({count} of 20 photos)" in capsys.readouterr().out
