@@ -102,11 +102,10 @@ def _up(seen: _Seen) -> np.ndarray:
     `_COMMON_PITCH`: where the x axes are all parallel, as in front of a wall, the second decides.
     Photos rolled by much more than `_ROLL` lose their say (Cauchy weights).
     """
-    x, mean = seen.rotations[:, 0], -seen.rotations[:, 1].mean(axis=0)
-    if np.linalg.norm(mean) < 0.3:
-        # The upper edges point every way: photos that look straight down, taken on the way to and
-        # fro. (People photograph the ground, not the sky.)
-        mean = -seen.forward.mean(axis=0)
+    x, upper = seen.rotations[:, 0], -seen.rotations[:, 1].mean(axis=0)
+    # Where the upper edges point every way, photos look straight down, taken on the way to and fro.
+    # (People photograph the ground, not the sky.)
+    mean = upper if np.linalg.norm(upper) >= 0.3 else -seen.forward.mean(axis=0)
     up = mean / max(float(np.linalg.norm(mean)), 1e-12)
     for _ in range(50):
         roll = x @ up
@@ -120,7 +119,9 @@ def _up(seen: _Seen) -> np.ndarray:
         up /= np.linalg.norm(up)
         if np.linalg.norm(step) < 1e-10:
             break
-    return up
+    # Such photos, if few, may all the same have edges that point one way more than another.
+    looks_down = abs(upper @ up) < 0.3
+    return -up if looks_down and seen.forward.mean(axis=0) @ up > 0 else up
 
 
 def _heading(seen: _Seen, up: np.ndarray) -> np.ndarray:
