@@ -27,6 +27,7 @@ class Clip:
     seconds: float  # from the first frame to the end of the last
     width: int  # pixels, upright
     height: int
+    aspect: float = 1.0  # width over height of a stored pixel; some camcorders' are not square
 
 
 def is_video(path: Path) -> bool:
@@ -58,6 +59,7 @@ def read_clip(path: Path) -> Clip:
             rate = float(stream.average_rate or 30)
             # The header is trusted for this alone: to say how much of a damaged file is absent.
             promised = stream.frames
+            aspect = float(stream.sample_aspect_ratio or 1)
             with suppress(av.FFmpegError):
                 for packet in container.demux(stream):
                     stamp = packet.pts if packet.pts is not None else packet.dts
@@ -73,7 +75,7 @@ def read_clip(path: Path) -> Clip:
     if min(times) < 0 and -1.0 in times:  # a raw stream, without times
         times = [i / rate for i in range(len(times))]
     length = max(times) - min(times)
-    width, height = _upright_size(first)
+    width, height = upright_size(first, aspect)
     return Clip(
         path=path,
         packets=len(times),
@@ -82,6 +84,7 @@ def read_clip(path: Path) -> Clip:
         seconds=length + length / max(1, len(times) - 1) if length > 0 else len(times) / rate,
         width=width,
         height=height,
+        aspect=aspect,
     )
 
 
@@ -103,14 +106,9 @@ def frames_wanted(clip: Clip, fps: float | None, frames: int | None) -> int:
     return max(1, min(round(wanted), clip.packets))
 
 
-def square_pixels(frame: VideoFrame) -> tuple[int, int]:
-    """Width and height of a frame, not turned; some camcorders' pixels are not square."""
-    aspect = getattr(frame, "sample_aspect_ratio", None)
-    return (round(frame.width * aspect) if aspect else frame.width), frame.height
-
-
-def _upright_size(frame: VideoFrame) -> tuple[int, int]:
-    width, height = square_pixels(frame)
+def upright_size(frame: VideoFrame, aspect: float) -> tuple[int, int]:
+    """Width and height that a frame is shown with: turned, and with square pixels."""
+    width, height = round(frame.width * aspect), frame.height
     return (height, width) if round(frame.rotation / 90) % 2 else (width, height)
 
 

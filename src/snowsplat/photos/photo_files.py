@@ -93,21 +93,30 @@ def read_header(path: Path) -> Header:
             exif = image.getexif() if noted else Image.Exif()
             transparent = image.mode in _TRANSPARENT or "transparency" in image.info
             png = image.format == "PNG"
+            width, height = _stored_size(image)
             header = Header(
                 format=image.format or "",
-                width=image.width,
-                height=image.height,
+                width=width,
+                height=height,
                 plain=image.mode in ("L", "RGB", *(["RGBA"] if png else []))
                 and "transparency" not in image.info
                 and _bits(path, image) == 8,
                 transparent=transparent,
-                notes=read_notes(exif, image.width, image.height),
+                notes=read_notes(exif, width, height),
             )
     except Exception as error:  # Pillow's parsers raise anything on damaged files
         raise Unusable(f"cannot be decoded ({_reason(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
     return header
+
+
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    """Of the pixels in the file: Pillow turns TIFFs by itself, and gives their size turned."""
+    tags = getattr(image, "tag_v2", {})
+    if image.format == "TIFF" and 256 in tags and 257 in tags:
+        return tags[256], tags[257]
+    return image.size
 
 
 def _bits(path: Path, image: Image.Image) -> int:
@@ -152,7 +161,7 @@ def decode_small(path: Path, side: int) -> Image.Image:
     """
     try:
         with open_image(path) as opened:
-            opened.draft("RGB", (2 * side, 2 * side))
+            opened.draft("RGB", scaled_size(opened.width, opened.height, 2 * side))
             return _eight_bits(opened)
     except Exception as error:  # as above
         raise Unusable(f"cannot be decoded ({_reason(error)})") from None

@@ -14,11 +14,14 @@ FRAME_SIDE = 640
 #: Longest side of the copies on which a picture is judged by itself, and on which motion is found.
 PICTURE_SIDE = 320
 
-# Measured with pycolmap's SIFT on three real captures of 1000 to 1280 pixels, blurred by Gaussians:
-# at σ = 8 pixels (a share of 0.18 to 0.23) neighbours still have 21 to 107 matches that fit, at
-# σ = 12 (0.10 to 0.14) 0 to 20, at σ = 16 (0.06 to 0.08) none. Sharp ones have 0.58 to 0.70.
-_BLURRED = 0.09
-_BLUR_SIDE = 160
+# Fine detail below which a picture is useless, on copies of two longest sides; see `_fine_detail`.
+# Measured with pycolmap's SIFT on three real captures of 1000 to 1280 pixels, blurred by Gaussians
+# saved as JPEG of 75 and 95: at σ = 8 pixels neighbours have 21 to 107 matches that fit, at 12 they
+# have 0 to 20, at 16 none.     sharp        σ = 8        12           16           24 and 32
+#   longest side of 160    0.60 to 0.74  0.18 to 0.24  0.09 to 0.14  0.06 to 0.12  0.04 to 0.15
+#                    80    0.60 to 0.75  0.39 to 0.47  0.24 to 0.32  0.17 to 0.23  0.07 to 0.14
+# What is seen again of heavily blurred ones at 160 are the squares of JPEG; at 80 they are gone.
+_BLURRED = {160: 0.09, 80: 0.16}
 # Grey levels between nearly the darkest and nearly the brightest. A lens cap has 2 to 5 of them.
 _BLANK = 8.0
 # Pixels of the copy; 0.6% of its longest side. A still camera gives 0 or 1, noisy as it may be; a
@@ -55,7 +58,8 @@ def why_useless(grey: np.ndarray) -> str | None:
     low, high = np.quantile(grey, [0.005, 0.995])
     if high - low < _BLANK:
         return BLACK if high < 64 else WHITE if low > 191 else FLAT
-    return BLURRED if _fine_detail(grey) < _BLURRED else None
+    blurred = any(_fine_detail(grey, side) < least for side, least in _BLURRED.items())
+    return BLURRED if blurred else None
 
 
 BLACK = "is black all over"
@@ -64,13 +68,13 @@ FLAT = "is of one colour all over"
 BLURRED = "is blurred all over"
 
 
-def _fine_detail(grey: np.ndarray) -> float:
-    """The share of the gradients' energy, 0..1, that a blur by 1/160 of the picture takes away.
+def _fine_detail(grey: np.ndarray, side: int) -> float:
+    """The share of the gradients' energy, 0..1, that a blur by 1/``side`` takes away.
 
     Independent of contrast and nearly so of what is shown: pictures of things have detail at all
     scales, except where the lens or the hand has removed it.
     """
-    small = grey_copy(Image.fromarray(grey), _BLUR_SIDE).astype(np.float32)
+    small = grey_copy(Image.fromarray(grey), side).astype(np.float32)
     if min(small.shape) < 8:
         return 1.0
     blurred = (small[:-2] + 2 * small[1:-1] + small[2:]) / 4

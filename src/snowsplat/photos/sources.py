@@ -197,11 +197,11 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
             head = file.read(32)
     except OSError as error:
         raise UserError(f"{shown(path)}: cannot be read ({error.strerror})") from None
+    suffix = path.suffix.lower()
+    if suffix in _RAW_SUFFIXES:  # many are a kind of TIFF, with a thumbnail in front
+        raise UserError(f"{shown(path)}: is a raw photo; save it as JPEG or PNG first")
     if _is_photo(head):
         return "photo"
-    suffix = path.suffix.lower()
-    if suffix in _RAW_SUFFIXES:
-        raise UserError(f"{shown(path)}: is a raw photo; save it as JPEG or PNG first")
     if is_video(path):
         return "video"
     if suffix in PHOTO_SUFFIXES:

@@ -20,7 +20,7 @@ from snowsplat.photos.clip import (
     decoded_frames,
     nothing_decodes,
     open_video,
-    square_pixels,
+    upright_size,
 )
 from snowsplat.photos.photo_files import resized, save, scaled_size
 from snowsplat.photos.progress import Report
@@ -91,7 +91,7 @@ def extract_frames(
         if reason is None and last is not None and last.shape == small.shape:
             reason = None if has_moved(last, small) else SAME_VIEW
         if reason is None:
-            frames.kept.append(_write(best, folder, len(frames.kept) + 1, size))
+            frames.kept.append(_write(best, clip, folder, len(frames.kept) + 1, size))
             last = small
         else:
             frames.skipped.append((best.seconds, reason))
@@ -103,7 +103,9 @@ def extract_frames(
             for frame in decoded_frames(container):
                 timed = frame.time is not None
                 seconds = frame.time - clip.start if timed else frames.read / rate
-                index = min(int(max(seconds, 0.0) / clip.seconds * windows), windows - 1)
+                # A little later, so that rounding does not bring two frames into one window.
+                place = (max(seconds, 0.0) + 1e-6) / clip.seconds
+                index = min(int(place * windows), windows - 1)
                 if index > window:
                     close_window()
                     window = index
@@ -147,16 +149,14 @@ def _grey(frame: VideoFrame) -> np.ndarray:
     return small.to_ndarray()
 
 
-def _write(best: _Best, folder: Path, number: int, size: int | None) -> Frame:
+def _write(best: _Best, clip: Clip, folder: Path, number: int, size: int | None) -> Frame:
     frame = best.frame
     assert frame is not None
-    picture = rgb_picture(frame)
-    width, height = square_pixels(frame)
-    image = resized(Image.fromarray(picture), (width, height))
+    image = Image.fromarray(rgb_picture(frame))
     turns = round(frame.rotation / 90) % 4
     if turns:  # counter-clockwise, as Pillow counts too
         image = image.transpose(Image.Transpose(1 + turns))
-    image = resized(image, scaled_size(image.width, image.height, size))
+    image = resized(image, scaled_size(*upright_size(frame, clip.aspect), size))
     name = f"frame_{number:05d}.jpg"
     save(image, folder / name)
     return Frame(name, best.seconds, image.width, image.height)

@@ -1,0 +1,83 @@
+"""Photos and videos to gather: a textured wall, seen from places side by side."""
+
+from fractions import Fraction
+
+import av
+import numpy as np
+from PIL import Image, ImageFilter
+
+WIDTH, HEIGHT = 320, 240
+
+
+def wall(offset=0, width=WIDTH, height=HEIGHT, seed=0) -> np.ndarray:
+    """(height, width, 3) uint8: blotches of all sizes in all colours, moved left by ``offset``.
+
+    The upper left corner has a white square and the rest of the left edge is dark, so that turns
+    and mirrors show.
+    """
+    random = np.random.default_rng(seed)
+    total = np.zeros((height, 3 * width, 3))
+    for cells in (4, 12, 40, 120):
+        noise = random.integers(0, 256, (cells * height // width + 1, 3 * cells, 3))
+        layer = Image.fromarray(noise.astype(np.uint8)).resize((3 * width, height), 3)
+        total += np.asarray(layer) / 4
+    total = np.clip(128 + 1.6 * (total - 128), 0, 255)
+    picture = total[:, offset : offset + width].copy()
+    picture[:, : width // 10] *= 0.2
+    picture[: height // 6, : width // 8] = 255
+    return picture.astype(np.uint8)
+
+
+def photo(offset=0, **options) -> Image.Image:
+    """`wall` as an image."""
+    return Image.fromarray(wall(offset, **options))
+
+
+def blurred(picture: np.ndarray, radius: float) -> np.ndarray:
+    """By a Gaussian."""
+    return np.asarray(Image.fromarray(picture).filter(ImageFilter.GaussianBlur(radius)))
+
+
+def exif(tags=None, details=None, gps=None) -> Image.Exif:
+    """Notes of a camera: of the picture, of the exposure, of the place."""
+    notes = Image.Exif()
+    notes.update(tags or {})
+    notes.get_ifd(0x8769).update(details or {})
+    notes.get_ifd(0x8825).update(gps or {})
+    return notes
+
+
+def write_photos(folder, count=3, ending="jpg"):
+    """``0.jpg`` … in a new folder, which it gives."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        photo(20 * i).save(folder / f"{i}.{ending}", quality=95)
+    return folder
+
+
+def write_video(path, pictures, rate=10, rotation=None, codec="libx264", times=None, aspect=None):
+    """Encode (H, W, 3) uint8 pictures; ``times`` (in 1/1000 s) make it of variable rate."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        if aspect:
+            stream.codec_context.sample_aspect_ratio = aspect
+        stream.bit_rate = 4_000_000
+        if rotation:
+            stream.set_display_rotation(rotation)
+        if times is not None:
+            stream.codec_context.time_base = Fraction(1, 1000)
+        for i, picture in enumerate(pictures):
+            frame = av.VideoFrame.from_ndarray(picture, "rgb24")
+            if times is not None:
+                frame.pts, frame.time_base = times[i], Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def pan(count, step=8, **options) -> list[np.ndarray]:
+    """Pictures of a camera that moves sideways."""
+    large = np.asarray(wall(0, width=WIDTH + step * count, **options))
+    return [np.ascontiguousarray(large[:, step * i : step * i + WIDTH]) for i in range(count)]
