@@ -273,14 +273,16 @@ def test_a_video_of_a_still_scene(tmp_path):
 
 def test_too_few(tmp_path):
     root = write_photos(tmp_path / "p", 2)
-    with pytest.raises(UserError, match="only 2 pictures are left.* at least 3, better 20"):
+    with pytest.raises(UserError, match="only 2 usable pictures, .* at least 3, better 20"):
         gathered(root, tmp_path / "out")
     (root / "broken.jpg").write_text("no photo")
     with pytest.raises(UserError, match=r"only 2 .*; .*broken.jpg cannot be decoded \(not an"):
         gathered(root, tmp_path / "out2")
     for name in ("0.jpg", "1.jpg"):
         (root / name).write_text("no photo")
-    with pytest.raises(UserError, match=r"all 3 pictures, .*0.jpg first, cannot be decoded"):
+    with pytest.raises(
+        UserError, match=r"no usable picture: all 3 pictures, .*0.jpg first, cannot be decoded"
+    ):
         gathered(root, tmp_path / "out3")
 
 

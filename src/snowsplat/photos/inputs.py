@@ -204,7 +204,7 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
         left_out = "".join(f"; {source} {why}" for source, why in skipped[:3])
         left_out += f"; and {len(skipped) - 3} more" if len(skipped) > 3 else ""
         return UserError(
-            f"{_count(usable)} to be used, but poses need at least {_FEWEST}, better 20 or more "
+            f"{_count(usable)}, but poses need at least {_FEWEST}, better 20 or more "
             f"from different places around the scene{left_out}"
         )
     if reason == SAME_VIEW:
@@ -222,12 +222,12 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
             "still for each photo, in good light and in focus"
         )
     return UserError(
-        f"{_count(usable)} to be used: {who}, {skipped[0][0]} first, {reason}; poses need at least "
+        f"{_count(usable)}: {who}, {skipped[0][0]} first, {reason}; poses need at least "
         f"{_FEWEST}, better 20 or more"
     )
 
 
 def _count(usable: int) -> str:
-    return {0: "no picture is left", 1: "only 1 picture is left"}.get(
-        usable, f"only {usable} pictures are left"
+    return {0: "no usable picture", 1: "only 1 usable picture"}.get(
+        usable, f"only {usable} usable pictures"
     )
