@@ -64,7 +64,7 @@ def read_clip(path: Path) -> Clip:
                 for packet in container.demux(stream):
                     stamp = packet.pts if packet.pts is not None else packet.dts
                     if packet.size:
-                        known = stamp is not None and packet.time_base is not None
+                        known = stamp is not None and bool(packet.time_base)
                         times.append(float(stamp * packet.time_base) if known else -1.0)
         with open_video(path) as container:
             first = next(decoded_frames(container), None)
