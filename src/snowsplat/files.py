@@ -3,10 +3,13 @@
 import contextlib
 import json
 import os
+import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
+
+_TEMPORARY = re.compile(r"\.(.+)\.[a-z0-9_]{8}\.tmp")
 
 
 def _default_mode() -> int:
@@ -40,6 +43,14 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
         raise
     _sync_folder(path.parent)
+
+
+def remove_temporaries(folder: Path, names: Collection[str]) -> None:
+    """Remove from ``folder`` what a kill has left of `atomic_path` for files of these names."""
+    for path in folder.glob(".*.tmp"):
+        match = _TEMPORARY.fullmatch(path.name)
+        if match and match[1] in names:
+            path.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -14,6 +14,7 @@ from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.making import CAPTURE, STAGES, Making, TrainingStopped
 from snowsplat.cli.presets import FRAMES_OF_A_VIDEO, Quality, quality_within
 from snowsplat.errors import UserError
+from snowsplat.files import remove_temporaries
 
 if TYPE_CHECKING:
     from snowsplat.photos.stages import Stages
@@ -128,5 +129,7 @@ def _check_free(out: Path) -> None:
     """Raises: UserError: ``out`` is a file, or holds something else."""
     if out.exists() and not out.is_dir():
         raise UserError(f"{out}: is a file; name a folder for the output")
+    if out.is_dir():
+        remove_temporaries(out, (RECORD,))
     if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
         raise UserError(f"{out}: holds other files; name a new or an empty folder")

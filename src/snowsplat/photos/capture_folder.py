@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from snowsplat.errors import UserError
+from snowsplat.files import remove_temporaries
 from snowsplat.photos.inputs import GatherOptions, find_inputs, gather
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.sfm import SfmOptions, describe_model, estimate_poses
@@ -228,6 +229,7 @@ def _check_free(
         return
     if not folder.is_dir():
         raise UserError(f"{folder}: is a file; name a folder for the capture")
+    remove_temporaries(folder, (RECORD, REPORT))
     record = folder / RECORD
     if record.is_file():
         before = Stages(record, STAGES).about.get("inputs")

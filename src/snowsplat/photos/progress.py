@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Report(Protocol):
-    """Called now and then with how much is ``done`` of ``total`` (0: not known) and what that is."""
+    """Called now and then: ``done`` of ``total`` (0: not known) of ``what`` are finished."""
 
     def __call__(self, done: int, total: int, what: str = "") -> None: ...
 
