@@ -31,7 +31,7 @@ def test_python_example_runs(tmp_path, monkeypatch, capsys):
 def commands() -> list[str]:
     shown = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
     lines = [line for block in shown for line in block.splitlines()]
-    lines += re.findall(r"`(snowsplat (?:train|render|evaluate) [^`]+)`", README)
+    lines += re.findall(r"`(snowsplat (?:capture|make|train|render|evaluate) [^`]+)`", README)
     return lines
 
 
@@ -43,8 +43,9 @@ def test_command_is_understood(command):
 
 
 def test_flags_named_exist(capsys):
-    with pytest.raises(SystemExit):
-        cli._parse(["train", "--help"])
+    for verb in cli.VERBS:
+        with pytest.raises(SystemExit):
+            cli._parse([verb, "--help"])
     known = capsys.readouterr().out
     for flag in set(re.findall(r"`(-[-a-zA-Z_]+)", README)):
         assert flag.replace("_", "-") in known, flag
