@@ -134,7 +134,7 @@ def _check_model(where: str, values: _Json) -> None:
         kind = model if model not in _PINHOLE_MODELS else "fisheye"
         raise UserError(
             f"{where}: its camera model is {kind[:40]}, but Gaussians need pinhole cameras; "
-            "undistort the images first, e.g. with colmap image_undistorter"
+            "make a capture of the photos anew: snowsplat capture PHOTOS -o CAPTURE"
         )
 
 
@@ -188,8 +188,8 @@ def _camera(where: str, values: _Json, image: Path) -> Camera:
     if any(distortion.values()):
         shown = ", ".join(f"{key} = {value:g}" for key, value in distortion.items() if value)
         raise UserError(
-            f"{where}: the lens is distorted ({shown}), and Gaussians are drawn without; undistort "
-            "the images first, e.g. with colmap image_undistorter"
+            f"{where}: the lens is distorted ({shown}), and Gaussians are drawn without; "
+            "make a capture of the photos anew: snowsplat capture PHOTOS -o CAPTURE"
         )
     width, height = _number(where, values, "w"), _number(where, values, "h")
     if width is None or height is None:

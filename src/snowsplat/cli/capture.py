@@ -37,7 +37,7 @@ class Capture:
     on with the same command.
     """
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT")] = ()
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
     """Folders of photos (JPEG, PNG, WebP, TIFF, HEIC), photos, and videos."""
     output: Annotated[Path | None, flag("CAPTURE", "-o")] = None
     """Folder for the capture; made if it is not there."""

@@ -37,7 +37,7 @@ class Make:
     on with the same command; what is finished is not done again, unless photos or settings changed.
     """
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT")] = ()
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
     """Folders of photos (JPEG, PNG, WebP, TIFF, HEIC), photos, and videos."""
     output: Annotated[Path | None, flag("OUT", "-o", default="INPUT_scene, here")] = None
     """Folder for all that is made."""
