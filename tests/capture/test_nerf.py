@@ -82,10 +82,10 @@ def test_a_frame_overrides_the_file(scene):
 @pytest.mark.parametrize(
     ("common", "message"),
     [
-        ({"fl_x": 50, "k1": 0.1}, r"distorted \(k1 = 0.1\).*undistort"),
-        ({"fl_x": 50, "p2": -0.001}, "distorted.*undistort"),
-        ({"fl_x": 50, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE.*undistort"),
-        ({"fl_x": 50, "is_fisheye": True}, "fisheye.*undistort"),
+        ({"fl_x": 50, "k1": 0.1}, r"distorted \(k1 = 0.1\).*snowsplat capture"),
+        ({"fl_x": 50, "p2": -0.001}, "distorted.*snowsplat capture"),
+        ({"fl_x": 50, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE.*snowsplat capture"),
+        ({"fl_x": 50, "is_fisheye": True}, "fisheye.*snowsplat capture"),
         ({}, "no focal length"),
         ({"fl_x": "wide"}, "fl_x should be a number"),
         ({"fl_x": 0}, "focal lengths of 0"),
