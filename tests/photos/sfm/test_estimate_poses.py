@@ -16,6 +16,7 @@ from snowsplat.errors import UserError
 from snowsplat.geometry import similarity_from_points
 from snowsplat.photos.progress import silent
 from snowsplat.photos.sfm import SfmOptions, SfmResult, describe_model, estimate_poses
+from snowsplat.photos.sfm.options import CAMERA_MODELS
 
 from . import scenes
 
@@ -127,6 +128,20 @@ def test_camera_model_and_focal_length_are_as_given(tmp_path, pictures, camera_m
     options = dataclasses.replace(DRAFT, camera_model=camera_model, threads=1)
     (camera,) = estimate_poses(tmp_path, photos, options, silent).cameras
     assert (camera["model"], camera["focal_from"]) == (camera_model, "exif")
+
+
+def test_unknown_camera_model(tmp_path, pictures):
+    photos = scenes.write(tmp_path, pictures[:3])
+    options = dataclasses.replace(DRAFT, camera_model="OPENVC")
+    with pytest.raises(UserError, match="'OPENVC': no such camera model; there are auto, .*OPENCV"):
+        estimate_poses(tmp_path, photos, options, silent)
+
+
+@pytest.mark.parametrize("camera_model", CAMERA_MODELS)
+def test_camera_models_are_known_to_colmap(camera_model):
+    camera = pycolmap.Camera.create_from_model_name(1, camera_model, 500.0, 640, 480)
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    assert pinhole.model_name == "PINHOLE"
 
 
 def test_global_mapper(tmp_path, pictures):

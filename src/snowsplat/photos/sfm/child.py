@@ -19,7 +19,7 @@ from typing import Any
 from snowsplat.errors import UserError
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.progress import Report
-from snowsplat.photos.sfm.options import SfmOptions, SfmResult, thread_count
+from snowsplat.photos.sfm.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
 
 _MODULE = "snowsplat.photos.sfm.worker"
 _POLL_SECONDS = 0.5
@@ -50,15 +50,21 @@ def estimate_poses(
     Writes ``distorted/sparse/N`` (0 has most photos), in the photos' own cameras, at an arbitrary
     scale and orientation, and ``distorted/database.db``; ``distorted/colmap.log`` is what COLMAP
     said. Features and matches of an interrupted run are used again. The same photos and settings
-    give the same pairs and matches; poses then differ by rounding alone.
+    give the same pairs and matches, and the same poses but for rounding; of more than 150 photos,
+    also but for the frame.
 
     Raises:
-        UserError: fewer than 3 photos, no poses to be found (the message says why), or COLMAP
-            crashed twice.
+        UserError: fewer than 3 photos, no such camera model, no poses to be found (the message
+            says why), or COLMAP crashed twice.
     """
     if len(photos) < 3:
         raise UserError(
             f"{len(photos)} photos are too few to see depth; take at least 3, better 30 or more"
+        )
+    if options.camera_model not in ("auto", *CAMERA_MODELS):
+        raise UserError(
+            f"{options.camera_model!r}: no such camera model; there are auto, "
+            + ", ".join(CAMERA_MODELS)
         )
     distorted = capture.absolute() / "distorted"
     distorted.mkdir(parents=True, exist_ok=True)

@@ -20,6 +20,9 @@ MIN_POINTS = 15
 MIN_PHOTOS = 3
 # Pixels at which features were looked for: an observation further off is left out at the end.
 _KEPT_ERROR = 3.0
+# COLMAP's threads race for the pair to begin with, and so for the frame and a little of everything.
+# With fewer photos than this they save nothing: one thread, and always the same poses.
+_MANY_PHOTOS = 150
 _MIN_ANGLE = 1.5  # degrees between the rays of a point
 
 
@@ -50,14 +53,17 @@ class Mapping:
         Photos of the others are among them: what was apart may come together.
         """
         grown = self._map_incrementally(self._options(relaxed=True), start=models[0])
-        refined = [self._refine(model) for model in grown]
-        if not refined or refined[0].num_reg_images() <= models[0].num_reg_images():
+        if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():
             return models
-        return _usable([refined[0], *models[1:]])
+        refined = self._refine(grown[0])
+        if refined.num_reg_images() <= models[0].num_reg_images():
+            return models
+        return _usable([refined, *models[1:]])
 
     def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = self.threads
+        many = count_rows(self.database, "images") > _MANY_PHOTOS
+        options.num_threads = self.threads if many else 1
         options.random_seed = SEED
         options.min_model_size = MIN_PHOTOS
         mapper, triangulation = options.mapper, options.triangulation

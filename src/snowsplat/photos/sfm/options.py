@@ -10,12 +10,27 @@ from typing import Any, Literal
 Mapper = Literal["incremental", "global"]
 EffortName = Literal["draft", "normal", "best"]
 
+# Those of COLMAP's that can be undistorted to a pinhole camera.
+CAMERA_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "FOV",
+    "OPENCV_FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+)
+
 
 @dataclass(frozen=True)
 class SfmOptions:
     """How poses are found."""
 
-    # One of COLMAP's, or "auto": OPENCV where enough photos share a camera to fix its eight
+    # One of `CAMERA_MODELS`, or "auto": OPENCV where enough photos share a camera to fix its eight
     # numbers, else SIMPLE_RADIAL.
     camera_model: str = "auto"
     mapper: Mapper = "incremental"

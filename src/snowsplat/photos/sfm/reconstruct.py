@@ -13,6 +13,7 @@ The one with most photos placed is kept.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,6 +86,7 @@ class Reconstruction:
         Raises:
             UserError: no camera positions were found.
         """
+        shutil.rmtree(self.folders.sparse, ignore_errors=True)
         first, second = self.folders.database, self.folders.distorted / "database_strong.db"
         mapper = self.options.mapper
         matched = self._match(first, effort, effort)
