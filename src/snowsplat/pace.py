@@ -31,7 +31,7 @@ _TRUST = 0.3
 _OUTLIER = 5.0
 # How long measurements are remembered, as a part of the time given and at least; and the seconds
 # between two looks at them.
-_MEMORY, _SHORTEST_MEMORY = 0.1, 2.0
+_MEMORY, _SHORTEST_MEMORY = 0.2, 3.0
 _BETWEEN = 0.1
 # So many parts of the steps left are reckoned one by one.
 _PARTS = 40

@@ -18,7 +18,10 @@ from snowsplat.schedule import Schedule
 from snowsplat.trainer import Trainer
 
 # As many steps as the largest photos are worth: so many, and so many looks at each photo.
-_STEPS, _LOOKS = 1500, 10
+_STEPS, _LOOKS = 1000, 10
+# Where there are few steps, Gaussians are added more often: so many times in each half, but with so
+# many steps between.
+_DENSIFICATIONS, _FEWEST_BETWEEN = 15, 25
 # The longer side of photos, in pixels.
 _SMALLEST, _LARGEST = 400, 1600
 # Where there is time for so many steps with the recipe's cap, it may rise, so far.
@@ -65,6 +68,7 @@ def make_plan(
     *,
     resize: bool = True,
     more_gaussians: bool = True,
+    more_often: bool = True,
 ) -> Plan:
     """The best training of ``capture`` (at full resolution) that fits into ``seconds``.
 
@@ -73,6 +77,7 @@ def make_plan(
         slowness: from `measure_slowness`.
         resize: choose the size of the photos, or leave it.
         more_gaussians: whether the cap may rise.
+        more_often: whether a short training may densify more often.
     """
     camera = max((view.camera for view in capture.train), key=lambda c: c.width * c.height)
     longer = max(camera.width, camera.height)
@@ -86,6 +91,10 @@ def make_plan(
         start = config.initial_points if capture.points is None else len(capture.points)
         start = min(start, sized.density.max_gaussians or start)
         steps, mean = _steps(work, seconds - _SETTING_UP, slowness, start)
+        if more_often:
+            sized = _densified_in(sized, steps)
+            work = replace(work, config=sized)
+            steps, mean = _steps(work, seconds - _SETTING_UP, slowness, start)
         resolution = None if width == camera.width else width
         return Plan(resolution, width, height, replace(sized, iterations=steps), slowness, mean)
 
@@ -136,6 +145,17 @@ def _capped(config: TrainConfig, pixels: int, rise: float) -> TrainConfig:
     if rise > 1.0 and cap:
         config = replace(config, density=changed(config, max_gaussians=round(rise * cap)).density)
     return config.capped(pixels)
+
+
+def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:
+    interval = max(_FEWEST_BETWEEN, steps // (2 * _DENSIFICATIONS))
+    density = config.density
+    begin = density.densify_from
+    return changed(
+        config,
+        densify_interval=min(density.densify_interval, interval),
+        densify_from=begin if isinstance(begin, float) else min(begin, interval),
+    )
 
 
 def _steps(work: Work, seconds: float, slowness: float, gaussians: int) -> tuple[int, float]:

@@ -23,7 +23,7 @@ CAPTURE, SCENE = "capture", "scene"
 STAGES = ("scene", "pictures")  # the capture keeps its own record
 HOLD_OUT = 8
 # What of a preset is about the training.
-_OF_TRAINING = ("side", "iterations", "max_gaussians")
+_OF_TRAINING = ("side", "iterations", "max_gaussians", "densify_interval")
 # What a kill may cost.
 _CHECKPOINT_SECONDS = 15.0
 # The shortest training that is worth it: seconds, and as a part of the time given.
@@ -172,6 +172,7 @@ class Making:
         if self.minutes is None:
             preset = PRESETS[self.quality]
             train.iterations, train.max_gaussians = preset.iterations, preset.max_gaussians
+            train.densify_interval = preset.densify_interval
             train.resolution = _width(capture, preset)
         else:
             train.minutes = self._minutes_left(capture)

@@ -21,7 +21,8 @@ class Preset:
         photos: size to which photos are reduced when they are read.
         side: size at which they are trained on.
         iterations: steps of the training.
-        max_gaussians: its cap; None is that of the recipe.
+        max_gaussians, densify_interval: its cap, and the steps between two densifications; None
+            is that of the recipe.
         photo_seconds, pair_seconds: to find the cameras, on two cores: what each photo takes, and
             each pair of photos that is compared.
         pairs: with how many others a photo is compared, at most.
@@ -31,6 +32,7 @@ class Preset:
     side: int
     iterations: int
     max_gaussians: int | None
+    densify_interval: int | None
     photo_seconds: float
     pair_seconds: float
     pairs: int
@@ -43,9 +45,9 @@ class Preset:
 
 
 PRESETS: dict[Quality, Preset] = {
-    "draft": Preset(1600, 640, 1500, 60_000, 0.5, 0.012, 20),
-    "normal": Preset(2400, 1000, 3000, None, 1.3, 0.04, 35),
-    "best": Preset(3200, 1600, 10_000, 250_000, 4.0, 0.15, 60),
+    "draft": Preset(1600, 640, 1500, 60_000, 50, 0.35, 0.005, 20),
+    "normal": Preset(2400, 1000, 3000, None, None, 0.8, 0.06, 35),
+    "best": Preset(3200, 1600, 10_000, 250_000, None, 2.5, 0.24, 60),
 }
 
 

@@ -61,16 +61,12 @@ class TimeBudget:
         """For a checkpoint."""
         return {"seconds": self.seconds, "spent": self.seconds - self.left}
 
-    def plan(
-        self, capture: Capture, config: TrainConfig, *, resize: bool, more_gaussians: bool
-    ) -> Plan:
-        """What to train, for a capture that was read at full resolution."""
+    def plan(self, capture: Capture, config: TrainConfig, **may: bool) -> Plan:
+        """What to train. ``capture`` is at full resolution; ``may``: see `make_plan`."""
         from snowsplat.plan import make_plan, measure_slowness
 
         slowness = measure_slowness(capture, config)
-        return make_plan(
-            *(capture, config, self.left, slowness), resize=resize, more_gaussians=more_gaussians
-        )
+        return make_plan(capture, config, self.left, slowness, **may)
 
     def described(self, plan: Plan) -> str:
         """The plan in one line."""

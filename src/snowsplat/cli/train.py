@@ -195,6 +195,7 @@ class Train:
                 *(capture, config),
                 resize=self.resolution is None,
                 more_gaussians=self.max_gaussians is None,
+                more_often=self.densify_interval is None and self.densify_from is None,
             )
             config, slowness = plan.config, plan.slowness
             if plan.resolution is not None:

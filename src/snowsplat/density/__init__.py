@@ -62,6 +62,11 @@ class DensityConfig(Protocol):
         ...
 
     @property
+    def densify_from(self) -> When:
+        """The first moment that may add Gaussians."""
+        ...
+
+    @property
     def densify_until(self) -> When:
         """The last moment that may add Gaussians."""
         ...
