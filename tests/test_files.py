@@ -10,11 +10,16 @@ import pytest
 from snowsplat.files import atomic_path, remove_temporaries, write_json, write_text
 
 
+def interrupted_write(path):
+    with atomic_path(path) as temporary:
+        temporary.write_text("a par")
+        raise KeyboardInterrupt(temporary.name)
+
+
 def test_a_failure_leaves_the_old_file_and_nothing_beside_it(tmp_path):
     write_text(tmp_path / "a.txt", "old")
-    with pytest.raises(KeyboardInterrupt), atomic_path(tmp_path / "a.txt") as temporary:
-        temporary.write_text("new")
-        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_write(tmp_path / "a.txt")
     assert (tmp_path / "a.txt").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
@@ -34,11 +39,10 @@ def test_json_knows_no_infinity(tmp_path):
 
 
 def test_what_a_kill_left_is_removed_and_nothing_else(tmp_path):
-    with pytest.raises(RuntimeError), atomic_path(tmp_path / "job.json") as temporary:
-        left = temporary.with_name(temporary.name)
-        content = left.read_bytes()
-        raise RuntimeError
-    left.write_bytes(content)  # as if the process had been killed before it could remove it
+    with pytest.raises(KeyboardInterrupt) as caught:
+        interrupted_write(tmp_path / "job.json")
+    # As if the process had been killed before it could remove it.
+    (tmp_path / str(caught.value)).write_text("a par")
     for name in (".other.json.abcdefgh.tmp", ".job.json.tmp", "job.json"):
         (tmp_path / name).write_text("")
     remove_temporaries(tmp_path, ["job.json"])

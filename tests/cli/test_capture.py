@@ -1,5 +1,6 @@
 """`snowsplat capture`: what stands in the folder, what is done again, what failures leave."""
 
+import errno
 import json
 import os
 import shutil
@@ -149,6 +150,22 @@ def test_a_failure_leaves_nothing(refused, photos, tmp_path):
     refused("capture", photos, "-o", tmp_path / "x", "--skip-matching")
     refused("capture", photos, "-o", tmp_path / "x", "--fps", 1, "--frames", 20)
     assert sorted(path.name for path in tmp_path.iterdir()) in (["new", "two"], ["two"])
+
+
+def test_a_full_disk_loses_nothing_that_is_finished(captured, photos, run, tmp_path, monkeypatch):
+    out = tmp_path / "garden"
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("snowsplat.photos.undistort.undistort", full)
+    result = run("capture", photos, "-o", out, *QUICK)
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert "the disk is full; make room, then give the same command again" in result.err
+    monkeypatch.undo()
+    result = run("capture", photos, "-o", out, *QUICK)
+    assert result.code == 0
+    assert result.out.count("done before") == 2
 
 
 @pytest.mark.parametrize("stage", ["photos", "poses", "images"])

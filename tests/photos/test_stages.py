@@ -17,15 +17,16 @@ class _Job:
     def run(self, first="a", second="b"):
         stages = Stages(self.folder / "job.json", ["one", "two"])
         self.done.clear(), self.reasons.clear()
-        outcomes = [
-            stages.run(name, {"word": word}, [out], lambda n=name, w=word, o=out: self._work(n, w, o),
-                       self.reasons.append)
-            for name, word, out in (
-                ("one", first, self.folder / "one.txt"),
-                ("two", second, self.folder / "two"),
-            )
-        ]  # fmt: skip
-        return outcomes
+        return [
+            self._stage(stages, "one", first, self.folder / "one.txt"),
+            self._stage(stages, "two", second, self.folder / "two"),
+        ]
+
+    def _stage(self, stages, name, word, out):
+        def work():
+            return self._work(name, word, out)
+
+        return stages.run(name, {"word": word}, [out], work, self.reasons.append)
 
     def _work(self, name, word, out):
         self.done.append(name)

@@ -14,6 +14,7 @@ where it was, see `stages`.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import shutil
@@ -89,9 +90,9 @@ def make_capture(
         `Undistorted`, as JSON values; "report" names the file.
 
     Raises:
-        UserError: unusable photos, a folder that is taken, poses that cannot be found. What this
-            run began is removed.
-        OSError: the disk is full, a file cannot be read.
+        UserError: unusable photos, a folder that is taken, poses that cannot be found: then what
+            this run began is removed; or the disk is full.
+        OSError: a file cannot be read or written.
     """
     sources = find_inputs(inputs)
     in_place = any(path.resolve() == (folder / "input").resolve() for path in inputs)
@@ -252,9 +253,10 @@ def _check_free(
 
 @contextmanager
 def _nothing_half_made(folder: Path) -> Iterator[None]:
-    """Take back what was begun in a new folder when it comes to nothing.
+    """Take back what was begun in a new folder when the input is of no use.
 
-    After Ctrl-C the stages that are finished stay: the same command goes on.
+    After Ctrl-C, or where the disk is full, the stages that are finished stay: the same command
+    goes on.
     """
     existed = folder.exists()
     there = {entry.name for entry in folder.iterdir()} if existed else set()
@@ -263,11 +265,15 @@ def _nothing_half_made(folder: Path) -> Iterator[None]:
     except BaseException as error:
         record = folder / RECORD
         worth = record.is_file() and Stages(record, STAGES).is_finished("photos")
-        if RECORD not in there and not (worth and isinstance(error, KeyboardInterrupt)):
+        if RECORD not in there and (isinstance(error, UserError) or not worth):
             for name in {"input", ".new", *_OURS} - there:
                 _remove(folder / name)
             if not existed and folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise UserError(
+                f"{folder}: the disk is full; make room, then give the same command again"
+            ) from None
         raise
 
 

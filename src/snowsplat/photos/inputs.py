@@ -92,8 +92,7 @@ def gather(
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
-                f"{shown(capture)}: the disk is full; make room, or take smaller pictures with "
-                "--size 1600"
+                "the disk is full; make room, or take smaller pictures with --size 1600"
             ) from None
         raise
     for mask in found.unused_masks:
@@ -189,8 +188,8 @@ def _check_room(
     free = shutil.disk_usage(capture).free
     if needed > free:
         raise UserError(
-            f"{shown(capture)}: the photos need about {needed / 1e9:.1f} GB and the disk has "
-            f"{free / 1e9:.1f} GB left; make room, or take smaller pictures with --size 1600"
+            f"the photos need about {needed / 1e6:,.0f} MB and the disk has {free / 1e6:,.0f} MB "
+            "left; make room, or take smaller pictures with --size 1600"
         )
 
 

@@ -1,7 +1,9 @@
 """The child process: it ends with its parent, and its death is told or mended."""
 
+import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -161,11 +163,21 @@ def test_child_finds_its_modules_from_any_folder(tmp_path, photos, monkeypatch):
 
 
 def test_what_goes_wrong_in_the_child_is_in_the_log(tmp_path, photos):
-    """A capture whose photos are gone: no answer, twice; one line that names the log."""
+    """A capture whose photos are gone: no answer, twice; one line with what it said last."""
     for path in (tmp_path / "input").iterdir():
         path.unlink()
     with pytest.raises(
-        UserError, match=r"failed twice: it ended with status 1; report it \(.*colmap.log"
+        UserError, match=r"failed twice: it ended with status 1; report it \(.*FileNotFoundError"
     ):
         estimate_poses(tmp_path, photos, DRAFT, silent)
     assert "FileNotFoundError" in (tmp_path / "distorted" / "colmap.log").read_text()
+
+
+def test_a_full_disk_is_told_as_such(tmp_path, photos, monkeypatch):
+    for path in (tmp_path / "input").iterdir():
+        path.unlink()  # so that the child fails
+    full = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        estimate_poses(tmp_path, photos, DRAFT, silent)
+    assert caught.value.errno == errno.ENOSPC

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import json
 import os
 import queue
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -21,6 +23,8 @@ from snowsplat.photos.photo import Photo
 from snowsplat.photos.progress import Report
 from snowsplat.photos.sfm.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
 
+# A database that grows needs so many bytes for its next step.
+_ROOM = 8_000_000
 _MODULE = "snowsplat.photos.sfm.worker"
 _POLL_SECONDS = 0.5
 
@@ -56,6 +60,7 @@ def estimate_poses(
     Raises:
         UserError: fewer than 3 photos, no such camera model, no poses to be found (the message
             says why), or COLMAP crashed twice.
+        OSError: the disk is full.
     """
     if len(photos) < 3:
         raise UserError(
@@ -80,18 +85,31 @@ def estimate_poses(
         return _run({**job, "gentle": False}, log, threads, report)
     except Crashed as crash:
         first = crash
+        _check_disk(distorted)
     try:
         result = _run({**job, "gentle": True}, log, 1, report)
     except Crashed as crash:
+        _check_disk(distorted)
         advice = "report it"
         if crash.code < 0:
             advice = "use fewer or smaller photos, or a lower quality"
         raise UserError(
             f"finding the camera positions failed twice: {crash.how}; {advice} "
-            f"({log} has the details)"
+            f"(its last words: {_last_line(log)})"
         ) from None
     note = f"as asked: {first.how}; what follows was done with smaller photos and one thread"
     return dataclasses.replace(result, attempts=[note, *result.attempts])
+
+
+def _check_disk(folder: Path) -> None:
+    """Raises: OSError: the disk is full, which is why the child has ended."""
+    if shutil.disk_usage(folder).free < _ROOM:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+    return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "none")
 
 
 def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmResult:
