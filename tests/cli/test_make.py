@@ -205,8 +205,10 @@ def test_two_photos_leave_nothing(refused, capture, tmp_path):
 
 
 def test_the_effort_that_a_time_allows():
-    assert [quality_within(seconds, 50, 2) for seconds in (30, 60, 300, 3600)] == [
+    assert [quality_within(seconds, 50, 0, 2) for seconds in (30, 60, 300, 3600)] == [
         *("draft", "draft", "normal", "best"),
     ]
-    assert quality_within(300, 50, 16) == "best"
-    assert quality_within(300, 1000, 2) == "draft"
+    assert quality_within(300, 50, 0, 16) == "best"
+    assert quality_within(300, 1000, 0, 2) == "draft"
+    assert quality_within(120, 0, 1, 2) == "draft"
+    assert quality_within(240, 0, 1, 2) == "normal"

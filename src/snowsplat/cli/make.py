@@ -12,7 +12,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.making import CAPTURE, STAGES, Making, TrainingStopped
-from snowsplat.cli.presets import FRAMES_OF_A_VIDEO, Quality, quality_within
+from snowsplat.cli.presets import Quality, quality_within
 from snowsplat.errors import UserError
 from snowsplat.files import remove_temporaries
 
@@ -69,12 +69,11 @@ class Make:
         from snowsplat.photos.stages import Stages
 
         kinds = [source.kind for source in find_sources(self.inputs).sources]
-        photos = kinds.count("photo") + FRAMES_OF_A_VIDEO * kinds.count("video")
         existed = out.exists()
         out.mkdir(parents=True, exist_ok=True)
         stages = Stages(out / RECORD, STAGES)
         try:
-            quality = self._quality(stages, photos)
+            quality = self._quality(stages, kinds.count("photo"), kinds.count("video"))
             stages.save()  # from here on the folder is known to be ours
             return Making(
                 *(self.inputs, name, out, quality, stages, self._command()),
@@ -102,17 +101,17 @@ class Make:
         name = (first.stem if first.is_file() else first.resolve().name) or "scene"
         return name, self.output or Path(f"{name}_scene")
 
-    def _quality(self, stages: Stages, photos: int) -> Quality:
+    def _quality(self, stages: Stages, photos: int, videos: int) -> Quality:
         """As asked for, or what the time allows; decided once, as cameras depend on it."""
         if self.quality is not None or self.minutes is None:
             return self.quality or "normal"
         from snowsplat import ops
 
-        about = {"minutes": self.minutes, "photos": photos}
+        about = {"minutes": self.minutes, "photos": photos, "videos": videos}
         before = stages.about.get("effort", {})
         if {word: before.get(word) for word in about} != about:
             threads = self.threads or ops.get_num_threads()
-            quality = quality_within(60.0 * self.minutes, photos, threads)
+            quality = quality_within(60.0 * self.minutes, photos, videos, threads)
             stages.about["effort"] = about | {"quality": quality}
         chosen: Quality = stages.about["effort"]["quality"]
         return chosen

@@ -7,10 +7,10 @@ from typing import Literal
 
 Quality = Literal["draft", "normal", "best"]
 
-#: Frames that a video counts for, before it has been looked at.
-FRAMES_OF_A_VIDEO = 100
-#: The part of a time that finding the cameras may take.
-SHARE_OF_CAMERAS = 0.5
+# Frames that a video counts for, before it has been looked at; a frame is compared with few others.
+_FRAMES_OF_A_VIDEO, _PAIRS_OF_A_FRAME = 80, 12
+# The part of a time that finding the cameras may take.
+_SHARE_OF_CAMERAS = 0.4
 
 
 @dataclass(frozen=True)
@@ -37,24 +37,26 @@ class Preset:
     pair_seconds: float
     pairs: int
 
-    def camera_seconds(self, photos: int, threads: int) -> float:
-        """About how long it takes to find the cameras of so many photos."""
-        compared = photos * min((photos - 1) / 2, self.pairs)
-        seconds = self.photo_seconds * photos + self.pair_seconds * compared
+    def camera_seconds(self, photos: int, videos: int, threads: int) -> float:
+        """About how long it takes to find the cameras of so many photos and videos."""
+        frames = _FRAMES_OF_A_VIDEO * videos
+        compared = photos * min((photos - 1) / 2, self.pairs) + frames * _PAIRS_OF_A_FRAME
+        seconds = self.photo_seconds * (photos + frames) + self.pair_seconds * compared
         return seconds * 2 / threads
 
 
 PRESETS: dict[Quality, Preset] = {
-    "draft": Preset(1600, 640, 1500, 60_000, 50, 0.35, 0.005, 20),
-    "normal": Preset(2400, 1000, 3000, None, None, 0.8, 0.06, 35),
-    "best": Preset(3200, 1600, 10_000, 250_000, None, 2.5, 0.24, 60),
+    "draft": Preset(1600, 640, 1500, 60_000, 50, 0.25, 0.004, 20),
+    "normal": Preset(2400, 1000, 3000, None, None, 0.6, 0.035, 35),
+    "best": Preset(3200, 1600, 10_000, 250_000, None, 2.0, 0.15, 60),
 }
 
 
-def quality_within(seconds: float, photos: int, threads: int) -> Quality:
+def quality_within(seconds: float, photos: int, videos: int, threads: int) -> Quality:
     """The best effort to find the cameras that leaves enough of the time for the training."""
     choices: tuple[Quality, ...] = ("best", "normal")
     for quality in choices:
-        if PRESETS[quality].camera_seconds(photos, threads) <= SHARE_OF_CAMERAS * seconds:
+        needed = PRESETS[quality].camera_seconds(photos, videos, threads)
+        if needed <= _SHARE_OF_CAMERAS * seconds:
             return quality
     return "draft"
