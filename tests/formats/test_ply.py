@@ -274,6 +274,7 @@ def test_not_there_and_not_a_file(tmp_path):
     assert "cannot be read" in one_line(tmp_path / "absent.ply")
     (tmp_path / "folder.ply").mkdir()
     assert "cannot be read" in one_line(tmp_path / "folder.ply")
+    (tmp_path / "scene.obj").write_bytes(b"v 0 0 0")
     with pytest.raises(UserError, match=r"\.ply"):
         read_gaussians(tmp_path / "scene.obj")
 

@@ -1,41 +1,120 @@
-"""Scene files: one module a format, told apart by their suffix."""
+"""Scene files: one module a format, one row a format in `FORMATS`.
 
+A file is read as what its first bytes say it is, whatever it is called; only formats without a
+signature are told by their names. It is written in the format that its name asks for.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 
 from snowsplat.errors import UserError
 from snowsplat.formats import ply
 from snowsplat.gaussians import Gaussians
 
-__all__ = ["read_gaussians", "write_gaussians"]
+__all__ = [
+    "FORMATS",
+    "Format",
+    "format_for_reading",
+    "format_for_writing",
+    "read_gaussians",
+    "write_gaussians",
+]
 
-_FORMATS = {".ply": ply}
+_HEAD_BYTES = 16_384
+
+
+@dataclass(frozen=True)
+class Format:
+    """What the program knows about one kind of scene file.
+
+    ``suffixes`` are lower case with their dots, as in ".compressed.ply"; the longest that fits a
+    name counts. ``recognises`` is asked about the first 16,384 bytes of a file (fewer where it is
+    shorter); None: the format has no signature. ``read`` and ``write`` are None where we do not.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    recognises: Callable[[bytes], bool] | None
+    read: Callable[[Path], Gaussians] | None
+    write: Callable[[Path, Gaussians], None] | None
+
+
+#: In the order in which `recognises` is asked: a special kind before the general one.
+FORMATS: tuple[Format, ...] = (
+    Format("PLY", (".ply",), ply.is_ply, ply.read_gaussians, ply.write_gaussians),
+)
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """Read a scene file of any format we know.
+    """Read a scene file of any format we know, in the house frame.
 
     Raises:
         UserError: absent, of an unknown kind, damaged, or not a file of Gaussians.
     """
-    return _format_of(Path(path)).read_gaussians(path)
+    path = Path(path)
+    format = format_for_reading(path)
+    if format.read is None:
+        raise UserError(f"{path}: {format.name} files are written here, not read")
+    return format.read(path)
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
-    """Write a scene file in the format its suffix names, atomically.
+    """Write a scene file in the format its name asks for, atomically.
 
     Raises:
-        UserError: a suffix that names no format.
+        UserError: a name that asks for no format that we write.
         OSError: the folder is absent or not writable, or the disk is full.
     """
-    _format_of(Path(path)).write_gaussians(path, gaussians)
+    path = Path(path)
+    write = format_for_writing(path).write
+    assert write is not None
+    write(path, gaussians)
 
 
-def _format_of(path: Path) -> ModuleType:
+def format_for_reading(path: Path | str) -> Format:
+    """The format of a file that is there: by its first bytes, else by its name.
+
+    Raises:
+        UserError: not readable, or nothing that we know.
+    """
+    path = Path(path)
     try:
-        return _FORMATS[path.suffix.lower()]
-    except KeyError:
-        known = ", ".join(_FORMATS)
+        with open(path, "rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+    for format in FORMATS:
+        if format.recognises is not None and format.recognises(head):
+            return format
+    named = _by_name(path, FORMATS)
+    if named is None:
+        known = _suffixes([format for format in FORMATS if format.read is not None])
+        raise UserError(f"{path}: not a scene file I know; I read {known}")
+    return named
+
+
+def format_for_writing(path: Path | str) -> Format:
+    """The format that the name of a file asks for.
+
+    Raises:
+        UserError: none that we write.
+    """
+    path = Path(path)
+    writable = [format for format in FORMATS if format.write is not None]
+    format = _by_name(path, writable)
+    if format is None:
         raise UserError(
-            f"{path}: not a scene file I know; its name should end in {known}"
-        ) from None
+            f"{path}: its name says no format that I write; end it in {_suffixes(writable)}"
+        )
+    return format
+
+
+def _by_name(path: Path, formats: Sequence[Format]) -> Format | None:
+    name = path.name.lower()
+    fitting = [(len(s), f) for f in formats for s in f.suffixes if name.endswith(s)]
+    return max(fitting, key=lambda pair: pair[0])[1] if fitting else None
+
+
+def _suffixes(formats: Sequence[Format]) -> str:
+    return ", ".join(suffix for format in formats for suffix in format.suffixes)

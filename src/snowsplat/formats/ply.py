@@ -32,6 +32,11 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _REQUIRED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 
 
+def is_ply(head: bytes) -> bool:
+    """Whether a file that begins so is a PLY file, of whatever."""
+    return head.startswith((b"ply\n", b"ply\r\n"))
+
+
 def is_scene(table: PlyTable) -> bool:
     """Whether the columns are those of Gaussians (else, at most, of a point cloud)."""
     return all(name in table.columns for name in _REQUIRED)

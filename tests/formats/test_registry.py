@@ -1,0 +1,80 @@
+"""The table of formats: content before name, one line for what it does not know."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.errors import UserError
+from snowsplat.formats import (
+    FORMATS,
+    format_for_reading,
+    format_for_writing,
+    read_gaussians,
+    write_gaussians,
+)
+from snowsplat.gaussians import Gaussians
+
+
+def one() -> Gaussians:
+    return Gaussians(
+        torch.zeros(1, 3),
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.zeros(1),
+        torch.zeros(1, 1, 3),
+        torch.zeros(1, 0, 3),
+    )
+
+
+def test_no_name_belongs_to_two_formats():
+    suffixes = [suffix for format in FORMATS for suffix in format.suffixes]
+    assert len(suffixes) == len(set(suffixes))
+    assert all(s.startswith(".") and s == s.lower() for s in suffixes)
+    assert len({format.name for format in FORMATS}) == len(FORMATS)
+
+
+@pytest.mark.parametrize(
+    "format", [f for f in FORMATS if f.write and f.read], ids=lambda format: format.name
+)
+def test_what_is_written_under_a_name_is_read_as_that_format(tmp_path, format):
+    for suffix in format.suffixes:
+        path = tmp_path / f"A scene{suffix.upper()}"
+        assert format_for_writing(path) is format
+        write_gaussians(path, one())
+        assert format_for_reading(path) is format
+        assert len(read_gaussians(path)) == 1
+
+
+@pytest.mark.parametrize(
+    "format", [f for f in FORMATS if f.write and f.recognises], ids=lambda format: format.name
+)
+def test_the_content_counts_not_the_name(tmp_path, format):
+    path = tmp_path / f"scene{format.suffixes[0]}"
+    write_gaussians(path, one())
+    for other in ("scene", "scene.splat", "scene.ply", "scene.glb.spz"):
+        renamed = tmp_path / other
+        if renamed != path:
+            renamed.write_bytes(path.read_bytes())
+        assert format_for_reading(renamed) is format
+
+
+def test_what_is_not_known_is_told_in_one_line(tmp_path):
+    path = tmp_path / "scene.obj"
+    with pytest.raises(UserError, match=r"cannot be read \(No such file"):
+        read_gaussians(path)
+    path.write_bytes(b"v 1 2 3\n")
+    with pytest.raises(UserError, match=r"not a scene file I know; I read .*\.ply") as error:
+        read_gaussians(path)
+    assert "\n" not in str(error.value)
+    with pytest.raises(UserError, match=r"says no format that I write; end it in .*\.ply"):
+        write_gaussians(path, one())
+    with pytest.raises(UserError, match="cannot be read"):
+        read_gaussians(tmp_path)
+
+
+def test_names_alone_never_raise_on_folders_with_dots(tmp_path):
+    folder = tmp_path / "v1.ply"
+    folder.mkdir()
+    with pytest.raises(UserError, match="says no format"):
+        format_for_writing(Path(folder) / "scene")
