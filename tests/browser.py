@@ -1,0 +1,277 @@
+"""A real headless Chromium, driven by the DevTools protocol over a pipe; no package is needed.
+
+    with Browser() as browser:
+        page = browser.open("http://127.0.0.1:8080/")
+        page.wait_for("document.title !== ''")
+        pixels = page.screenshot()
+
+What pages write to their console, and errors that they do not catch, are in `Page.console`.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import fcntl
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from queue import Empty, Queue
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+_FLAGS = [
+    "--headless=new",
+    "--no-sandbox",  # tests run as root, in containers
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--remote-debugging-pipe",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-dev-shm-usage",  # a container's /dev/shm is small
+    "--force-color-profile=srgb",
+    "--mute-audio",
+]
+
+
+def chromium() -> str | None:
+    """The program: SNOWSPLAT_CHROMIUM, else the first of its usual names on the PATH."""
+    named = os.environ.get("SNOWSPLAT_CHROMIUM")
+    if named:
+        return named
+    names = ("chromium", "chromium-browser", "google-chrome")
+    return next((found for name in names if (found := shutil.which(name))), None)
+
+
+needs_chromium = pytest.mark.skipif(
+    chromium() is None,
+    reason="needs Chromium (apt install chromium), or SNOWSPLAT_CHROMIUM with its path",
+)
+
+
+class BrowserError(Exception):
+    """The browser refused a command, a script in a page failed, or nothing came in time."""
+
+
+class Browser:
+    """One process of Chromium with a profile of its own, both gone at the end."""
+
+    def __init__(self, width: int = 640, height: int = 480) -> None:
+        self.width, self.height = width, height
+
+    def __enter__(self) -> Browser:
+        program = chromium()
+        assert program is not None, "ask needs_chromium first"
+        self._profile = tempfile.mkdtemp(prefix="snowsplat-chromium-")
+        to_browser, self._commands = _pipe()
+        self._replies, from_browser = _pipe()
+        # Chromium takes commands at file 3 and writes its answers to file 4.
+        shell = f'exec "$@" 3<&{to_browser} 4>&{from_browser}'
+        flags = [*_FLAGS, f"--window-size={self.width},{self.height}"]
+        command = [program, *flags, f"--user-data-dir={self._profile}", "about:blank"]
+        self._process = subprocess.Popen(
+            ["bash", "-c", shell, "chromium", *command],
+            pass_fds=(to_browser, from_browser),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        os.close(to_browser)
+        os.close(from_browser)
+        self._last = 0
+        self._writing = threading.Lock()
+        self._waiting: dict[int, Queue[dict[str, Any]]] = {}
+        self._pages: dict[str, Page] = {}
+        threading.Thread(target=self._read, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(BrowserError, OSError, subprocess.TimeoutExpired):
+            self.call("Browser.close", timeout=5)
+            self._process.wait(5)
+        # The whole group, renderers and the GPU process too, if that was not enough.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        os.close(self._commands)
+        shutil.rmtree(self._profile, ignore_errors=True)
+
+    def open(self, url: str, timeout: float = 30.0) -> Page:
+        """A new tab of its own size that shows ``url``; waits until its document is loaded."""
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        page = self._pages[session] = Page(self, session, target)
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            page.call(f"{domain}.enable")
+        page.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=self.width,
+            height=self.height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        page.navigate(url, timeout)
+        return page
+
+    def call(
+        self, method: str, session: str | None = None, timeout: float = 60.0, **parameters: Any
+    ) -> dict[str, Any]:
+        """Send one command of the protocol and wait for its result."""
+        answer: Queue[dict[str, Any]] = Queue()
+        with self._writing:
+            self._last += 1
+            message = {"id": self._last, "method": method, "params": parameters}
+            if session:
+                message["sessionId"] = session
+            self._waiting[self._last] = answer
+            data = json.dumps(message).encode() + b"\0"
+            while data:
+                data = data[os.write(self._commands, data) :]
+        try:
+            reply = answer.get(timeout=timeout)
+        except Empty:
+            raise BrowserError(f"{method}: no answer in {timeout:.0f} s") from None
+        if "error" in reply:
+            raise BrowserError(f"{method}: {reply['error'].get('message')}")
+        return reply["result"]
+
+    def _read(self) -> None:
+        with open(self._replies, "rb") as replies:
+            rest = b""
+            while block := replies.read1(1 << 20):
+                *messages, rest = (rest + block).split(b"\0")
+                for message in messages:
+                    self._take(json.loads(message))
+        for answer in list(self._waiting.values()):
+            answer.put({"error": {"message": "the browser has ended"}})
+
+    def _take(self, message: dict[str, Any]) -> None:
+        if "id" in message:
+            answer = self._waiting.pop(message["id"], None)
+            if answer is not None:
+                answer.put(message)
+        elif (page := self._pages.get(message.get("sessionId", ""))) is not None:
+            page._event(message["method"], message["params"])
+
+
+class Page:
+    """A tab.
+
+    Attributes:
+        console: lines of the console, "error: …" among them, uncaught errors, failed requests.
+        requests: the addresses that the page asked for.
+    """
+
+    def __init__(self, browser: Browser, session: str, target: str) -> None:
+        self._browser, self._session, self._target = browser, session, target
+        self.console: deque[str] = deque(maxlen=1000)
+        self.requests: deque[str] = deque(maxlen=1000)
+        self._loaded = threading.Event()
+
+    @property
+    def errors(self) -> list[str]:
+        """The lines of the console that are errors."""
+        return [line for line in self.console if line.startswith("error: ")]
+
+    def call(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:
+        """One command of the DevTools protocol, to this tab."""
+        return self._browser.call(method, self._session, timeout, **parameters)
+
+    def navigate(self, url: str, timeout: float = 30.0) -> None:
+        """Show another address; waits until its document is loaded."""
+        self._loaded.clear()
+        result = self.call("Page.navigate", url=url)
+        if "errorText" in result:
+            raise BrowserError(f"{url}: {result['errorText']}")
+        if not self._loaded.wait(timeout):
+            raise BrowserError(f"{url}: not loaded in {timeout:.0f} s")
+
+    def evaluate(self, script: str, timeout: float = 60.0) -> Any:
+        """The value of a JavaScript expression; promises are waited for."""
+        result = self.call(
+            "Runtime.evaluate",
+            timeout,
+            expression=script,
+            awaitPromise=True,
+            returnByValue=True,
+            userGesture=True,
+        )
+        if "exceptionDetails" in result:
+            raise BrowserError(f"{script}: {_error_text(result['exceptionDetails'])}")
+        return result["result"].get("value")
+
+    def wait_for(self, script: str, timeout: float = 30.0) -> Any:
+        """Evaluate again and again until the value is true; gives it."""
+        end = time.monotonic() + timeout
+        while not (value := self.evaluate(script)):
+            if time.monotonic() > end:
+                shown = "\n".join(self.console)
+                raise BrowserError(f"not in {timeout:.0f} s: {script}\nconsole:\n{shown}")
+            time.sleep(0.05)
+        return value
+
+    def screenshot(self, path: Path | None = None) -> np.ndarray:
+        """(H, W, 3) uint8, what the tab shows; kept as a PNG file too where one is named."""
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        if path is not None:
+            path.write_bytes(data)
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+    def click(self, x: float, y: float) -> None:
+        """Press and release the left button at a place, in pixels from the upper left corner."""
+        for kind in ("mousePressed", "mouseReleased"):
+            self._mouse(kind, x, y, button="left", clickCount=1)
+
+    def drag(self, x0: float, y0: float, x1: float, y1: float, steps: int = 8) -> None:
+        """Drag with the left button, in a straight line."""
+        self._mouse("mousePressed", x0, y0, button="left", clickCount=1)
+        for i in range(1, steps + 1):
+            x, y = x0 + (x1 - x0) * i / steps, y0 + (y1 - y0) * i / steps
+            self._mouse("mouseMoved", x, y, button="left", buttons=1)
+        self._mouse("mouseReleased", x1, y1, button="left", clickCount=1)
+
+    def close(self) -> None:
+        """Close the tab."""
+        self._browser.call("Target.closeTarget", targetId=self._target)
+
+    def _mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+    def _event(self, method: str, given: dict[str, Any]) -> None:
+        if method == "Page.loadEventFired":
+            self._loaded.set()
+        elif method == "Network.requestWillBeSent":
+            self.requests.append(given["request"]["url"])
+        elif method == "Runtime.consoleAPICalled":
+            words = [str(a.get("value", a.get("description", ""))) for a in given["args"]]
+            self.console.append(f"{given['type']}: {' '.join(words)}")
+        elif method == "Runtime.exceptionThrown":
+            self.console.append(f"error: {_error_text(given['exceptionDetails'])}")
+        elif method == "Log.entryAdded":  # failed requests, refusals of the content policy
+            entry = given["entry"]
+            self.console.append(f"{entry['level']}: {entry['text']} {entry.get('url', '')}")
+
+
+def _pipe() -> tuple[int, int]:
+    """The two ends, both above 9: so that the shell can put them where it is told to."""
+    ends = os.pipe()
+    above = tuple(fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in ends)
+    for end in ends:
+        os.close(end)
+    return above[0], above[1]
+
+
+def _error_text(details: dict[str, Any]) -> str:
+    return str(details.get("exception", {}).get("description", details.get("text")))
