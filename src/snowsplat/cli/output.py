@@ -7,7 +7,10 @@
     OUT/config.json                                ours: every setting, exactly
     OUT/checkpoints/step_N.safetensors             ours: see snowsplat.checkpoint
     OUT/metrics.json                               figures of the last evaluation
+    OUT/history.json                               ours: the curves of the training
+    OUT/report.html                                ours: how the training went, to look at
     OUT/test/ours_N/renders, gt                    what `snowsplat render` makes; train/ alike
+    OUT/films/                                     ours: and its films
 
 Folders that the reference itself made are read as well.
 """
@@ -34,8 +37,9 @@ if TYPE_CHECKING:
     from snowsplat.gaussians import Gaussians
 
 _SCENE = re.compile(r"iteration_(\d+)")
-_RESULTS = ("point_cloud", "checkpoints", "train", "test")
-_FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", "metrics.json")
+_RESULTS = ("point_cloud", "checkpoints", "train", "test", "films")
+_REPORTS = ("metrics.json", "history.json", "report.html")
+_FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,10 @@ class OutputFolder:
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
 
+    @property
+    def history(self) -> Path:
+        return self.path / "history.json"
+
     def is_one(self) -> bool:
         """Whether a training, ours or the reference's, has written here."""
         return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))
@@ -103,7 +111,8 @@ class OutputFolder:
         """Make the folder and write what is known before the first step, without old results."""
         for name in _RESULTS:
             shutil.rmtree(self.path / name, ignore_errors=True)
-        (self.path / "metrics.json").unlink(missing_ok=True)
+        for name in _REPORTS:
+            (self.path / name).unlink(missing_ok=True)
         self.path.mkdir(parents=True, exist_ok=True)
         if capture.points is not None:
             from snowsplat.capture.points_ply import write_points

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from snowsplat.cli.output import CaptureSettings, OutputFolder
 from snowsplat.cli.progress import TrainingProgress, duration, held_out_line, peak_bytes
 from snowsplat.cli.timed import TimeBudget
+from snowsplat.history import History
 
 if TYPE_CHECKING:
     from snowsplat.evaluate import Evaluation
@@ -47,13 +48,15 @@ class TrainingRun:
         self.progress = TrainingProgress(self.trainer.schedule.iterations, self.trainer.step)
         self.last_checkpoint = time.monotonic()
         self.evaluation: tuple[int, Evaluation] | None = None  # the newest, and its step
+        self.history = History.read(self.out.history, self.first_step)
 
     def run(self) -> int:
         """Gives the exit code: 0, or 130 after Ctrl-C."""
         stopped = False
         try:
             with nullcontext() if self.quiet else self.progress:
-                self.trainer.run(self._after_step)
+                self.history.step_begins()
+                self.trainer.run(self._record)
         except KeyboardInterrupt:
             if self.trainer.step == 0:
                 self.out.discard()
@@ -64,9 +67,15 @@ class TrainingRun:
             raise
         return self._stopped() if stopped else self._finished()
 
+    def _record(self, progress: Progress) -> None:
+        measured = progress.metrics is not None  # within the step, as it seems from here
+        self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=not measured)
+        self._after_step(progress)
+        self.history.step_begins()
+
     def _after_step(self, progress: Progress) -> None:
         if progress.metrics is not None and progress.metrics.views:
-            self.evaluation = (progress.step, progress.metrics)
+            self._measured(progress.step, progress.metrics)
         if not self.quiet:
             self.progress(progress)
         if self._checkpoint_is_due(progress.step):
@@ -103,7 +112,12 @@ class TrainingRun:
             self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta
         )
         self.last_checkpoint = time.monotonic()
+        self.history.write(self.out.history)
         return path
+
+    def _measured(self, step: int, evaluation: Evaluation) -> None:
+        self.evaluation = (step, evaluation)
+        self.history.measure(step, evaluation.psnr, evaluation.ssim)
 
     def _stopped(self) -> int:
         path = self.out.write_scene(self.trainer.step, self.trainer.gaussians)
@@ -122,9 +136,11 @@ class TrainingRun:
         )
         if self.trainer.capture.test:
             if self.evaluation is None or self.evaluation[0] != step:
-                self.evaluation = (step, self.trainer.evaluate())
+                self._measured(step, self.trainer.evaluate())
+            assert self.evaluation is not None
             self.out.write_metrics(step, "test", self.evaluation[1])
             print(held_out_line(*self.evaluation))
+        self.history.write(self.out.history)
         if self.budget is not None:
             self.out.write_config(self.settings, replace(self.config, iterations=step))
             spent = self.budget.as_json()["spent"]
