@@ -25,8 +25,10 @@ def take_photos(folder: Path) -> Truth:
     """Photos in ``folder``/photos; those that are there are kept. Their poses are kept aside."""
 
     def report(done: int, total: int, what: str = "") -> None:
-        if sys.stdout.isatty() or done in (0, total):
-            print(f"\r{what}: {done} of {total}", end="\n" if done == total else "", flush=True)
+        if sys.stdout.isatty() and done < total:
+            print(f"\r{what}: {done} of {total}", end="", flush=True)
+        elif done == total:
+            print(f"\r{what}: {total} of {total}", flush=True)
 
     truth = write_synthetic_photos(folder / "photos", report=report)
     truth.write(folder / "truth")
