@@ -52,7 +52,8 @@ compiler:
 	@command -v "$${CXX:-c++}" >/dev/null 2>&1 || command -v g++ >/dev/null 2>&1 || \
 	    command -v clang++ >/dev/null 2>&1 || { echo "$(NO_COMPILER)" >&2; exit 1; }
 
-# One library for each instruction set, into src/snowsplat/_lib; only what changed is compiled.
+# One library for each instruction set, into src/snowsplat/_lib, and the viewer's page, into _viewer;
+# only what changed is compiled.
 native: $(ENVIRONMENT) | compiler
 	@mkdir -p $(BUILD)
 	@$(LOCK) sh -ec ' \
@@ -86,4 +87,4 @@ pytest: native
 	    done
 
 clean:
-	rm -rf build dist src/snowsplat/_lib .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf build dist src/snowsplat/_lib src/snowsplat/_viewer .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -1,9 +1,11 @@
 """What a user meets first: the wheel, where it is put, a machine without a compiler."""
 
+import hashlib
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -14,6 +16,8 @@ from snowsplat import __version__
 from snowsplat.ops import native
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+THIRD_PARTY = REPOSITORY / "third_party"
+VIEWER_FILES = ("index.html", "index.css", "index.js", "LICENSE")
 NO_COMPILER = "snowsplat: no C++ compiler found; install one (Debian/Ubuntu: apt install g++)"
 
 
@@ -52,6 +56,48 @@ def test_wheel_carries_the_libraries_and_all_of_python(wheel):
     assert sources <= names
     assert "snowsplat/py.typed" in names
     assert not any(name.startswith("snowsplat/native/cpu") for name in names)
+
+
+def test_wheel_carries_the_viewer_and_its_licence(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        files = {name: archive.read(f"snowsplat/_viewer/{name}") for name in VIEWER_FILES}
+        assert sum("_viewer/" in name for name in archive.namelist()) == len(files)
+        assert not any("third_party" in name for name in archive.namelist())
+    with tarfile.open(next(THIRD_PARTY.glob("*.tar.xz"))) as vendored:
+        for member in vendored.getmembers():
+            if member.isfile():
+                content = vendored.extractfile(member)
+                assert content is not None
+                assert files.pop(Path(member.name).name) == content.read()
+    assert not files
+
+
+def test_what_is_vendored_is_pinned_and_told():
+    (archive,) = THIRD_PARTY.glob("*.tar.xz")
+    assert archive.stat().st_size < 1.5e6
+    assert hashlib.sha256(archive.read_bytes()).hexdigest() in (
+        REPOSITORY / "CMakeLists.txt"
+    ).read_text(encoding="utf-8")
+    assert archive.name in (THIRD_PARTY / "README.md").read_text(encoding="utf-8")
+    with tarfile.open(archive) as vendored:
+        assert all(not member.name.startswith(("/", "..")) for member in vendored.getmembers())
+        assert sorted(Path(m.name).name for m in vendored.getmembers() if m.isfile()) == sorted(
+            VIEWER_FILES
+        )
+
+
+def test_an_archive_that_was_tampered_with_is_not_built(tmp_path):
+    copy = tmp_path / "checkout"
+    shutil.copytree(THIRD_PARTY, copy / "third_party")
+    shutil.copy(REPOSITORY / "CMakeLists.txt", copy)
+    with open(next((copy / "third_party").glob("*.tar.xz")), "ab") as file:
+        file.write(b"more")
+    cmake = shutil.which("cmake", path=f"{Path(sys.executable).parent}{os.pathsep}/usr/bin")
+    if cmake is None:
+        pytest.skip("needs cmake (make dev installs it)")
+    result = run(cmake, "-S", copy, "-B", tmp_path / "build")
+    assert result.returncode != 0
+    assert "is not the file that it should be" in " ".join(result.stderr.split())
 
 
 def test_wheel_works_out_of_the_checkout(wheel, tmp_path):
