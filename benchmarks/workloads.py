@@ -21,9 +21,8 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.camera import Camera
-from snowsplat.density.rows import morton_order
 from snowsplat.gaussians import SH_C0, Gaussians
-from snowsplat.geometry import look_at, quat_from_rotation
+from snowsplat.geometry import look_at, morton_order, quat_from_rotation
 
 GARDEN = Path(__file__).resolve().parents[2] / "shared" / "captures" / "garden_points.npz"
 

@@ -117,3 +117,17 @@ def test_random_in_bounds_is_inside_and_repeatable():
     assert (a.means.amax(0) - a.means.amin(0) > 0.9 * (bounds[1] - bounds[0])).all()
     for name, tensor in a.parameters().items():
         assert torch.equal(tensor, b.parameters()[name])
+
+
+def test_finite_rows():
+    gaussians = Gaussians(
+        torch.zeros(4, 3),
+        torch.zeros(4, 3),
+        torch.zeros(4, 4),
+        torch.zeros(4),
+        torch.zeros(4, 1, 3),
+        torch.zeros(4, 0, 3),
+    )
+    gaussians.quats[1, 3] = torch.nan
+    gaussians.opacity_logits[2] = torch.inf
+    assert gaussians.finite_rows().tolist() == [True, False, False, True]

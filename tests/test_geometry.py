@@ -1,5 +1,6 @@
 """Rotations, rigid transforms, similarities: round trips, half turns, gradients, conventions."""
 
+import itertools
 import json
 import math
 
@@ -7,10 +8,12 @@ import pytest
 import torch
 
 from snowsplat.geometry import (
+    MORTON_BITS,
     Similarity,
     compose_rigid,
     invert_rigid,
     look_at,
+    morton_order,
     quat_from_rotation,
     rotation_from_quat,
     similarity_from_points,
@@ -226,3 +229,36 @@ def test_similarity_of_too_little_is_refused():
         similarity_from_points(points, points / 0)
     with pytest.raises(ValueError, match="N, 3"):
         similarity_from_points(points, points[:4])
+
+
+def interleaved(cell: tuple[int, int, int]) -> int:
+    """The Morton code by its definition, one bit at a time."""
+    return sum(
+        ((cell[axis] >> bit) & 1) << (3 * bit + axis)
+        for bit in range(MORTON_BITS)
+        for axis in (0, 1, 2)
+    )
+
+
+def test_morton_order_is_that_of_the_interleaved_bits():
+    side = 2**MORTON_BITS - 1
+    cells = list(itertools.product((0, 1, 5, 2**20, side), repeat=3))
+    order = morton_order(torch.tensor(cells, dtype=torch.float64))
+    assert [cells[i] for i in order] == sorted(cells, key=interleaved)
+
+
+def test_morton_order_keeps_neighbours_together_beside_a_stray_point():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(4000, 3, generator=generator)
+    points[17] = torch.tensor([1000.0, -1000.0, 500.0])
+    order = morton_order(points)
+    assert torch.equal(order.sort().values, torch.arange(4000))
+    ordered = points[order]
+    steps = (ordered[1:] - ordered[:-1]).norm(dim=1).median()
+    shuffled = (points[1:] - points[:-1]).norm(dim=1).median()
+    assert steps < 0.2 * shuffled
+
+
+def test_morton_order_of_equal_points_and_of_none():
+    assert torch.equal(morton_order(torch.ones(5, 3)), torch.arange(5))
+    assert len(morton_order(torch.empty(0, 3))) == 0

@@ -122,6 +122,13 @@ class Gaussians:
 
     # Sets of Gaussians
 
+    def finite_rows(self) -> Tensor:
+        """(N,) bool: Gaussians all of whose parameters are finite."""
+        finite = torch.ones(len(self), dtype=torch.bool, device=self.means.device)
+        for parameter in self.parameters().values():
+            finite &= parameter.reshape(len(self), -1).isfinite().all(dim=1)
+        return finite
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Apply one function to every parameter tensor."""
         return Gaussians(*(function(tensor) for tensor in self.parameters().values()))

@@ -15,10 +15,10 @@ from snowsplat.capture.capture import Capture, Points
 from snowsplat.capture.decode import LoadedImage
 from snowsplat.capture.images import ImageLoader
 from snowsplat.config import TrainConfig
-from snowsplat.density.rows import morton_order
 from snowsplat.errors import UserError
 from snowsplat.evaluate import Evaluation, evaluate_views
 from snowsplat.gaussians import Gaussians
+from snowsplat.geometry import morton_order
 from snowsplat.losses import view_loss
 from snowsplat.optim import Adam
 from snowsplat.process import interrupts_between_steps, single_threaded

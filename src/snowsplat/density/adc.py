@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.density.rows import finite_rows, morton_order
 from snowsplat.gaussians import Gaussians
-from snowsplat.geometry import rotation_from_quat
+from snowsplat.geometry import morton_order, rotation_from_quat
 from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam
 from snowsplat.schedule import Schedule, When
@@ -150,7 +149,7 @@ class AdaptiveDensityControl:
         knobs = self.knobs
         grads = self.grad_sum / self.views.clamp_min(1.0)
         size = gaussians.log_scales.amax(dim=1).exp() / self.extent
-        alive = (gaussians.opacities >= knobs.prune_opacity) & finite_rows(gaussians)
+        alive = (gaussians.opacities >= knobs.prune_opacity) & gaussians.finite_rows()
         dense = self._densified(grads, alive)
         split = dense & (size > knobs.percent_dense)
         # A split parent makes way for two children; every other survivor stays as it is, and a

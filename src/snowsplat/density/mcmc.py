@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from snowsplat.density.rows import finite_rows, morton_order
 from snowsplat.errors import UserError
 from snowsplat.gaussians import Gaussians
-from snowsplat.geometry import rotation_from_quat
+from snowsplat.geometry import morton_order, rotation_from_quat
 from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam
 from snowsplat.schedule import Schedule, When
@@ -122,7 +121,7 @@ class McmcDensityControl:
     def _relocate(self, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         count = len(gaussians)
         opacities = gaussians.opacities
-        alive = (opacities > self.knobs.prune_opacity) & finite_rows(gaussians)
+        alive = (opacities > self.knobs.prune_opacity) & gaussians.finite_rows()
         survivors = torch.nonzero(alive)[:, 0]
         if len(survivors) == 0:
             return gaussians
