@@ -73,7 +73,7 @@ def write_report(capture: Path, facts: dict[str, Any]) -> Path:
         UserError: the model in ``sparse/0`` or an image cannot be read.
     """
     photos = _placed(capture, facts)
-    name = capture.resolve().name
+    name = _name(facts["inputs"])
     body = [
         _headline(name, facts),
         _cards(facts),
@@ -249,6 +249,12 @@ def _course(facts: dict[str, Any]) -> str:
         f"<ol>{attempts}</ol>\n"
         f"<details><summary>Settings</summary><pre>{settings}</pre></details>"
     )
+
+
+def _name(inputs: Sequence[str]) -> str:
+    """What the capture is of; of photos in LOCATION/input, that is LOCATION."""
+    first = Path(inputs[0])
+    return first.parent.name if first.name == "input" else first.stem
 
 
 def _next(capture: Path) -> str:
