@@ -58,7 +58,7 @@ def orientation(model: pycolmap.Reconstruction) -> Similarity:
     seen = _read(model)
     if not len(seen.centres):
         raise ValueError("a model without cameras has no orientation")
-    up = _up(seen)
+    up = up_direction(seen.rotations)
     forward = _heading(seen, up)
     down = -up
     rotation = np.stack([np.cross(down, forward), down, forward])
@@ -95,17 +95,19 @@ def _read(model: pycolmap.Reconstruction) -> _Seen:
     return _Seen(rotations, centres, points, distances)
 
 
-def _up(seen: _Seen) -> np.ndarray:
-    """(3,) the direction to which the cameras' x axes are most perpendicular.
+def up_direction(rotations: np.ndarray) -> np.ndarray:
+    """(3,) unit, world: up, the direction to which the cameras' x axes are most perpendicular.
+
+    ``rotations`` (N, 3, 3) are those of cam_from_world.
 
     The most likely one if each photo is rolled by `_ROLL` and all together pitched by
     `_COMMON_PITCH`: where the x axes are all parallel, as in front of a wall, the second decides.
     Photos rolled by much more than `_ROLL` lose their say (Cauchy weights).
     """
-    x, upper = seen.rotations[:, 0], -seen.rotations[:, 1].mean(axis=0)
+    x, upper, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
     # Where the upper edges point every way, photos look straight down, taken on the way to and fro.
     # (People photograph the ground, not the sky.)
-    mean = upper if np.linalg.norm(upper) >= 0.3 else -seen.forward.mean(axis=0)
+    mean = upper if np.linalg.norm(upper) >= 0.3 else -forward
     up = mean / max(float(np.linalg.norm(mean)), 1e-12)
     for _ in range(50):
         roll = x @ up
@@ -121,7 +123,7 @@ def _up(seen: _Seen) -> np.ndarray:
             break
     # Such photos, if few, may all the same have edges that point one way more than another.
     looks_down = abs(upper @ up) < 0.3
-    return -up if looks_down and seen.forward.mean(axis=0) @ up > 0 else up
+    return -up if looks_down and forward @ up > 0 else up
 
 
 def _heading(seen: _Seen, up: np.ndarray) -> np.ndarray:
