@@ -114,12 +114,16 @@ class OutputFolder:
         for name in _REPORTS:
             (self.path / name).unlink(missing_ok=True)
         self.path.mkdir(parents=True, exist_ok=True)
+        from snowsplat.camera_list import write_cameras
+
         if capture.points is not None:
             from snowsplat.capture.points_ply import write_points
 
             points = capture.points
             write_points(self.path / "input.ply", points.xyz.numpy(), points.rgb.numpy())
-        write_json(self.path / "cameras.json", _cameras(capture))
+        views = [*capture.train, *capture.test]
+        cameras = ((Path(view.name).stem, view.camera) for view in views)
+        write_cameras(self.path / "cameras.json", cameras)
         self.write_config(settings, config)
 
     def write_config(self, settings: CaptureSettings, config: TrainConfig) -> None:
@@ -239,24 +243,3 @@ def _namespace(text: str) -> dict[str, Any]:
     if not isinstance(call, ast.Call):
         raise ValueError("not a Namespace")
     return {word.arg: ast.literal_eval(word.value) for word in call.keywords if word.arg}
-
-
-def _cameras(capture: Capture) -> list[dict[str, Any]]:
-    """`cameras.json`: position and rotation are those of world_from_cam; sizes are in pixels."""
-    entries = []
-    for i, view in enumerate([*capture.train, *capture.test]):
-        camera = view.camera
-        pose = camera.world_from_cam.detach()
-        entries.append(
-            {
-                "id": i,
-                "img_name": Path(view.name).stem,
-                "width": camera.width,
-                "height": camera.height,
-                "position": pose[:, 3].tolist(),
-                "rotation": pose[:, :3].tolist(),
-                "fy": camera.fy,
-                "fx": camera.fx,
-            }
-        )
-    return entries
