@@ -451,3 +451,28 @@ def test_pack_and_its_views() -> None:
     conic = torch.stack([a, b, b, c], dim=1).reshape(-1, 2, 2)
     major = torch.linalg.eigvalsh(torch.linalg.inv(conic))[:, 1]
     assert_close(splats.radii, 3 * major.sqrt(), 1e-9)
+
+
+# How many splats a pixel blends
+
+
+@pytest.mark.parametrize("counted", [ops, reference], ids=["native", "twin"])
+@pytest.mark.parametrize(
+    ("opacities", "expected"),
+    # Each α = 0.5 leaves half: 13 of them leave 2⁻¹³ > 1e-4, one more would not. 0.003 < 1/255.
+    [([0.5] * 20, 13), ([0.5] * 5, 5), ([0.003, 0.5], 1), ([0.003], 0)],
+)
+def test_count_of_a_stack(counted, opacities, expected):
+    counts = counted.count_blended(flat_stack(opacities), 20, 18)
+    assert counts.shape == (18, 20)
+    assert bool((counts == expected).all())
+
+
+def test_counts_of_native_and_twin():
+    splats = random_splats(3, 300, 45, 37)
+    exact = reference.count_blended(splats, 45, 37)
+    assert float(exact.max()) > 5
+    assert torch.equal(ops.count_blended(splats, 45, 37), exact)
+    single = Splats2D(splats.packed.float(), None, splats.channels)
+    wrong = ops.count_blended(single, 45, 37).double() != exact
+    assert float(wrong.double().mean()) < 0.01  # α next to 1/255, rounded

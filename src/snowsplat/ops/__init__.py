@@ -8,7 +8,7 @@ from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.neighbours import neighbours
 from snowsplat.ops.photometric import photometric_loss, ssim
 from snowsplat.ops.project import project
-from snowsplat.ops.rasterize import rasterize
+from snowsplat.ops.rasterize import count_blended, rasterize
 from snowsplat.ops.splats import Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
 
@@ -16,6 +16,7 @@ __all__ = [
     "Splats2D",
     "accumulate_screen_statistics",
     "adam_step",
+    "count_blended",
     "get_num_threads",
     "neighbours",
     "photometric_loss",

@@ -49,6 +49,23 @@ def rasterize(
     return planes[:channels].permute(1, 2, 0), alpha, depth
 
 
+@torch.no_grad()
+def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
+    """(H, W) how many splats `rasterize` blends into each pixel, which is what it costs.
+
+    Not counted: those fainter than 1/255 there, and those behind where the pixel is finished.
+
+    Raises ValueError where shapes or dtypes do not fit.
+    """
+    check_float("count_blended", "splats", splats.packed)
+    check_size("count_blended", width, height)
+    packed = splats.packed.detach().contiguous()
+    frame = _Frame(packed, width, height, _channel_groups(1, False)[0][1])
+    counts = scratch.empty((height, width), packed.dtype)
+    launch(variant("blend_count", packed), frame.tiles, *frame.blend_args(), counts)
+    return counts
+
+
 class _Frame:
     """The splats of a frame sorted into tiles: what blending needs, forward and backward."""
 

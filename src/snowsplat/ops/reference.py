@@ -6,6 +6,7 @@ float64. Read top to bottom, this file is the method:
 
     project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
     rasterize       2D splats → image            α, T, C             ibid., §6 and eq. 2–3
+    count_blended   what that costs, by pixel
     photometric_loss, ssim                       L1, D-SSIM          ibid., eq. 7; Wang et al. 2004
     neighbours      the initial size             ibid., §5.1
     adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
@@ -261,6 +262,20 @@ def rasterize(
     image = planes[:channels] + T_end * background[:, None, None]
     depth = planes[channels] if with_depth else None
     return image.permute(1, 2, 0), 1 - T_end, depth
+
+
+def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
+    """(H, W) how many splats `rasterize` blends into each pixel."""
+    order = torch.argsort(splats.depths.detach(), stable=True)
+    means2d, conics, opacities = (
+        values[order] for values in (splats.means2d, splats.conics, splats.opacities)
+    )
+    rows = []
+    for y in range(height):
+        pixels = _pixel_centres(0, y, width, 1).to(means2d)
+        alpha, _, _ = _blend_weights(pixels, means2d, conics, opacities)
+        rows.append((alpha > 0).sum(1).to(means2d))
+    return torch.stack(rows)
 
 
 def _pixel_centres(left: int, top: int, width: int, height: int) -> Tensor:

@@ -161,7 +161,8 @@ struct Frame {
   typename Tile<V>::Bits* instance_blocks;
 };
 
-template <class V, int C, class T = typename V::Scalar>
+// With `Count`, the image is the number of splats that were blended.
+template <class V, int C, bool Count = false, class T = typename V::Scalar>
 void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* background, T* image,
                   T* alpha) {
   using TileV = Tile<V>;
@@ -229,7 +230,10 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
           }
         }
         transmittance = next;
-        for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
+        if constexpr (Count)
+          color[0] += zero_unless((power >= threshold) & open, V(1.f));
+        else
+          for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
       }
       block[b].transmittance = transmittance;
       for (int k = 0; k < C; k++) block[b].color[k] = color[k];
@@ -393,6 +397,19 @@ using namespace snow;
         forward_tile<V, 3>(f, t, int(channels), background, image, alpha);                        \
       else                                                                                        \
         forward_tile<V, 4>(f, t, int(channels), background, image, alpha);                        \
+    });                                                                                           \
+    return 0;                                                                                     \
+  }                                                                                               \
+  SNOW_EXPORT int64_t blend_count##SUFFIX(                                                        \
+      int64_t tiles, int64_t width, int64_t height, const SplatRecord<V::Scalar>* records,        \
+      const uint32_t* tile_start, uint32_t* tile_end, const uint32_t* instance_splat,             \
+      Tile<V>::Bits* instance_blocks, V::Scalar* counts) {                                        \
+    const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
+                        records,  tile_start,     instance_splat,                                 \
+                        tile_end, instance_blocks};                                               \
+    const V::Scalar nothing_behind = 0;                                                           \
+    for_tiles(tiles, [&](int64_t t) {                                                             \
+      forward_tile<V, 1, true, V::Scalar>(f, t, 1, &nothing_behind, counts, nullptr);             \
     });                                                                                           \
     return 0;                                                                                     \
   }                                                                                               \
