@@ -7,7 +7,7 @@ enough for it, so that a damaged or hostile file costs one line.
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -62,6 +62,7 @@ class PlyTable:
     format: str
     count: int
     columns: dict[str, str]
+    elements: tuple[str, ...]  # the names of all of the file
     _before: list[_Element]
     _data_start: int
 
@@ -162,7 +163,7 @@ def open_table(path: Path | str, element: str = "vertex") -> PlyTable:
         needed = sum(e.count * e.row_bytes for e in [*before, wanted])
     if wanted.count and needed > size - data_start:
         raise _truncated(path)
-    return PlyTable(path, format, wanted.count, wanted.properties, before, data_start)
+    return PlyTable(path, format, wanted.count, wanted.properties, tuple(names), before, data_start)
 
 
 def _header_lines(path: Path, file: BinaryIO) -> list[list[str]]:
@@ -217,6 +218,13 @@ def _parse_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Elemen
 
 def header(count: int, properties: list[tuple[str, str]]) -> bytes:
     """The header of a little-endian file of vertices; properties are pairs (PLY type, name)."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property {kind} {name}" for kind, name in properties]
+    return header_of([("vertex", count, properties)])
+
+
+def header_of(elements: Sequence[tuple[str, int, list[tuple[str, str]]]]) -> bytes:
+    """The header of a little-endian file of elements: name, count, pairs (PLY type, name)."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    for name, count, properties in elements:
+        lines.append(f"element {name} {count}")
+        lines += [f"property {kind} {column}" for kind, column in properties]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")

@@ -10,6 +10,14 @@ from pathlib import Path
 
 from snowsplat.errors import UserError
 from snowsplat.formats import ply
+from snowsplat.formats.compressed_ply import (
+    is_compressed_ply,
+    read_compressed_ply,
+    write_compressed_ply,
+)
+from snowsplat.formats.ksplat import read_ksplat
+from snowsplat.formats.splat import read_splat, write_splat
+from snowsplat.formats.spz import is_spz, read_spz, write_spz
 from snowsplat.gaussians import Gaussians
 
 __all__ = [
@@ -42,7 +50,17 @@ class Format:
 
 #: In the order in which `recognises` is asked: a special kind before the general one.
 FORMATS: tuple[Format, ...] = (
+    Format(
+        "compressed PLY",
+        (".compressed.ply",),
+        is_compressed_ply,
+        read_compressed_ply,
+        write_compressed_ply,
+    ),
     Format("PLY", (".ply",), ply.is_ply, ply.read_gaussians, ply.write_gaussians),
+    Format("SPZ", (".spz",), is_spz, read_spz, write_spz),
+    Format("splat", (".splat",), None, read_splat, write_splat),
+    Format("ksplat", (".ksplat",), None, read_ksplat, None),
 )
 
 

@@ -1,0 +1,194 @@
+"""`.ksplat` files, of the viewer GaussianSplats3D: read only.
+
+A header of 4096 bytes, then one of 1024 bytes for each section, then the sections. A section holds
+the sizes of its partly filled buckets, the centres of all its buckets, and its Gaussians, bucket by
+bucket, each in one row:
+
+==================  ===========================  ==========================================
+level 0             levels 1 and 2
+==================  ===========================  ==========================================
+3 floats            3 uint16                     position; as uint16 from its bucket's centre
+3 floats            3 halves                     standard deviations, not their logarithms
+4 floats            4 halves                     quaternion wxyz
+4 bytes             4 bytes                      RGBA
+0, 9, 24 floats     as many halves (1), bytes    SH degree by degree; in each all coefficients of
+                    between two bounds (2)       red, then of green, then of blue
+==================  ===========================  ==========================================
+
+Little-endian, in the frame of the PLY files. Facts from github.com/mkkellogg/GaussianSplats3D
+(MIT).
+"""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.errors import UserError
+from snowsplat.formats import packing
+from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+
+_HEADER_BYTES = 4096
+_SECTION_HEADER_BYTES = 1024
+_DEFAULT_RANGE = 32767
+_DEFAULT_SH_BOUND = 1.5
+#: Types of position, scales and rotation, and SH by compression level.
+_TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
+
+
+@dataclass
+class _Section:
+    """One section: how many Gaussians and buckets, and where they lie in the file."""
+
+    count: int
+    sh_degree: int
+    row: np.dtype
+    bucket_size: int
+    full_buckets: int
+    partial_buckets: int
+    bucket_count: int
+    step: float  # of a uint16 position, world units
+    offset: int  # that stands for 0 in a uint16 position
+    start: int
+    centers_start: int
+    rows_start: int
+
+
+@np.errstate(all="ignore")  # what is not finite is left out at the end
+def read_ksplat(path: Path | str) -> Gaussians:
+    """Read a scene of SH degree 0 to 3; sections of a lower degree than others get zeros.
+
+    Raises:
+        UserError: not readable, of another version, damaged, or too short.
+    """
+    path = Path(path)
+    data = packing.read_file(path)
+    if len(data) < _HEADER_BYTES:
+        raise UserError(f"{path}: too short for a .ksplat file; copy or export it again")
+    major, minor, section_count, level = struct.unpack_from("<BB2xI12xH", data)
+    if major != 0 or minor < 1 or level >= len(_TYPES):
+        raise UserError(
+            f"{path}: not a .ksplat file that I know (version {major}.{minor}, compression level "
+            f"{level}; I read 0.1 with levels 0 to 2)"
+        )
+    low, high = struct.unpack_from("<2f", data, 36)
+    bounds = low or -_DEFAULT_SH_BOUND, high or _DEFAULT_SH_BOUND
+    sections = _sections(path, data, section_count, level)
+    degree = max((section.sh_degree for section in sections), default=0)
+    # One empty part first, so that a file without sections is an empty scene.
+    parts = [_no_gaussians(SH_REST_COUNTS[degree])]
+    for section in sections:
+        parts.append(_unpack(path, data, section, level, bounds, SH_REST_COUNTS[degree]))
+    return packing.to_gaussians(path, *(np.concatenate(c) for c in zip(*parts, strict=True)))
+
+
+def _sections(path: Path, data: bytes, section_count: int, level: int) -> list[_Section]:
+    """The sections, all of which lie within the file."""
+    start = _HEADER_BYTES + section_count * _SECTION_HEADER_BYTES
+    if start > len(data):
+        raise _damaged(path)
+    sections = []
+    for i in range(section_count):
+        head = _HEADER_BYTES + i * _SECTION_HEADER_BYTES
+        count, capacity, bucket_size, bucket_count, block, bucket_bytes, span, full, partial, sh = (
+            struct.unpack_from("<4IfH2xI4x2IH", data, head)
+        )
+        if count > capacity or sh >= len(SH_REST_COUNTS):
+            raise _damaged(path)
+        if level and (bucket_bytes != 12 or full + partial > bucket_count):
+            raise _damaged(path)
+        position, other, harmonic = _TYPES[level]
+        row = np.dtype(
+            [
+                ("means", position, 3),
+                ("scales", other, 3),
+                ("quats", other, 4),
+                ("rgba", "u1", 4),
+                ("sh", harmonic, 3 * SH_REST_COUNTS[sh]),
+            ]
+        )
+        centers_start = start + 4 * partial
+        rows_start = centers_start + bucket_bytes * bucket_count
+        end = rows_start + row.itemsize * capacity
+        if end > len(data):
+            raise _damaged(path)
+        span = span or _DEFAULT_RANGE
+        sections.append(
+            _Section(
+                count=count,
+                sh_degree=sh,
+                row=row,
+                bucket_size=bucket_size,
+                full_buckets=full,
+                partial_buckets=partial,
+                bucket_count=bucket_count,
+                step=block / 2 / span,
+                offset=span,
+                start=start,
+                centers_start=centers_start,
+                rows_start=rows_start,
+            )
+        )
+        start = end
+    return sections
+
+
+def _unpack(
+    path: Path,
+    data: bytes,
+    section: _Section,
+    level: int,
+    bounds: tuple[float, float],
+    rest: int,
+) -> packing.Arrays:
+    rows = np.frombuffer(data, section.row, section.count, section.rows_start)
+    means: np.ndarray = rows["means"].astype(np.float32)
+    if level:
+        centers = np.frombuffer(data, "<f4", 3 * section.bucket_count, section.centers_start)
+        bucket = _buckets(path, data, section)
+        means = (means - section.offset) * np.float32(section.step) + centers.reshape(-1, 3)[bucket]
+    harmonics = rows["sh"].astype(np.float32)
+    if level == 2:
+        low, high = bounds
+        harmonics = np.float32(low) + harmonics / 255 * np.float32(high - low)
+    sh_rest = np.zeros((section.count, rest, 3), np.float32)
+    first = 0
+    for degree in range(1, section.sh_degree + 1):
+        width = 2 * degree + 1
+        band = harmonics[:, 3 * first : 3 * (first + width)].reshape(-1, 3, width)
+        sh_rest[:, first : first + width] = band.transpose(0, 2, 1)
+        first += width
+    return (
+        means,
+        packing.log_scales(rows["scales"].astype(np.float32)),
+        packing.unit_quats(rows["quats"].astype(np.float32)),
+        packing.opacity_logits(rows["rgba"][:, 3]),
+        packing.color_sh(rows["rgba"][:, :3]),
+        sh_rest,
+    )
+
+
+def _buckets(path: Path, data: bytes, section: _Section) -> np.ndarray:
+    """Which bucket each Gaussian of a section is in: the full ones first, then the others."""
+    sizes = np.frombuffer(data, "<u4", section.partial_buckets, section.start)
+    ends = section.bucket_size * np.arange(1, section.full_buckets + 1, dtype=np.int64)
+    filled = section.bucket_size * section.full_buckets
+    ends = np.concatenate([ends, filled + np.cumsum(sizes, dtype=np.int64)])
+    if section.count > (ends[-1] if len(ends) else 0):
+        raise _damaged(path)
+    return np.searchsorted(ends, np.arange(section.count), side="right")
+
+
+def _no_gaussians(rest: int) -> packing.Arrays:
+    shapes = ((0, 3), (0, 3), (0, 4), (0,), (0, 1, 3), (0, rest, 3))
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = (
+        np.zeros(shape, np.float32) for shape in shapes
+    )
+    return means, log_scales, quats, opacity_logits, sh_dc, sh_rest
+
+
+def _damaged(path: Path) -> UserError:
+    return UserError(
+        f"{path}: a damaged .ksplat file: its sections do not fit its size; copy or export it again"
+    )

@@ -1,0 +1,97 @@
+"""What the tests of all formats need: scenes, how they compare, how damage is told."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.camera import Camera
+from snowsplat.errors import UserError
+from snowsplat.formats import read_gaussians
+from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.geometry import look_at
+from snowsplat.render import render
+
+Make = Callable[..., Gaussians]
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of scene files beside the project; without it the test is skipped."""
+    folder = Path(__file__).parents[2].parent / "shared/splats"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def make_scene() -> Make:
+    """``make_scene(n, degree)``: as trained scenes are: small, thin, from faint to opaque."""
+
+    def make(n: int, degree: int = 3, seed: int = 0) -> Gaussians:
+        generator = torch.Generator().manual_seed(seed)
+
+        def normal(*shape: int) -> torch.Tensor:
+            return torch.randn(*shape, generator=generator)
+
+        return Gaussians(
+            normal(n, 3),
+            normal(n, 3) - 3,
+            normal(n, 4),
+            2 * normal(n) + 1,
+            0.7 * normal(n, 1, 3),
+            0.12 * normal(n, SH_REST_COUNTS[degree], 3),
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def view() -> Callable[[Gaussians], torch.Tensor]:
+    """The picture (120, 160, 3) that a camera in front of such a scene takes."""
+    cam_from_world = look_at(
+        torch.tensor([0.5, -1.0, -5.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
+    )
+    camera = Camera(160, 120, 150.0, 150.0, 80.0, 60.0, cam_from_world)
+    return lambda gaussians: render(gaussians, camera).image
+
+
+@pytest.fixture(scope="session")
+def psnr(view) -> Callable[[Gaussians, Gaussians], float]:
+    """Of the pictures of two scenes, in dB."""
+
+    def compare(a: Gaussians, b: Gaussians) -> float:
+        error = float(((view(a).clamp(0, 1) - view(b).clamp(0, 1)) ** 2).mean())
+        return math.inf if error == 0 else -10 * math.log10(error)
+
+    return compare
+
+
+@pytest.fixture(scope="session")
+def one_line() -> Callable[[Path], str]:
+    """Reads a file that must be refused; gives the line that says why."""
+
+    def refused(path: Path) -> str:
+        with pytest.raises(UserError) as error:
+            read_gaussians(path)
+        line = str(error.value)
+        assert line.startswith(str(path))
+        assert "\n" not in line
+        assert len(line) < 300 + len(str(path))
+        return line
+
+    return refused
+
+
+@pytest.fixture(scope="session")
+def rotation_error() -> Callable[[Gaussians, Gaussians], float]:
+    """The largest difference of unit quaternions, whose sign says nothing."""
+
+    def largest(a: Gaussians, b: Gaussians) -> float:
+        p, q = a.rotations, b.rotations
+        error = torch.minimum((p - q).abs().amax(1), (p + q).abs().amax(1))
+        return float(error.max()) if len(error) else 0.0
+
+    return largest
