@@ -21,6 +21,7 @@ from snowsplat.cli.info import Info
 from snowsplat.cli.make import Make
 from snowsplat.cli.render import Render
 from snowsplat.cli.train import Train
+from snowsplat.cli.view import View
 from snowsplat.errors import UserError
 
 VERBS: dict[str, Any] = {
@@ -29,6 +30,7 @@ VERBS: dict[str, Any] = {
     "train": Train,
     "evaluate": Evaluate,
     "render": Render,
+    "view": View,
     "info": Info,
 }
 
@@ -39,6 +41,7 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, s
   snowsplat train CAPTURE -o OUT --eval     photos with known cameras -> a scene in OUT
   snowsplat evaluate OUT                    PSNR, SSIM of the photos held out
   snowsplat render OUT                      pictures of the scene beside the photos
+  snowsplat view FILE|OUT                   fly through a scene in the browser
   snowsplat info ANYTHING                   what is in a scene, a capture, an output folder
 
 Each has its own help: snowsplat train --help

@@ -1,0 +1,269 @@
+"""A small web server for one page: some files in memory, for the browsers of one person.
+
+It serves what it was given and nothing else: names are looked up, never opened. Its address has a
+part that cannot be guessed, and requests that name a foreign host are refused: a web page elsewhere
+cannot reach it through a name that it makes point here (DNS rebinding).
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import hmac
+import ipaddress
+import logging
+import re
+import secrets
+import socket
+import socketserver
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler
+from typing import Any, cast
+
+from snowsplat.errors import UserError
+
+_BLOCK = 1 << 18  # bytes sent at once
+_IDLE_SECONDS = 60.0  # after which a connection that says nothing is closed
+_RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ServedFile:
+    """A file's bytes and its content type."""
+
+    content: bytes = field(repr=False)
+    type: str
+
+    @cached_property
+    def etag(self) -> str:
+        return f'"{hashlib.sha256(self.content).hexdigest()[:32]}"'
+
+
+class StaticServer:
+    """Serves ``files`` by name ("" is the page itself) from the time it is made, until `close`.
+
+    Every response carries the headers ``headers`` too.
+
+    Raises:
+        UserError: the port is taken or not allowed, the host is no address of this machine.
+    """
+
+    def __init__(
+        self,
+        files: Mapping[str, ServedFile],
+        headers: Mapping[str, str],
+        host: str = "127.0.0.1",
+        port: int = 0,
+    ) -> None:
+        self.host = host
+        self._token = secrets.token_urlsafe(16)
+        self._server = _listen(host, port)
+        self._server.prefix = f"/{self._token}/"
+        self._server.files = dict(files)
+        self._server.headers = dict(headers)
+        self._server.host = host
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        return int(self._server.server_address[1])
+
+    @property
+    def url(self) -> str:
+        """The page's address, for a browser on this machine."""
+        host = self.host
+        if host in ("", "0.0.0.0", "::"):
+            host = "127.0.0.1"
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}/"
+
+    def close(self) -> None:
+        """Stop; downloads under way are cut off."""
+        self._server.shutdown()
+        self._server.server_close()
+
+    def __enter__(self) -> StaticServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Server(socketserver.ThreadingTCPServer):
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = sys.platform != "win32"  # there it would share a port that is taken
+    request_queue_size = 64
+
+    prefix: str
+    files: dict[str, ServedFile]
+    headers: dict[str, str]
+    host: str
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        # A browser that leaves in the middle of a download is not an error.
+        error = sys.exc_info()[1]
+        if not isinstance(error, ConnectionError | TimeoutError):
+            _log.error("the viewer's server: %s: %s", type(error).__name__, error)
+
+
+class _Server6(_Server):
+    address_family = socket.AF_INET6
+
+
+def _listen(host: str, port: int) -> _Server:
+    try:
+        return (_Server6 if ":" in host else _Server)((host, port), _Handler)
+    except OverflowError:
+        raise UserError(f"--port is {port}; it must be 0 to 65535") from None
+    except PermissionError:
+        raise UserError(f"port {port} is not allowed to you; name one above 1023") from None
+    except socket.gaierror:
+        raise UserError(f"{host}: not a name or address of this machine") from None
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise UserError(
+                f"port {port} is taken; name another, or leave --port out for a free one"
+            ) from None
+        raise UserError(f"{host}: cannot be listened on ({error.strerror})") from None
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version = "snowsplat"
+    sys_version = ""
+    timeout = _IDLE_SECONDS
+
+    def do_GET(self) -> None:
+        self._answer(with_body=True)
+
+    def do_HEAD(self) -> None:
+        self._answer(with_body=False)
+
+    def _refuse_method(self) -> None:
+        self.close_connection = True  # its body was not read
+        self._send_empty(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": "GET, HEAD"})
+
+    do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = do_CONNECT = _refuse_method
+
+    @property
+    def _ours(self) -> _Server:
+        return cast(_Server, self.server)
+
+    def _answer(self, with_body: bool) -> None:
+        if not is_own_host(self.headers.get("Host", ""), self._ours.host):
+            self._send_empty(HTTPStatus.MISDIRECTED_REQUEST)
+            return
+        file = self._file()
+        if file is None:
+            self._send_empty(HTTPStatus.NOT_FOUND)
+            return
+        common = {"ETag": file.etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
+        if file.etag in (self.headers.get("If-None-Match") or ""):
+            self._send_empty(HTTPStatus.NOT_MODIFIED, common)
+            return
+        size = len(file.content)
+        part = self._range(file)
+        if part is None:
+            status, start, end = HTTPStatus.OK, 0, size
+        elif part[0] < part[1]:
+            status, (start, end) = HTTPStatus.PARTIAL_CONTENT, part
+            common["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+        else:
+            refused = {**common, "Content-Range": f"bytes */{size}"}
+            self._send_empty(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, refused)
+            return
+        common |= {"Content-Type": file.type, "Content-Length": str(end - start)}
+        self._send_head(status, common)
+        if with_body:
+            content = memoryview(file.content)
+            for at in range(start, end, _BLOCK):
+                self.wfile.write(content[at : min(at + _BLOCK, end)])
+
+    def _file(self) -> ServedFile | None:
+        """What the path names, taken as it stands: no name of ours needs decoding."""
+        path = self.path.partition("?")[0]
+        prefix = self._ours.prefix
+        start, name = path[: len(prefix)], path[len(prefix) :]
+        if not hmac.compare_digest(start.encode(), prefix.encode()):
+            return None
+        return self._ours.files.get(name)
+
+    def _range(self, file: ServedFile) -> tuple[int, int] | None:
+        """First byte asked for and the one after the last; None: the whole file.
+
+        A range that the file does not have is empty. Several ranges at once, and what is no range,
+        are answered by the whole file, as the protocol allows.
+        """
+        match = _RANGE.fullmatch(self.headers.get("Range", "").replace(" ", ""))
+        if match is None or match[0] == "bytes=-":
+            return None
+        if self.headers.get("If-Range", file.etag) != file.etag:
+            return None
+        size = len(file.content)
+        # A number with thousands of digits is refused by int(); any of these is past the end.
+        first, last = (int(digits[:19]) if digits else None for digits in match.groups())
+        if first is None:
+            return max(0, size - (last or 0)), size
+        if last is None:
+            return min(first, size), size
+        if last < first:
+            return None
+        return min(first, size), min(last + 1, size)
+
+    def _send_empty(self, status: HTTPStatus, headers: Mapping[str, str] | None = None) -> None:
+        length = {} if status is HTTPStatus.NOT_MODIFIED else {"Content-Length": "0"}
+        self._send_head(status, {**(headers or {}), **length})
+
+    def _send_head(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
+        self.send_response(status)
+        always = {
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",  # the address is a secret
+            "Cross-Origin-Resource-Policy": "same-origin",
+        }
+        for name, value in {**always, **self._ours.headers, **headers}.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        _log.debug(format, *args)
+
+
+def is_own_host(header: str, listening: str) -> bool:
+    """Whether the Host of a request is a name of this machine, as seen by one who may ask.
+
+    The port is not looked at: with SSH forwarding it is another one. A server that listens on this
+    machine alone is called by its loopback names; one that listens to others also by any address,
+    since only names can be made to point here.
+    """
+    match = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^:\[\]]+)(?::\d*)?", header.strip())
+    if match is None:
+        return False
+    name = match[1].strip("[]").rstrip(".").lower()
+    if name in ("localhost", listening.lower()):
+        return True
+    try:
+        address = ipaddress.ip_address(name)
+    except ValueError:
+        return not _is_loopback(listening) and name in _names_of_this_machine()
+    return address.is_loopback or not _is_loopback(listening)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def _names_of_this_machine() -> set[str]:
+    name = socket.gethostname().lower()
+    return {name, name.partition(".")[0], f"{name.partition('.')[0]}.local"}
