@@ -1,4 +1,4 @@
-"""`snowsplat render`: pictures of a scene from the cameras of its photos."""
+"""`snowsplat render`: pictures of a scene from the cameras of its photos, and films of it."""
 
 from __future__ import annotations
 
@@ -15,20 +15,26 @@ from snowsplat.errors import UserError
 if TYPE_CHECKING:
     import numpy as np
 
+    from snowsplat.camera import Camera
     from snowsplat.capture import View
     from snowsplat.gaussians import Gaussians
 
 
 @dataclass
 class Render(SceneFlags):
-    """Render a scene from the cameras of its photos, beside the photos.
+    """Render a scene from the cameras of its photos, beside the photos; or a film of it.
 
     Examples:
       snowsplat render out/garden
       snowsplat render out/garden --split test --depth color
+      snowsplat render out/garden --path ellipse
+      snowsplat render out/garden --path training --seconds 20 --size 1920x1080
+      snowsplat render out/garden --path keys.json --side-by-side
+      snowsplat render garden.ply --path ellipse --film garden.mp4
 
     The pictures are OUT/test/ours_N/renders/00000.png …, the photos gt/00000.png …, in the order
-    of the photos' names; OUT/train/ours_N alike.
+    of the photos' names; OUT/train/ours_N alike. Films are OUT/films/ellipse.mp4 …; a scene's file
+    is enough for those around it (ellipse) and along a list of cameras.
     """
 
     split: Annotated[Literal["all", "test", "train"], flag("{all,test,train}", default="all")] = (
@@ -43,10 +49,32 @@ class Render(SceneFlags):
         Literal["none", "16bit", "color"], flag("{none,16bit,color}", default="none")
     ] = "none"
     """Depth too, as depth/00000.png: 16 bits of grey, whose steps world_units_per_step.json
-    tells, or coloured from near (yellow) to far (violet)."""
+    tells, or coloured from near (yellow) to far (violet). Of a film: another one, in colour."""
+
+    path: Annotated[str | None, flag("{training,ellipse,spiral,FILE}", default="pictures")] = None
+    """Make a film. training: along the way of the photos, smoothed; ellipse: around what they show;
+    spiral: before what cameras that look one way show; or through the cameras of a FILE like
+    OUT/cameras.json, which makes a loop where the last one is the first."""
+    seconds: Annotated[float | None, flag("F", default="10")] = None
+    """Length of the film."""
+    fps: Annotated[float | None, flag("F", default="30")] = None
+    """Frames a second."""
+    size: Annotated[str | None, flag("WxH|W", default="that of the photos")] = None
+    """Size of the film in pixels, or its width."""
+    side_by_side: Annotated[bool, switch()] = False
+    """Colour and depth beside each other in one film."""
+    film: Annotated[Path | None, flag("FILE.mp4", default="in OUT/films")] = None
+    """The film's file."""
 
     def run(self) -> int:
         """Gives the exit code, 0."""
+        if self.path is not None:
+            self._film(self.path)
+            return 0
+        for name in ("seconds", "fps", "size", "side_by_side", "film"):
+            if getattr(self, name):
+                flag_name = name.replace("_", "-")
+                raise UserError(f"--{flag_name} is for films; say which by --path, as ellipse")
         iteration, gaussians, capture, background = self.load()
         chosen = {
             "test": [] if self.split == "train" or self.skip_test else capture.test,
@@ -62,6 +90,52 @@ class Render(SceneFlags):
                 self._render(gaussians, views, background, target)
                 print(f"{target / 'renders'}: {len(views)} pictures")
         return 0
+
+    def _film(self, way: str) -> None:
+        from snowsplat.cli.films import Film, FilmSize, cameras_along, frames_in
+
+        if self.depth == "16bit":
+            raise UserError("--depth 16bit is for pictures; a film takes --depth color")
+        if self.film is not None and self.film.suffix.lower() != ".mp4":
+            raise UserError(f"--film is {self.film}; its name must end in .mp4")
+        fps = 30.0 if self.fps is None else self.fps
+        frames = frames_in(10.0 if self.seconds is None else self.seconds, fps)
+        size = FilmSize.parse(self.size)
+        self.use_threads()
+        name = way if Path(way).suffix == "" else Path(way).stem
+        gaussians, trained, background, file = self._film_source(name)
+        cameras = cameras_along(way, gaussians, trained, frames, size)
+        depth = self.depth == "color"
+        Film(
+            *(gaussians, cameras, background, self.film or file, fps, depth),
+            side_by_side=self.side_by_side,
+        ).make()
+
+    def _film_source(
+        self, name: str
+    ) -> tuple[
+        Gaussians,
+        tuple[list[str], list[Camera]] | None,
+        tuple[float, float, float],
+        Path,
+    ]:
+        """Scene, cameras of its training, background, and the film's file: of a folder or a file.
+
+        The photos themselves are not needed.
+        """
+        from snowsplat.camera_list import read_cameras
+        from snowsplat.formats import read_gaussians
+
+        suffix = "_side_by_side" if self.side_by_side else ""
+        scene = self.output or self.model_path
+        if scene is not None and scene.is_file():
+            file = scene.with_name(f"{scene.stem}_{name}{suffix}.mp4")
+            return read_gaussians(scene), None, (0.0, 0.0, 0.0), file
+        folder = self.folder()
+        _, background = folder.settings()
+        _, gaussians = folder.read_scene(self.iteration)
+        file = folder.path / "films" / f"{name}{suffix}.mp4"
+        return gaussians, read_cameras(folder.path / "cameras.json"), background, file
 
     def _render(
         self,

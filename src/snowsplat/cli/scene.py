@@ -51,17 +51,29 @@ class SceneFlags:
         Raises:
             UserError: one of them is absent or damaged.
         """
-        folder = self.folder()
-        settings, background = folder.settings()
+        capture, background = self.load_capture()
+        iteration, gaussians = self.folder().read_scene(self.iteration)
+        return iteration, gaussians, capture, background
+
+    def load_capture(self) -> tuple[Capture, tuple[float, float, float]]:
+        """Capture and background colour; sets the number of threads.
+
+        Raises:
+            UserError: there is none, or it is damaged.
+        """
+        settings, background = self.folder().settings()
         if self.capture is not None:
             settings = replace(settings, path=str(self.capture))
         if self.resolution is not None:
             settings = replace(settings, resolution=self.resolution)
+        self.use_threads()
+        return settings.load(), background
+
+    def use_threads(self) -> None:
+        """Raises: UserError: none at all."""
         if self.threads is not None:
             from snowsplat import ops
 
             if self.threads < 1:
                 raise UserError(f"--threads is {self.threads}; it must be at least 1")
             ops.set_num_threads(self.threads)
-        iteration, gaussians = folder.read_scene(self.iteration)
-        return iteration, gaussians, settings.load(), background

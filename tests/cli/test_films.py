@@ -1,0 +1,111 @@
+"""`snowsplat render --path`: films of a training and of a scene's file."""
+
+import shutil
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from snowsplat.cli.films import FilmSize, frames_in
+from snowsplat.cli.main import main
+from snowsplat.errors import UserError
+
+from ..paths.rigs import camera_at
+
+SHORT = ("--seconds", 1, "--fps", 10)
+
+
+@pytest.fixture(scope="module")
+def trained(capture, tmp_path_factory) -> Path:
+    """An output folder whose capture is not needed any more; not to be changed but for films."""
+    out = tmp_path_factory.mktemp("films") / "out"
+    flags = ["--iterations", "60", "--eval", "--quiet", "--background", "white"]
+    assert main(["train", str(capture), "-o", str(out), *flags]) == 0
+    return out
+
+
+def frames(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+@pytest.mark.parametrize("way", ["training", "ellipse"])
+def test_film_of_a_training(run, trained, way):
+    result = run("render", trained, "--path", way, *SHORT)
+    assert result.code == 0, result.err
+    assert f"{trained}/films/{way}.mp4: 10 frames 48x36" in result.out
+    pictures = frames(trained / "films" / f"{way}.mp4")
+    assert [picture.shape for picture in pictures] == [(36, 48, 3)] * 10
+    # The scene is in them, and it moves.
+    assert all(20 < picture.mean() < 250 and picture.std() > 5 for picture in pictures)
+    assert abs(pictures[0].astype(int) - pictures[5]).mean() > 3
+
+
+def test_depth_beside_or_in_a_film_of_its_own(run, trained, tmp_path):
+    common = ("render", trained, "--path", "ellipse", *SHORT)
+    assert run(*common, "--depth", "color", "--film", tmp_path / "a.mp4").code == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mp4", "a_depth.mp4"]
+    assert run(*common, "--side-by-side", "--size", "64x32").code == 0
+    both = frames(trained / "films/ellipse_side_by_side.mp4")[3]
+    assert both.shape == (32, 128, 3)
+    depth = frames(tmp_path / "a_depth.mp4")[3]
+    # From far (violet) to near (yellow): green is what tells.
+    assert depth[:, :, 1].std() > 10
+    assert both[:, 64:, 1].std() > 10
+
+
+def test_film_through_saved_cameras(run, trained, tmp_path):
+    shutil.copy(trained / "cameras.json", tmp_path / "my keys.json")
+    result = run("render", trained, "--path", tmp_path / "my keys.json", *SHORT, "--size", 64)
+    assert result.code == 0, result.err
+    assert frames(trained / "films/my keys.mp4")[0].shape == (48, 64, 3)
+
+
+def test_film_of_a_file(run, refused, trained, tmp_path):
+    scene = tmp_path / "scene.ply"
+    shutil.copy(trained / "point_cloud/iteration_60/point_cloud.ply", scene)
+    assert run("render", scene, "--path", "ellipse", *SHORT, "--size", "64x48").code == 0
+    around = frames(tmp_path / "scene_ellipse.mp4")
+    assert len(around) == 10
+    assert around[0].shape == (48, 64, 3)
+    assert around[0].std() > 5
+    assert run("render", scene, "--path", trained / "cameras.json", *SHORT).code == 0
+    assert (tmp_path / "scene_cameras.mp4").exists()
+    for way in ("training", "spiral"):
+        assert "needs the cameras of a training" in refused("render", scene, "--path", way)
+
+
+def test_refused(refused, trained, tmp_path):
+    film = ("render", trained, "--path", "ellipse")
+    assert "must be training, ellipse, spiral or a file" in refused(
+        "render", trained, "--path", "helix"
+    )
+    assert "no such file" in refused("render", trained, "--path", tmp_path / "absent.json")
+    assert "take an ellipse" in refused("render", trained, "--path", "spiral")
+    assert "must end in .mp4" in refused(*film, "--film", tmp_path / "a.gif")
+    assert "must be like 1280x720" in refused(*film, "--size", "large")
+    assert "16 to 8192" in refused(*film, "--size", "64x9000")
+    assert "a film takes --depth color" in refused(*film, "--depth", "16bit")
+    assert "more than 0" in refused(*film, "--seconds", 0)
+    assert "make it shorter" in refused(*film, "--seconds", 1e9)
+    assert "say which by --path" in refused("render", trained, "--size", "64x48")
+    assert "no such folder" in refused("render", tmp_path / "absent", "--path", "ellipse")
+    assert "--threads is 0" in refused(*film, "--threads", 0)
+
+
+def test_sizes_are_even():
+    camera = camera_at((0.0, 0.0, -3.0))  # 64×48
+    assert FilmSize.parse(None).of(camera) == (64, 48)
+    assert FilmSize.parse("127").of(camera) == (126, 94)
+    assert FilmSize.parse("33x21").of(camera) == (32, 20)
+    large = camera.scaled(4000, 3000)
+    assert FilmSize.parse(None).of(large) == (1920, 1440)
+
+
+def test_number_of_frames():
+    assert frames_in(2.0, 12.5) == 25
+    assert frames_in(0.001, 1.0) == 1
+    for wrong in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(UserError, match="more than 0"):
+            frames_in(wrong, 30.0)
