@@ -15,6 +15,7 @@ from snowsplat.formats.compressed_ply import (
     read_compressed_ply,
     write_compressed_ply,
 )
+from snowsplat.formats.html import write_html
 from snowsplat.formats.ksplat import read_ksplat
 from snowsplat.formats.splat import read_splat, write_splat
 from snowsplat.formats.spz import is_spz, read_spz, write_spz
@@ -61,6 +62,7 @@ FORMATS: tuple[Format, ...] = (
     Format("SPZ", (".spz",), is_spz, read_spz, write_spz),
     Format("splat", (".splat",), None, read_splat, write_splat),
     Format("ksplat", (".ksplat",), None, read_ksplat, None),
+    Format("HTML", (".html",), None, None, write_html),
 )
 
 
