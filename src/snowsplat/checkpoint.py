@@ -75,7 +75,7 @@ def save(
             safetensors.torch.save_file(whole, temporary, metadata={_HEADER: json.dumps(header)})
         except safetensors.SafetensorError as error:
             raise OSError(f"{path}: cannot be written ({error})") from None
-    for _, old in _steps(folder)[keep:]:
+    for _, old in files(folder)[keep:]:
         old.unlink(missing_ok=True)
     return path
 
@@ -109,7 +109,7 @@ def load(path: Path | str) -> Checkpoint:
 
 def latest(folder: Path | str) -> Checkpoint | None:
     """The newest whole checkpoint of ``folder``, or None; a warning for each newer, damaged one."""
-    for _, path in _steps(Path(folder)):
+    for _, path in files(folder):
         try:
             return load(path)
         except UserError as error:
@@ -119,11 +119,12 @@ def latest(folder: Path | str) -> Checkpoint | None:
 
 def exists(folder: Path | str) -> bool:
     """Whether ``folder`` holds a checkpoint, whole or not."""
-    return bool(_steps(Path(folder)))
+    return bool(files(folder))
 
 
-def _steps(folder: Path) -> list[tuple[int, Path]]:
-    """Checkpoint files, newest first."""
+def files(folder: Path | str) -> list[tuple[int, Path]]:
+    """Steps and files of the checkpoints of ``folder``, newest first."""
+    folder = Path(folder)
     if not folder.is_dir():
         return []
     found = [

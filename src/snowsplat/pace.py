@@ -170,6 +170,12 @@ class Pace:
         fewest = math.ceil((1.0 - schedule.share(step)) * step / _HURRY)
         return step + max(steps, fewest, 1)
 
+    def put_off(self, seconds: float) -> None:
+        """So much of the time since the last step was a pause: the end comes later by it."""
+        self.deadline += seconds
+        self._before += seconds
+        self._looked += seconds
+
     def _mean(self, schedule: Schedule, step: int, gaussians: int) -> float:
         """Mean seconds of the steps that are left."""
         parts = self._work.parts_ahead(schedule, step, gaussians)

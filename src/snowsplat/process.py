@@ -21,28 +21,33 @@ def single_threaded() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
+_held = threading.Event()  # a Ctrl-C that `interrupts_between_steps` holds back
+
+
+def let_interrupt() -> None:
+    """Raise the Ctrl-C that is held back: for those who wait between two steps."""
+    if _held.is_set():
+        raise KeyboardInterrupt
+
+
 @contextmanager
 def interrupts_between_steps() -> Iterator[Callable[[], None]]:
     """Hold Ctrl-C back until the function that this gives is called. The second one is not held.
 
     Where Python's own handler of SIGINT is not in place, whoever replaced it decides.
     """
-    pending = threading.Event()
 
     def hold(*_: object) -> None:
-        pending.set()
+        _held.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def let_interrupt() -> None:
-        if pending.is_set():
-            raise KeyboardInterrupt
 
     main_thread = threading.current_thread() is threading.main_thread()
     if not main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield let_interrupt
+        yield lambda: None
         return
     signal.signal(signal.SIGINT, hold)
     try:
         yield let_interrupt
     finally:
+        _held.clear()
         signal.signal(signal.SIGINT, signal.default_int_handler)

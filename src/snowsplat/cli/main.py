@@ -22,6 +22,7 @@ from snowsplat.cli.make import Make
 from snowsplat.cli.render import Render
 from snowsplat.cli.train import Train
 from snowsplat.cli.view import View
+from snowsplat.cli.watch import Watch
 from snowsplat.errors import UserError
 
 VERBS: dict[str, Any] = {
@@ -31,6 +32,7 @@ VERBS: dict[str, Any] = {
     "evaluate": Evaluate,
     "render": Render,
     "view": View,
+    "watch": Watch,
     "info": Info,
 }
 
@@ -42,6 +44,7 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, s
   snowsplat evaluate OUT                    PSNR, SSIM of the photos held out
   snowsplat render OUT                      pictures of the scene beside the photos
   snowsplat view FILE|OUT                   fly through a scene in the browser
+  snowsplat watch OUT                       a scene with its photos, also while it is trained
   snowsplat info ANYTHING                   what is in a scene, a capture, an output folder
 
 Each has its own help: snowsplat train --help

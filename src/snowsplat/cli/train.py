@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,6 +14,7 @@ from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.output import CaptureSettings, OutputFolder
 from snowsplat.cli.timed import TimeBudget
 from snowsplat.cli.training_run import TrainingRun
+from snowsplat.cli.viewing import PageFlags
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
@@ -85,6 +87,13 @@ class Train:
     white_background: Annotated[bool, switch("-w")] = False
     """The same as --background white."""
 
+    view: Annotated[bool, switch()] = False
+    """Watch the training in a browser: the scene as it grows, curves, pause. Ctrl-C ends it."""
+    port: Annotated[int | None, flag("N", default="8080, or the next that is free")] = None
+    """Where that page is: http://localhost:N."""
+    host: Annotated[str | None, flag("H", default="127.0.0.1, this computer alone")] = None
+    """Who may look; 0.0.0.0: everybody in the network."""
+
     max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Most Gaussians that the scene may have: memory and time follow it. 0: no limit."""
     checkpoint_every: Annotated[int | None, flag("N", default="none")] = None
@@ -156,6 +165,8 @@ class Train:
     """For callers from Python: seconds between checkpoints, instead of steps."""
     again: Annotated[str | None, tyro.conf.Suppress] = None
     """For callers from Python: the command that goes on with a training that was stopped."""
+    stay: Annotated[bool, tyro.conf.Suppress] = True
+    """For callers from Python: keep the page of --view open until Ctrl-C."""
 
     def run(self) -> int:
         """Gives the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
@@ -166,6 +177,7 @@ class Train:
             raise UserError("--resume and --overwrite exclude each other; leave one out")
         if self.minutes is not None and self.iterations is not None:
             raise UserError("--minutes and --iterations both say when to end; leave one out")
+        PageFlags(self.port, self.host).check(self.view)
         out = OutputFolder(self.output)
         out.check_free(resume=self.resume, overwrite=self.overwrite)
         if not self.resume and self._capture_path() is None:
@@ -211,13 +223,27 @@ class Train:
         if budget is not None and start is None:
             self._say(budget.described(plan))
         pace = None if budget is None else budget.pace(trainer, slowness)
-        return TrainingRun(
+        run = TrainingRun(
             *(out, settings, recipe, trainer, budget, pace),
             save_iterations=self.save_iterations,
             checkpoint_seconds=self.checkpoint_seconds,
             again=self.again or f"snowsplat train -o {self.output} --resume",
             quiet=self.quiet,
-        ).run()
+        )
+        return self._viewed(run) if self.view else run.run()
+
+    def _viewed(self, run: TrainingRun) -> int:
+        """Run it with a page, which stays when it is over."""
+        run.viewer = PageFlags(self.port, self.host).open_for(run.trainer, run.out.path.name)
+        try:
+            code = run.run()
+            if code == 0 and self.stay:
+                print(f"the scene stays at {run.viewer.viewer.url} until Ctrl-C", flush=True)
+                with suppress(KeyboardInterrupt):
+                    run.viewer.end(run.trainer.step, run.trainer.gaussians)
+            return code
+        finally:
+            run.viewer.viewer.close()
 
     # Flags -> settings
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from snowsplat.evaluate import Evaluation
     from snowsplat.pace import Pace
     from snowsplat.trainer import Progress, Trainer
+    from snowsplat.viewer.network.training import TrainingViewer
 
 
 @dataclass
@@ -29,6 +30,7 @@ class TrainingRun:
         save_iterations: steps after which the scene is written too.
         checkpoint_seconds: between checkpoints, where the configuration names no steps.
         again: the command that goes on where Ctrl-C stopped.
+        viewer: the page that shows it.
     """
 
     out: OutputFolder
@@ -41,6 +43,7 @@ class TrainingRun:
     checkpoint_seconds: float | None = None
     again: str = ""
     quiet: bool = False
+    viewer: TrainingViewer | None = None
 
     def __post_init__(self) -> None:
         self.config = self.trainer.config
@@ -82,6 +85,13 @@ class TrainingRun:
             self._save_checkpoint()
         if progress.step in self.save_iterations:
             self.out.write_scene(progress.step, self.trainer.gaussians)
+        if self.viewer is not None:
+            paused = self.viewer.after_step(
+                progress.step, progress.iterations, progress.loss, self.trainer.gaussians
+            )
+            if self.pace is not None and self.budget is not None:
+                self.pace.put_off(paused)
+                self.budget.started += paused
         if self.pace is not None:
             schedule = self.trainer.schedule
             length = self.pace.iterations_after(

@@ -1,0 +1,68 @@
+"""The flags `--view`, `--port` and `--host`, and the page that they ask for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from snowsplat.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.capture import Capture
+    from snowsplat.trainer import Trainer
+    from snowsplat.viewer.network.training import TrainingViewer
+    from snowsplat.viewer.network.viewer import NetworkViewer
+
+LOCAL = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class PageFlags:
+    """Where a page is to be."""
+
+    port: int | None = None
+    host: str | None = None
+
+    def check(self, view: bool) -> None:
+        """Before anything is begun.
+
+        Raises:
+            UserError: a place for a page that nobody wants, or one that cannot be had.
+        """
+        if view:
+            from snowsplat.viewer.network.server import free_port
+
+            free_port(self.host or LOCAL, self.port)
+            return
+        for name, value in (("--port", self.port), ("--host", self.host)):
+            if value is not None:
+                raise UserError(f"{name} says where a page is to be; add --view to have one")
+
+    def open(
+        self, capture: Capture, background: tuple[float, float, float], label: str
+    ) -> NetworkViewer:
+        """Open the page, and say where it is.
+
+        Raises:
+            UserError: the port is taken, or the host is not this machine.
+        """
+        from snowsplat.viewer.network.viewer import NetworkViewer
+
+        host = self.host or LOCAL
+        viewer = NetworkViewer(capture, background, host=host, port=self.port, label=label)
+        print(f"watch it in a browser: {viewer.url}", flush=True)
+        if host == LOCAL:
+            port = viewer.url.rpartition(":")[2]
+            print(f"from another computer: ssh -L {port}:localhost:{port} THIS_ONE", flush=True)
+        return viewer
+
+    def open_for(self, trainer: Trainer, label: str) -> TrainingViewer:
+        """The page of a training."""
+        from snowsplat.viewer.network.gauge import Gauge
+        from snowsplat.viewer.network.training import TrainingViewer
+
+        white = trainer.config.background == "white"
+        background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+        viewer = self.open(trainer.capture, background, label)
+        views = trainer.capture.test or trainer.capture.train
+        return TrainingViewer(viewer, Gauge(views, viewer.background))

@@ -1,0 +1,182 @@
+"""`NetworkViewer`: a page for any number of browsers, and the pictures that they wait for."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import viser
+
+from snowsplat.capture import Capture
+from snowsplat.gaussians import Gaussians
+from snowsplat.viewer.network.look import Pose
+from snowsplat.viewer.network.page import Controls, ScenePanel
+from snowsplat.viewer.network.photos import Photos, placed_photo
+from snowsplat.viewer.network.pictures import draw
+from snowsplat.viewer.network.server import address, start_server, stop_server
+from snowsplat.viewer.network.session import Due, Session, Visitor
+
+# Quality of the JPEG pictures, of a camera that moves and of one that is still.
+_QUALITY = {"moving": 60, "still": 90, "idle": 90}
+# Seconds between two looks at what is due: with browsers, and without.
+_TICK, _LONG_TICK = 0.02, 0.5
+# Seconds between two looks at whether there is a newer scene.
+_POLL = 2.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is shown.
+
+    Attributes:
+        gaussians: None where there is nothing yet.
+        number: that changes when the Gaussians do.
+        about: lines for people.
+    """
+
+    gaussians: Gaussians | None
+    number: int
+    about: list[str]
+
+
+class NetworkViewer:
+    """A page at `url` that shows Gaussians.
+
+    Pictures are made by `serve` and `hold`, in the thread that calls them and in no other: nothing
+    reads the Gaussians while they change, and nothing has to copy them.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        label: str = "snowsplat",
+    ) -> None:
+        """
+        Args:
+            capture: its cameras and photos are in the scene.
+            background: behind the Gaussians, 0..1.
+            port: None takes 8080, or the next that is free.
+
+        Raises:
+            UserError: the port is taken, or the host is not this machine.
+        """
+        self.session = Session()
+        self.background = torch.tensor(background, dtype=torch.float32)
+        self._bounds = capture.bounds
+        self.server = start_server(host, port, label)
+        self.url = address(host, self.server.get_port())
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self.server.scene.set_up_direction("-y")
+        self._photos = Photos(
+            *(self.server, self.session, capture.train, capture.test, capture.extent),
+            *(self._bounds.mean(0), self.background),
+        )
+        self._lock = threading.Lock()
+        self._browsers: dict[int, tuple[viser.ClientHandle, Visitor, Controls]] = {}
+        self._photos.on_click(self._clicked)
+        self.server.on_client_connect(self._entered)
+        self.server.on_client_disconnect(self._left)
+
+    def close(self) -> None:
+        """Close the page."""
+        self._photos.close()
+        stop_server(self.server)
+
+    # Threads of the server
+
+    def _entered(self, client: viser.ClientHandle) -> None:
+        visitor = self.session.enter(client.client_id)
+        controls = Controls(client, self.session, visitor, self._photos, self._bounds)
+        with self._lock:
+            self._browsers[client.client_id] = client, visitor, controls
+        self._photos.begin()
+
+        def moved(camera: viser.CameraHandle) -> None:
+            pose = _pose(camera)
+            if pose is not None:
+                self.session.move(visitor, pose)
+                controls.follow()
+
+        moved(client.camera)
+        client.camera.on_update(moved)
+        if client.client_id not in self.server.get_clients():  # it has left meanwhile
+            self._left(client)
+
+    def _left(self, client: viser.ClientHandle) -> None:
+        self.session.leave(client.client_id)
+        with self._lock:
+            self._browsers.pop(client.client_id, None)
+
+    def _clicked(self, client: viser.ClientHandle, index: int) -> None:
+        with self._lock:
+            browser = self._browsers.get(client.client_id)
+        if browser is not None:
+            browser[2].stand_at(index)
+
+    # The caller's thread
+
+    def serve(self, gaussians: Gaussians, scene: int, *, training: bool) -> bool:
+        """Make the most urgent picture and send it; whether there was one.
+
+        Args:
+            scene: a number that changes when the Gaussians do.
+            training: steps are waiting, and get their share of the time.
+        """
+        due = self.session.next_due(scene, training)
+        if due is None:
+            return False
+        started = time.monotonic()
+        picture = self._draw(due, gaussians)
+        with self._lock:
+            client = next((c for c, v, _ in self._browsers.values() if v is due.visitor), None)
+        if client is not None:  # else it has left while this was drawn
+            quality = _QUALITY[due.kind]
+            client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+            client.flush()
+        self.session.spent(due, scene, time.monotonic() - started)
+        return True
+
+    def _draw(self, due: Due, gaussians: Gaussians) -> np.ndarray:
+        if due.stand is None:
+            camera = due.pose.camera(due.width, due.height)
+            return draw(gaussians, camera, due.look, self.background)
+        photo = placed_photo(due.stand, due.width, due.height)
+        camera = photo.placed.camera(due.stand.camera, due.width, due.height)
+        return draw(gaussians, camera, due.look, self.background, photo)
+
+    def wait(self) -> None:
+        """For something to happen, or some hundredths of a second."""
+        self.session.wait(_TICK if self.session.visitors else _LONG_TICK)
+
+    def hold(self, newest: Callable[[], Scene]) -> None:
+        """Show the newest scene until Ctrl-C, which it raises."""
+        panel = ScenePanel(self.server)
+        scene, looked = None, 0.0
+        while True:
+            if time.monotonic() - looked > _POLL:
+                before, scene = scene, newest()
+                looked = time.monotonic()
+                if scene != before:
+                    panel.show(scene.about)
+            assert scene is not None
+            if scene.gaussians is None or not self.serve(
+                scene.gaussians, scene.number, training=False
+            ):
+                self.wait()
+
+
+def _pose(camera: viser.CameraHandle) -> Pose | None:
+    """Where a browser looks from; None where that makes no sense."""
+    quat, position = torch.from_numpy(camera.wxyz.copy()), torch.from_numpy(camera.position.copy())
+    sane = bool(torch.isfinite(quat).all() and torch.isfinite(position).all())
+    if not sane or min(camera.image_width, camera.image_height) < 1 or not camera.fov > 0:
+        return None
+    return Pose(quat, position, camera.fov, camera.image_width, camera.image_height)
