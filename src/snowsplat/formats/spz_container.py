@@ -1,0 +1,179 @@
+"""The container of an `.spz` file: its header and its columns as bytes, packed and unpacked.
+
+Versions 1 to 3 are a header of 16 bytes and the columns, in one gzip stream (or none: some tools
+leave that to others). Version 4 is a header of 32 bytes, extensions, a table of the sizes of each
+column, packed and unpacked, and the columns, each a zstd stream; empty ones are left out.
+
+What a file promises is held against its size before memory is taken for it.
+"""
+
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import zstandard
+
+from snowsplat.errors import UserError
+
+#: Bits of `Header.flags`.
+ANTIALIASED = 1
+EXTENDED = 2
+
+_MAGIC = b"NGSP"
+_GZIP = b"\x1f\x8b"
+_HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fraction, flags, streams
+_HEADER_BYTES = 32  # of version 4
+_EXTENSION_LIMIT = 1 << 16
+# Real scenes are at most twice as large when unpacked, uniform ones a thousand times: a file may
+# promise this many bytes, or so many times its size, before it is refused as one made to do harm.
+_UNPACKED_LIMIT = 64 << 20
+_UNPACKED_RATIO = 64
+
+_GZIP_LEVEL = 4
+_ZSTD_LEVEL = 5
+
+
+@dataclass
+class Header:
+    """What the first 15 bytes say; the 16th is how many streams follow, 0 before version 4."""
+
+    version: int
+    count: int
+    sh_degree: int
+    fractional_bits: int
+    flags: int
+
+    def columns(self) -> list[int]:
+        """Bytes a Gaussian of position, opacity, colour, scales, rotation, SH."""
+        position = 6 if self.version == 1 else 9
+        rotation = 3 if self.version < 3 else 4
+        return [position, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1) ** 2 - 1)]
+
+
+@dataclass
+class Contents:
+    """A file, unpacked: a column each of position, opacity, colour, scales, rotation, SH.
+
+    Invariant: each column has the size that the header says.
+    """
+
+    header: Header
+    columns: list[bytes]
+    extensions: bytes
+
+
+def is_spz(head: bytes) -> bool:
+    """Whether a file that begins so is an .spz file of any version."""
+    if head.startswith(_GZIP):
+        try:
+            head = zlib.decompressobj(31).decompress(head, 4)
+        except zlib.error:
+            return False
+    return head.startswith(_MAGIC)
+
+
+def unpack(path: Path, data: bytes) -> Contents:
+    """What is in the bytes of a file.
+
+    Raises:
+        UserError: of another version, damaged, too short, or promising absurdly much.
+    """
+    try:
+        return _unpack(path, data)
+    except (zlib.error, zstandard.ZstdError, struct.error):
+        raise _damaged(path) from None
+
+
+def _unpack(path: Path, data: bytes) -> Contents:
+    if not data.startswith(_GZIP):
+        header = _header(path, data, len(data))
+        if header.version > 3:
+            return _unpack_streams(path, data, header)
+        body = data[_HEAD.size :]
+        size = sum(header.columns()) * header.count
+    else:
+        stream = zlib.decompressobj(31)
+        head = stream.decompress(data, _HEAD.size)
+        header = _header(path, head, len(data))
+        size = sum(header.columns()) * header.count
+        # A whole stream ends; only then its checksum has been compared.
+        body = stream.decompress(stream.unconsumed_tail, size + _EXTENSION_LIMIT)
+        if header.version > 3 or not stream.eof:
+            raise _damaged(path)
+    if len(body) < size:
+        raise _damaged(path)
+    columns, start = [], 0
+    for width in header.columns():
+        columns.append(body[start : start + width * header.count])
+        start += width * header.count
+    return Contents(header, columns, body[start:] if header.flags & EXTENDED else b"")
+
+
+def _header(path: Path, head: bytes, file_size: int) -> Header:
+    if not head.startswith(_MAGIC):
+        raise UserError(f"{path}: not an .spz file (it should begin with NGSP when unpacked)")
+    _, *values, _ = _HEAD.unpack_from(head)
+    header = Header(*values)
+    if not 1 <= header.version <= 4:
+        raise UserError(f"{path}: version {header.version} of .spz; I read 1 to 4")
+    if header.sh_degree > 4 or header.fractional_bits > 31:
+        raise _damaged(path)
+    size = sum(header.columns()) * header.count
+    if size > max(_UNPACKED_LIMIT, _UNPACKED_RATIO * file_size):
+        raise UserError(
+            f"{path}: an .spz file of {file_size} bytes that promises {header.count} Gaussians; "
+            "it is damaged or made to do harm"
+        )
+    return header
+
+
+def _unpack_streams(path: Path, data: bytes, header: Header) -> Contents:
+    (table,) = struct.unpack_from("<I", data, _HEAD.size)
+    sizes = [width * header.count for width in header.columns()]
+    streams = sum(size > 0 for size in sizes)
+    start = table + 16 * streams
+    if table < _HEADER_BYTES or data[_HEAD.size - 1] != streams:
+        raise _damaged(path)
+    entry, columns = table, []
+    for size in sizes:
+        if not size:
+            columns.append(b"")
+            continue
+        packed, unpacked = struct.unpack_from("<QQ", data, entry)
+        if unpacked != size or start + packed > len(data):
+            raise _damaged(path)
+        # A reader, not decompress(): that believes the size that the stream itself promises.
+        unpacker = zstandard.ZstdDecompressor(max_window_size=1 << 27)
+        column = unpacker.stream_reader(data[start : start + packed]).read(size + 1)
+        if len(column) != size:
+            raise _damaged(path)
+        columns.append(column)
+        entry, start = entry + 16, start + packed
+    return Contents(header, columns, data[_HEADER_BYTES:table] if header.flags & EXTENDED else b"")
+
+
+def pack(header: Header, columns: Sequence[bytes]) -> bytes:
+    """The bytes of a file of version 3 or 4."""
+    streams = [column for column in columns if column]
+    count = len(streams) if header.version > 3 else 0
+    head = _HEAD.pack(
+        _MAGIC,
+        header.version,
+        header.count,
+        header.sh_degree,
+        header.fractional_bits,
+        header.flags,
+        count,
+    )
+    if header.version == 3:
+        packer = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, 31)
+        return b"".join([packer.compress(part) for part in (head, *streams)]) + packer.flush()
+    packed = [zstandard.ZstdCompressor(_ZSTD_LEVEL).compress(stream) for stream in streams]
+    sizes = [struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True)]
+    return b"".join([head, struct.pack("<I12x", _HEADER_BYTES), *sizes, *packed])
+
+
+def _damaged(path: Path) -> UserError:
+    return UserError(f"{path}: a damaged or incomplete .spz file; copy or export it again")
