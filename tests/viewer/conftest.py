@@ -1,0 +1,33 @@
+"""A small trained scene."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from snowsplat.camera import Camera
+from snowsplat.camera_list import read_cameras
+from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat.cli.main import main
+from snowsplat.formats import read_gaussians
+from snowsplat.gaussians import Gaussians
+
+
+@dataclass
+class Trained:
+    out: Path
+    scene: Path
+    gaussians: Gaussians
+    cameras: list[Camera]
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory) -> Trained:
+    """Balls in a sphere, world z up, seen from a distance of 3; an output folder of 200 steps."""
+    root = tmp_path_factory.mktemp("trained")
+    capture = write_synthetic_capture(root / "capture", "colmap-bin", 12, 96, 72, n_points=2000)
+    flags = ["--iterations", "200", "--quiet"]
+    assert main(["train", str(capture), "-o", str(root / "out"), *flags]) == 0
+    scene = root / "out/point_cloud/iteration_200/point_cloud.ply"
+    _, cameras = read_cameras(root / "out/cameras.json")
+    return Trained(root / "out", scene, read_gaussians(scene), cameras)
