@@ -44,7 +44,7 @@ def test_film_of_a_training(run, trained, way):
 
 def test_depth_beside_or_in_a_film_of_its_own(run, trained, tmp_path):
     common = ("render", trained, "--path", "ellipse", *SHORT)
-    assert run(*common, "--depth", "color", "--film", tmp_path / "a.mp4").code == 0
+    assert run(*common, "--depth", "color", "-o", tmp_path / "a.mp4").code == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mp4", "a_depth.mp4"]
     assert run(*common, "--side-by-side", "--size", "64x32").code == 0
     both = frames(trained / "films/ellipse_side_by_side.mp4")[3]
@@ -57,9 +57,12 @@ def test_depth_beside_or_in_a_film_of_its_own(run, trained, tmp_path):
 
 def test_film_through_saved_cameras(run, trained, tmp_path):
     shutil.copy(trained / "cameras.json", tmp_path / "my keys.json")
-    result = run("render", trained, "--path", tmp_path / "my keys.json", *SHORT, "--size", 64)
+    flags = ("--path", tmp_path / "my keys.json", *SHORT, "--size", 64)
+    result = run("render", trained, *flags)
     assert result.code == 0, result.err
     assert frames(trained / "films/my keys.mp4")[0].shape == (48, 64, 3)
+    assert run("render", trained, *flags, "--film", tmp_path / "a.mp4").code == 0
+    assert (tmp_path / "a.mp4").exists()
 
 
 def test_film_of_a_file(run, refused, trained, tmp_path):

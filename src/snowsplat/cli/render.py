@@ -96,6 +96,9 @@ class Render(SceneFlags):
 
         if self.depth == "16bit":
             raise UserError("--depth 16bit is for pictures; a film takes --depth color")
+        out = self.model_path
+        if self.film is None and out is not None and out.suffix.lower() == ".mp4":
+            self.film, self.model_path = out, None  # -o FILE.mp4 can mean nothing else
         if self.film is not None and self.film.suffix.lower() != ".mp4":
             raise UserError(f"--film is {self.film}; its name must end in .mp4")
         fps = 30.0 if self.fps is None else self.fps

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import math
 import shlex
 from collections.abc import Iterable, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +15,7 @@ from PIL import Image
 from snowsplat.capture.colmap import posed_camera
 from snowsplat.capture.colmap_files import read_model, read_points
 from snowsplat.files import write_text
+from snowsplat.page import bar, cards, duration, page, picture, printable, table, text
 from snowsplat.photos.scene_map import PlacedPhoto, draw_scene
 
 _FILE = "capture_report.html"
@@ -30,35 +28,10 @@ _FOCAL_FROM = {"exif": "the camera's note (EXIF) refined", "guessed": "found fro
 _STAGES = {"photos": "reading photos", "poses": "finding poses", "images": "undistorting"}
 
 _STYLE = """
-:root { color-scheme: light dark; --bg: #fbfaf7; --card: #fff; --ink: #20252c; --soft: #667080;
-  --line: #e3e0d8; --accent: #b8650a; --bad: #b3261e; }
-@media (prefers-color-scheme: dark) { :root { --bg: #14171b; --card: #1c2127; --ink: #e6e9ed;
-  --soft: #98a2ae; --line: #2e353d; --accent: #ffb454; --bad: #ff8a80; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--bg); color: var(--ink); line-height: 1.5;
-  font-family: system-ui, -apple-system, "Segoe UI", sans-serif; }
-main { max-width: 1120px; margin: 0 auto; padding: 32px 20px 64px; }
-h1 { font-size: 1.7rem; margin: 0; overflow-wrap: anywhere; }
-h2 { font-size: 1.05rem; margin: 36px 0 10px; }
-p { margin: 6px 0; } .soft, figcaption { color: var(--soft); } .bad { color: var(--bad); }
-.cards { display: flex; flex-wrap: wrap; gap: 12px; margin: 22px 0; }
-.card { flex: 1 1 150px; background: var(--card); border: 1px solid var(--line);
-  border-radius: 8px; padding: 12px 16px; }
-.card b { display: block; font-size: 1.6rem; font-weight: 600; font-variant-numeric: tabular-nums; }
 .maps { display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start; }
-figure { margin: 0; min-width: 0; } svg.map { width: 100%; height: auto; display: block; }
-figcaption { font-size: .9rem; margin-top: 4px; }
+svg.map { width: 100%; height: auto; display: block; }
 .strip { display: flex; gap: 6px; overflow-x: auto; padding-bottom: 8px; }
 .strip img { height: 110px; border-radius: 4px; display: block; }
-table { border-collapse: collapse; width: 100%; font-size: .92rem; }
-th, td { text-align: left; padding: 5px 14px 5px 0; border-bottom: 1px solid var(--line);
-  vertical-align: top; overflow-wrap: break-word; }
-th { color: var(--soft); font-weight: 500; } .names td { overflow-wrap: anywhere; }
-code, pre { font-family: ui-monospace, Menlo, Consolas, monospace; font-size: .9em; }
-pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px;
-  padding: 10px 14px; overflow-x: auto; margin: 8px 0; }
-.bar { display: inline-block; height: .7em; border-radius: 2px; background: var(--accent); }
-summary { cursor: pointer; color: var(--soft); } ol { margin: 6px 0; padding-left: 1.4em; }
 """
 
 
@@ -84,14 +57,8 @@ def write_report(capture: Path, facts: dict[str, Any]) -> Path:
         _course(facts),
         _next(capture),
     ]
-    page = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
-        '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
-        f"<title>{_text(name)} – capture</title><style>{_STYLE}</style></head>\n"
-        "<body><main>\n" + "\n".join(filter(None, body)) + "\n</main></body></html>\n"
-    )
     path = capture / _FILE
-    write_text(path, page)
+    write_text(path, page(f"{name} – capture", body, _STYLE))
     return path
 
 
@@ -103,7 +70,7 @@ def _placed(capture: Path, facts: dict[str, Any]) -> list[PlacedPhoto]:
         camera = posed_camera(model, image)
         half = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
         pose = camera.cam_from_world.numpy()
-        photos.append(PlacedPhoto(_printable(image.name), sequences.get(image.name), pose, *half))
+        photos.append(PlacedPhoto(printable(image.name), sequences.get(image.name), pose, *half))
     return photos
 
 
@@ -117,7 +84,7 @@ def _headline(name: str, facts: dict[str, Any]) -> str:
         verdict = f"All {placed} photos have their place."
     else:
         verdict = f"{placed} of {placed + rest} photos have their place."
-    lines = [f"<h1>{_text(name)}</h1>", f"<p>{verdict}</p>"]
+    lines = [f"<h1>{text(name)}</h1>", f"<p>{verdict}</p>"]
     if len(sfm["sub_models"]) > 1:
         sizes = ", ".join(map(str, sfm["sub_models"]))
         lines.append(
@@ -137,15 +104,14 @@ def _cards(facts: dict[str, Any]) -> str:
     sfm = facts["sfm"]
     total = len(sfm["registered"]) + len(sfm["unregistered"])
     error = sfm["reprojection_error"]
-    cards = [
+    figures = [
         (f"{len(sfm['registered'])} / {total}", "photos placed"),
         (f"{sfm['points']:,}", f"points, seen {sfm['observations']:,} times"),
         ("–" if error is None else f"{error:.2f} px", "mean reprojection error"),
         (str(len(sfm["cameras"])), "lens" if len(sfm["cameras"]) == 1 else "lenses"),
-        (_duration(sum(facts["seconds"].values())), "in all"),
+        (duration(sum(facts["seconds"].values())), "in all"),
     ]
-    inner = "".join(f'<div class="card"><b>{value}</b>{label}</div>' for value, label in cards)
-    return f'<div class="cards">{inner}</div>'
+    return cards(figures)
 
 
 def _maps(capture: Path, photos: Sequence[PlacedPhoto]) -> str:
@@ -172,15 +138,14 @@ def _strip(capture: Path, names: Sequence[str]) -> str:
     count = min(len(names), _THUMBNAILS)
     chosen = [names[i * len(names) // count] for i in range(count)]
     images = "".join(
-        f'<img src="data:image/jpeg;base64,{_thumbnail(capture / "images" / name)}" '
-        f'alt="{_text(name)}" title="{_text(name)}"/>'
+        picture(_thumbnail(capture / "images" / name), name)
         for name in chosen
         if (capture / "images" / name).is_file()
     )
     return f'<h2>Images</h2>\n<div class="strip">{images}</div>'
 
 
-def _thumbnail(path: Path) -> str:
+def _thumbnail(path: Path) -> Image.Image:
     with Image.open(path) as image:
         image.draft("RGB", (4 * _THUMBNAIL_HEIGHT, 2 * _THUMBNAIL_HEIGHT))  # JPEG decodes smaller
         width = max(1, round(image.width * _THUMBNAIL_HEIGHT / image.height))
@@ -189,9 +154,7 @@ def _thumbnail(path: Path) -> str:
     if small.mode == "RGBA":
         ground = Image.new("RGBA", small.size, (128, 128, 128, 255))
         small = Image.alpha_composite(ground, small).convert("RGB")
-    data = io.BytesIO()
-    small.save(data, "JPEG", quality=75)
-    return base64.b64encode(data.getvalue()).decode("ascii")
+    return small
 
 
 def _lenses(cameras: Iterable[dict[str, Any]], undistorted: dict[str, Any]) -> str:
@@ -213,8 +176,8 @@ def _lenses(cameras: Iterable[dict[str, Any]], undistorted: dict[str, Any]) -> s
     how = (
         "without lens distortion" if undistorted["resampled"] else "copied: there is no distortion"
     )
-    table = _table(["photos", "size", "focal length (longer side)", "lens model"], rows)
-    return f'<h2>Lenses</h2>\n{table}\n<p class="soft">Images for training: {sizes}, {how}.</p>'
+    lenses = table(["photos", "size", "focal length (longer side)", "lens model"], rows)
+    return f'<h2>Lenses</h2>\n{lenses}\n<p class="soft">Images for training: {sizes}, {how}.</p>'
 
 
 def _left_out(facts: dict[str, Any]) -> str:
@@ -224,10 +187,10 @@ def _left_out(facts: dict[str, Any]) -> str:
     ]
     if not entries:
         return ""
-    rows = [[_text(name), _text(why)] for name, why in entries[:_NAMED]]
+    rows = [[text(name), text(why)] for name, why in entries[:_NAMED]]
     more = len(entries) - _NAMED
     rest = f'<p class="soft">… and {more:,} more, see capture.json.</p>' if more > 0 else ""
-    return f"<h2>Not used</h2>\n{_table(['photo', 'why'], rows, 'names')}{rest}"
+    return f"<h2>Not used</h2>\n{table(['photo', 'why'], rows, 'names')}{rest}"
 
 
 def _course(facts: dict[str, Any]) -> str:
@@ -235,17 +198,14 @@ def _course(facts: dict[str, Any]) -> str:
     longest = max([*seconds.values(), 1e-9])
     rows = []
     for stage, value in seconds.items():
-        share = max(0.01, value / longest)
-        width = f"width:{35 * share:.1f}vw;max-width:{400 * share:.0f}px"
-        bar = f'<span class="bar" style="{width}"></span>'
-        rows.append([_text(_STAGES.get(stage, stage)), _duration(value), bar])
+        rows.append([text(_STAGES.get(stage, stage)), duration(value), bar(value / longest)])
     sfm = facts["sfm"]
-    attempts = "".join(f"<li>{_text(attempt)}</li>" for attempt in sfm["attempts"])
-    settings = _text(json.dumps(facts["settings"], indent=2, ensure_ascii=False))
-    inputs = ", ".join(_text(path) for path in facts["inputs"])
+    attempts = "".join(f"<li>{text(attempt)}</li>" for attempt in sfm["attempts"])
+    settings = text(json.dumps(facts["settings"], indent=2, ensure_ascii=False))
+    inputs = ", ".join(text(path) for path in facts["inputs"])
     return (
-        f"<h2>How it went</h2>\n{_table(['stage', 'time', ''], rows)}\n"
-        f'<p class="soft">From {inputs}. Pairs of photos: {_text(sfm["pairs"])}.</p>\n'
+        f"<h2>How it went</h2>\n{table(['stage', 'time', ''], rows)}\n"
+        f'<p class="soft">From {inputs}. Pairs of photos: {text(sfm["pairs"])}.</p>\n'
         f"<ol>{attempts}</ol>\n"
         f"<details><summary>Settings</summary><pre>{settings}</pre></details>"
     )
@@ -259,33 +219,4 @@ def _name(inputs: Sequence[str]) -> str:
 
 def _next(capture: Path) -> str:
     command = f"snowsplat train {shlex.quote(str(capture))} -o {shlex.quote(capture.name + '-out')}"
-    return f"<h2>Next</h2>\n<pre>{_text(command)}</pre>"
-
-
-# Words and tables
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "plain") -> str:
-    """Cells are HTML already."""
-    top = "".join(f"<th>{head}</th>" for head in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    return f"<table class='{kind}'><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"
-
-
-def _text(value: object) -> str:
-    return escape(_printable(str(value)))
-
-
-def _printable(text: str) -> str:
-    """File names may hold bytes that are no text, and control characters that XML refuses."""
-    text = text.encode("utf-8", "replace").decode("utf-8")
-    return "".join(c if c in "\n\t" or c.isprintable() else "\ufffd" for c in text)
+    return f"<h2>Next</h2>\n<pre>{text(command)}</pre>"

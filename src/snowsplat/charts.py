@@ -1,0 +1,139 @@
+"""Curves as SVG, for reports: axes with few round numbers, in the colours of the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from html import escape
+
+_WIDTH, _HEIGHT = 520, 230  # in units of the drawing
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 10, 34
+_TICKS_X, _TICKS_Y = 6, 5  # about as many
+
+#: CSS that the page needs.
+STYLE = """
+svg.chart { width: 100%; height: auto; display: block; }
+.chart text { fill: var(--soft); font-size: 12px; font-variant-numeric: tabular-nums; }
+.chart .grid { stroke: var(--line); } .chart .dot { fill: var(--accent); }
+.chart .curve { fill: none; stroke: var(--accent); stroke-width: 2; stroke-linejoin: round; }
+.chart .raw { fill: none; stroke: var(--accent); stroke-width: 1; opacity: .3; }
+"""
+
+_Points = Sequence[tuple[float, float]]
+
+
+def chart(
+    points: _Points,
+    *,
+    x_label: str,
+    y_label: str,
+    raw: _Points = (),
+    dots: bool = False,
+    from_zero: bool = True,
+) -> str:
+    """A curve through points (x, y); "" if there is none to draw.
+
+    Args:
+        x_label, y_label: what the axes are, and their units.
+        raw: the same before it was smoothed, drawn faintly behind.
+        dots: mark the points, which are few.
+        from_zero: the vertical axis begins at 0.
+    """
+    points, raw = _finite(points), _finite(raw)
+    if not points:
+        return ""
+    # What is not smoothed may go beyond the edge, lest a single step makes the curve flat.
+    ys = [y for _, y in points] + sorted(y for _, y in raw)[len(raw) // 50 : -(len(raw) // 50) - 1]
+    x_ticks = ticks(min(0.0, points[0][0]), max(points[-1][0], 1e-9), _TICKS_X)
+    y_ticks = ticks(0.0 if from_zero else min(ys), max(ys), _TICKS_Y)
+    left, right = x_ticks[0], max(points[-1][0], 1e-9)
+    low, high = min(y_ticks[0], *ys), max(y_ticks[-1], *ys)
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        y = min(max(y, low), high)
+        return (
+            _LEFT + (x - left) / (right - left) * (_WIDTH - _LEFT - _RIGHT),
+            _HEIGHT - _BOTTOM - (y - low) / (high - low) * (_HEIGHT - _TOP - _BOTTOM),
+        )
+
+    parts = []
+    for tick, word in zip(y_ticks, tick_words(y_ticks), strict=True):
+        _, y = at(left, tick)
+        parts.append(f'<path class="grid" d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}"/>')
+        parts.append(f'<text x="{_LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{word}</text>')
+    bottom = _HEIGHT - _BOTTOM
+    for tick, word in zip(x_ticks, tick_words(x_ticks), strict=True):
+        if tick > right:
+            continue
+        x, _ = at(tick, low)
+        parts.append(f'<path class="grid" d="M{x:.1f} {bottom}v4"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 17}" text-anchor="middle">{word}</text>')
+    # At the end of its axis, below the numbers.
+    parts.append(
+        f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 4}" text-anchor="end">{escape(x_label)}</text>'
+    )
+    if raw:
+        parts.append(f'<path class="raw" d="{_line([at(*point) for point in raw])}"/>')
+    places = [at(*point) for point in points]
+    if len(places) > 1:
+        parts.append(f'<path class="curve" d="{_line(places)}"/>')
+    if dots or len(places) == 1:
+        parts += [f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="3.5"/>' for x, y in places]
+    inner = "".join(parts)
+    return (
+        f'<svg class="chart" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" '
+        f'role="img"><title>{escape(y_label)}</title>{inner}</svg>'
+    )
+
+
+def ticks(low: float, high: float, count: int) -> list[float]:
+    """About ``count`` round numbers, at equal steps, from ``low`` or below to ``high`` or above."""
+    span = high - low
+    if not span > 1e-9 * max(abs(low), abs(high), 1e-9):
+        span = abs(high) or 1.0
+        low, high = low - span / 2, high + span / 2
+    rough = span / max(1, count - 1)
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * (1 - 1e-9))
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [i * step for i in range(first, last + 1)]
+
+
+def tick_words(values: Sequence[float]) -> list[str]:
+    """All with as many decimals as they need; from 10,000 on as k, from a million on as M."""
+    largest = max(abs(value) for value in values)
+    step = values[1] - values[0] if len(values) > 1 else largest
+    for least, unit, word in ((1e6, 1e6, "M"), (1e4, 1e3, "k")):
+        if largest >= least:
+            shown = [value / unit for value in values]
+            places = _decimals(step / unit)
+            return [f"{value:.{places}f}{word}" if value else "0" for value in shown]
+    places = _decimals(step)
+    return [f"{value:.{places}f}" if value else "0" for value in values]
+
+
+def smoothed(points: _Points, window: int) -> list[tuple[float, float]]:
+    """Each y the mean of those around it, a triangle of weights ``window`` to each side."""
+    result = []
+    for i, (x, _) in enumerate(points):
+        reach = min(window, i, len(points) - 1 - i)  # even to both sides: the ends do not lag
+        weights = [reach + 1 - abs(k) for k in range(-reach, reach + 1)]
+        near = [y for _, y in points[i - reach : i + reach + 1]]
+        mean = sum(w * y for w, y in zip(weights, near, strict=True)) / sum(weights)
+        result.append((x, mean))
+    return result
+
+
+def _decimals(step: float) -> int:
+    for places in range(7):
+        if abs(step * 10**places - round(step * 10**places)) < 1e-6 * step * 10**places:
+            return places
+    return 7
+
+
+def _finite(points: _Points) -> list[tuple[float, float]]:
+    return [(x, y) for x, y in points if math.isfinite(x) and math.isfinite(y)]
+
+
+def _line(places: Sequence[tuple[float, float]]) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
