@@ -1,6 +1,9 @@
 """What the tests of all formats need: scenes, how they compare, how damage is told."""
 
 import math
+import os
+import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -95,3 +98,26 @@ def rotation_error() -> Callable[[Gaussians, Gaussians], float]:
         return float(error.max()) if len(error) else 0.0
 
     return largest
+
+
+@pytest.fixture(scope="session")
+def splat_transform() -> Callable[..., None]:
+    """``splat_transform(source, target, *flags)``: PlayCanvas' converter, which shares no code
+    with ours. It needs Node; `npm ci --ignore-scripts` in tests/node installs it.
+    """
+    program = Path(__file__).parents[1] / "node/node_modules/.bin/splat-transform"
+    if not program.exists() or shutil.which("node") is None:
+        pytest.skip(f"{program} or node is absent; `npm ci --ignore-scripts` in tests/node")
+
+    def convert(source: Path, target: Path, *flags: str) -> None:
+        command = ["node", program, "--quiet", "--overwrite", source, *flags, target]
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=100,
+            env={**os.environ, "NO_COLOR": "1"},
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    return convert

@@ -170,7 +170,7 @@ def test_one_stray_gaussian_does_not_cost_the_others_their_precision(tmp_path, m
         write_gaussians(tmp_path / "a.spz", scene)
     assert "1 Gaussians lie farther out" in caplog.text
     read = read_gaussians(tmp_path / "a.spz")
-    assert read.means[7, 1] > 8000
+    assert read.means[7, 1] > 4000
     scene.means[7] = read.means[7]
     assert (read.means - scene.means).abs().max() < 1e-3
 

@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 #: means, log_scales, quats, opacity_logits, sh_dc, sh_rest.
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
-_FLAT = 1e-12  # the least standard deviation that a reader gives: that of a disc
+_FLAT = 1e-12  # instead of a standard deviation of 0, which has no logarithm
 
 
 def read_file(path: Path) -> bytes:
@@ -108,7 +108,7 @@ def to_bytes(values: np.ndarray) -> np.ndarray:
 
 def log_scales(scales: np.ndarray) -> np.ndarray:
     """Logarithms of standard deviations; 0 and less, of a flat Gaussian, as of 1e-12."""
-    return np.log(np.maximum(scales, np.float32(_FLAT)))  # NaN stays NaN
+    return np.log(np.where(scales <= 0, np.float32(_FLAT), scales))  # NaN stays NaN
 
 
 def largest_of_four(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

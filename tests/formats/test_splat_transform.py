@@ -1,0 +1,68 @@
+"""Our files read by PlayCanvas' converter, and its files by us: the same scene each time."""
+
+import pytest
+import torch
+
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats.frames import UP_BACK, flip_axes
+from snowsplat.formats.spz import write_spz
+from snowsplat.gaussians import Gaussians
+
+
+def assert_same(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
+    assert len(a) == len(b)
+    assert a.sh_degree == b.sh_degree
+    torch.testing.assert_close(a.means, b.means, rtol=0, atol=tolerance)
+    torch.testing.assert_close(a.log_scales, b.log_scales, rtol=0, atol=tolerance)
+    torch.testing.assert_close(a.opacities, b.opacities, rtol=0, atol=1.1e-3)  # 0 and 255
+    torch.testing.assert_close(a.sh_dc, b.sh_dc, rtol=0, atol=tolerance)
+    torch.testing.assert_close(a.sh_rest, b.sh_rest, rtol=0, atol=tolerance)
+    cosine = (a.rotations * b.rotations).sum(1).abs()
+    # It takes a .splat's bytes for 127.5 + 127.5 q.
+    assert (1 - cosine).max() < 1e-4
+
+
+def as_it_reads_spz(scene: Gaussians) -> Gaussians:
+    """It takes the numbers of an .spz file for those of a PLY, without turning the frame."""
+    turned = flip_axes(scene.means.numpy(), scene.quats.numpy(), scene.sh_rest.numpy(), UP_BACK)
+    means, quats, sh_rest = (torch.from_numpy(array) for array in turned)
+    return Gaussians(means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_it_reads_what_we_write(tmp_path, make_scene, splat_transform, degree):
+    scene = make_scene(700, degree)
+    for name in ("a.ply", "a.compressed.ply", "a.splat"):
+        write_gaussians(tmp_path / name, scene)
+        splat_transform(tmp_path / name, tmp_path / "back.ply")
+        assert_same(read_gaussians(tmp_path / "back.ply"), read_gaussians(tmp_path / name))
+    for version in (3, 4):
+        write_spz(tmp_path / "a.spz", scene, version)
+        splat_transform(tmp_path / "a.spz", tmp_path / "back.ply")
+        ours = as_it_reads_spz(read_gaussians(tmp_path / "a.spz"))
+        assert_same(read_gaussians(tmp_path / "back.ply"), ours)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_we_read_what_it_writes(tmp_path, make_scene, splat_transform, degree):
+    write_gaussians(tmp_path / "a.ply", make_scene(700, degree))
+    splat_transform(tmp_path / "a.ply", tmp_path / "a.compressed.ply")
+    splat_transform(tmp_path / "a.compressed.ply", tmp_path / "back.ply")
+    assert_same(
+        read_gaussians(tmp_path / "a.compressed.ply"), read_gaussians(tmp_path / "back.ply")
+    )
+    for version in ("3", "4"):
+        splat_transform(tmp_path / "a.ply", tmp_path / "a.spz", "--spz-version", version)
+        splat_transform(tmp_path / "a.spz", tmp_path / "back.ply")
+        ours = as_it_reads_spz(read_gaussians(tmp_path / "a.spz"))
+        assert_same(ours, read_gaussians(tmp_path / "back.ply"))
+
+
+def test_we_read_fixtures_as_it_does(tmp_path, shared, splat_transform):
+    for name in ("minimal.splat", "minimal.ksplat", "guitar.compressed.ply"):
+        splat_transform(shared / name, tmp_path / "back.ply")
+        assert_same(read_gaussians(shared / name), read_gaussians(tmp_path / "back.ply"))
+    for name in ("minimal-v2.spz", "minimal-v3.spz", "minimal-v4.spz"):
+        splat_transform(shared / name, tmp_path / "back.ply")
+        ours = as_it_reads_spz(read_gaussians(shared / name))
+        assert_same(ours, read_gaussians(tmp_path / "back.ply"))
