@@ -73,20 +73,30 @@ class View:
         from snowsplat.camera_list import read_cameras
         from snowsplat.formats import read_gaussians
 
-        black = (0.0, 0.0, 0.0)
         if not path.exists():
             raise UserError(f"{path}: no such file or folder")
-        if not path.is_dir():
+        if path.is_dir():
+            folder = OutputFolder(path)
+            iteration, gaussians = folder.read_scene(self.iteration)
+            scene = folder.scene_path(iteration)
+        else:
             if self.iteration is not None:
                 raise UserError("--iteration chooses a scene of an output folder, not of a file")
-            return path, read_gaussians(path), [], black
-        folder = OutputFolder(path)
-        iteration, gaussians = folder.read_scene(self.iteration)
+            scene, gaussians = path, read_gaussians(path)
+            folder = folder_around(path)
         cameras: list[Camera] = []
-        if (path / "cameras.json").is_file():
-            _, cameras = read_cameras(path / "cameras.json")
-        background = folder.settings()[1] if folder.is_one() else black
-        return folder.scene_path(iteration), gaussians, cameras, background
+        if (folder.path / "cameras.json").is_file():
+            _, cameras = read_cameras(folder.path / "cameras.json")
+        background = folder.settings()[1] if folder.is_one() else (0.0, 0.0, 0.0)
+        return scene, gaussians, cameras, background
+
+
+def folder_around(scene: Path) -> OutputFolder:
+    """OUT of OUT/point_cloud/iteration_N/point_cloud.ply; of other files, one that holds nothing."""
+    scene = scene.resolve()
+    folder = OutputFolder(scene.parents[min(2, len(scene.parents) - 1)])
+    is_inside = scene in [folder.scene_path(iteration) for iteration in folder.scenes()]
+    return folder if is_inside else OutputFolder(scene)
 
 
 def over_ssh() -> bool:

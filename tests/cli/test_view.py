@@ -1,0 +1,128 @@
+"""`snowsplat view`: finds the scene, says where the page is, ends by Ctrl-C."""
+
+import shutil
+import signal
+import socket
+import threading
+import urllib.request
+import webbrowser
+from pathlib import Path
+
+import pytest
+
+from snowsplat.cli import view
+from snowsplat.cli.main import main
+from snowsplat.formats import read_gaussians, write_gaussians
+
+from ..browser import Browser, needs_chromium
+
+
+@pytest.fixture(scope="module")
+def out(capture, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("view") / "out"
+    flags = ["--iterations", "60", "--save-iterations", "30", "--quiet"]
+    assert main(["train", str(capture), "-o", str(folder), *flags]) == 0
+    return folder
+
+
+def scene(out: Path) -> Path:
+    return out / "point_cloud/iteration_60/point_cloud.ply"
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+def test_serves_until_it_is_told_to_end(start, out, sign):
+    process = start("view", out, "--no-browser")
+    assert str(scene(out)) in process.stdout.readline()
+    url = process.stdout.readline().strip()
+    assert url.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(url, timeout=10) as page:
+        assert b"<title>out - snowsplat</title>" in page.read()
+    with urllib.request.urlopen(f"{url}scene.compressed.ply", timeout=10) as content:
+        assert content.read(4) == b"ply\n"
+    process.send_signal(sign)
+    assert process.wait(10) == 0
+    assert process.stderr.read() == ""
+
+
+@needs_chromium
+def test_a_real_browser_at_the_printed_address(start, out):
+    process = start("view", out, "--no-browser")
+    process.stdout.readline()
+    with Browser(320, 240) as browser:
+        page = browser.open(process.stdout.readline().strip() + "?webgl&noui")
+        page.wait_for("!!window.app", 60)
+        assert page.screenshot().std() > 10
+        assert not page.errors
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 0
+    assert process.stderr.read() == ""
+
+
+@pytest.fixture
+def served(run, monkeypatch):
+    """Run the verb up to where it waits: its result, the addresses opened, the site's arguments."""
+    from snowsplat.viewer import static_scene
+
+    def served(*arguments, environment=()):
+        for name in ("SSH_CONNECTION", "SSH_TTY", "DISPLAY", "WAYLAND_DISPLAY"):
+            monkeypatch.delenv(name, raising=False)
+        for name in environment:
+            monkeypatch.setenv(name, ":0")
+        opened, sites, done = [], [], threading.Event()
+        site = static_scene.site
+        monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), done.set()))
+        monkeypatch.setattr(static_scene, "site", lambda *a: (sites.append(a), site(*a))[1])
+        monkeypatch.setattr(view, "wait_for_interrupt", lambda: done.wait(0.3))
+        result = run("view", *arguments)
+        assert result.code == 0, result.err
+        return result, opened, sites[0]
+
+    return served
+
+
+def test_it_opens_the_browser_where_one_can_be_seen(served, out):
+    result, opened, _ = served(out, environment=["DISPLAY"])
+    assert opened == [result.out.splitlines()[1]]
+    assert served(out, "--no-browser", environment=["DISPLAY"])[1] == []
+    assert served(out)[1] == []
+
+
+def test_over_ssh_it_says_how_to_reach_it(served, out):
+    result, opened, _ = served(out, environment=["SSH_CONNECTION"])
+    port = result.out.splitlines()[1].split(":")[2].split("/")[0]
+    assert f"ssh -L {port}:127.0.0.1:{port} " in result.out
+    assert not opened
+    assert "ssh" not in served(out)[0].out
+
+
+def test_which_scene_and_which_cameras(served, out, tmp_path):
+    _, _, (title, gaussians, cameras, background) = served(out, "--iteration", 30)
+    assert title == "out - snowsplat"
+    thirty = read_gaussians(out / "point_cloud/iteration_30/point_cloud.ply")
+    assert gaussians.means.equal(thirty.means)
+    assert len(cameras) == 9
+    assert background == (0.0, 0.0, 0.0)
+    assert len(served(scene(out))[2][2]) == 9  # the folder around it is found
+    shutil.copy(scene(out), tmp_path / "point_cloud.ply")
+    assert served(tmp_path / "point_cloud.ply")[2][2] == []
+
+
+def test_scenes_of_other_formats(served, out, tmp_path):
+    gaussians = read_gaussians(scene(out))
+    for name in ("scene.splat", "scene.spz", "scene.compressed.ply"):
+        write_gaussians(tmp_path / name, gaussians)
+        result, _, (_, shown, _, _) = served(tmp_path / name)
+        assert f"{tmp_path / name}: {len(gaussians):,} Gaussians" in result.out
+        assert len(shown) == len(gaussians)
+
+
+def test_refused(refused, out, tmp_path):
+    assert "needs a scene" in refused("view")
+    assert "no such file" in refused("view", tmp_path / "absent")
+    assert "holds no scene" in refused("view", tmp_path)
+    assert "not of a file" in refused("view", scene(out), "--iteration", 3)
+    write_gaussians(tmp_path / "empty.ply", read_gaussians(scene(out)).map(lambda t: t[:0]))
+    assert "holds no Gaussians" in refused("view", tmp_path / "empty.ply")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert f"port {port} is taken" in refused("view", out, "--port", port)
