@@ -92,7 +92,7 @@ class View:
 
 
 def folder_around(scene: Path) -> OutputFolder:
-    """OUT of OUT/point_cloud/iteration_N/point_cloud.ply; of other files, one that holds nothing."""
+    """OUT of OUT/point_cloud/iteration_N/point_cloud.ply; else one that holds nothing."""
     scene = scene.resolve()
     folder = OutputFolder(scene.parents[min(2, len(scene.parents) - 1)])
     is_inside = scene in [folder.scene_path(iteration) for iteration in folder.scenes()]
