@@ -83,3 +83,8 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return value
+
+
+def shown(path: Path | str) -> str:
+    """A path for people: bytes that are no text become "?"."""
+    return str(path).encode("utf-8", "replace").decode()

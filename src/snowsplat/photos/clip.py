@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from snowsplat.errors import UserError
-from snowsplat.photos.sources import shown
+from snowsplat.files import shown
 
 if TYPE_CHECKING:
     from av import VideoFrame

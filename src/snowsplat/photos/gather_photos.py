@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
+from snowsplat.files import shown
 from snowsplat.photos.mask_files import read_mask, write_mask
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.photo_files import (
@@ -24,7 +25,7 @@ from snowsplat.photos.photo_files import (
 )
 from snowsplat.photos.progress import Report
 from snowsplat.photos.sharpness import PICTURE_SIDE, grey_copy, why_useless
-from snowsplat.photos.sources import Source, free_names, shown
+from snowsplat.photos.sources import Source, free_names
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from snowsplat.errors import UserError
+from snowsplat.files import shown
 from snowsplat.photos.clip import Clip, frames_wanted, read_clip
 from snowsplat.photos.gather_photos import Planned, plan_photos, write_photos
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.progress import Report
 from snowsplat.photos.sharpness import BLACK, BLURRED, FLAT, WHITE
-from snowsplat.photos.sources import Source, find_sources, shown
+from snowsplat.photos.sources import Source, find_sources
 from snowsplat.photos.video import SAME_VIEW, extract_frames
 
 logger = logging.getLogger(__name__)

@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from snowsplat.errors import UserError
+from snowsplat.files import shown
 from snowsplat.photos.photo_files import Header, open_image, turned
-from snowsplat.photos.sources import shown
 
 
 def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from snowsplat.errors import UserError
+from snowsplat.files import shown
 
 PHOTO_SUFFIXES = {
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".webp", ".tif", ".tiff"),
@@ -79,7 +80,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
         if not path.is_dir():
             kind = kind_of_file(path)
             if kind == "photo":
-                add(Source(path, kind, _text(path.name), Masks(path.parent).of(path.name)))
+                add(Source(path, kind, shown(path.name), Masks(path.parent).of(path.name)))
             else:
                 add(Source(path, kind, "" if len(inputs) == 1 else _free(path.stem, folders)))
             continue
@@ -87,7 +88,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
         prefix = "" if len(inputs) == 1 else _free(path.resolve().name, folders)
         masks = Masks(path)
         for relative in photos:
-            name = str(PurePosixPath(prefix) / _text(relative))
+            name = str(PurePosixPath(prefix) / shown(relative))
             add(Source(path / relative, "photo", name, masks.of(relative)))
         unused += masks.unused
         for relative in videos:
@@ -243,7 +244,7 @@ def free_names(names: Sequence[str]) -> Iterator[str]:
 
 
 def _free(name: str, taken: set[str]) -> str:
-    name = _text(name)
+    name = shown(name)
     path = PurePosixPath(name)
     candidate, n = name, 1
     while candidate.casefold() in taken:
@@ -251,12 +252,3 @@ def _free(name: str, taken: set[str]) -> str:
         candidate = str(path.with_name(f"{path.stem}_{n}{path.suffix}"))
     taken.add(candidate.casefold())
     return candidate
-
-
-def shown(path: Path) -> str:
-    """A path for people: bytes that are no text become "?"."""
-    return _text(str(path))
-
-
-def _text(name: str) -> str:
-    return name.encode("utf-8", "replace").decode()

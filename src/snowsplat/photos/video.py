@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from snowsplat.files import shown
 from snowsplat.photos.clip import (
     Clip,
     decoded_frames,
@@ -32,7 +33,6 @@ from snowsplat.photos.sharpness import (
     sharpness,
     why_useless,
 )
-from snowsplat.photos.sources import shown
 from snowsplat.photos.tone import rgb_picture
 
 if TYPE_CHECKING:
