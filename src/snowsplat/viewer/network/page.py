@@ -36,8 +36,8 @@ _LEGENDS: dict[Mode, str] = {
     "cost": "How many a pixel blends. Black: none, red: about 30, pale yellow: 256 or more.",
     "error": "Black: none, pale yellow: a quarter of the range or more.",
 }
-_NOWHERE = "Click a camera in the scene to stand where its photo was taken."
-_NEEDS_PHOTO = "Shown where you stand at a photo: click a camera."
+_NOWHERE = "Show the cameras and click one, to stand where its photo was taken."
+_NEEDS_PHOTO = "Shown where you stand at a photo: click a camera, or Next below."
 
 
 def _note(text: str) -> str:
@@ -169,8 +169,8 @@ class Controls:
                 "SH degree", 0, 3, 1, look.sh_degree, hint="How far colours change with direction"
             )
             scale = gui.add_slider(
-                *("Gaussian size (%)", 2, 100, 2, 100),
-                hint="Shrinks every Gaussian, to see each by itself",
+                *("Gaussian size", 2, 100, 2, 100),
+                hint="Percent: shrinks every Gaussian, to see each by itself",
             )
             finest = gui.add_slider(
                 *("Most pixels", 320, 2560, 80, self._visitor.longest),
@@ -195,13 +195,14 @@ class Controls:
     def _add_photos(self) -> None:
         gui = self._client.gui
         with gui.add_folder("Photos", order=2, visible=bool(self._photos.views)):
-            self._shown = gui.add_checkbox("Cameras", True)
+            self._shown = gui.add_checkbox("Cameras", False)
             self._where = gui.add_html(_note(_NOWHERE))
             self._wipe = gui.add_slider(
                 *("Photo (%)", 0, 100, 1, 0), visible=False, hint="From the left, over the render"
             )
             self._flip = gui.add_button_group("Show only", ("Render", "Photo"), visible=False)
             self._move = gui.add_button_group("Go to", ("Previous", "Next"))
+        self._show_frustums()
         self._shown.on_update(lambda _: self._show_frustums())
         self._wipe.on_update(lambda _: self._look(wipe=self._wipe.value / 100.0))
         self._flip.on_click(lambda _: self._wipe_to(100 if self._flip.value == "Photo" else 0))

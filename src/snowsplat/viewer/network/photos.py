@@ -13,6 +13,7 @@ import viser
 from PIL import Image
 from torch import Tensor
 
+from snowsplat import ops
 from snowsplat.camera import Camera
 from snowsplat.capture import View
 from snowsplat.capture.decode import load_image
@@ -25,9 +26,9 @@ from snowsplat.viewer.network.session import Session, Stand, Visitor
 #: The parent of all frustums.
 FRUSTUMS = "/photos"
 _TRAIN_COLOR, _TEST_COLOR = (70, 130, 230), (240, 150, 40)
-# Length of a frustum, in extents of the scene; and the most that there are, and the longer side of
-# the small photos in them, pixels.
-_LENGTH, _MOST, _SMALL = 0.06, 400, 96
+# Length of a frustum, in the distance to the next camera, and in extents of the scene at most; how
+# many there are at most; the longer side of the small photos in them, pixels.
+_LENGTH, _LONGEST, _MOST, _SMALL = 0.6, 0.06, 400, 96
 # While a training runs, the small photos are read in this part of the time.
 _READING = 0.2
 
@@ -58,6 +59,11 @@ class Photos:
         self.views = [*train, *test]
         self._session = session
         self._extent = extent
+        self._length = _LONGEST * extent
+        if len(self.views) > 1:
+            places = torch.stack([view.camera.position.detach() for view in self.views])
+            spacing = ops.neighbours(places.to(torch.float32).contiguous(), k=1).median()
+            self._length = min(max(_LENGTH * float(spacing), 0.2 * self._length), self._length)
         self._centre = centre.to(torch.float64)
         self._background = background
         self._began = threading.Event()  # reading the small photos
@@ -84,7 +90,7 @@ class Photos:
             f"{FRUSTUMS}/{index}",
             fov=2.0 * math.atan(0.5 * camera.height / camera.fy),
             aspect=camera.width / camera.height,
-            scale=_LENGTH * self._extent,
+            scale=self._length,
             thickness=1.5,
             thickness_units="screen",
             color=color,

@@ -13,7 +13,6 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.camera import Camera
 from snowsplat.gaussians import Gaussians
-from snowsplat.geometry import rotation_from_quat
 from snowsplat.ops.splats import COLORS, CONICS, OPACITIES, Splats2D
 from snowsplat.process import single_threaded
 from snowsplat.render import project
@@ -141,14 +140,19 @@ def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tenso
     straight it points there, (M,) in 0..1."""
     assert splats.ids is not None
     ids = splats.ids.long()
-    shortest = gaussians.log_scales[ids].argmin(1)
-    rotations = rotation_from_quat(gaussians.quats[ids])
-    axes = rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    shortest = torch.eye(3)[gaussians.log_scales[ids].argmin(1)].to(gaussians.quats)
+    axes = _rotated(gaussians.rotations[ids], shortest)
     to_camera = camera.position.to(axes.dtype) - gaussians.means[ids]
     facing = (axes * to_camera).sum(1)
     axes = torch.where(facing[:, None] < 0, -axes, axes)
     straight = facing.abs() / to_camera.norm(dim=1).clamp_min(1e-9)
     return axes @ camera.cam_from_world[:, :3].T.to(axes.dtype), straight
+
+
+def _rotated(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors (M, 3) turned by unit quaternions wxyz (M, 4): v + 2 q × (q × v + w v)."""
+    w, q = quats[:, :1], quats[:, 1:]
+    return vectors + 2.0 * torch.linalg.cross(q, torch.linalg.cross(q, vectors) + w * vectors)
 
 
 def _recolored(splats: Splats2D, colors: Tensor) -> Splats2D:
@@ -176,14 +180,17 @@ def _as_points(splats: Splats2D) -> Splats2D:
 
 def _as_ellipsoids(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Splats2D:
     """Opaque discs with a sharp edge, the darker the more they are seen from the side."""
+    assert splats.ids is not None
     _, straight = _axes(splats, gaussians, camera)
+    shortest, middle = gaussians.log_scales[splats.ids.long()].sort(1).values[:, :2].unbind(1)
+    roundness = torch.exp(shortest - middle)  # what is round has no side
+    light = 0.4 + 0.6 * (straight + (1.0 - straight) * roundness)
     packed = splats.packed.clone()
-    packed[:, COLORS : COLORS + 3] *= (0.4 + 0.6 * straight)[:, None]
+    packed[:, COLORS : COLORS + 3] *= light[:, None]
     opaque = (packed[:, OPACITIES] >= _ELLIPSOID_OPACITY).nonzero()[:, 0]
     packed = packed[opaque]
     packed[:, CONICS] *= 2.0 * _DISC / _ELLIPSOID_END**2
     packed[:, OPACITIES] = math.exp(_DISC)
-    assert splats.ids is not None
     return Splats2D(packed, splats.ids[opaque], splats.channels)
 
 
@@ -192,9 +199,9 @@ def _error(image: Tensor, photo: Photo) -> Tensor:
     picture = _bytes(image)
     at = photo.placed
     rows, columns = slice(at.top, at.top + at.height), slice(at.left, at.left + at.width)
-    seen = image[rows, columns].clamp(0.0, 1.0)
-    error = (seen - photo.pixels.to(torch.float32) / 255.0).abs().mean(2)
-    picture[rows, columns] = palette.HEAT[_steps(error / _WORST)]
+    seen, there = picture[rows, columns].to(torch.float32), photo.pixels.to(torch.float32)
+    error = (seen - there).abs_().mean(2) / (255.0 * _WORST)
+    picture[rows, columns] = palette.HEAT[_steps(error)]
     return picture
 
 

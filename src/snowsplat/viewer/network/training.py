@@ -11,8 +11,8 @@ from snowsplat.viewer.network.gauge import Curve, Gauge
 from snowsplat.viewer.network.page import TrainingPanel
 from snowsplat.viewer.network.viewer import NetworkViewer, Scene
 
-# The figures are new every so many seconds, or less often where they would take more of the time.
-_SECONDS, _SHARE = 1.0, 0.03
+# Seconds between two looks at the figures. PSNR may take this part of the time.
+_SECONDS, _PSNR_SHARE = 1.0, 0.03
 # The loss shown is the mean of about so many steps, the rate of about so many seconds.
 _LOSS_STEPS, _RATE_SECONDS = 50, 3.0
 
@@ -30,7 +30,7 @@ class TrainingViewer:
         self._loss = math.nan
         self._rate = 0.0
         self._rated = (0, time.monotonic())  # step and time when the rate was reckoned
-        self._next = 0.0  # when figures are due
+        self._next = self._next_psnr = 0.0  # when figures are due
         self._measured = 0  # the step of the last PSNR
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
@@ -66,22 +66,23 @@ class TrainingViewer:
 
     def _tell(self, step: int, steps: int, gaussians: Gaussians) -> None:
         """Figures and curves, now and then."""
-        started = time.monotonic()
-        if started < self._next:
+        now = time.monotonic()
+        if now < self._next:
             return
-        if self._gauge.can_measure and step > self._measured:
+        self._next = now + _SECONDS
+        if self._gauge.can_measure and step > self._measured and now >= self._next_psnr:
             psnr = self._gauge.measure(gaussians)
             self._measured = step
             if math.isfinite(psnr):
                 self._psnrs.add(step, psnr)
+            took = time.monotonic() - now
+            self._next_psnr = now + took / _PSNR_SHARE
         pace = "paused" if self._session.paused else f"{self._steps_a_second(step):.1f} a second"
         figures = [f"{len(gaussians):,} Gaussians", f"loss {self._loss:.4f}"]
         if len(self._psnrs):
             figures.append(f"PSNR {self._psnrs.arrays()[1][-1]:.2f} dB")
         about = [f"Step {step:,} of {steps:,}, {pace}", ", ".join(figures)]
         self._panel.show(about, step / steps, self._losses, self._psnrs)
-        now = time.monotonic()
-        self._next = now + max(_SECONDS, (now - started) * (1.0 / _SHARE - 1.0))
 
     def _steps_a_second(self, step: int) -> float:
         now = time.monotonic()
