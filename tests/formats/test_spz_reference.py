@@ -1,0 +1,90 @@
+"""`.spz` against its reference implementation: both read each other's files alike, frame too."""
+
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.formats import read_gaussians
+from snowsplat.formats.spz import write_spz
+from snowsplat.gaussians import Gaussians
+
+NODE = Path(__file__).parents[1] / "node"
+
+
+@pytest.fixture(scope="module")
+def reference() -> Callable[..., str]:
+    """``reference("read", file)`` gives JSON; ``reference("write", version, file, input=json)``."""
+    if not (NODE / "node_modules/@adobe/spz").is_dir() or shutil.which("node") is None:
+        pytest.skip(f"{NODE}/node_modules or node is absent; `npm ci --ignore-scripts` in {NODE}")
+
+    def run(*arguments: object, input: str = "") -> str:
+        command = ["node", str(NODE / "spz.mjs"), *map(str, arguments)]
+        done = subprocess.run(command, input=input, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def from_json(text: str) -> Gaussians:
+    scene = json.loads(text)
+    n = scene["numPoints"]
+    columns = {
+        name: torch.tensor(scene[name], dtype=torch.float32)
+        for name in ("positions", "scales", "rotations", "alphas", "colors", "sh")
+    }
+    return Gaussians(
+        columns["positions"].view(n, 3),
+        columns["scales"].view(n, 3),
+        columns["rotations"].view(n, 4).roll(1, 1),  # xyzw there
+        columns["alphas"],
+        columns["colors"].view(n, 1, 3),
+        columns["sh"].view(n, (scene["shDegree"] + 1) ** 2 - 1, 3),
+    )
+
+
+def to_json(scene: Gaussians) -> str:
+    return json.dumps(
+        {
+            "numPoints": len(scene),
+            "shDegree": scene.sh_degree,
+            "positions": scene.means.flatten().tolist(),
+            "scales": scene.log_scales.flatten().tolist(),
+            "rotations": scene.rotations.roll(-1, 1).flatten().tolist(),
+            "alphas": scene.opacity_logits.tolist(),
+            "colors": scene.sh_dc.flatten().tolist(),
+            "sh": scene.sh_rest.flatten().tolist(),
+        }
+    )
+
+
+def assert_same(a: Gaussians, b: Gaussians) -> None:
+    assert a.sh_degree == b.sh_degree
+    for name in ("means", "log_scales", "sh_dc", "sh_rest"):
+        x, y = getattr(a, name), getattr(b, name)
+        torch.testing.assert_close(x, y, rtol=0, atol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
+    torch.testing.assert_close(a.opacities, b.opacities, rtol=0, atol=1.1e-3)  # 0 and 255
+    assert ((a.rotations * b.rotations).sum(1).abs() > 1 - 1e-6).all()
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_it_reads_what_we_write_as_we_do(tmp_path, make_scene, reference, version, degree):
+    write_spz(tmp_path / "a.spz", make_scene(300, degree), version)
+    ours = read_gaussians(tmp_path / "a.spz")
+    assert_same(from_json(reference("read", tmp_path / "a.spz")), ours)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_we_read_what_it_writes_as_it_does(tmp_path, make_scene, reference, version, degree):
+    scene = make_scene(300, degree)
+    reference("write", version, tmp_path / "a.spz", input=to_json(scene))
+    ours = read_gaussians(tmp_path / "a.spz")
+    assert_same(from_json(reference("read", tmp_path / "a.spz")), ours)
+    torch.testing.assert_close(ours.means, scene.means, rtol=0, atol=0.51 / 4096)
