@@ -14,12 +14,14 @@ def test_page_is_xml_whatever_the_words_are():
         html.cards([(html.text(nasty), "words")]),
         "",
         html.table(["head"], [[html.text(nasty)], [html.bar(0.5)]], "names"),
+        html.table([], [["about", html.text(nasty)]]),
         html.picture(Image.new("RGB", (8, 6)), nasty),
     ]
     page = html.page(nasty, parts, ".own { color: red; }")
     root = ET.fromstring(page)
     told = "".join(root.find("body").itertext())
-    assert told.count("a <b> & 'c' \"d\"") == 2
+    assert told.count("a <b> & 'c' \"d\"") == 3
+    assert root.find(".//table[@class='facts']/tbody/tr/th").text == "about"
     assert root.find("head/title").text.startswith("a <b> &")
     assert "<b>" not in page.replace("<b>a &lt;b&gt;", "")  # but that of the card
     assert ".own { color: red; }" in page

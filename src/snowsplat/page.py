@@ -33,7 +33,8 @@ figure { margin: 0; min-width: 0; } figcaption { font-size: .9rem; margin-top: 4
 table { border-collapse: collapse; width: 100%; font-size: .92rem; }
 th, td { text-align: left; padding: 5px 14px 5px 0; border-bottom: 1px solid var(--line);
   vertical-align: top; overflow-wrap: break-word; }
-th { color: var(--soft); font-weight: 500; } .names td { overflow-wrap: anywhere; }
+th { color: var(--soft); font-weight: 500; } .facts th { width: 16em; }
+.names td { overflow-wrap: anywhere; }
 code, pre { font-family: ui-monospace, Menlo, Consolas, monospace; font-size: .9em; }
 pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px;
   padding: 10px 14px; overflow-x: auto; margin: 8px 0; }
@@ -59,10 +60,20 @@ def cards(html: Iterable[tuple[str, str]]) -> str:
 
 
 def table(heads: Sequence[str], html: Iterable[Sequence[str]], kind: str = "plain") -> str:
-    """Rows of cells; ``kind`` "names" breaks long words anywhere."""
+    """Rows of cells; ``kind`` "names" breaks long words anywhere.
+
+    Without heads, the first cell of a row is what it is about.
+    """
+    if not heads:
+        lines = (f"<tr><th>{row[0]}</th>{_cells(row[1:])}</tr>" for row in html)
+        return f"<table class='facts'><tbody>{''.join(lines)}</tbody></table>"
     top = "".join(f"<th>{head}</th>" for head in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in html)
+    body = "".join(f"<tr>{_cells(row)}</tr>" for row in html)
     return f"<table class='{kind}'><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _cells(html: Sequence[str]) -> str:
+    return "".join(f"<td>{cell}</td>" for cell in html)
 
 
 def bar(share: float) -> str:

@@ -32,7 +32,7 @@ def test_the_output_folder(run, capture, tmp_path):
     assert result.err == ""
     assert files(out) == {
         *("cfg_args", "cameras.json", "input.ply", "config.json", "metrics.json"),
-        "history.json",
+        *("history.json", "report.html"),
         *(f"point_cloud/iteration_{n}/point_cloud.ply" for n in (10, 20, 30)),
     }
     assert (out / "cfg_args").read_text().startswith("Namespace(data_device='cpu', eval=True, ")

@@ -83,6 +83,10 @@ class OutputFolder:
     def history(self) -> Path:
         return self.path / "history.json"
 
+    @property
+    def report(self) -> Path:
+        return self.path / "report.html"
+
     def is_one(self) -> bool:
         """Whether a training, ours or the reference's, has written here."""
         return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))

@@ -149,10 +149,41 @@ class TrainingRun:
                 self._measured(step, self.trainer.evaluate())
             assert self.evaluation is not None
             self.out.write_metrics(step, "test", self.evaluation[1])
-            print(held_out_line(*self.evaluation))
         self.history.write(self.out.history)
+        print(f"{self._write_report()}: how it went")
+        if self.evaluation is not None:
+            print(held_out_line(*self.evaluation))
         if self.budget is not None:
             self.out.write_config(self.settings, replace(self.config, iterations=step))
             spent = self.budget.as_json()["spent"]
             print(f"{duration(spent)} in all, of {duration(self.budget.seconds)}")
         return 0
+
+    def _write_report(self) -> Path:
+        from snowsplat.config import config_to_json
+        from snowsplat.training_report import Trained, write_training_report
+
+        # The page may be given away: of paths it tells no more than names.
+        out = self.out.path
+        capture = asdict(self.settings)
+        for word in ("path", "test_list"):
+            capture[word] = capture[word] and Path(capture[word]).name
+        write_training_report(
+            self.out.report,
+            Trained(
+                name=out.resolve().name if out.is_absolute() else str(out),
+                capture=self.trainer.capture,
+                gaussians=self.trainer.gaussians,
+                step=self.trainer.step,
+                background=self.out.settings()[1],
+                history=self.history,
+                evaluation=None if self.evaluation is None else self.evaluation[1],
+                settings={
+                    "recipe": self.recipe,
+                    "capture": capture,
+                    "training": config_to_json(self.config),
+                },
+                peak_bytes=peak_bytes(),
+            ),
+        )
+        return self.out.report
