@@ -131,3 +131,4 @@ def test_finite_rows():
     gaussians.quats[1, 3] = torch.nan
     gaussians.opacity_logits[2] = torch.inf
     assert gaussians.finite_rows().tolist() == [True, False, False, True]
+    assert gaussians.select(torch.arange(0)).finite_rows().tolist() == []

@@ -126,7 +126,8 @@ class Gaussians:
         """(N,) bool: Gaussians all of whose parameters are finite."""
         finite = torch.ones(len(self), dtype=torch.bool, device=self.means.device)
         for parameter in self.parameters().values():
-            finite &= parameter.reshape(len(self), -1).isfinite().all(dim=1)
+            values = parameter if parameter.ndim > 1 else parameter[:, None]
+            finite &= values.isfinite().flatten(1).all(dim=1)
         return finite
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:

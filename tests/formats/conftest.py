@@ -12,7 +12,7 @@ import torch
 
 from snowsplat.camera import Camera
 from snowsplat.errors import UserError
-from snowsplat.formats import read_gaussians
+from snowsplat.formats import format_for_reading, read_gaussians
 from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.geometry import look_at
 from snowsplat.render import render
@@ -86,6 +86,25 @@ def one_line() -> Callable[[Path], str]:
         return line
 
     return refused
+
+
+@pytest.fixture(scope="session")
+def survives() -> Callable[[Path], None]:
+    """Reads a file of random damage: one line, or finite Gaussians, not absurdly many."""
+
+    def read(path: Path) -> None:
+        try:
+            scene = read_gaussians(path)
+        except UserError as error:
+            lines = str(error).count("\n") + 1
+        else:
+            lines = 1
+            assert len(scene) <= max(1000, 100 * path.stat().st_size)
+            if format_for_reading(path).name != "PLY":  # which is read as it is
+                assert bool(scene.finite_rows().all())
+        assert lines == 1
+
+    return read
 
 
 @pytest.fixture(scope="session")

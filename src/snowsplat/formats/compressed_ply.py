@@ -135,6 +135,7 @@ def _between(
     return low[chunk] * (1 - t) + high[chunk] * t
 
 
+@np.errstate(all="ignore")  # what is too large is clamped
 def write_compressed_ply(path: Path | str, gaussians: Gaussians) -> None:
     """Write the layout above, in the order of a space-filling curve, atomically.
 

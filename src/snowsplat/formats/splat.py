@@ -46,6 +46,7 @@ def read_splat(path: Path | str) -> Gaussians:
     )
 
 
+@np.errstate(all="ignore")  # what is too large is clamped
 def write_splat(path: Path | str, gaussians: Gaussians) -> None:
     """Write the layout above, the largest and most opaque Gaussians first, atomically.
 

@@ -125,6 +125,7 @@ def _unpack_rotations(rotation: np.ndarray) -> np.ndarray:
     return np.roll(xyzw, 1, axis=1)
 
 
+@np.errstate(all="ignore")  # what is too large is clamped
 def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
     """Write version 3, which all readers know, or 4, which is smaller and faster; atomically.
 
