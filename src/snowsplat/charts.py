@@ -113,14 +113,23 @@ def tick_words(values: Sequence[float]) -> list[str]:
 
 
 def smoothed(points: _Points, window: int) -> list[tuple[float, float]]:
-    """Each y the mean of those around it, a triangle of weights ``window`` to each side."""
+    """Each y that of a line through those around it, less weighed up to ``window`` to each side.
+
+    (A mean would lag behind at the ends.)
+    """
     result = []
     for i, (x, _) in enumerate(points):
-        reach = min(window, i, len(points) - 1 - i)  # even to both sides: the ends do not lag
-        weights = [reach + 1 - abs(k) for k in range(-reach, reach + 1)]
-        near = [y for _, y in points[i - reach : i + reach + 1]]
-        mean = sum(w * y for w, y in zip(weights, near, strict=True)) / sum(weights)
-        result.append((x, mean))
+        first = max(0, i - window)
+        near = points[first : i + window + 1]
+        weights = [window + 1 - abs(first + k - i) for k in range(len(near))]
+        total = sum(weights)
+        mean_x = sum(w * px for w, (px, _) in zip(weights, near, strict=True)) / total
+        mean_y = sum(w * py for w, (_, py) in zip(weights, near, strict=True)) / total
+        spread = sum(w * (px - mean_x) ** 2 for w, (px, _) in zip(weights, near, strict=True))
+        tilt = sum(
+            w * (px - mean_x) * (py - mean_y) for w, (px, py) in zip(weights, near, strict=True)
+        )
+        result.append((x, mean_y + (tilt / spread * (x - mean_x) if spread > 0 else 0.0)))
     return result
 
 

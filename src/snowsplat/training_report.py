@@ -44,7 +44,7 @@ _STYLE = (
     + """
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr));
   gap: 22px 28px; }
-.views { display: flex; flex-wrap: wrap; gap: 20px 28px; }
+.views { display: flex; flex-wrap: wrap; gap: 18px 16px; }
 .triple { display: flex; gap: 5px; }
 .triple img { height: auto; max-height: 200px; width: auto; min-width: 0; flex: 0 1 auto;
   object-fit: contain; border-radius: 3px; }
@@ -236,7 +236,7 @@ def _figures(evaluation: Evaluation, held_out: bool) -> str:
     rows = [
         [
             text(figures.name),
-            f"{figures.psnr:.2f} dB",
+            f"{figures.psnr:.2f}&#160;dB",
             f"{figures.ssim:.3f}",
             f"{100 * error:.1f}%",
             bar(error / largest),

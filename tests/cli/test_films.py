@@ -75,6 +75,11 @@ def test_film_of_a_file(run, refused, trained, tmp_path):
     assert around[0].std() > 5
     assert run("render", scene, "--path", trained / "cameras.json", *SHORT).code == 0
     assert (tmp_path / "scene_cameras.mp4").exists()
+    # Within the output folder of its training it has the cameras there.
+    inside = trained / "point_cloud/iteration_60/point_cloud.ply"
+    target = tmp_path / "inside.mp4"
+    assert run("render", inside, "--path", "training", *SHORT, "--film", target).code == 0
+    assert target.exists()
     for way in ("training", "spiral"):
         assert "needs the cameras of a training" in refused("render", scene, "--path", way)
 

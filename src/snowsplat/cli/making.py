@@ -83,6 +83,7 @@ class Making:
         print(
             f"\nThe scene, for any viewer:  {self.file}\n"
             f"How its cameras were found: {self.out / CAPTURE / 'capture_report.html'}\n"
+            f"How the training went:      {folder.report}\n"
             f"Pictures of it:             {pictures / 'renders'}\n"
             f" and photos held out:       {pictures / 'gt'}\n"
             f"On those:                   PSNR {scene.result['psnr']:.2f} dB, "

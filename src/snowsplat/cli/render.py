@@ -127,17 +127,21 @@ class Render(SceneFlags):
         The photos themselves are not needed.
         """
         from snowsplat.camera_list import read_cameras
+        from snowsplat.cli.view import folder_around
         from snowsplat.formats import read_gaussians
 
         suffix = "_side_by_side" if self.side_by_side else ""
         scene = self.output or self.model_path
         if scene is not None and scene.is_file():
             file = scene.with_name(f"{scene.stem}_{name}{suffix}.mp4")
-            return read_gaussians(scene), None, (0.0, 0.0, 0.0), file
-        folder = self.folder()
+            folder, gaussians = folder_around(scene), read_gaussians(scene)
+            if not folder.is_one():
+                return gaussians, None, (0.0, 0.0, 0.0), file
+        else:
+            folder = self.folder()
+            _, gaussians = folder.read_scene(self.iteration)
+            file = folder.path / "films" / f"{name}{suffix}.mp4"
         _, background = folder.settings()
-        _, gaussians = folder.read_scene(self.iteration)
-        file = folder.path / "films" / f"{name}{suffix}.mp4"
         return gaussians, read_cameras(folder.path / "cameras.json"), background, file
 
     def _render(
