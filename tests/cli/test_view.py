@@ -6,6 +6,7 @@ import socket
 import threading
 import urllib.request
 import webbrowser
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -63,7 +64,7 @@ def served(run, monkeypatch):
     """Run the verb up to where it waits: its result, the addresses opened, the site's arguments."""
     from snowsplat.viewer import static_scene
 
-    def served(*arguments, environment=()):
+    def served(*arguments: object, environment: Sequence[str] = ()):
         for name in ("SSH_CONNECTION", "SSH_TTY", "DISPLAY", "WAYLAND_DISPLAY"):
             monkeypatch.delenv(name, raising=False)
         for name in environment:
@@ -103,8 +104,14 @@ def test_which_scene_and_which_cameras(served, out, tmp_path):
     assert len(cameras) == 9
     assert background == (0.0, 0.0, 0.0)
     assert len(served(scene(out))[2][2]) == 9  # the folder around it is found
-    shutil.copy(scene(out), tmp_path / "point_cloud.ply")
-    assert served(tmp_path / "point_cloud.ply")[2][2] == []
+    shutil.copy(scene(out), tmp_path / "garden.ply")
+    assert served(tmp_path / "garden.ply")[2][2] == []
+    # What `snowsplat make` leaves: OUT/garden.ply is a copy of the scene in OUT/scene.
+    shutil.copytree(out, tmp_path / "scene")
+    assert len(served(tmp_path / "garden.ply")[2][2]) == 9
+    assert len(served(tmp_path)[2][2]) == 9
+    shutil.copy(out / "point_cloud/iteration_30/point_cloud.ply", tmp_path / "other.ply")
+    assert served(tmp_path / "other.ply")[2][2] == []
 
 
 def test_scenes_of_other_formats(served, out, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import signal
 import sys
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.making import SCENE
 from snowsplat.cli.output import OutputFolder
 from snowsplat.errors import UserError
 
@@ -35,7 +37,7 @@ class View:
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
-    """A scene file of any format, or the output folder of a training."""
+    """A scene file of any format, or the output folder of train or make."""
     iteration: Annotated[int | None, flag("N", default="the last")] = None
     """Which of the scenes in OUT."""
     host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this machine alone")] = "127.0.0.1"
@@ -77,6 +79,8 @@ class View:
             raise UserError(f"{path}: no such file or folder")
         if path.is_dir():
             folder = OutputFolder(path)
+            made = OutputFolder(path / SCENE)  # path may be OUT of `snowsplat make`
+            folder = made if made.scenes() and not folder.scenes() else folder
             iteration, gaussians = folder.read_scene(self.iteration)
             scene = folder.scene_path(iteration)
         else:
@@ -92,11 +96,18 @@ class View:
 
 
 def folder_around(scene: Path) -> OutputFolder:
-    """OUT of OUT/point_cloud/iteration_N/point_cloud.ply; else one that holds nothing."""
+    """The output folder of the training that a scene file comes from; if none, one without scenes.
+
+    That is OUT of OUT/point_cloud/iteration_N/point_cloud.ply, and OUT/scene of OUT/NAME.ply, the
+    copy that `snowsplat make` leaves.
+    """
     scene = scene.resolve()
-    folder = OutputFolder(scene.parents[min(2, len(scene.parents) - 1)])
-    is_inside = scene in [folder.scene_path(iteration) for iteration in folder.scenes()]
-    return folder if is_inside else OutputFolder(scene)
+    made, trained = OutputFolder(scene.parent / SCENE), OutputFolder(scene.parent.parent.parent)
+    if scene in map(trained.scene_path, trained.scenes()):
+        return trained
+    if any(filecmp.cmp(scene, made.scene_path(i), shallow=False) for i in made.scenes()[-1:]):
+        return made
+    return OutputFolder(scene)
 
 
 def over_ssh() -> bool:
