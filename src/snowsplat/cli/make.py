@@ -13,6 +13,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.making import CAPTURE, STAGES, Making, TrainingStopped
 from snowsplat.cli.presets import Quality, quality_within
+from snowsplat.cli.viewing import PageFlags
 from snowsplat.errors import UserError
 from snowsplat.files import remove_temporaries
 
@@ -54,6 +55,12 @@ class Make:
     """Threads to compute with."""
     overwrite: Annotated[bool, switch()] = False
     """Replace a scene of other photos that is in OUT."""
+    view: Annotated[bool, switch()] = False
+    """Watch the training in a browser, and the scene when it is ready, until Ctrl-C."""
+    port: Annotated[int | None, flag("N", default="8080, or the next that is free")] = None
+    """Where that page is: http://localhost:N."""
+    host: Annotated[str | None, flag("H", default="127.0.0.1, this computer alone")] = None
+    """Who may look; 0.0.0.0: everybody in the network."""
 
     def run(self) -> int:
         """Gives the exit code: 0, or 130 after Ctrl-C."""
@@ -64,6 +71,8 @@ class Make:
         if self.threads is not None and self.threads < 1:
             raise UserError(f"--threads is {self.threads}; it must be at least 1")
         _check_free(out)
+        page = PageFlags(self.port, self.host)
+        page.check(self.view)
 
         from snowsplat.photos.sources import find_sources
         from snowsplat.photos.stages import Stages
@@ -81,6 +90,7 @@ class Make:
                 threads=self.threads,
                 overwrite=self.overwrite,
                 started=started,
+                page=page if self.view else None,
             ).run()
         except TrainingStopped:
             return 130  # it has said how to go on
@@ -118,9 +128,10 @@ class Make:
 
     def _command(self) -> str:
         words = ["snowsplat", "make", *map(str, self.inputs)]
-        for flag_name in ("output", "quality", "minutes", "threads"):
+        for flag_name in ("output", "quality", "minutes", "threads", "port", "host"):
             value = getattr(self, flag_name)
             words += [] if value is None else [f"--{flag_name}", str(value)]
+        words += ["--view"] if self.view else []
         return shlex.join(words)
 
 

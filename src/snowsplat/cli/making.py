@@ -17,6 +17,7 @@ from snowsplat.files import atomic_path
 
 if TYPE_CHECKING:
     from snowsplat.cli.train import Train
+    from snowsplat.cli.viewing import PageFlags
     from snowsplat.photos.stages import Outcome, Stages
 
 CAPTURE, SCENE = "capture", "scene"
@@ -48,6 +49,7 @@ class Making:
         command: that goes on, for people.
         minutes, threads, overwrite: as the flags of the verb.
         started: when it was, by `time.monotonic`.
+        page: where the training is to be watched, and the scene in the end.
     """
 
     inputs: tuple[Path, ...]
@@ -60,6 +62,7 @@ class Making:
     threads: int | None
     overwrite: bool
     started: float
+    page: PageFlags | None = None
 
     def run(self) -> int:
         """Gives the exit code, 0.
@@ -88,8 +91,11 @@ class Making:
             f" and photos held out:       {pictures / 'gt'}\n"
             f"On those:                   PSNR {scene.result['psnr']:.2f} dB, "
             f"SSIM {scene.result['ssim']:.3f} ({scene.result['views']} photos)\n"
-            f"This took:                  {duration(self._elapsed())}"
+            f"This took:                  {duration(self._elapsed())}",
+            flush=True,
         )
+        if self.page is not None:
+            self._watch(folder.path, self.page)
         return 0
 
     @property
@@ -138,7 +144,7 @@ class Making:
             self.stages.about["training"] = settings
             self.stages.save()
         train = self._resumed(folder.path) if going_on else self._new(folder.path)
-        if train.run() != 0:
+        if self._viewed(train).run() != 0:
             raise TrainingStopped
         metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
         with atomic_path(self.file) as temporary:
@@ -146,6 +152,19 @@ class Making:
         shutil.rmtree(folder.checkpoints, ignore_errors=True)
         kept = {word: metrics[word] for word in ("iteration", "psnr", "ssim")}
         return kept | {"views": len(metrics["views"])}
+
+    def _watch(self, folder: Path, page: PageFlags) -> None:
+        """Show the scene until Ctrl-C."""
+        from snowsplat.cli.watch import Watch
+
+        Watch(output=folder, threads=self.threads, port=page.port, host=page.host).run()
+
+    def _viewed(self, train: Train) -> Train:
+        """With the page of the training, which makes way for that of the scene."""
+        if self.page is not None:
+            train.view, train.stay = True, False
+            train.port, train.host = self.page.port, self.page.host
+        return train
 
     def _resumed(self, folder: Path) -> Train:
         from snowsplat.cli.train import Train

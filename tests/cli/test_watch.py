@@ -1,0 +1,137 @@
+"""`snowsplat watch`, and `--view` of `train` and `make`: what is refused, what is said, Ctrl-C."""
+
+import shutil
+import signal
+import socket
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from snowsplat import checkpoint
+from snowsplat.cli.output import OutputFolder
+from snowsplat.cli.watch import NewestScene, Watch
+from snowsplat.errors import UserError
+from snowsplat.viewer.network.server import free_port
+
+
+@pytest.fixture(scope="module")
+def trained(capture, tmp_path_factory) -> Path:
+    """Checkpoints of step 20 and 40, scenes of 20 and 50."""
+    from snowsplat.cli.main import main
+
+    out = tmp_path_factory.mktemp("watch") / "out"
+    flags = ["--iterations", "50", "--checkpoint-every", "20", "--save-iterations", "20", "-q"]
+    assert main(["train", str(capture), "-o", str(out), *flags]) == 0
+    return out
+
+
+def url_of(process) -> str:
+    """Reads what a process says, up to where its page is."""
+    while line := process.stdout.readline():
+        if line.startswith("watch it in a browser: "):
+            return line.split()[-1]
+    raise AssertionError(process.communicate())
+
+
+def page_at(url: str) -> bytes:
+    with urllib.request.urlopen(url, timeout=10) as page:
+        return page.read()
+
+
+def test_watch_until_ctrl_c(start, trained):
+    process = start("watch", trained)
+    url = url_of(process)
+    assert url.startswith("http://127.0.0.1:")
+    assert b"<html" in page_at(url)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+    assert "ssh -L" in out
+    assert "Ctrl-C ends it" in out
+
+
+def test_the_newest_is_shown_as_it_comes(trained, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(trained, out)
+    folder = OutputFolder(out)
+    scene = NewestScene(folder, None)()
+    assert scene.about[0] == "After 50 steps"
+    assert NewestScene(folder, 20)().about[0] == "After 20 steps"
+    with pytest.raises(UserError, match="no scene of iteration 7; there are 20, 50"):
+        NewestScene(folder, 7)()
+
+    shutil.rmtree(out / "point_cloud/iteration_50")
+    newest = NewestScene(folder, None)
+    of_checkpoint = newest()
+    assert of_checkpoint.about[0] == "After 40 steps"
+    tensors = checkpoint.latest(folder.checkpoints).tensors
+    assert of_checkpoint.gaussians.means.equal(tensors["gaussians.means"])
+    assert newest() is of_checkpoint  # not read again
+
+    # A newer one comes, first damaged, then whole.
+    path = folder.scene_path(50)
+    path.parent.mkdir()
+    path.write_bytes(b"ply\n")
+    assert newest() is of_checkpoint
+    shutil.copyfile(trained / "point_cloud/iteration_50/point_cloud.ply", path)
+    later = newest()
+    assert later.about[0] == "After 50 steps"
+    assert later.number != of_checkpoint.number
+    shutil.rmtree(out / "point_cloud")
+    shutil.rmtree(out / "checkpoints")
+    assert newest() is later  # replaced at this moment
+    assert NewestScene(folder, None)().gaussians is None
+    assert "--checkpoint-every" in " ".join(NewestScene(folder, None)().about)
+
+
+def test_watch_refuses(refused, trained, tmp_path):
+    assert "no such folder" in refused("watch", tmp_path / "absent")
+    assert "once" in refused("watch")
+    (tmp_path / "empty").mkdir()
+    assert "not the output folder" in refused("watch", tmp_path / "empty")
+    assert "no scene of iteration 7" in refused("watch", trained, "--iteration", 7)
+    assert "no such folder" in refused("watch", trained, "-s", tmp_path / "absent")
+    assert "--host 192.0.2.1" in refused("watch", trained, "--host", "192.0.2.1")
+
+
+def test_a_port_that_is_taken(refused, trained, capture, tmp_path):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        port = listener.getsockname()[1]
+        assert f"port {port} is taken" in refused("watch", trained, "--port", port)
+        out = tmp_path / "out"
+        line = refused("train", capture, "-o", out, "--view", "--port", port)
+        assert f"port {port} is taken" in line
+        line = refused("make", capture / "images", "-o", out, "--view", "--port", port)
+        assert f"port {port} is taken" in line
+        assert not out.exists()
+
+
+def test_a_place_without_a_page(refused, capture, tmp_path):
+    for flags in (["--port", 9000], ["--host", "0.0.0.0"]):
+        assert "add --view" in refused("train", capture, "-o", tmp_path / "out", *flags)
+        assert "add --view" in refused("make", capture / "images", "-o", tmp_path / "out", *flags)
+
+
+def test_the_page_of_a_training_stays_until_ctrl_c(start, run, capture, tmp_path):
+    viewed, plain = tmp_path / "viewed", tmp_path / "plain"
+    port = free_port("127.0.0.1", None)
+    process = start("train", capture, "-o", viewed, "--iterations", 30, "--view", "--port", port)
+    url = url_of(process)
+    while not (line := process.stdout.readline()).startswith("the scene stays at"):
+        assert line
+    assert b"<html" in page_at(url)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+    assert run("train", capture, "-o", plain, "--iterations", 30).code == 0
+    name = "point_cloud/iteration_30/point_cloud.ply"
+    assert (viewed / name).read_bytes() == (plain / name).read_bytes()
+
+
+def test_the_folder_of_make_holds_that_of_a_training(trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "made" / "scene")
+    assert Watch(output=tmp_path / "made").folder().path == tmp_path / "made" / "scene"
+    assert Watch(output=trained).folder().path == trained
