@@ -110,8 +110,11 @@ def whole_page(title: str, bootstrap: Mapping[str, Any], body: str) -> str:
     text = _replaced(text, _IMPORT, script)
     text = _replaced(text, "    </body>", f"{body}\n    </body>")
     policy = html.escape(content_policy(text, "blob: data:"))
-    meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}" />'
-    return _replaced(text, '<meta charset="UTF-8" />', f'<meta charset="UTF-8" />\n        {meta}')
+    head = f"""<meta charset="UTF-8" />
+        <meta http-equiv="Content-Security-Policy" content="{policy}" />
+        <!-- The viewer, whose licence asks to be in every copy:
+{asset("LICENSE")}-->"""
+    return _replaced(text, '<meta charset="UTF-8" />', head)
 
 
 def content_policy(page: str, sources: str) -> str:

@@ -96,6 +96,12 @@ def test_over_ssh_it_says_how_to_reach_it(served, out):
     assert "ssh" not in served(out)[0].out
 
 
+def test_open_to_others_it_says_where_they_find_it(served, out):
+    here, others = served(out, "--host", "0.0.0.0", "--no-browser")[0].out.splitlines()[1:]
+    assert here.startswith("http://127.0.0.1:")
+    assert others.endswith(here.replace("127.0.0.1", socket.gethostname()))
+
+
 def test_which_scene_and_which_cameras(served, out, tmp_path):
     _, _, (title, gaussians, cameras, background) = served(out, "--iteration", 30)
     assert title == "out - snowsplat"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import filecmp
 import os
 import signal
+import socket
 import sys
 import threading
 from dataclasses import dataclass
@@ -50,7 +51,7 @@ class View:
     def run(self) -> int:
         """Gives the exit code: 0, after Ctrl-C too, which is how one leaves."""
         from snowsplat.viewer.static_scene import site
-        from snowsplat.viewer.static_server import StaticServer
+        from snowsplat.viewer.static_server import ANY_HOST, StaticServer
 
         if self.path is None:
             raise UserError("view needs a scene; name a file or the output folder of a training")
@@ -63,7 +64,9 @@ class View:
         with StaticServer(files, headers, self.host, self.port) as server:
             print(f"{name}: {len(gaussians):,} Gaussians")
             print(server.url, flush=True)
-            if over_ssh():
+            if self.host in ANY_HOST:
+                print(f"from other computers: {server.url_at(socket.gethostname())}", flush=True)
+            elif over_ssh():
                 print(f"from your computer: {forwarding(server.port)}", flush=True)
             if not self.no_browser and has_screen():
                 open_browser(server.url)
@@ -118,7 +121,6 @@ def over_ssh() -> bool:
 def forwarding(port: int) -> str:
     """The command that makes a port of this machine one of the user's own."""
     import getpass
-    import socket
 
     return f"ssh -L {port}:127.0.0.1:{port} {getpass.getuser()}@{socket.gethostname()}"
 

@@ -27,6 +27,9 @@ from typing import Any, cast
 
 from snowsplat.errors import UserError
 
+#: Hosts that mean all addresses of this machine.
+ANY_HOST = ("", "0.0.0.0", "::")
+
 _BLOCK = 1 << 18  # bytes sent at once
 _IDLE_SECONDS = 60.0  # after which a connection that says nothing is closed
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
@@ -79,9 +82,10 @@ class StaticServer:
     @property
     def url(self) -> str:
         """The page's address, for a browser on this machine."""
-        host = self.host
-        if host in ("", "0.0.0.0", "::"):
-            host = "127.0.0.1"
+        return self.url_at("127.0.0.1" if self.host in ANY_HOST else self.host)
+
+    def url_at(self, host: str) -> str:
+        """The page's address for those who call this machine ``host``."""
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}/"
 
     def close(self) -> None:
