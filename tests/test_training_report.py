@@ -125,3 +125,16 @@ def test_train_writes_it_and_a_resumed_training_goes_on_with_its_curves(tmp_path
     assert main([*train, "--iterations", "10", "--overwrite"]) == 0
     history = json.loads((out / "history.json").read_text())
     assert sum(stretch["steps"] for stretch in history["stretches"]) == 10
+
+
+def test_what_a_kill_left_of_a_file_goes_with_the_next_training(tmp_path):
+    from snowsplat.cli.main import main
+
+    write_synthetic_capture(tmp_path / "photos", n_views=9, width=48, height=36, n_points=300)
+    out = tmp_path / "out"
+    train = ["train", str(tmp_path / "photos"), "-o", str(out), "-q", "--checkpoint-every", "10"]
+    assert main([*train, "--iterations", "10"]) == 0
+    for name in ("history.json", "report.html"):
+        (out / f".{name}.ab12cd_9.tmp").write_text("half")
+    assert main(["train", "-o", str(out), "--resume", "-q", "--iterations", "20"]) == 0
+    assert not list(out.rglob("*.tmp"))

@@ -159,6 +159,7 @@ class Film:
         import torch
 
         from snowsplat.cli.stages import StageProgress
+        from snowsplat.files import remove_temporaries
         from snowsplat.film import film
 
         first = self.cameras[0]
@@ -168,6 +169,7 @@ class Film:
             started = time.monotonic()
             report = progress.begin("film")
             self.file.parent.mkdir(parents=True, exist_ok=True)
+            remove_temporaries(self.file.parent, [file.name for file, _ in pictures])
             near, far = self._depth_range()
             with ExitStack() as stack:
                 adds = [

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 from snowsplat import __version__
 from snowsplat.errors import UserError
-from snowsplat.files import write_json, write_text
+from snowsplat.files import remove_temporaries, write_json, write_text
 
 if TYPE_CHECKING:
     from snowsplat.capture import Capture
@@ -131,9 +131,10 @@ class OutputFolder:
         self.write_config(settings, config)
 
     def write_config(self, settings: CaptureSettings, config: TrainConfig) -> None:
-        """`config.json` and `cfg_args`."""
+        """`config.json` and `cfg_args`; what a kill has left of earlier ones goes."""
         from snowsplat.config import config_to_json
 
+        remove_temporaries(self.path, _FILES)
         whole = {
             "snowsplat": __version__,
             "capture": asdict(settings),

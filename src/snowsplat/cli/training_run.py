@@ -118,11 +118,11 @@ class TrainingRun:
         if self.budget is not None:
             meta["time"] = self.budget.as_json()
             meta["schedule"] = asdict(self.trainer.schedule)
+        self.history.write(self.out.history)  # first: who goes on from there finds it whole
         path = checkpoint.save(
             self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta
         )
         self.last_checkpoint = time.monotonic()
-        self.history.write(self.out.history)
         return path
 
     def _measured(self, step: int, evaluation: Evaluation) -> None:
