@@ -1,4 +1,4 @@
-"""Changes to a finished scene: moved, cut, thinned out, put together. Gaussians in, Gaussians out."""
+"""Changes to a finished scene: moved, cut, thinned out, put together; Gaussians in and out."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def sh_rotation(rotation: Tensor, degree: int) -> list[Tensor]:
 
 
 def crop(gaussians: Gaussians, box: Tensor) -> Gaussians:
-    """Those whose centre is within ``box`` (2, 3), its low and its high corner, borders included."""
+    """Those with their centre in ``box`` (2, 3), its low and its high corner, borders included."""
     low, high = box.to(gaussians.means.dtype)
     return gaussians.select(((gaussians.means >= low) & (gaussians.means <= high)).all(1))
 
@@ -82,7 +82,7 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """At SH ``degree`` 0 to 3: coefficients of higher degrees are dropped, missing ones are zero."""
+    """At SH ``degree`` 0 to 3: coefficients beyond it are dropped, missing ones are zero."""
     wanted, rest = SH_REST_COUNTS[degree], gaussians.sh_rest
     if wanted > rest.shape[1]:
         rest = torch.cat([rest, rest.new_zeros(len(rest), wanted - rest.shape[1], 3)], 1)

@@ -17,6 +17,7 @@ from snowsplat.formats.compressed_ply import (
 )
 from snowsplat.formats.html import write_html
 from snowsplat.formats.ksplat import read_ksplat
+from snowsplat.formats.sog import is_sog, read_sog, write_sog
 from snowsplat.formats.splat import read_splat, write_splat
 from snowsplat.formats.spz import is_spz, read_spz, write_spz
 from snowsplat.gaussians import Gaussians
@@ -60,6 +61,7 @@ FORMATS: tuple[Format, ...] = (
     ),
     Format("PLY", (".ply",), ply.is_ply, ply.read_gaussians, ply.write_gaussians),
     Format("SPZ", (".spz",), is_spz, read_spz, write_spz),
+    Format("SOG", (".sog",), is_sog, read_sog, write_sog),
     Format("splat", (".splat",), None, read_splat, write_splat),
     Format("ksplat", (".ksplat",), None, read_ksplat, None),
     Format("HTML", (".html",), None, None, write_html),

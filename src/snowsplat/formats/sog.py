@@ -1,0 +1,267 @@
+"""SOG files: every number of a scene as pixels of lossless pictures, in a zip file (`.sog`).
+
+`meta.json` names the pictures and says how their bytes become numbers; the i-th pixel of each, row
+by row, belongs to the i-th Gaussian. Of version 2, which is what we write:
+
+- means_l, means_u: low and high bytes of 16 bits an axis, evenly between mins and maxs, of
+  sign(x) · log(1 + |x|);
+- scales: logarithms of the standard deviations, by a codebook of 256 levels;
+- quats: the three entries that are not the largest, ± 1/√2 in a byte each; alpha is 252 + the index
+  (wxyz) of the largest;
+- sh0: the constant SH coefficients by a codebook; alpha is the opacity;
+- shN_labels, shN_centroids (above SH degree 0): 16 bits which entry of a palette, and that palette:
+  64 entries a row, a pixel a coefficient, by a codebook.
+
+Version 1 has even steps between mins and maxs instead of codebooks. It is mostly found as a folder;
+of those, name the `meta.json`. The frame is that of the PLY files. Specification:
+developer.playcanvas.com, "The SOG Format".
+"""
+
+import io
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from snowsplat.errors import UserError
+from snowsplat.files import atomic_path
+from snowsplat.formats import packing
+from snowsplat.formats.bundle import Bundle, Damaged
+from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
+from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.geometry import morton_order
+
+_PALETTE_LIMIT = 1 << 16  # labels have 16 bits
+_PALETTE_COLUMNS = 64
+_SH_LIMIT = np.float32(1e6)
+_SIDE_LIMIT = 16_383  # of a WebP picture
+# A real scene takes five bytes a Gaussian or more; less than 1/8 is a picture of nothing, blown up.
+_GAUSSIANS_A_BYTE, _ALWAYS_ALLOWED = 8, 1 << 18
+_STEPS = np.arange(256) / 255
+
+
+def is_sog(head: bytes) -> bool:
+    """Whether a file begins as a bundle, or as the `meta.json` of a folder."""
+    return head.startswith(b"PK\x03\x04") or (
+        head.lstrip().startswith(b"{") and b'"means"' in head and b'"quats"' in head
+    )
+
+
+@np.errstate(all="ignore")  # what is not finite is left out at the end
+def read_sog(path: Path | str) -> Gaussians:
+    """Read a bundle, or a folder's `meta.json`, of version 1 or 2.
+
+    Raises:
+        UserError: not readable, damaged, or larger than its bytes can account for.
+    """
+    path = Path(path)
+    try:
+        with Bundle(path) as files:
+            layout = _layout(files.meta())
+            if layout.count > _ALWAYS_ALLOWED + _GAUSSIANS_A_BYTE * files.size:
+                raise Damaged(f"promises {layout.count} Gaussians in {files.size} bytes")
+            arrays = _decode(files, layout)
+    except Damaged as error:
+        raise UserError(f"{path}: {error}; copy or export it again") from None
+    return packing.to_gaussians(path, *arrays)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """`meta.json` of either version: every byte is looked up in a table."""
+
+    count: int
+    files: dict[str, str]
+    low: np.ndarray  # (3,) of the logarithmic means
+    high: np.ndarray
+    scales: np.ndarray  # (256, 3)
+    colors: np.ndarray  # (256, 3)
+    opacity_logits: np.ndarray  # (256,)
+    rest: np.ndarray | None  # (256,)
+
+
+def _layout(meta: dict[str, Any]) -> _Layout:
+    try:
+        first = "version" not in meta or meta["version"] == 1
+        if not first and meta["version"] != 2:
+            raise Damaged(f"of SOG version {str(meta['version'])[:20]}, of which I know 1 and 2")
+        means, scales, sh0, rest = meta["means"], meta["scales"], meta["sh0"], meta.get("shN")
+        count = means["shape"][0] if first else meta["count"]
+        if not isinstance(count, int) or count < 0:
+            raise Damaged("has a meta.json whose count is no number")
+        files = dict(zip(("means_l", "means_u"), means["files"], strict=True))
+        files |= {"scales": scales["files"][0], "quats": meta["quats"]["files"][0]}
+        files |= {"sh0": sh0["files"][0]}
+        if rest is not None:
+            files |= dict(zip(("centroids", "labels"), rest["files"], strict=True))
+        if not all(isinstance(name, str) for name in files.values()):
+            raise TypeError
+        if first:
+            color = _even(sh0, 4)
+            tables = _even(scales, 3), color[:, :3], color[:, 3]
+            rest_table = None if rest is None else _even(rest, 1)[:, 0]
+        else:
+            tables = _codes(scales), _codes(sh0), packing.opacity_logits(np.arange(256))
+            rest_table = None if rest is None else _codes(rest)[:, 0]
+        low, high = _numbers(means["mins"], 3), _numbers(means["maxs"], 3)
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
+        raise Damaged("has a meta.json that is not that of a SOG scene") from None
+    return _Layout(count, files, low, high, *tables, rest_table)
+
+
+def _numbers(values: Any, count: int) -> np.ndarray:
+    numbers = np.array(values, np.float64).reshape(-1)
+    if len(numbers) != count:
+        raise ValueError
+    return numbers
+
+
+def _even(entry: dict[str, Any], channels: int) -> np.ndarray:
+    """(256, channels): even steps between mins and maxs."""
+    low, high = _numbers(entry["mins"], channels), _numbers(entry["maxs"], channels)
+    return low + (high - low) * _STEPS[:, None]
+
+
+def _codes(entry: dict[str, Any]) -> np.ndarray:
+    """(256, 3): a codebook, the same for each channel. Entries that it lacks are not finite."""
+    book = np.full(LEVELS, np.nan)
+    values = np.array(entry["codebook"], np.float64)  # null becomes NaN
+    book[: len(values)] = values
+    if np.isnan(book[0]):  # some writers' first level got lost; the others tell where it was
+        book[0] = book[1] + (book[1] - book[-1]) / (LEVELS - 1)
+    return np.repeat(book[:, None], 3, axis=1)
+
+
+def _decode(files: Bundle, layout: _Layout) -> packing.Arrays:
+    n, channel = layout.count, np.arange(3)
+
+    def pixels(name: str) -> np.ndarray:
+        # The last row is seldom full; some writers add rows.
+        return files.picture(layout.files[name], n, 4 * n + (1 << 16)).reshape(-1, 4)[:n]
+
+    steps = pixels("means_l")[:, :3] + 256.0 * pixels("means_u")[:, :3]
+    logs = layout.low + (layout.high - layout.low) * (steps / 65535)
+    quats = pixels("quats")
+    others = (quats[:, :3] / 255.0 - 0.5) * 2**0.5
+    unit = packing.from_largest_of_four(np.maximum(quats[:, 3], 252) - 252, others)
+    unit[quats[:, 3] < 252] = 1, 0, 0, 0
+    colors = pixels("sh0")
+    return (
+        np.sign(logs) * np.expm1(np.abs(logs)),
+        layout.scales[pixels("scales")[:, :3], channel],
+        unit,
+        layout.opacity_logits[colors[:, 3]],
+        layout.colors[colors[:, :3], channel][:, None],
+        _decode_rest(files, layout, None if layout.rest is None else pixels("labels")),
+    )
+
+
+def _decode_rest(files: Bundle, layout: _Layout, labels: np.ndarray | None) -> np.ndarray:
+    """(N, K, 3)."""
+    if labels is None or layout.rest is None:
+        return np.zeros((layout.count, 0, 3), np.float32)
+    index = labels[:, 0] + 256 * labels[:, 1].astype(np.int64)
+    used = int(index.max(initial=0)) // _PALETTE_COLUMNS + 1  # rows of the palette
+    picture = files.picture(layout.files["centroids"], 1, _PALETTE_LIMIT * SH_REST_COUNTS[-1])
+    k, over = divmod(picture.shape[1], _PALETTE_COLUMNS)  # its width tells the degree
+    if over or k not in SH_REST_COUNTS[1:] or len(picture) < used:
+        raise Damaged(f"has a palette of {picture.shape[1]}×{len(picture)} pixels; it fits none")
+    table = layout.rest.astype(np.float32)
+    return table[picture.reshape(-1, k, 4)[index, :, :3]]
+
+
+def write_sog(path: Path | str, gaussians: Gaussians) -> None:
+    """Write a bundle of version 2, its Gaussians in Morton order, atomically.
+
+    Raises:
+        UserError: too many Gaussians for a picture.
+        OSError: the folder is absent or not writable, or the disk is full.
+    """
+    path = Path(path)
+    arrays = packing.to_arrays(path, gaussians)
+    order = morton_order(torch.from_numpy(arrays[0])).numpy()
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = (array[order] for array in arrays)
+    n = len(means)
+    if n > (_SIDE_LIMIT - 3) ** 2:
+        raise UserError(f"{path}: {n} Gaussians are too many for SOG; write .ply or .spz")
+
+    logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+    low, high = (logs.min(0), logs.max(0)) if n else (np.zeros(3), np.zeros(3))
+    steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
+    largest, others = packing.largest_of_four(quats)
+    scale_levels, scales = levels_for(log_scales)
+    color_levels, colors = levels_for(sh_dc[:, 0])
+    pictures = {
+        "means_l": _picture(steps & 255),
+        "means_u": _picture(steps >> 8),
+        "quats": _picture(packing.to_bytes(255 * (others / 2**0.5 + 0.5)), 252 + largest),
+        "scales": _picture(scales),
+        "sh0": _picture(colors, packing.opacity_bytes(opacity_logits)),
+    }
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "snowsplat"},
+        "count": n,
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), **_named("means_l", "means_u")},
+        "scales": {"codebook": scale_levels.tolist(), **_named("scales")},
+        "quats": _named("quats"),
+        "sh0": {"codebook": color_levels.tolist(), **_named("sh0")},
+    }
+    if n and sh_rest.shape[1]:
+        sh_rest = np.clip(sh_rest, -_SH_LIMIT, _SH_LIMIT)  # whose squares are floats
+        palette, labels = palette_for(sh_rest.reshape(n, -1), _palette_size(n))
+        levels, codes = levels_for(palette)
+        pictures["shN_centroids"] = _palette_picture(codes, sh_rest.shape[1])
+        pictures["shN_labels"] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1))
+        meta["shN"] = {
+            "count": len(palette),
+            "bands": gaussians.sh_degree,
+            "codebook": levels.tolist(),
+            **_named("shN_centroids", "shN_labels"),
+        }
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
+        # Stored: WebP is packed already. ZipInfo has a date of its own, so equal scenes are equal.
+        bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
+        for name, pixels in pictures.items():
+            bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
+
+
+def _palette_size(count: int) -> int:
+    """Entries for so many Gaussians: as many as 16 bits tell, or one for every second Gaussian."""
+    return min(_PALETTE_LIMIT, max(64, count // 2))
+
+
+def _named(*names: str) -> dict[str, list[str]]:
+    return {"files": [f"{name}.webp" for name in names]}
+
+
+def _picture(rgb: np.ndarray, alpha: np.ndarray | int = 255) -> np.ndarray:
+    """(H, W, 4) uint8, about square, sides multiples of 4: a pixel a row of ``rgb`` (N, 3)."""
+    n = len(rgb)
+    width = max(4, int(np.ceil(n**0.5 / 4)) * 4)
+    height = max(4, int(np.ceil(n / width / 4)) * 4)
+    pixels = np.zeros((height * width, 4), np.uint8)
+    pixels[:n, :3] = rgb
+    pixels[:n, 3] = alpha
+    return pixels.reshape(height, width, 4)
+
+
+def _palette_picture(codes: np.ndarray, coefficients: int) -> np.ndarray:
+    """(H, 64 K, 4) uint8 of codes (P, 3 K)."""
+    rows = -(-len(codes) // _PALETTE_COLUMNS)
+    pixels = np.zeros((rows * _PALETTE_COLUMNS, coefficients, 4), np.uint8)
+    pixels[:, :, 3] = 255
+    pixels[: len(codes), :, :3] = codes.reshape(len(codes), coefficients, 3)
+    return pixels.reshape(rows, _PALETTE_COLUMNS * coefficients, 4)
+
+
+def _webp(pixels: np.ndarray) -> bytes:
+    data = io.BytesIO()
+    # exact keeps the colours of pixels whose alpha is 0.
+    Image.fromarray(pixels).save(data, format="WEBP", lossless=True, exact=True)
+    return data.getvalue()

@@ -1,0 +1,245 @@
+"""SOG: what bytes can hold comes back; version 1; hostile bundles give one line."""
+
+import io
+import json
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.formats import read_gaussians, sog, write_gaussians
+from snowsplat.geometry import morton_order
+
+
+def in_order(scene):
+    return scene.select(morton_order(scene.means))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [1, 2, 17, 2000])
+def test_round_trip(tmp_path, make_scene, rotation_error, degree, n):
+    scene, path = in_order(make_scene(n, degree)), tmp_path / "a.sog"
+    write_gaussians(path, scene)
+    read = read_gaussians(path)
+    assert (len(read), read.sh_degree) == (n, degree)
+    # 16 bits between the ends, in logarithms.
+    span = torch.log1p(scene.means.abs()).max() * 2
+    error = (read.means - scene.means).abs() / (1 + scene.means.abs())
+    assert float(error.max()) <= float(span) / 65535 * 0.51 + 1e-6
+    # 256 levels, dense where the values are: the error is that of the cell.
+    assert float((read.log_scales - scene.log_scales).square().mean().sqrt()) < 0.02
+    assert float((read.sh_dc - scene.sh_dc).square().mean().sqrt()) < 0.02
+    assert float((read.opacities - scene.opacities).abs().max()) <= 0.51 / 255
+    # Half a step is 2^½ / 510; the largest entry, at least ½, takes up the others' errors.
+    assert rotation_error(scene, read) < 0.0091
+    if degree:
+        rough = (read.sh_rest - scene.sh_rest).square().mean() / scene.sh_rest.square().mean()
+        assert float(rough) < (1e-3 if n < 100 else 0.6)  # noise does not cluster
+
+
+def test_a_real_scene(tmp_path, shared, psnr):
+    scene = read_gaussians(shared / "reference_layout_sh3.ply")
+    write_gaussians(tmp_path / "a.sog", scene)
+    read = read_gaussians(tmp_path / "a.sog")
+    assert (tmp_path / "a.sog").stat().st_size < 40 * len(scene)
+    assert psnr(scene, read) > 40
+    explained = 1 - (read.sh_rest - in_order(scene).sh_rest).var() / scene.sh_rest.var()
+    assert float(explained) > 0.99
+
+
+def test_the_same_scene_gives_the_same_file(tmp_path, make_scene):
+    scene = make_scene(3000)
+    for name in ("a.sog", "b.sog"):
+        write_gaussians(tmp_path / name, scene)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+def test_colours_under_no_opacity_survive(tmp_path, make_scene):
+    scene = in_order(make_scene(200, 0))
+    scene.opacity_logits[:] = -20.0
+    write_gaussians(tmp_path / "a.sog", scene)
+    read = read_gaussians(tmp_path / "a.sog")
+    assert float((read.sh_dc - scene.sh_dc).abs().max()) < 0.1
+    assert float(read.opacities.max()) < 1 / 510
+
+
+def members(path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as bundle:
+        return {name: bundle.read(name) for name in bundle.namelist()}
+
+
+def bundle(path, files: dict[str, bytes], compression: int = zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", compression) as out:
+        for name, data in files.items():
+            out.writestr(name, data)
+    return path
+
+
+@pytest.fixture
+def files(tmp_path, make_scene):
+    """The members of a small bundle, with its meta.json as a dictionary under ``None``."""
+    write_gaussians(tmp_path / "seed.sog", make_scene(50, 2))
+    return members(tmp_path / "seed.sog")
+
+
+def with_meta(files, change) -> dict[str, bytes]:
+    meta = json.loads(files["meta.json"])
+    change(meta)
+    return files | {"meta.json": json.dumps(meta).encode()}
+
+
+def test_the_layout_is_that_of_the_specification(files):
+    meta = json.loads(files["meta.json"])
+    assert (meta["version"], meta["count"], meta["shN"]["bands"]) == (2, 50, 2)
+    for entry in ("scales", "sh0", "shN"):
+        assert len(meta[entry]["codebook"]) == 256
+        assert meta[entry]["codebook"] == sorted(meta[entry]["codebook"])
+    named = [
+        name
+        for entry in meta.values()
+        if isinstance(entry, dict)
+        for name in entry.get("files", [])
+    ]
+    assert {*named, "meta.json"} == set(files)
+    sizes = {
+        name: Image.open(io.BytesIO(data)).size for name, data in files.items() if ".webp" in name
+    }
+    assert sizes.pop("shN_centroids.webp") == (64 * 8, 1)
+    assert set(sizes.values()) == {(8, 8)}
+    assert all(data[12:16] in (b"VP8L", b"VP8X") for name, data in files.items() if ".webp" in name)
+    quats = np.asarray(Image.open(io.BytesIO(files["quats.webp"])).convert("RGBA")).reshape(-1, 4)
+    assert quats[:50, 3].min() >= 252
+
+
+def test_deflated_members_and_a_folder(tmp_path, files):
+    expected = read_gaussians(tmp_path / "seed.sog")
+    read = read_gaussians(bundle(tmp_path / "a.sog", files, zipfile.ZIP_DEFLATED))
+    torch.testing.assert_close(read.means, expected.means, rtol=0, atol=0)
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    read = read_gaussians(tmp_path / "meta.json")
+    torch.testing.assert_close(read.sh_rest, expected.sh_rest, rtol=0, atol=0)
+
+
+def test_version_1(tmp_path, files):
+    """Even steps between mins and maxs, logits of the opacity, a palette without a count."""
+
+    def older(meta):
+        meta["means"]["shape"] = [meta.pop("count"), 3]
+        del meta["version"]
+        meta["scales"] |= {"mins": [-6, -5, -4], "maxs": [0, 0, 1]}
+        meta["sh0"] |= {"mins": [-1, -2, -3, -4], "maxs": [1, 2, 3, 5]}
+        meta["shN"] = {"mins": -0.5, "maxs": 0.25, "files": meta["shN"]["files"]}
+
+    read = read_gaussians(bundle(tmp_path / "a.sog", with_meta(files, older)))
+    expected = read_gaussians(tmp_path / "seed.sog")
+    torch.testing.assert_close(read.means, expected.means, rtol=0, atol=0)
+    torch.testing.assert_close(read.quats, expected.quats, rtol=0, atol=0)
+
+    def pixels(name):
+        image = Image.open(io.BytesIO(files[name])).convert("RGBA")
+        return torch.from_numpy(np.array(image)).reshape(-1, 4)[:50].double() / 255
+
+    scales = torch.tensor([-6.0, -5, -4]) + torch.tensor([6.0, 5, 5]) * pixels("scales.webp")[:, :3]
+    torch.testing.assert_close(read.log_scales, scales.float())
+    color = torch.tensor([-1.0, -2, -3, -4]) + torch.tensor([2.0, 4, 6, 9]) * pixels("sh0.webp")
+    torch.testing.assert_close(read.sh_dc[:, 0], color[:, :3].float())
+    torch.testing.assert_close(read.opacity_logits, color[:, 3].float())
+    assert read.sh_degree == 2
+    assert -0.5 <= float(read.sh_rest.min()) < float(read.sh_rest.max()) <= 0.25
+
+
+def test_a_lost_first_level_is_mended(tmp_path, files):
+    """Files are about whose codebooks begin with null, which stood for the lowest level."""
+
+    def lose(meta):
+        meta["scales"]["codebook"][0] = None
+
+    assert len(read_gaussians(bundle(tmp_path / "a.sog", with_meta(files, lose)))) == 50
+
+
+BROKEN = {
+    "no means": lambda meta: meta.pop("means"),
+    "means a number": lambda meta: meta.update(means=3),
+    "count a word": lambda meta: meta.update(count="many"),
+    "count negative": lambda meta: meta.update(count=-1),
+    "count huge": lambda meta: meta.update(count=10**12),
+    "count true size, bomb": lambda meta: meta.update(count=10**6),
+    "version 9": lambda meta: meta.update(version=9),
+    "one file of two": lambda meta: meta["means"].update(files=["means_l.webp"]),
+    "file a number": lambda meta: meta["quats"].update(files=[7]),
+    "absent file": lambda meta: meta["quats"].update(files=["other.webp"]),
+    "no file": lambda meta: meta["quats"].update(files=[]),
+    "path out": lambda meta: meta["quats"].update(files=["../../etc/passwd"]),
+    "wrong picture": lambda meta: meta["quats"].update(files=["shN_centroids.webp", ""]),
+    "meta as a picture": lambda meta: meta["sh0"].update(files=["meta.json"]),
+    "codebook too long": lambda meta: meta["sh0"].update(codebook=[0.0] * 300),
+    "codebook of words": lambda meta: meta["sh0"].update(codebook=["a"] * 256),
+    "codebook of lists": lambda meta: meta["sh0"].update(codebook=[[]]),
+    "mins short": lambda meta: meta["means"].update(mins=[0, 0]),
+    "palette elsewhere": lambda meta: meta["shN"].update(files=["sh0.webp", "shN_labels.webp"]),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_meta_json_that_makes_no_sense(tmp_path, files, one_line, name):
+    if name == "wrong picture":  # as large as the others, but no picture of quaternions
+        files = files | {"shN_centroids.webp": b"RIFF0000WEBPVP8L"}
+    one_line(bundle(tmp_path / "a.sog", with_meta(files, BROKEN[name])))
+
+
+def test_a_folder_is_not_left(tmp_path, files, one_line):
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    for name, data in files.items():
+        (inner / name).write_bytes(data)
+    (tmp_path / "quats.webp").write_bytes(files["quats.webp"])
+
+    for name in ("../quats.webp", str(tmp_path / "quats.webp"), "..", ""):
+        changed = with_meta(files, lambda meta, name=name: meta["quats"].update(files=[name]))
+        (inner / "meta.json").write_bytes(changed["meta.json"])
+        one_line(inner / "meta.json")
+
+
+def test_bombs(tmp_path, files, one_line):
+    zeros = bytes(200 << 20)
+    path = bundle(tmp_path / "a.sog", files | {"quats.webp": zeros}, zipfile.ZIP_DEFLATED)
+    assert "would unpack to" in one_line(path)
+    blank = io.BytesIO()
+    Image.new("RGBA", (9000, 9000)).save(blank, format="WEBP", lossless=True)
+    path = bundle(tmp_path / "a.sog", files | {"quats.webp": blank.getvalue()})
+    assert "9000×9000 pixels" in one_line(path)
+    deep = b'{"means":' + b"[" * 100_000 + b"]" * 100_000 + b"}"
+    assert "not JSON" in one_line(bundle(tmp_path / "a.sog", files | {"meta.json": deep}))
+    path = bundle(tmp_path / "a.sog", files, zipfile.ZIP_LZMA)
+    assert "packed in a way" in one_line(path)
+
+
+def test_a_member_that_lies_about_its_size(tmp_path, files, one_line):
+    path = bundle(tmp_path / "a.sog", files, zipfile.ZIP_DEFLATED)
+    data = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        offset = archive.start_dir
+    for _ in range(len(files)):  # the uncompressed sizes in the central directory
+        struct.pack_into("<I", data, offset + 24, 7)
+        name, extra, comment = struct.unpack_from("<HHH", data, offset + 28)
+        offset += 46 + name + extra + comment
+    path.write_bytes(data)
+    one_line(path)
+
+
+def test_not_a_scene(tmp_path, one_line):
+    assert "without 'meta.json'" in one_line(bundle(tmp_path / "a.sog", {"x": b""}))
+    (tmp_path / "b.sog").write_bytes(b"PK\x03\x04 and no more")
+    assert "zip" in one_line(tmp_path / "b.sog")
+    assert "meta.json" in one_line(bundle(tmp_path / "c.sog", {"meta.json": b"[]"}))
+
+
+def test_too_many_for_a_picture(tmp_path, make_scene, monkeypatch):
+    monkeypatch.setattr(sog, "_SIDE_LIMIT", 7)
+    with pytest.raises(Exception, match="too many for SOG"):
+        write_gaussians(tmp_path / "a.sog", make_scene(20, 0))
+    assert not (tmp_path / "a.sog").exists()
