@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat import ops
+from snowsplat import Gaussians, load_capture, ops, write_gaussians
 from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.ops import native, reference
 
@@ -145,3 +145,21 @@ def test_a_wrong_capture_is_one_line(tmp_path):
     assert run.returncode == 1
     assert run.stderr.startswith("train: ")
     assert len(run.stderr.splitlines()) == 1
+
+
+def test_formats(tmp_path):
+    write_synthetic_capture(tmp_path / "capture", "colmap-bin", 9, 32, 24, n_points=60)
+    points = load_capture(tmp_path / "capture").points
+    assert points is not None
+    write_gaussians(tmp_path / "a.ply", Gaussians.from_points(points))
+    text = benchmark(
+        "formats.py",
+        tmp_path / "a.ply",
+        *("--capture", tmp_path / "capture", "--gaussians", 200, "--repeats", 1),
+    )
+    assert "times of 200; 2 views" in text
+    assert row(text, "PLY")[2:4] == [pytest.approx(248, abs=30), float("inf")]
+    for name in ("compressed PLY", "SPZ", "SPZ 4", "splat"):
+        size, similar = row(text, f"{name:<14}")[2:4]
+        assert 0 < size < 200
+        assert similar > 30

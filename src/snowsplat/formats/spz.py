@@ -40,6 +40,10 @@ logger = logging.getLogger(__name__)
 _FRAME_EXTENSION = 0xADBE0003
 _FRAMES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 _COLOR_STEP = 0.15 * 255
+# Bytes of SH are rounded to multiples of these, of degree 1 and of the others, for the packer's
+# sake. The reference implementation takes 8 and 16, which costs a trained scene more than 1 dB
+# against its photos; with these it is 0.1 dB, and the file is half as large again.
+_SH_STEPS = (2, 4)
 
 
 @np.errstate(all="ignore")  # what is not finite is left out at the end
@@ -194,7 +198,7 @@ def _pack_rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _pack_sh(sh_rest: np.ndarray) -> np.ndarray:
-    """Degree 1 to the nearest multiple of 8, others of 16: the rest of the byte would be noise."""
-    step = np.where(np.arange(sh_rest.shape[1]) < 3, 8, 16)[:, None]
+    """Bytes (N, K, 3), rounded to multiples of `_SH_STEPS`."""
+    step = np.where(np.arange(sh_rest.shape[1]) < 3, *_SH_STEPS)[:, None]
     nearest = np.floor((np.rint(sh_rest * 128) + 128 + step // 2) / step) * step
     return np.clip(nearest, 0, 255).astype(np.uint8)
