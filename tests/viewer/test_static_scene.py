@@ -4,6 +4,8 @@ import dataclasses
 import json
 import math
 import re
+import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -127,9 +129,9 @@ def test_a_real_browser_shows_what_we_render(trained, tmp_path):
     with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
-        shown = page.screenshot(tmp_path / "viewer.png").astype(float)
+        shown = soon(page, lambda shown: psnr(shown, ours) > 30)
+        page.screenshot(tmp_path / "viewer.png")  # to be looked at
         assert shown.std() > 10
-        assert psnr(shown, ours) > 30
         assert np.corrcoef(shown.ravel(), ours.ravel())[0, 1] > 0.98
         assert not page.errors
         assert all(url.startswith((server.url, f"blob:{server.url[:16]}")) for url in page.requests)
@@ -143,9 +145,17 @@ def with_controls(browser: Browser, server: StaticServer, before: np.ndarray) ->
     still = page.screenshot().astype(float)
     assert psnr(still, before) > 12  # but for the controls
     page.drag(WIDTH / 2, HEIGHT / 2, WIDTH / 2 + 120, HEIGHT / 2 + 20)
-    page.wait_for("new Promise(done => setTimeout(() => done(true), 1500))")
-    assert psnr(page.screenshot().astype(float), still) < 22
+    soon(page, lambda shown: psnr(shown, still) < 22)
     assert not page.errors
+
+
+def soon(page: Page, fits: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """The first screenshot that fits: frames come when the machine has time for them."""
+    end = time.monotonic() + 30
+    while not fits(shown := page.screenshot().astype(float)):
+        assert time.monotonic() < end, "the picture that was waited for did not come"
+        time.sleep(0.2)
+    return shown
 
 
 def _similarity(scale: float, rotation: list[list[float]]) -> Similarity:
