@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from snowsplat.camera import Camera
+from snowsplat.upright import up_direction
 
 #: Up in a scene that stands upright.
 HOUSE_UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 
-_LEVEL = math.sin(math.radians(15))  # cameras held by people are rolled by less
+_LEVEL = math.sin(math.radians(5))  # as people hold cameras, or better
 _PARALLEL = math.sin(math.radians(8)) ** 2
 _CAMERAS = 16  # enough for a median
 _POINTS = 20_000
@@ -37,21 +38,15 @@ def typical(cameras: Sequence[Camera]) -> Camera:
 
 
 def up_of(cameras: Sequence[Camera]) -> Tensor:
-    """(3,) unit: −y where the cameras are level in that frame, else what they make of it.
+    """(3,) unit: −y where most cameras are level in that frame, else what they make of it.
 
-    Many captures of COLMAP do not stand upright. There up is across the cameras' x axes, which
-    people hold level; where these are all alike, it is the mean of the pictures' upper edges.
+    Many captures of COLMAP do not stand upright.
     """
     rotations = rotations_of(cameras)
-    right, upper, forward = rotations[:, 0], -rotations[:, 1].mean(0), rotations[:, 2].mean(0)
-    # Where the upper edges point every way, the cameras look straight down.
-    rough = upper if float(upper.norm()) >= 0.3 else -forward
-    if float((right @ HOUSE_UP).abs().median()) < _LEVEL and float(rough @ HOUSE_UP) > 0:
+    right, upper = rotations[:, 0], -rotations[:, 1].mean(0)
+    if float((right @ HOUSE_UP).abs().median()) < _LEVEL and float(upper @ HOUSE_UP) > 0:
         return HOUSE_UP
-    spread, axes = torch.linalg.eigh(right.T @ right / len(right))  # ascending
-    if float(spread[1]) > 0.05:
-        return axes[:, 0] * torch.sign(axes[:, 0] @ rough)
-    return rough / rough.norm().clamp_min(1e-12)
+    return torch.from_numpy(up_direction(rotations.cpu().numpy()))
 
 
 def viewing_distance(cameras: Sequence[Camera], points: Tensor) -> float:

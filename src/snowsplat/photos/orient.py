@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from snowsplat.geometry import Similarity
+from snowsplat.upright import up_direction
 
 if TYPE_CHECKING:
     import pycolmap
@@ -22,11 +23,6 @@ if TYPE_CHECKING:
 #: metre for things and rooms photographed by hand, as viewers take it: for their near planes, for
 #: the speed of walking, and in VR.
 VIEWING_DISTANCE = 3.0
-
-# People hold cameras level to within some degrees, photo by photo, whereas all photos of a capture
-# may look down together. So a photo's x axis tells much about up, and the photos' y axes a little.
-_ROLL = math.radians(3)
-_COMMON_PITCH = math.radians(30)
 
 _POINTS_SAMPLED = 5000  # enough for medians
 
@@ -93,37 +89,6 @@ def _read(model: pycolmap.Reconstruction) -> _Seen:
         if len(of_camera):
             distances[i] = np.median(of_camera)
     return _Seen(rotations, centres, points, distances)
-
-
-def up_direction(rotations: np.ndarray) -> np.ndarray:
-    """(3,) unit, world: up, the direction to which the cameras' x axes are most perpendicular.
-
-    ``rotations`` (N, 3, 3) are those of cam_from_world.
-
-    The most likely one if each photo is rolled by `_ROLL` and all together pitched by
-    `_COMMON_PITCH`: where the x axes are all parallel, as in front of a wall, the second decides.
-    Photos rolled by much more than `_ROLL` lose their say (Cauchy weights).
-    """
-    x, upper, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
-    # Where the upper edges point every way, photos look straight down, taken on the way to and fro.
-    # (People photograph the ground, not the sky.)
-    mean = upper if np.linalg.norm(upper) >= 0.3 else -forward
-    up = mean / max(float(np.linalg.norm(mean)), 1e-12)
-    for _ in range(50):
-        roll = x @ up
-        weights = 1 / (_ROLL**2 + (roll / 3) ** 2)
-        # One Newton step in the plane across `up`, spanned by two rows.
-        across = np.linalg.svd(up[None])[2][1:]
-        matrix = across @ (x.T * weights @ x) @ across.T + np.eye(2) / _COMMON_PITCH**2
-        slope = across @ (x.T @ (weights * roll) - mean / _COMMON_PITCH**2)
-        step = -np.linalg.solve(matrix, slope)
-        up = up + step @ across
-        up /= np.linalg.norm(up)
-        if np.linalg.norm(step) < 1e-10:
-            break
-    # Such photos, if few, may all the same have edges that point one way more than another.
-    looks_down = abs(upper @ up) < 0.3
-    return -up if looks_down and forward @ up > 0 else up
 
 
 def _heading(seen: _Seen, up: np.ndarray) -> np.ndarray:

@@ -15,9 +15,10 @@ from snowsplat.edit import transform
 from snowsplat.formats.compressed_ply import write_compressed_ply
 from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import Similarity
-from snowsplat.photos.orient import VIEWING_DISTANCE, up_direction
+from snowsplat.photos.orient import VIEWING_DISTANCE
 from snowsplat.render import render
 from snowsplat.start_view import StartView, overview, view_of_camera
+from snowsplat.upright import up_direction
 from snowsplat.viewer.static_server import ServedFile
 from snowsplat.viewer_page import asset, content_policy, page, settings
 
