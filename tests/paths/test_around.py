@@ -103,8 +103,10 @@ def test_spiral_winds_within_cameras_that_look_one_way():
 
 
 def test_spiral_is_refused_where_cameras_look_every_way():
-    with pytest.raises(UserError, match="take an ellipse"):
-        spiral_path(ring(12), 10, 3.0)
+    above = [camera_at((3 * math.cos(t), -3.0, 3 * math.sin(t))) for t in range(12)]
+    for cameras in (ring(12), above):
+        with pytest.raises(UserError, match="take an ellipse"):
+            spiral_path(cameras, 10, 3.0)
 
 
 def test_orbit_goes_around_most_of_the_points():

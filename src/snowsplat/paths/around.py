@@ -17,6 +17,7 @@ from snowsplat.paths.sight import HOUSE_UP, focus_of, positions_of, rotations_of
 # Cameras stand all around something if no wider sector than this is without one.
 _WIDEST_GAP = math.radians(110)
 _STEEPEST = math.radians(80)  # nearer to straight above, the picture would turn quickly
+_ONE_WAY = 0.75  # length of the mean of unit vectors: about 60° to each side of the middle
 _LEAST_SWING = math.radians(2)
 _FLATTEST = 0.25  # the shorter axis of an oval, in longer ones
 _DENSE = 20  # places a frame at which the way is measured
@@ -83,7 +84,7 @@ def spiral_path(cameras: Sequence[Camera], frames: int, distance: float) -> list
         UserError: the cameras look every way.
     """
     forward = rotations_of(cameras)[:, 2].mean(0)
-    if float(forward.norm()) < 0.5:
+    if float(forward.norm()) < _ONE_WAY:
         raise UserError("a spiral is for cameras that look one way, these do not; take an ellipse")
     up, focus = up_of(cameras), focus_of(cameras, distance)
     positions = positions_of(cameras)
