@@ -24,7 +24,7 @@ def trained(tmp_path_factory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("report") / "capture"
     write_synthetic_capture(folder, n_views=17, width=48, height=36, n_points=300)
     capture = load_capture(folder, hold_out=2)
-    trainer = Trainer(capture, TrainConfig(iterations=40, test_iterations=(20,)))
+    trainer = Trainer(capture, TrainConfig(iterations=40, test_iterations=(20, 40)))
     history = History()
 
     def record(progress: Any) -> None:

@@ -138,6 +138,7 @@ def _curves(history: History) -> str:
     stretches = history.stretches
     window = max(1, len(stretches) // _SMOOTHED)
     loss = [(float(s.step), s.loss) for s in stretches]
+    psnr = [(float(m.step), m.psnr) for m in history.measured]
     milliseconds = [(float(s.step), 1000 * s.seconds / s.steps) for s in stretches]
     drawings = [
         (
@@ -147,7 +148,7 @@ def _curves(history: History) -> str:
         (
             "PSNR of the held-out photos, dB",
             charts.chart(
-                [(float(m.step), m.psnr) for m in history.measured],
+                psnr if len(psnr) > 1 else [],  # one is told above
                 x_label="steps",
                 y_label="PSNR, dB",
                 dots=True,
