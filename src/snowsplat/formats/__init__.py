@@ -15,6 +15,7 @@ from snowsplat.formats.compressed_ply import (
     read_compressed_ply,
     write_compressed_ply,
 )
+from snowsplat.formats.gltf import is_glb, read_glb, write_glb
 from snowsplat.formats.html import write_html
 from snowsplat.formats.ksplat import read_ksplat
 from snowsplat.formats.sog import is_sog, read_sog, write_sog
@@ -62,6 +63,7 @@ FORMATS: tuple[Format, ...] = (
     Format("PLY", (".ply",), ply.is_ply, ply.read_gaussians, ply.write_gaussians),
     Format("SPZ", (".spz",), is_spz, read_spz, write_spz),
     Format("SOG", (".sog",), is_sog, read_sog, write_sog),
+    Format("glTF", (".glb",), is_glb, read_glb, write_glb),
     Format("splat", (".splat",), None, read_splat, write_splat),
     Format("ksplat", (".ksplat",), None, read_ksplat, None),
     Format("HTML", (".html",), None, None, write_html),

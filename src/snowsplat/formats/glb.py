@@ -1,0 +1,166 @@
+"""The GLB container: glTF's JSON and its one binary chunk, accessors as arrays, nodes as matrices.
+
+Nothing is allocated from a number in the JSON before the binary chunk is known to hold it.
+Specification: Khronos, glTF 2.0, sections 3.6 and 4.4.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+
+from snowsplat.geometry import rotation_from_quat
+
+MAGIC = b"glTF"
+_JSON, _BIN = 0x4E4F534A, 0x004E4942
+_JSON_LIMIT = 16 << 20
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+#: numpy's name, and by what a normalised value is divided.
+_COMPONENTS = {
+    5120: ("<i1", 127.0),
+    5121: ("<u1", 255.0),
+    5122: ("<i2", 32767.0),
+    5123: ("<u2", 65535.0),
+    5126: ("<f4", 1.0),
+}
+
+
+class Damaged(Exception):
+    """What is wrong with the file; its name is put before it further up."""
+
+
+def unpack(data: bytes) -> tuple[dict[str, Any], memoryview]:
+    """The JSON and the binary chunk (empty where there is none).
+
+    Raises:
+        Damaged: not GLB 2, chunks beyond its end, or no JSON.
+    """
+    if len(data) < 20 or data[:4] != MAGIC:
+        raise Damaged("not a GLB file")
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise Damaged(f"of GLB version {version}, of which I know 2")
+    if length > len(data):
+        raise Damaged("the file ends before its contents")
+    chunks, position = [], 12
+    while position + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, position)
+        if size > length - position - 8:
+            raise Damaged("has a chunk that is larger than the file")
+        chunks.append((kind, memoryview(data)[position + 8 : position + 8 + size]))
+        position += 8 + size
+    if not chunks or chunks[0][0] != _JSON or len(chunks[0][1]) > _JSON_LIMIT:
+        raise Damaged("does not begin with a chunk of JSON")
+    try:
+        document = json.loads(bytes(chunks[0][1]))
+    except (ValueError, RecursionError):
+        document = None
+    if not isinstance(document, dict):
+        raise Damaged("its JSON is none")
+    binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _BIN else memoryview(b"")
+    return document, binary
+
+
+def pack(document: dict[str, Any], arrays: list[np.ndarray]) -> Iterator[bytes]:
+    """The pieces of a GLB file; the arrays, each of a multiple of 4 bytes, are its binary chunk."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    size = sum(array.nbytes for array in arrays)
+    yield struct.pack("<4sII", MAGIC, 2, 12 + 8 + len(text) + (8 + size if size else 0))
+    yield struct.pack("<II", len(text), _JSON) + text
+    if size:
+        yield struct.pack("<II", size, _BIN)
+        for array in arrays:
+            yield array.tobytes()
+
+
+def accessor(document: dict[str, Any], binary: memoryview, index: int, kind: str) -> np.ndarray:
+    """(count, width) float32 of an accessor of ``kind`` (SCALAR, VEC3, VEC4).
+
+    Raises:
+        Damaged: of another kind, or not all of it in the binary chunk.
+        KeyError, IndexError, TypeError, ValueError: JSON that is no glTF.
+    """
+    entry = _item(document, "accessors", index)
+    if entry["type"] != kind or entry["componentType"] not in _COMPONENTS or "sparse" in entry:
+        raise Damaged(f"its accessor {index} is not one of splats")
+    code, divisor = _COMPONENTS[entry["componentType"]]
+    dtype, width, count = np.dtype(code), _WIDTHS[kind], _natural(entry["count"])
+    view = _item(document, "bufferViews", entry["bufferView"])
+    buffer = _item(document, "buffers", view["buffer"])
+    if view["buffer"] != 0 or "uri" in buffer:
+        raise Damaged("keeps its splats in another file")
+    row = width * dtype.itemsize
+    stride = _natural(view.get("byteStride", row))
+    start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])
+    offset = _natural(entry.get("byteOffset", 0))
+    needed = offset + (stride * (count - 1) + row if count else 0)
+    if stride < row or needed > length or start + length > len(binary):
+        raise Damaged(f"its accessor {index} is not all in the file")
+    values = np.ndarray((count, width), dtype, binary, start + offset, (stride, dtype.itemsize))
+    result = values.astype(np.float32)
+    if entry.get("normalized", False) and divisor != 1.0:
+        # The most negative integer stands for -1 as well.
+        result = np.maximum(result / np.float32(divisor), np.float32(-1))
+    return result
+
+
+def meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Each mesh of the scene with its ``world_from_mesh`` (4, 4), once a node that shows it.
+
+    Raises:
+        Damaged: nodes that are no trees.
+        KeyError, IndexError, TypeError, ValueError: JSON that is no glTF.
+    """
+    nodes = document.get("nodes", [])
+    if document.get("scenes"):
+        roots = _item(document, "scenes", document.get("scene", 0)).get("nodes", [])
+    else:
+        inner = {child for node in nodes for child in node.get("children", [])}
+        roots = [index for index in range(len(nodes)) if index not in inner]
+    waiting = deque((root, np.eye(4)) for root in roots)
+    visits = 0
+    while waiting:
+        index, world_from_parent = waiting.popleft()
+        node = _item(document, "nodes", index)
+        visits += 1
+        children = node.get("children", [])
+        # In a tree no node is met twice.
+        if visits + len(waiting) + len(children) > len(nodes):
+            raise Damaged("its nodes are no trees")
+        world_from_node = world_from_parent @ _local(node)
+        if "mesh" in node:
+            yield _item(document, "meshes", node["mesh"]), world_from_node
+        waiting.extend((child, world_from_node) for child in children)
+
+
+def _local(node: dict[str, Any]) -> np.ndarray:
+    """(4, 4) ``parent_from_node``."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T  # column-major
+    x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
+    local = np.eye(4)
+    local[:3, :3] = rotation_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64)).numpy()
+    local[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
+    local[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
+    return local
+
+
+def _item(document: dict[str, Any], name: str, index: Any) -> dict[str, Any]:
+    """An entry of one of the top-level arrays."""
+    entry = document[name][_natural(index)]
+    if not isinstance(entry, dict):
+        raise TypeError
+    return entry
+
+
+def _natural(value: Any) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise ValueError
+    return value

@@ -1,0 +1,282 @@
+"""glTF: nothing is lost but rounding; nodes place the splats; hostile JSON gives one line."""
+
+import json
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat import edit
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.geometry import Similarity, rotation_from_quat
+
+PREFIX = "KHR_gaussian_splatting:"
+
+
+def parts(path) -> tuple[dict, bytes]:
+    data = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    binary = data[20 + size + 8 :]
+    if binary:
+        assert struct.unpack_from("<I4s", data, 20 + size) == (len(binary), b"BIN\0")
+    return json.loads(data[20 : 20 + size]), binary
+
+
+def assemble(path, document, binary: bytes):
+    text = document if isinstance(document, bytes) else json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+@pytest.fixture
+def seed(tmp_path, make_scene):
+    """JSON and binary chunk of a small file, and the scene."""
+    scene = make_scene(30, 2)
+    write_gaussians(tmp_path / "seed.glb", scene)
+    return (*parts(tmp_path / "seed.glb"), scene)
+
+
+def assert_same(a, b, atol=2e-6):
+    for name in ("means", "log_scales", "sh_dc", "sh_rest", "opacities"):
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=1e-5, atol=atol)
+    assert float((1 - (a.rotations * b.rotations).sum(1).abs()).max()) < 1e-6
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [1, 500])
+def test_round_trip(tmp_path, make_scene, psnr, degree, n):
+    scene = make_scene(n, degree)
+    write_gaussians(tmp_path / "a.glb", scene)
+    read = read_gaussians(tmp_path / "a.glb")
+    assert read.sh_degree == degree
+    assert_same(read, scene)
+    assert psnr(scene, read) > 90
+
+
+def test_a_real_scene(tmp_path, shared, psnr):
+    scene = read_gaussians(shared / "reference_layout_sh3.ply")
+    write_gaussians(tmp_path / "a.glb", scene)
+    assert psnr(scene, read_gaussians(tmp_path / "a.glb")) > 90
+
+
+def test_the_layout_is_that_of_the_specification(seed, tmp_path):
+    document, binary, scene = seed
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0
+    extension = primitive["extensions"]["KHR_gaussian_splatting"]
+    assert extension == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+
+    def values(name: str) -> np.ndarray:
+        entry = document["accessors"][primitive["attributes"][name]]
+        view = document["bufferViews"][entry["bufferView"]]
+        data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        return np.frombuffer(data, {5126: "<f4", 5121: "u1"}[entry["componentType"]]).reshape(
+            30, -1
+        )
+
+    means, scales = values("POSITION"), values(PREFIX + "SCALE")
+    # y up, z toward the viewer, x as it is.
+    np.testing.assert_array_equal(means * [1, -1, -1], scene.means.numpy())
+    entry = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(entry["min"], means.min(0))
+    np.testing.assert_array_equal(entry["max"], means.max(0))
+    np.testing.assert_allclose(scales, scene.scales.numpy(), rtol=1e-6)
+    np.testing.assert_allclose(values(PREFIX + "OPACITY")[:, 0], scene.opacities, rtol=1e-6)
+    x, y, z, w = values(PREFIX + "ROTATION").T
+    unit = scene.rotations.numpy()
+    np.testing.assert_allclose(np.stack([w, x, -y, -z], 1), unit, atol=1e-6)
+    np.testing.assert_array_equal(values(PREFIX + "SH_DEGREE_0_COEF_0"), scene.sh_dc[:, 0])
+    # (-y, z, -x) at y, z turned about: the first two of degree 1 change their signs.
+    for n, sign in enumerate((-1, -1, 1)):
+        coefficient = values(f"{PREFIX}SH_DEGREE_1_COEF_{n}")
+        np.testing.assert_array_equal(coefficient, sign * scene.sh_rest[:, n].numpy())
+    color = np.clip(0.5 + 0.28209479 * scene.sh_dc[:, 0].numpy(), 0, 1)
+    assert np.abs(values("COLOR_0")[:, :3] / 255 - color**2.2).max() < 0.02
+
+
+def test_half_a_turn_about_x_is_what_the_frames_differ_by(seed, tmp_path):
+    document, binary, scene = seed
+    document["nodes"][0]["rotation"] = [1.0, 0.0, 0.0, 0.0]
+    read = read_gaussians(assemble(tmp_path / "a.glb", document, binary))
+    half = Similarity(1.0, torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.zeros(3))
+    assert_same(read, edit.transform(scene, half))
+
+
+def test_nodes_place_the_splats(seed, tmp_path):
+    document, binary, scene = seed
+    angle = 0.7
+    quat = [0.0, math.sin(angle / 2), 0.0, math.cos(angle / 2)]  # about y, xyzw
+    document["nodes"] = [
+        {"children": [1, 2], "translation": [1, 2, 3], "rotation": quat, "scale": [2, 2, 2]},
+        {"mesh": 0, "translation": [0, 0, 1]},
+        {"mesh": 0, "matrix": [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]},
+    ]
+    read = read_gaussians(assemble(tmp_path / "a.glb", document, binary))
+    assert len(read) == 60
+    up = Similarity(1.0, torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.zeros(3))
+    turn = rotation_from_quat(torch.tensor([quat[3], 0.0, quat[1], 0.0], dtype=torch.float64))
+    outer = Similarity(2.0, turn, torch.tensor([1.0, 2.0, 3.0]))
+    shift = Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.0, 1.0]))
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    second = Similarity(1.0, quarter, torch.tensor([5.0, 0.0, 0.0]))
+    for rows, inner in ((slice(0, 30), shift), (slice(30, 60), second)):
+        expected = scene
+        for step in (up, inner, outer, up):
+            expected = edit.transform(expected, step)
+        got = read.select(torch.arange(60)[rows])
+        assert_same(got, expected, atol=2e-5)
+
+
+def test_quantised_attributes(seed, tmp_path):
+    """As the table of the specification allows, interleaved."""
+    document, _, scene = seed
+    del document["accessors"][7:], document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
+    rows = np.zeros(
+        30,
+        [
+            ("p", "<f4", 3),
+            ("r", "<i2", 4),
+            ("s", "<u2", 3),
+            ("o", "u1"),
+            ("_", "u1"),
+            ("c", "<f4", 3),
+        ],
+    )
+    rows["p"] = scene.means.numpy() * [1, -1, -1]
+    w, x, y, z = scene.rotations.numpy().T
+    rows["r"] = np.rint(32767 * np.stack([x, -y, -z, w], 1))
+    scales = torch.randint(1, 9, (30, 3), generator=torch.Generator().manual_seed(0))
+    rows["s"] = scales
+    rows["o"] = np.rint(255 * scene.opacities.numpy())
+    rows["c"] = scene.sh_dc[:, 0]
+    document["bufferViews"] = [
+        {"buffer": 0, "byteLength": rows.nbytes, "byteStride": rows.itemsize}
+    ]
+    names = {"POSITION": 0, "ROTATION": 1, "SCALE": 2, "OPACITY": 3, "SH_DEGREE_0_COEF_0": 4}
+    columns = [("p", 5126, "VEC3"), ("r", 5122, "VEC4"), ("s", 5123, "VEC3")]
+    columns += [("o", 5121, "SCALAR"), ("c", 5126, "VEC3")]
+    document["accessors"] = [
+        {
+            "bufferView": 0,
+            "byteOffset": rows.dtype.fields[column][1],
+            "componentType": code,
+            "type": kind,
+            "count": 30,
+            "normalized": column in "ro",
+        }
+        for column, code, kind in columns
+    ]
+    document["meshes"][0]["primitives"][0]["attributes"] = {
+        (PREFIX if name != "POSITION" else "") + name: index for name, index in names.items()
+    }
+    read = read_gaussians(assemble(tmp_path / "a.glb", document, rows.tobytes()))
+    assert read.sh_degree == 0
+    torch.testing.assert_close(read.means, scene.means)
+    torch.testing.assert_close(read.scales, scales.float())
+    torch.testing.assert_close(read.opacities, scene.opacities, rtol=0, atol=0.003)
+    assert float((1 - (read.rotations * scene.rotations).sum(1).abs()).max()) < 1e-6
+
+
+def test_nothing(tmp_path, make_scene, one_line):
+    write_gaussians(tmp_path / "a.glb", make_scene(0, 3))
+    assert len(read_gaussians(tmp_path / "a.glb")) == 0
+    document, _ = parts(tmp_path / "a.glb")
+    assert "meshes" not in document  # an accessor of nothing would not be valid
+    del document["extensionsUsed"]
+    assert "without Gaussian splats" in one_line(assemble(tmp_path / "b.glb", document, b""))
+
+
+def test_opacities_of_0_and_1(seed, tmp_path, make_scene):
+    scene = make_scene(2, 0)
+    scene.opacity_logits[:] = torch.tensor([-200.0, 40.0])
+    write_gaussians(tmp_path / "a.glb", scene)
+    read = read_gaussians(tmp_path / "a.glb")
+    torch.testing.assert_close(read.opacities, torch.tensor([0.0, 1.0]), rtol=0, atol=1e-6)
+    assert bool(read.opacity_logits.isfinite().all())
+
+
+def primitive(document: dict) -> dict:
+    return document["meshes"][0]["primitives"][0]
+
+
+def extension(document: dict) -> dict:
+    return primitive(document)["extensions"]["KHR_gaussian_splatting"]
+
+
+BROKEN = {
+    "count huge": lambda d: d["accessors"][0].update(count=10**15),
+    "count negative": lambda d: d["accessors"][0].update(count=-1),
+    "count less": lambda d: d["accessors"][0].update(count=7),
+    "count a word": lambda d: d["accessors"][0].update(count="7"),
+    "no buffer view": lambda d: d["accessors"][0].pop("bufferView"),
+    "sparse": lambda d: d["accessors"][0].update(sparse={}),
+    "of integers": lambda d: d["accessors"][0].update(componentType=5125),
+    "of pairs": lambda d: d["accessors"][0].update(type="VEC2"),
+    "view outside": lambda d: d["bufferViews"][0].update(byteOffset=10**9),
+    "view too long": lambda d: d["bufferViews"][-1].update(byteLength=10**9),
+    "stride of none": lambda d: d["bufferViews"][0].update(byteStride=0),
+    "offset negative": lambda d: d["accessors"][0].update(byteOffset=-4),
+    "index outside": lambda d: primitive(d)["attributes"].update(POSITION=99),
+    "index negative": lambda d: primitive(d)["attributes"].update(POSITION=-1),
+    "no position": lambda d: primitive(d)["attributes"].pop("POSITION"),
+    "no scale": lambda d: primitive(d)["attributes"].pop(PREFIX + "SCALE"),
+    "part of a degree": lambda d: primitive(d)["attributes"].pop(PREFIX + "SH_DEGREE_2_COEF_3"),
+    "a degree left out": lambda d: [
+        primitive(d)["attributes"].pop(f"{PREFIX}SH_DEGREE_1_COEF_{n}") for n in range(3)
+    ],
+    "triangles": lambda d: primitive(d).update(mode=4),
+    "another kernel": lambda d: extension(d).update(kernel="box"),
+    "packed": lambda d: (
+        primitive(d).update(attributes={"POSITION": 0}),
+        extension(d).update(extensions={"KHR_gaussian_splatting_compression_spz_2": {}}),
+    ),
+    "needs more": lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"]),
+    "another file": lambda d: d["buffers"][0].update(uri="../../etc/passwd"),
+    "a circle": lambda d: d["nodes"][0].update(children=[0]),
+    "many times": lambda d: d.update(
+        nodes=[{"mesh": 0}] * 200, scenes=[{"nodes": list(range(200))}]
+    ),
+    "one node many times": lambda d: d.update(scenes=[{"nodes": [0] * 1000}]),
+    "flat": lambda d: d["nodes"][0].update(scale=[1, 1, 0]),
+    "stretched": lambda d: d["nodes"][0].update(scale=[1, 2, 1]),
+    "mirrored": lambda d: d["nodes"][0].update(scale=[1, 1, -1]),
+    "infinite": lambda d: d["nodes"][0].update(translation=[1e999, 0, 0]),
+    "meshes a word": lambda d: d.update(meshes="m"),
+    "nodes numbers": lambda d: d.update(nodes=[1, 2]),
+    "accessors absent": lambda d: d.pop("accessors"),
+    "extension a list": lambda d: primitive(d).update(extensions=[]),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_json_that_makes_no_sense(tmp_path, seed, one_line, name):
+    document, binary, _ = seed
+    BROKEN[name](document)
+    one_line(assemble(tmp_path / "a.glb", document, binary))
+
+
+def test_chunks_that_make_no_sense(tmp_path, seed, one_line):
+    document, binary, _ = seed
+    whole = assemble(tmp_path / "a.glb", document, binary).read_bytes()
+    for at, word in ((4, 1), (8, 2**32 - 1), (12, 2**32 - 1), (12, 8), (16, 7)):
+        (tmp_path / "a.glb").write_bytes(whole[:at] + struct.pack("<I", word) + whole[at + 4 :])
+        one_line(tmp_path / "a.glb")
+    for length in (4, 12, 19, 200, len(whole) - 1):
+        (tmp_path / "a.glb").write_bytes(whole[:length])
+        one_line(tmp_path / "a.glb")
+    for text in (b"[" * 100_000, b"7", b"{]", b'{"a":' + b"9" * 10_000 + b"}"):
+        one_line(assemble(tmp_path / "a.glb", text, binary))
+
+
+def test_linear_colours_are_told(tmp_path, seed, caplog):
+    document, binary, _ = seed
+    extension(document)["colorSpace"] = "lin_rec709_display"
+    assert len(read_gaussians(assemble(tmp_path / "a.glb", document, binary))) == 30
+    assert "taken as sRGB" in caplog.text
