@@ -5,49 +5,32 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from PIL import Image
-from torch import Tensor
-
 from snowsplat import charts, ops
-from snowsplat.capture import Capture, ImageLoader, View
-from snowsplat.evaluate import Evaluation, ViewMetrics, evaluate_views
+from snowsplat.capture import Capture
+from snowsplat.evaluate import Evaluation, evaluate_views
 from snowsplat.files import write_text
 from snowsplat.gaussians import Gaussians
 from snowsplat.history import History
 from snowsplat.machine import memory_bytes, processor_name, system_name
 from snowsplat.ops import native
-from snowsplat.page import bar, cards, duration, page, picture, table, text
+from snowsplat.page import bar, cards, duration, page, table, text
 from snowsplat.process import single_threaded
-from snowsplat.render import render
+from snowsplat.training_report import pictures
 
-_WORST, _BEST = 3, 2  # views that are shown
 _TRAINING_VIEWS = 8  # that are measured where none were held out
-_PICTURE_SIDE = 360  # pixels of the longer side
 _LISTED = 200  # views
-_WHITE_ERROR = 0.25  # mean difference of the channels that is drawn white
 _SMOOTHED = 40  # the loss is the mean of so many parts of the training
-
-# From no error to `_WHITE_ERROR`: black, red, orange, white.
-_ERROR_COLORS = np.array(
-    [[0, 0, 0], [96, 14, 30], [200, 60, 20], [250, 170, 60], [255, 255, 255]], np.float32
-)
 
 _STYLE = (
     charts.STYLE
+    + pictures.STYLE
     + """
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr));
   gap: 22px 28px; }
-.views { display: flex; flex-wrap: wrap; gap: 18px 16px; }
-.triple { display: flex; gap: 5px; }
-.triple img { height: auto; max-height: 200px; width: auto; min-width: 0; flex: 0 1 auto;
-  object-fit: contain; border-radius: 3px; }
 td { font-variant-numeric: tabular-nums; }
 """
 )
@@ -97,7 +80,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
             _headline(trained, evaluation, held_out),
             _cards(trained, evaluation, held_out),
             _curves(trained.history),
-            _pictures(trained, views, evaluation),
+            pictures.compared(trained.gaussians, views, evaluation, trained.background),
             _figures(evaluation, held_out),
             _settings(trained),
             _machine(trained),
@@ -181,55 +164,6 @@ def _curves(history: History) -> str:
     return f'<h2>The training</h2>\n<div class="charts">{figures}</div>' if figures else ""
 
 
-def _pictures(trained: Trained, views: Sequence[View], evaluation: Evaluation) -> str:
-    """Photo, render and error of the views with the lowest and the highest PSNR."""
-    order = sorted(evaluation.views, key=lambda figures: figures.psnr)
-    if len(order) <= _WORST + _BEST:
-        groups = [("Photo, render, error", order)]
-    else:
-        groups = [
-            ("Least like their photos", order[:_WORST]),
-            ("Most like them", order[: -_BEST - 1 : -1]),
-        ]
-    by_name = {view.name: view for view in views}
-    parts = []
-    with ImageLoader(views) as loader:
-        for title, chosen in groups:
-            figures = "\n".join(
-                _triple(trained, by_name[one.name], one, loader)
-                for one in chosen
-                if one.name in by_name
-            )
-            parts.append(f'<h2>{title}</h2>\n<div class="views">{figures}</div>')
-    white = f"{100 * _WHITE_ERROR:.0f}%"
-    parts.append(
-        '<p class="soft">Photo, render, and error: the mean difference of red, green and blue, '
-        f"from black (none) to white ({white} of the range, or more).</p>"
-    )
-    return "\n".join(parts)
-
-
-def _triple(trained: Trained, view: View, figures: ViewMetrics, loader: ImageLoader) -> str:
-    color = torch.tensor(trained.background)
-    loaded = loader.get(view)
-    photo = loaded.over(color)
-    with torch.no_grad():
-        image = render(trained.gaussians, view.camera, color).image.clamp(0.0, 1.0)
-    difference = (image - photo).abs().mean(2)
-    if loaded.mask is not None:
-        difference = torch.where(loaded.mask, difference, 0.0)
-    images = "".join(
-        picture(_small(pixels), f"{view.name}: {what}", quality=80)
-        for what, pixels in (
-            ("photo", _bytes(photo)),
-            ("render", _bytes(image)),
-            ("error", _error_in_color(difference.cpu().numpy())),
-        )
-    )
-    caption = f"{text(view.name)}: PSNR {figures.psnr:.2f} dB, SSIM {figures.ssim:.3f}"
-    return f'<figure><div class="triple">{images}</div><figcaption>{caption}</figcaption></figure>'
-
-
 def _figures(evaluation: Evaluation, held_out: bool) -> str:
     """The list of views, and how far each is off: a bar that begins at zero."""
     errors = [_rms(figures.psnr) for figures in evaluation.views]
@@ -288,29 +222,6 @@ def _next(name: str) -> str:
     return f"<h2>Next</h2>\n<pre>snowsplat view {out}\nsnowsplat render {out} --path ellipse</pre>"
 
 
-# Pictures and figures
-
-
 def _rms(psnr: float) -> float:
     """Root of the mean square of the differences, of a range of 1."""
     return 0.0 if math.isinf(psnr) else 10.0 ** (-psnr / 20.0)
-
-
-def _bytes(image: Tensor) -> np.ndarray:
-    return (image * 255.0 + 0.5).byte().contiguous().cpu().numpy()
-
-
-def _error_in_color(difference: np.ndarray) -> np.ndarray:
-    """(H, W) in 0..1 -> (H, W, 3) uint8."""
-    position = np.clip(difference / _WHITE_ERROR, 0.0, 1.0) * (len(_ERROR_COLORS) - 1)
-    low = np.minimum(position.astype(np.int64), len(_ERROR_COLORS) - 2)
-    share = (position - low)[:, :, None]
-    color = _ERROR_COLORS[low] * (1.0 - share) + _ERROR_COLORS[low + 1] * share
-    return np.rint(color).astype(np.uint8)
-
-
-def _small(pixels: np.ndarray) -> Image.Image:
-    image = Image.fromarray(pixels)
-    scale = min(1.0, _PICTURE_SIDE / max(image.size))
-    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
-    return image.resize(size, Image.Resampling.LANCZOS)
