@@ -3,10 +3,12 @@
 import pytest
 import torch
 
+from snowsplat.edit import transform
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.frames import UP_BACK, flip_axes
 from snowsplat.formats.spz import write_spz
 from snowsplat.gaussians import Gaussians
+from snowsplat.geometry import Similarity, rotation_from_quat
 
 
 def assert_same(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
@@ -66,3 +68,39 @@ def test_we_read_fixtures_as_it_does(tmp_path, shared, splat_transform):
         splat_transform(shared / name, tmp_path / "back.ply")
         ours = as_it_reads_spz(read_gaussians(shared / name))
         assert_same(ours, read_gaussians(tmp_path / "back.ply"))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_it_reads_our_sog(tmp_path, make_scene, splat_transform, degree):
+    write_gaussians(tmp_path / "a.sog", make_scene(300, degree))
+    splat_transform(tmp_path / "a.sog", tmp_path / "back.ply")
+    assert_same(read_gaussians(tmp_path / "back.ply"), read_gaussians(tmp_path / "a.sog"))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_we_read_its_sog(tmp_path, make_scene, splat_transform, degree):
+    write_gaussians(tmp_path / "a.ply", make_scene(300, degree))
+    splat_transform(tmp_path / "a.ply", tmp_path / "a.sog", "--gpu", "cpu")
+    splat_transform(tmp_path / "a.sog", tmp_path / "back.ply")
+    assert_same(read_gaussians(tmp_path / "a.sog"), read_gaussians(tmp_path / "back.ply"))
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    splat_transform(tmp_path / "a.ply", folder / "meta.json", "--gpu", "cpu")
+    splat_transform(folder / "meta.json", tmp_path / "back.ply")
+    assert_same(read_gaussians(folder / "meta.json"), read_gaussians(tmp_path / "back.ply"))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_we_read_its_glb(tmp_path, make_scene, splat_transform, degree):
+    """It takes y up from a PLY by half a turn about z, we by one about x: the difference is half a
+    turn about the vertical."""
+    scene = make_scene(300, degree)
+    write_gaussians(tmp_path / "a.ply", scene)
+    splat_transform(tmp_path / "a.ply", tmp_path / "a.glb")
+    half = Similarity(1.0, torch.diag(torch.tensor([-1.0, 1.0, -1.0])), torch.zeros(3))
+    read = transform(read_gaussians(tmp_path / "a.glb"), half)
+    # The axes of an ellipsoid point either way.
+    axes = rotation_from_quat(read.quats).mT @ rotation_from_quat(scene.quats)
+    torch.testing.assert_close(axes.abs(), torch.eye(3).expand(300, 3, 3), rtol=0, atol=1e-5)
+    read.quats = scene.quats
+    assert_same(read, scene)
