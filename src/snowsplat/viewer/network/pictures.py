@@ -166,7 +166,8 @@ def _normals(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Tensor:
     axes, _ = _axes(splats, gaussians, camera)
     # Blended as they are, then of unit length: the direction of the mean.
     image, alpha, _ = ops.rasterize(_recolored(splats, axes), camera.width, camera.height)
-    normals = torch.nn.functional.normalize(image, dim=2) * image.new_tensor([0.5, -0.5, -0.5])
+    length = image.permute(2, 0, 1).square().sum(0).sqrt_().clamp_min_(1e-9)  # plane by plane
+    normals = image / length[:, :, None] * image.new_tensor([0.5, -0.5, -0.5])
     return _bytes((normals + 0.5) * (alpha >= _OPAQUE_ENOUGH)[:, :, None])
 
 

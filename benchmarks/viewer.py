@@ -1,0 +1,216 @@
+"""What the network viewer takes: a picture, the answer to a camera that moves, and of a training.
+
+    python benchmarks/viewer.py                      200k Gaussians at 960×540
+    python benchmarks/viewer.py --capture DIR        a training too: alone, watched, with a camera
+                                                     that moves all the time
+
+The browser is a client of ours that takes the pictures and draws nothing, so that a real one (which
+may be on another machine) costs nothing here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import math
+import statistics
+import threading
+import time
+from pathlib import Path
+
+import msgspec
+import torch
+import viser
+import viser._messages as messages
+import zstandard
+from PIL import Image
+from websockets.sync.client import connect
+from workloads import SIZES, workload
+
+from snowsplat import Trainer, load_capture, ops, recipe
+from snowsplat.capture import Capture, Points, View
+from snowsplat.capture.decode import ImageSource
+from snowsplat.geometry import quat_from_rotation
+from snowsplat.process import single_threaded
+from snowsplat.viewer.network.gauge import Gauge
+from snowsplat.viewer.network.look import Look
+from snowsplat.viewer.network.pictures import draw
+from snowsplat.viewer.network.training import TrainingViewer
+from snowsplat.viewer.network.viewer import NetworkViewer
+
+MODES = ("color", "depth", "alpha", "normals", "points", "ellipsoids", "cost")
+
+
+class Client:
+    """What a browser is to the server, without a screen."""
+
+    def __init__(self, viewer: NetworkViewer, width: int, height: int) -> None:
+        address = viewer.url.replace("http", "ws")
+        protocol = [f"viser-v{viser.__version__}"]
+        self._socket = connect(address, subprotocols=protocol, max_size=None, compression=None)
+        self._size = width, height
+        self.pictures = 0
+
+    def move(self, cam_from_world: torch.Tensor, fov: float, shift: float) -> None:
+        """Look from there, ``shift`` to the right."""
+        width, height = self._size
+        rotation = cam_from_world[:, :3]
+        position = -rotation.T @ cam_from_world[:, 3] + shift * rotation[0]
+        message = messages.ViewerCameraMessage(
+            *(tuple(quat_from_rotation(rotation.T).tolist()), tuple(position.tolist()), fov),
+            *(0.01, 1000.0, height, width),
+            *(tuple((position + rotation[2]).tolist()), (0.0, -1.0, 0.0)),
+        )
+        self._socket.send(msgspec.msgpack.encode(message.as_serializable_dict([])))
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """For a picture; False if none came in time."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while True:
+            left = None if end is None else max(0.0, end - time.monotonic())
+            try:
+                data = self._socket.recv(timeout=left)
+            except TimeoutError:
+                return False
+            size = int.from_bytes(data[8:16], "little")
+            window = msgspec.msgpack.decode(zstandard.decompress(data[16 : 16 + size]))
+            for message in window["messages"]:
+                if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
+                    self.pictures += 1
+                    jpeg = data[data.index(b"\xff\xd8\xff", 16 + size) :]
+                    self.newest = Image.open(io.BytesIO(jpeg))
+                    return True
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def milliseconds(times: list[float]) -> str:
+    return f"{1000 * min(times):8.1f} {1000 * statistics.median(times):8.1f}"
+
+
+def pictures(name: str, repeats: int) -> None:
+    """Every mode, without a server."""
+    scene = workload(name)
+    print(
+        f"{len(scene.gaussians):,} Gaussians of {scene.source}, ops on "
+        f"{ops.get_num_threads()} threads\n\nms {'':12} {'min':>8} {'median':>8}"
+    )
+    for mode in MODES:
+        times = []
+        for _ in range(repeats):
+            started = time.perf_counter()
+            draw(scene.gaussians, scene.camera, Look(mode))
+            times.append(time.perf_counter() - started)
+        print(f"{mode:15} {milliseconds(times)}")
+
+
+def answers(name: str, repeats: int) -> None:
+    """From a camera that moves to its picture at the client."""
+    scene = workload(name)
+    camera = scene.camera
+    nowhere = ImageSource(Path("nowhere.jpg"), camera.width, camera.height)
+    points = Points(scene.gaussians.means, torch.zeros(len(scene.gaussians), 3, dtype=torch.uint8))
+    capture = Capture([View("view", camera, nowhere)], [], points, 1.0)
+    viewer = NetworkViewer(capture)
+    stop = threading.Event()
+    times: dict[str, list[float]] = {"answer": [], "full": []}
+    sizes: list[int] = []
+
+    def ask() -> None:
+        client = Client(viewer, camera.width, camera.height)
+        fov = 2 * math.atan(0.5 * camera.height / camera.fy)
+        for i in range(repeats + 5):
+            started = time.perf_counter()
+            client.move(camera.cam_from_world, fov, 0.001 * i)
+            client.wait()
+            first = time.perf_counter() - started
+            sizes.append(client.newest.width)
+            client.wait()
+            if i >= 5:  # until then it learns what is quick
+                times["answer"].append(first)
+                times["full"].append(time.perf_counter() - started)
+        client.close()
+        stop.set()
+
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    while not stop.is_set() and thread.is_alive():
+        if not viewer.serve(scene.gaussians, 0, training=False):
+            viewer.wait()
+    thread.join()
+    viewer.close()
+    for row, values in times.items():
+        print(f"{row:15} {milliseconds(values)}")
+    print(f"answers are {statistics.median(sizes):.0f} pixels wide, full pictures {camera.width}")
+
+
+def training(path: Path, seconds: float, rounds: int) -> None:
+    """Steps a second of one training, in turns: without a viewer, watched by nobody, …"""
+    capture = load_capture(path)
+    trainer = Trainer(capture, recipe("default", iterations=1_000_000, coarse_to_fine=()))
+    trainer.run(until=600)
+    viewer = NetworkViewer(capture)
+    hook = TrainingViewer(viewer, Gauge(capture.train, viewer.background))
+    camera = capture.train[0].camera
+    found: dict[str, list[float]] = {}
+
+    def measure(name: str, call: bool) -> None:
+        first, started = trainer.step, time.perf_counter()
+        while (elapsed := time.perf_counter() - started) < seconds:
+            loss = trainer.step_once()
+            if call:
+                hook.after_step(trainer.step, 1_000_000, loss, trainer.gaussians)
+        found.setdefault(name, []).append((trainer.step - first) / elapsed)
+
+    def watch(moving: bool) -> None:
+        client, shift = Client(viewer, 960, 540), 0.0
+        client.move(camera.cam_from_world, 1.0, 0.0)
+        while not stop.is_set():
+            if (client.wait(0.05) and moving) or shift == 0.0:
+                shift += 0.001
+                client.move(camera.cam_from_world, 1.0, shift)
+        shown.append(client.pictures)
+        client.close()
+
+    shown: list[int] = []
+    with single_threaded():
+        for _ in range(rounds):
+            measure("no viewer", False)
+            measure("nobody there", True)
+            for name, moving in (("watched", False), ("moving", True)):
+                stop = threading.Event()
+                thread = threading.Thread(target=watch, args=(moving,))
+                thread.start()
+                time.sleep(0.5)
+                measure(name, True)
+                stop.set()
+                thread.join()
+                time.sleep(0.5)
+    viewer.close()
+    print(f"\n{len(trainer.gaussians):,} Gaussians, {camera.width}x{camera.height}, steps a second")
+    alone = found["no viewer"]
+    for name, rates in found.items():
+        shares = [rate / base for rate, base in zip(rates, alone, strict=True)]
+        print(f"{name:15} {statistics.median(rates):8.1f}  {statistics.median(shares):6.1%}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", default="200k", choices=SIZES)
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--capture", type=Path, help="measure a training of it too")
+    parser.add_argument("--seconds", type=float, default=8.0, help="of each turn of the training")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", type=int)
+    arguments = parser.parse_args()
+    if arguments.threads:
+        ops.set_num_threads(arguments.threads)
+    pictures(arguments.size, arguments.repeats)
+    answers(arguments.size, arguments.repeats)
+    if arguments.capture:
+        training(arguments.capture, arguments.seconds, arguments.rounds)
+
+
+if __name__ == "__main__":
+    main()
