@@ -64,13 +64,13 @@ def crop(gaussians: Gaussians, box: Tensor) -> Gaussians:
 def decimate(gaussians: Gaussians, count: int) -> Gaussians:
     """The ``count`` most important Gaussians (all, where there are fewer), in their old order.
 
-    Importance is what one adds to pictures from anywhere: opacity × the area of its ellipse seen
-    along the shortest axis.
+    Importance is opacity × the longest standard deviation. Of opacity alone, and opacity × area or
+    volume and powers of them, this left the most PSNR in pictures of three trained scenes.
     """
     if count >= len(gaussians):
         return gaussians
-    longest = gaussians.log_scales.sort(dim=1, descending=True).values
-    importance = torch.nn.functional.logsigmoid(gaussians.opacity_logits) + longest[:, :2].sum(1)
+    size = gaussians.log_scales.amax(1)
+    importance = torch.nn.functional.logsigmoid(gaussians.opacity_logits) + size
     order = importance.argsort(descending=True, stable=True)
     return gaussians.select(order[:count].sort().values)
 

@@ -164,7 +164,7 @@ def test_info(run, refused, trained, capture, tmp_path):
     assert "no such file" in refused("info", tmp_path / "absent.ply")
     assert "no camera poses" in refused("info", tmp_path)
     (tmp_path / "scene.obj").write_text("v 0 0 0")
-    assert "not a kind of file" in refused("info", tmp_path / "scene.obj")
+    assert "not a scene file I know" in refused("info", tmp_path / "scene.obj")
 
 
 def test_info_of_a_checkpoint(run, capture, tmp_path):

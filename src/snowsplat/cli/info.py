@@ -14,6 +14,7 @@ from snowsplat.cli.output import OutputFolder
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
+    from snowsplat.formats import Format
     from snowsplat.gaussians import Gaussians
 
 _PERCENTILES = (1, 50, 99)
@@ -25,12 +26,13 @@ class Info:
 
     Examples:
       snowsplat info out/garden
+      snowsplat info garden.spz
       snowsplat info out/garden/point_cloud/iteration_3000/point_cloud.ply
       snowsplat info garden
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT|CAPTURE")] = None
-    """A .ply file, a checkpoint, the output folder of a training, or a capture."""
+    """A scene of any format, a checkpoint, the output folder of a training, or a capture."""
     json: Annotated[bool, switch()] = False
     """Print JSON, for programs."""
 
@@ -54,37 +56,55 @@ def describe(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
-    if path.suffix == ".ply":
-        return _ply(path)
     if path.suffix == ".safetensors":
         return _checkpoint(path)
-    if path.is_file() and path.suffix != ".json":
-        raise UserError(f"{path}: not a kind of file that I know (.ply, .safetensors, .json)")
+    if path.is_file():
+        from snowsplat.formats import format_for_reading
+
+        try:
+            format = format_for_reading(path)
+        except UserError as error:
+            if path.suffix != ".json":  # which a capture may be
+                raise UserError(f"{error}, checkpoints and captures") from None
+        else:
+            return _scene(path, format)
     folder = OutputFolder(path)
     if folder.is_one() or folder.scenes():
         return _output(folder)
     return _capture(path)
 
 
-def _ply(path: Path) -> dict[str, Any]:
-    from snowsplat.formats import ply
+def _scene(path: Path, format: Format) -> dict[str, Any]:
+    from snowsplat.formats import ply, read_gaussians
     from snowsplat.ply_table import open_table
 
-    table = open_table(path)
-    size = {"file": str(path), "bytes": path.stat().st_size, "encoding": table.format}
-    if ply.is_scene(table):
-        return {"kind": "scene", **size, **_gaussians(ply.read_gaussians(path))}
-    from snowsplat.capture.points_ply import read_points
+    facts: dict[str, Any] = {"file": str(path), "bytes": path.stat().st_size}
+    if format.name == "PLY":
+        table = open_table(path)
+        facts["encoding"] = table.format
+        if not ply.is_scene(table):
+            from snowsplat.capture.points_ply import read_points
 
-    xyz, _ = read_points(path)
-    return {"kind": "point cloud", **size, "points": len(xyz), **_bounds(xyz)}
+            xyz, _ = read_points(path)
+            return {"kind": "point cloud", **facts, "points": len(xyz), **_bounds(xyz)}
+    gaussians = read_gaussians(path)
+    facts |= {"format": _format_and_version(path, format), "lost_in_it": format.loses}
+    return {"kind": "scene", **facts, **_gaussians(gaussians)}
+
+
+def _format_and_version(path: Path, format: Format) -> str:
+    from snowsplat.formats import sog
+    from snowsplat.formats.spz_container import unpack
+
+    if format.name == "SPZ":
+        return f"SPZ {unpack(path, path.read_bytes()).header.version}"
+    if format.name == "SOG":
+        return f"SOG {sog.version_of(path)}"
+    return "glTF 2, KHR_gaussian_splatting" if format.name == "glTF" else format.name
 
 
 def _gaussians(gaussians: Gaussians) -> dict[str, Any]:
-    finite = gaussians.means.isfinite().all(1)
-    for tensor in gaussians.parameters().values():
-        finite &= tensor.flatten(1).isfinite().all(1) if tensor.ndim > 1 else tensor.isfinite()
-    good = gaussians.select(finite)
+    good = gaussians.select(gaussians.finite_rows())
     facts: dict[str, Any] = {
         "gaussians": len(gaussians),
         "sh_degree": gaussians.sh_degree,
@@ -156,7 +176,7 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
         except (ValueError, AttributeError):
             raise UserError(f"{metrics}: damaged; it is not JSON") from None
     if facts["scenes"]:
-        facts["last_scene"] = _ply(folder.scene_path(facts["scenes"][-1]))
+        facts["last_scene"] = describe(folder.scene_path(facts["scenes"][-1]))
     return facts
 
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from snowsplat.cli.capture import Capture
+from snowsplat.cli.convert import Convert
 from snowsplat.cli.evaluate import Evaluate
 from snowsplat.cli.info import Info
 from snowsplat.cli.make import Make
@@ -33,6 +34,7 @@ VERBS: dict[str, Any] = {
     "render": Render,
     "view": View,
     "watch": Watch,
+    "convert": Convert,
     "info": Info,
 }
 
@@ -45,6 +47,7 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, s
   snowsplat render OUT                      pictures of the scene beside the photos
   snowsplat view FILE|OUT                   fly through a scene in the browser
   snowsplat watch OUT                       a scene with its photos, also while it is trained
+  snowsplat convert SCENE [MORE …] FILE     another format; cut, thinned out, turned, merged
   snowsplat info ANYTHING                   what is in a scene, a capture, an output folder
 
 Each has its own help: snowsplat train --help

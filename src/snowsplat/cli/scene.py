@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from snowsplat.cli.flags import flag
+from snowsplat.cli.making import SCENE
 from snowsplat.cli.output import OutputFolder
 from snowsplat.errors import UserError
 
@@ -77,3 +78,18 @@ class SceneFlags:
             if self.threads < 1:
                 raise UserError(f"--threads is {self.threads}; it must be at least 1")
             ops.set_num_threads(self.threads)
+
+
+def scene_file(path: Path) -> Path:
+    """The scene that ``path`` names: itself, or the last one in the output folder of a training.
+
+    Raises:
+        UserError: no such file or folder, or a folder without a scene.
+    """
+    if not path.is_dir():
+        return path
+    for folder in (OutputFolder(path), OutputFolder(path / SCENE)):  # of train, and of make
+        scenes = folder.scenes()
+        if scenes:
+            return folder.scene_path(scenes[-1])
+    raise UserError(f"{path}: holds no scene (no point_cloud/iteration_N in it)")

@@ -42,6 +42,7 @@ class Format:
     ``suffixes`` are lower case with their dots, as in ".compressed.ply"; the longest that fits a
     name counts. ``recognises`` is asked about the first 16,384 bytes of a file (fewer where it is
     shorter); None: the format has no signature. ``read`` and ``write`` are None where we do not.
+    ``loses`` says to a user what a scene loses in it.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Format:
     recognises: Callable[[bytes], bool] | None
     read: Callable[[Path], Gaussians] | None
     write: Callable[[Path, Gaussians], None] | None
+    loses: str
 
 
 #: In the order in which `recognises` is asked: a special kind before the general one.
@@ -59,14 +61,64 @@ FORMATS: tuple[Format, ...] = (
         is_compressed_ply,
         read_compressed_ply,
         write_compressed_ply,
+        "positions and scales have 10 to 11 bits, rotations 10, colours, opacity and SH 8",
     ),
-    Format("PLY", (".ply",), ply.is_ply, ply.read_gaussians, ply.write_gaussians),
-    Format("SPZ", (".spz",), is_spz, read_spz, write_spz),
-    Format("SOG", (".sog",), is_sog, read_sog, write_sog),
-    Format("glTF", (".glb",), is_glb, read_glb, write_glb),
-    Format("splat", (".splat",), None, read_splat, write_splat),
-    Format("ksplat", (".ksplat",), None, read_ksplat, None),
-    Format("HTML", (".html",), None, None, write_html),
+    Format(
+        "PLY",
+        (".ply",),
+        ply.is_ply,
+        ply.read_gaussians,
+        ply.write_gaussians,
+        "nothing",
+    ),
+    Format(
+        "SPZ",
+        (".spz",),
+        is_spz,
+        read_spz,
+        write_spz,
+        "positions have 24 bits, rotations 10, all else 8 and SH 4 to 8",
+    ),
+    Format(
+        "SOG",
+        (".sog",),
+        is_sog,
+        read_sog,
+        write_sog,
+        "positions have 16 bits, all else 8; SH are rows of a palette",
+    ),
+    Format(
+        "glTF",
+        (".glb",),
+        is_glb,
+        read_glb,
+        write_glb,
+        "nothing but rounding",
+    ),
+    Format(
+        "splat",
+        (".splat",),
+        None,
+        read_splat,
+        write_splat,
+        "SH, all of it; rotations, colours and opacity have 8 bits",
+    ),
+    Format(
+        "ksplat",
+        (".ksplat",),
+        None,
+        read_ksplat,
+        None,
+        "positions and all else have 16 or 32 bits, SH 8 to 32",
+    ),
+    Format(
+        "HTML",
+        (".html",),
+        None,
+        None,
+        write_html,
+        "what compressed PLY loses",
+    ),
 )
 
 

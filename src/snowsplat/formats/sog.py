@@ -71,6 +71,12 @@ def read_sog(path: Path | str) -> Gaussians:
     return packing.to_gaussians(path, *arrays)
 
 
+def version_of(path: Path) -> int:
+    """The version of a file that `read_sog` reads."""
+    with Bundle(path) as files:
+        return 2 if files.meta().get("version") == 2 else 1
+
+
 @dataclass(frozen=True)
 class _Layout:
     """`meta.json` of either version: every byte is looked up in a table."""

@@ -1,0 +1,167 @@
+"""`convert` and, of what it writes, `info`: formats into one another, changes, mistakes."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat import edit
+from snowsplat.cli.convert import _keep
+from snowsplat.errors import UserError
+from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
+from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+
+WRITTEN = [f.suffixes[0] for f in FORMATS if f.write]
+READ_BACK = [f for f in FORMATS if f.write and f.read]
+
+
+def scene(n: int, degree: int, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    rest = 0.1 * normal(n, SH_REST_COUNTS[degree], 3)
+    return Gaussians(
+        normal(n, 3), normal(n, 3) - 3, normal(n, 4), normal(n), 0.5 * normal(n, 1, 3), rest
+    )
+
+
+@pytest.fixture
+def ply(tmp_path) -> Path:
+    write_gaussians(tmp_path / "a.ply", scene(400, 2))
+    return tmp_path / "a.ply"
+
+
+@pytest.mark.parametrize("first", WRITTEN)
+def test_every_format_into_every_other(run, ply, tmp_path, first):
+    once = tmp_path / f"once{first}"
+    result = run("convert", ply, once)
+    assert result.code == 0, result.err
+    assert "lost in this format" in result.out
+    if first == ".html":
+        return
+    means = read_gaussians(ply).means.sort(0).values
+    for second in WRITTEN:
+        twice = tmp_path / f"twice{second}"
+        assert run("convert", once, twice).code == 0
+        if second != ".html":
+            read = read_gaussians(twice)
+            assert read.sh_degree == (0 if ".splat" in (first, second) else 2)
+            torch.testing.assert_close(read.means.sort(0).values, means, rtol=0, atol=0.01)
+
+
+def test_nothing_changes_where_nothing_is_asked_for(run, ply, tmp_path):
+    assert run("convert", ply, tmp_path / "b.ply").code == 0
+    assert (tmp_path / "b.ply").read_bytes() == ply.read_bytes()
+
+
+def test_changes_and_their_order(run, ply, tmp_path):
+    flags = ("--crop", -1, -1, -1, 1, 0.5, 1, "--rotate", 0, 0, 90, "--scale", 2)
+    flags += ("--translate", 10, 0, -1, "--decimate", "50%", "--sh-degree", 1)
+    result = run("convert", ply, tmp_path / "b.ply", *flags)
+    assert result.code == 0, result.err
+    before, after = read_gaussians(ply), read_gaussians(tmp_path / "b.ply")
+    inside = edit.crop(before, torch.tensor([[-1, -1, -1], [1, 0.5, 1]]))
+    assert len(after) == round(len(inside) / 2) > 20
+    assert after.sh_degree == 1
+    x, y, z = edit.decimate(inside, len(after)).means.T
+    # A quarter turn about z takes x to y, and y to -x.
+    expected = 2 * torch.stack([-y, x, z], 1) + torch.tensor([10, 0, -1])
+    torch.testing.assert_close(after.means, expected)
+
+
+def test_turns_are_about_x_then_y_then_z(run, tmp_path):
+    one = scene(1, 0)
+    one.means[:] = torch.tensor([[0.0, 1.0, 0.0]])
+    write_gaussians(tmp_path / "a.ply", one)
+    assert run("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--rotate", 90, 90, 0).code == 0
+    # y to z, then z to x.
+    means = read_gaussians(tmp_path / "b.ply").means
+    torch.testing.assert_close(means, torch.tensor([[1.0, 0.0, 0.0]]), rtol=0, atol=1e-6)
+
+
+def test_several_become_one(run, ply, tmp_path):
+    write_gaussians(tmp_path / "b.spz", scene(30, 3, seed=1))
+    assert run("convert", ply, tmp_path / "b.spz", tmp_path / "c.ply").code == 0
+    both = read_gaussians(tmp_path / "c.ply")
+    assert (len(both), both.sh_degree) == (430, 3)
+
+
+def test_the_newest_scene_of_an_output_folder(run, refused, ply, tmp_path):
+    for step, count in ((900, 5), (1000, 7)):
+        path = tmp_path / f"out/point_cloud/iteration_{step}/point_cloud.ply"
+        path.parent.mkdir(parents=True)
+        write_gaussians(path, scene(count, 0))
+    assert run("convert", tmp_path / "out", tmp_path / "b.spz").code == 0
+    assert len(read_gaussians(tmp_path / "b.spz")) == 7
+    shutil.copytree(tmp_path / "out", tmp_path / "made/scene")  # as `make` does
+    assert run("convert", tmp_path / "made", tmp_path / "c.spz").code == 0
+    assert len(read_gaussians(tmp_path / "c.spz")) == 7
+    (tmp_path / "empty").mkdir()
+    assert "holds no scene" in refused("convert", tmp_path / "empty", tmp_path / "d.spz")
+
+
+def test_a_file_that_is_there(run, refused, ply, tmp_path):
+    target = tmp_path / "b.spz"
+    target.write_bytes(b"mine")
+    assert "--overwrite" in refused("convert", ply, target)
+    assert target.read_bytes() == b"mine"
+    assert run("convert", ply, target, "--overwrite").code == 0
+    assert run("convert", ply, ply, "--overwrite", "--decimate", 9).code == 0  # in place
+    assert len(read_gaussians(ply)) == 9
+
+
+def test_mistakes(refused, ply, tmp_path):
+    out = tmp_path / "b.ply"
+    assert "name of a file" in refused("convert", ply)
+    assert "no format that I write" in refused("convert", ply, tmp_path / "b.obj")
+    assert "no format that I write" in refused("convert", ply, tmp_path / "b.ksplat")
+    assert "cannot be read" in refused("convert", tmp_path / "absent.ply", out)
+    assert "is a folder" in refused("convert", ply, tmp_path)
+    assert "0 to 3" in refused("convert", ply, out, "--sh-degree", 4)
+    assert "more than 0" in refused("convert", ply, out, "--scale", 0)
+    assert "more than 0" in refused("convert", ply, out, "--scale", "nan")
+    assert "finite" in refused("convert", ply, out, "--translate", "inf", 0, 0)
+    assert "lower corner first" in refused("convert", ply, out, "--crop", 0, 0, 0, 1, -1, 1)
+    assert "none of the Gaussians" in refused("convert", ply, out, "--crop", 9, 9, 9, 10, 10, 10)
+    for wrong in ("some", "-3", "101%", "1.5", "%"):
+        assert "--decimate" in refused("convert", ply, out, f"--decimate={wrong}")
+    assert not out.exists()
+
+
+def test_how_many_to_keep():
+    assert [_keep(text, 400) for text in ("0", "17", "0%", "50%", "12.5%", "100%")] == [
+        *(0, 17, 0, 200, 50, 400)
+    ]
+    with pytest.raises(UserError):
+        _keep("¾", 400)
+
+
+@pytest.mark.parametrize("format", READ_BACK, ids=lambda format: format.name)
+def test_info_of_every_format(run, ply, tmp_path, format):
+    path = tmp_path / f"b{format.suffixes[0]}"
+    assert run("convert", ply, path).code == 0
+    assert run("info", path).code == 0
+    facts = json.loads(run("info", path, "--json").out)
+    assert (facts["kind"], facts["gaussians"]) == ("scene", 400)
+    assert facts["format"].startswith(format.name)
+    assert facts["lost_in_it"] == format.loses
+    assert facts["bytes"] == path.stat().st_size
+    expected = read_gaussians(ply).means
+    bounds = np.array(facts["bounds"])
+    np.testing.assert_allclose(bounds, [expected.amin(0), expected.amax(0)], atol=0.01)
+
+
+def test_info_tells_versions_and_what_it_does_not_know(run, refused, ply, tmp_path):
+    assert run("convert", ply, tmp_path / "b.spz").code == 0
+    assert json.loads(run("info", tmp_path / "b.spz", "--json").out)["format"] == "SPZ 3"
+    assert run("convert", ply, tmp_path / "b.sog").code == 0
+    assert json.loads(run("info", tmp_path / "b.sog", "--json").out)["format"] == "SOG 2"
+    assert run("convert", ply, tmp_path / "b.html").code == 0
+    assert "written here, not read" in refused("info", tmp_path / "b.html")
+    (tmp_path / "scene.obj").write_text("v 0 0 0")
+    assert "not a scene file I know" in refused("info", tmp_path / "scene.obj")
