@@ -19,6 +19,7 @@ from snowsplat.capture import View
 from snowsplat.capture.decode import load_image
 from snowsplat.errors import UserError
 from snowsplat.geometry import quat_from_rotation
+from snowsplat.paths.sight import up_of
 from snowsplat.viewer.network.look import Placed, Pose, fit
 from snowsplat.viewer.network.pictures import Photo
 from snowsplat.viewer.network.session import Session, Stand, Visitor
@@ -80,7 +81,9 @@ class Photos:
             pose = self._pose(first, first.width, first.height)
             start = server.initial_camera
             start.position, start.look_at = pose.position.numpy(), self._look_at(first).numpy()
-            start.up, start.fov = (0.0, -1.0, 0.0), pose.fov
+            up = up_of([view.camera for view in self.views]).numpy()
+            server.scene.set_up_direction(up)
+            start.up, start.fov = up, pose.fov
 
     def _add_frustum(
         self, server: viser.ViserServer, index: int, camera: Camera, color: tuple[int, int, int]

@@ -74,7 +74,6 @@ class NetworkViewer:
         self.server = start_server(host, port, label)
         self.url = address(host, self.server.get_port())
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self.server.scene.set_up_direction("-y")
         self._photos = Photos(
             *(self.server, self.session, capture.train, capture.test, capture.extent),
             *(self._bounds.mean(0), self.background),
