@@ -36,7 +36,7 @@ class Convert:
       .ply              all of it; what every program for splats reads
       .compressed.ply   a quarter of that, for SuperSplat
       .spz              an eighth, for Niantic's and many other programs
-      .sog              a seventh, for PlayCanvas' viewers on the web
+      .sog              a tenth, for PlayCanvas' viewers on the web
       .glb              all of it, as glTF
       .splat            without view-dependent colour
       .html             a page with a viewer, to send by mail

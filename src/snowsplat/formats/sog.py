@@ -238,8 +238,8 @@ def write_sog(path: Path | str, gaussians: Gaussians) -> None:
 
 
 def _palette_size(count: int) -> int:
-    """Entries for so many Gaussians: as many as 16 bits tell, or one for every second Gaussian."""
-    return min(_PALETTE_LIMIT, max(64, count // 2))
+    """Entries for so many Gaussians: as many as 16 bits tell, or one for every fourth Gaussian."""
+    return min(_PALETTE_LIMIT, max(64, count // 4))
 
 
 def _named(*names: str) -> dict[str, list[str]]:
