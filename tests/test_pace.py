@@ -121,6 +121,26 @@ def test_a_pause_is_no_slow_machine():
     assert len(slept) == 1
 
 
+def test_time_that_was_put_off_is_not_lost():
+    """A minute for which somebody held the training: it ends a minute later, as if never held."""
+    now = 100.0
+    config = recipe("default")
+    pace, held = (Pace(Work(config, PIXELS, VIEWS), 60.0, 1.0, lambda: now) for _ in range(2))
+    plain, other = Schedule(2000), Schedule(2000)
+    clocks = [100.0, 100.0]
+    for step in range(1, 400):
+        lengths = []
+        for i, (each, schedule) in enumerate(((pace, plain), (held, other))):
+            clocks[i] += 0.023
+            if i and step == 200:
+                clocks[i] += 60.0
+                each.put_off(60.0)
+            now = clocks[i]
+            lengths.append(each.iterations_after(schedule, step, 1, 10_000))
+        assert lengths[1] == (lengths[0] and pytest.approx(lengths[0], abs=1)), step
+    assert held.deadline == pace.deadline + 60.0
+
+
 def test_no_time_at_all():
     """The schedule is run through all the same, in few steps."""
     machine = Machine(recipe("default"), usual)
