@@ -77,8 +77,7 @@ class Client:
             for message in window["messages"]:
                 if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
                     self.pictures += 1
-                    jpeg = data[data.index(b"\xff\xd8\xff", 16 + size) :]
-                    self.newest = Image.open(io.BytesIO(jpeg))
+                    self.newest = Image.open(io.BytesIO(message["rgb_data"]))
                     return True
 
     def close(self) -> None:
@@ -148,8 +147,10 @@ def answers(name: str, repeats: int) -> None:
 def training(path: Path, seconds: float, rounds: int) -> None:
     """Steps a second of one training, in turns: without a viewer, watched by nobody, …"""
     capture = load_capture(path)
-    trainer = Trainer(capture, recipe("default", iterations=1_000_000, coarse_to_fine=()))
-    trainer.run(until=600)
+    # Beyond its first steps a training of this length is the same all the time.
+    config = recipe("default", iterations=1_000_000, coarse_to_fine=(1, 2), densify_until=900)
+    trainer = Trainer(capture, config)
+    trainer.run(until=1000)
     viewer = NetworkViewer(capture)
     hook = TrainingViewer(viewer, Gauge(capture.train, viewer.background))
     camera = capture.train[0].camera
