@@ -4,6 +4,9 @@ import socket
 import urllib.request
 
 import pytest
+import viser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from snowsplat.errors import UserError
 from snowsplat.viewer.network.server import (
@@ -41,6 +44,28 @@ def test_a_page_is_served_and_the_port_given_back(capfd):
         stop_server(server)
     assert free_port("127.0.0.1", port) == port
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("page", "may"),
+    [
+        *(("http://127.0.0.1:8080", True), ("http://localhost:9999", True), (None, True)),
+        *(("http://elsewhere.example", False), ("https://localhost.elsewhere.example", False)),
+        *(("null", False), ("http://localhost.elsewhere.example:8080", False)),
+    ],
+)
+def test_pages_from_elsewhere_are_refused(page, may):
+    server = start_server("127.0.0.1", None, "a scene")
+    try:
+        url = address("127.0.0.1", server.get_port()).replace("http", "ws")
+        protocol = [f"viser-v{viser.__version__}"]
+        if may:
+            connect(url, subprotocols=protocol, origin=page).close()
+        else:
+            with pytest.raises(InvalidStatus, match="403"):
+                connect(url, subprotocols=protocol, origin=page)
+    finally:
+        stop_server(server)
 
 
 def test_ports_that_cannot_be_had(taken):

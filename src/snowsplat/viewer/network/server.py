@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import io
+import ipaddress
+import re
 import socket
 import warnings
+from collections.abc import Iterator
 
 import viser
+import websockets.asyncio.server
 
 from snowsplat.errors import UserError
 
 DEFAULT_PORT = 8080
 # How many ports are tried where none was asked for.
 _TRIED = 20
+
+
+# Pages that may connect to a server of this computer alone: its own, by whatever port they came
+# through SSH, and programs that are no browsers. Any page on the web could try to.
+_OWN_PAGES = (re.compile(r"http://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"), None)
 
 
 class _Server(viser.ViserServer):
@@ -32,12 +42,31 @@ def start_server(host: str, port: int | None, label: str) -> viser.ViserServer:
     free = free_port(host, port)
     # Viser welcomes in the terminal by itself, and complains of browsers that left.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    with contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.redirect_stdout(io.StringIO()), _refusing_other_pages(host):
         server = _Server(host=host, port=free, label=label, verbose=False)
     if server.get_port() != free:  # taken since, and viser takes the next by itself
         stop_server(server)
         raise UserError(f"port {free} is taken; name another: --port {free + 1}")
     return server
+
+
+@contextlib.contextmanager
+def _refusing_other_pages(host: str) -> Iterator[None]:
+    """Viser has no word for it, so what it starts its server with is given one meanwhile."""
+    serve = websockets.asyncio.server.serve
+    if _is_local(host):
+        refusing = functools.partial(serve, origins=_OWN_PAGES)
+        websockets.asyncio.server.serve = refusing  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def _is_local(host: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
 
 
 def stop_server(server: viser.ViserServer) -> None:
