@@ -2,15 +2,19 @@
 
 import json
 import math
+import os
 import struct
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
 
 from snowsplat import edit
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.geometry import Similarity, rotation_from_quat
+
+from . import json_damage
 
 PREFIX = "KHR_gaussian_splatting:"
 
@@ -280,3 +284,15 @@ def test_linear_colours_are_told(tmp_path, seed, caplog):
     extension(document)["colorSpace"] = "lin_rec709_display"
     assert len(read_gaussians(assemble(tmp_path / "a.glb", document, binary))) == 30
     assert "taken as sRGB" in caplog.text
+
+
+@settings(
+    max_examples=int(os.environ.get("SNOWSPLAT_FUZZ", "100")),
+    derandomize="SNOWSPLAT_FUZZ" not in os.environ,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(changes=json_damage.changes)
+def test_json_of_random_damage(tmp_path, seed, survives, changes):
+    document, binary, _ = seed
+    survives(assemble(tmp_path / "a.glb", json_damage.damaged(document, changes), binary))

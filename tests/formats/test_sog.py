@@ -2,16 +2,21 @@
 
 import io
 import json
+import os
 import struct
 import zipfile
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from snowsplat.formats import read_gaussians, sog, write_gaussians
 from snowsplat.geometry import morton_order
+
+from . import json_damage
 
 
 def in_order(scene):
@@ -243,3 +248,20 @@ def test_too_many_for_a_picture(tmp_path, make_scene, monkeypatch):
     with pytest.raises(Exception, match="too many for SOG"):
         write_gaussians(tmp_path / "a.sog", make_scene(20, 0))
     assert not (tmp_path / "a.sog").exists()
+
+
+@settings(
+    max_examples=int(os.environ.get("SNOWSPLAT_FUZZ", "100")),
+    derandomize="SNOWSPLAT_FUZZ" not in os.environ,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(changes=json_damage.changes, pixels=st.binary(min_size=4, max_size=256))
+def test_json_and_pixels_of_random_damage(tmp_path, files, survives, changes, pixels):
+    meta = json_damage.damaged(json.loads(files["meta.json"]), changes)
+    noise = np.resize(np.frombuffer(pixels, np.uint8), (8, 8, 4))
+    picture = io.BytesIO()
+    Image.fromarray(noise).save(picture, format="WEBP", lossless=True, exact=True)
+    name = ("quats.webp", "sh0.webp", "shN_labels.webp", "means_u.webp")[pixels[0] % 4]
+    changed = {"meta.json": json.dumps(meta).encode(), name: picture.getvalue()}
+    survives(bundle(tmp_path / "a.sog", files | changed))

@@ -60,12 +60,12 @@ def read_glb(path: Path | str) -> Gaussians:
         if unknown:
             raise Damaged(f"needs {sorted(map(str, unknown))[0][:60]}, which I do not read")
         parts = _parts(path, document, binary, _MOST_COPIES * len(data) // _LEAST_BYTES)
+        if not parts and EXTENSION not in document.get("extensionsUsed", []):
+            raise UserError(f"{path}: a GLB file, but without Gaussian splats ({EXTENSION})")
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
         raise UserError(f"{path}: its JSON is no glTF; copy or export it again") from None
-    if not parts and EXTENSION not in document.get("extensionsUsed", []):
-        raise UserError(f"{path}: a GLB file, but without Gaussian splats ({EXTENSION})")
     scene = merge(parts) if parts else _empty()
     means, quats, sh_rest = flip_axes(
         scene.means.numpy(), scene.quats.numpy(), scene.sh_rest.numpy(), UP_BACK
