@@ -87,7 +87,8 @@ class NewestScene:
             found = path, path.stat().st_mtime_ns
             if self._scene is None or self._read != found:
                 gaussians = self._gaussians(path)
-                about = [f"After {step:,} steps", f"{len(gaussians):,} Gaussians", path.name]
+                name = path.relative_to(self._folder.path).as_posix()
+                about = [f"After {step:,} steps", f"{len(gaussians):,} Gaussians", name]
                 self._scene, self._read = Scene(gaussians, found[1], about), found
         except (OSError, UserError):  # replaced or removed while it was read: next time
             if self._scene is None:

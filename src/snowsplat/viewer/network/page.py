@@ -254,7 +254,7 @@ class Controls:
         middle, half = bounds.mean(0), (bounds[1] - bounds[0]) / 2
         low, high = (middle - 2 * half).tolist(), (middle + 2 * half).tolist()
         with gui.add_folder("Crop box", order=3, expand_by_default=False):
-            self._crop = gui.add_checkbox("Show only what is within", False)
+            self._crop = gui.add_checkbox("Crop", False, hint="Show only what is within")
             self._ranges = [
                 gui.add_multi_slider(
                     name,
