@@ -41,10 +41,10 @@ class SceneFlags:
         """Raises: UserError: none named, or two."""
         if (self.output is None) == (self.model_path is None):
             raise UserError("name the output folder of a training, once")
-        folder = OutputFolder(self.output or self.model_path or Path())
-        if not folder.path.is_dir():
-            raise UserError(f"{folder.path}: no such folder; give the output folder of a training")
-        return folder
+        path = self.output or self.model_path or Path()
+        if not path.is_dir():
+            raise UserError(f"{path}: no such folder; give the output folder of a training")
+        return training_folder(path)
 
     def load(self) -> tuple[int, Gaussians, Capture, tuple[float, float, float]]:
         """Iteration, scene, capture and background colour.
@@ -80,6 +80,12 @@ class SceneFlags:
             ops.set_num_threads(self.threads)
 
 
+def training_folder(path: Path) -> OutputFolder:
+    """The output folder that ``path`` names: of `train`, or of `make`, which has that within."""
+    folder, made = OutputFolder(path), OutputFolder(path / SCENE)
+    return made if made.scenes() and not folder.scenes() else folder
+
+
 def scene_file(path: Path) -> Path:
     """The scene that ``path`` names: itself, or the last one in the output folder of a training.
 
@@ -88,8 +94,8 @@ def scene_file(path: Path) -> Path:
     """
     if not path.is_dir():
         return path
-    for folder in (OutputFolder(path), OutputFolder(path / SCENE)):  # of train, and of make
-        scenes = folder.scenes()
-        if scenes:
-            return folder.scene_path(scenes[-1])
-    raise UserError(f"{path}: holds no scene (no point_cloud/iteration_N in it)")
+    folder = training_folder(path)
+    scenes = folder.scenes()
+    if not scenes:
+        raise UserError(f"{path}: holds no scene (no point_cloud/iteration_N in it)")
+    return folder.scene_path(scenes[-1])

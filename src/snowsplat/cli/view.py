@@ -17,6 +17,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.making import SCENE
 from snowsplat.cli.output import OutputFolder
+from snowsplat.cli.scene import training_folder
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
@@ -81,9 +82,7 @@ class View:
         if not path.exists():
             raise UserError(f"{path}: no such file or folder")
         if path.is_dir():
-            folder = OutputFolder(path)
-            made = OutputFolder(path / SCENE)  # path may be OUT of `snowsplat make`
-            folder = made if made.scenes() and not folder.scenes() else folder
+            folder = training_folder(path)
             iteration, gaussians = folder.read_scene(self.iteration)
             scene = folder.scene_path(iteration)
         else:
