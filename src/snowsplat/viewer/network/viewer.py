@@ -104,8 +104,11 @@ class NetworkViewer:
                 self.session.move(visitor, pose)
                 controls.follow()
 
+        async def moved_in_order(camera: viser.CameraHandle) -> None:
+            moved(camera)  # in the server's own thread: of two poses, the later one stays
+
         moved(client.camera)
-        client.camera.on_update(moved)
+        client.camera.on_update(moved_in_order)
         if client.client_id not in self.server.get_clients():  # it has left meanwhile
             self._left(client)
 
