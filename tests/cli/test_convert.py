@@ -1,6 +1,7 @@
 """`convert` and, of what it writes, `info`: formats into one another, changes, mistakes."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -9,10 +10,13 @@ import pytest
 import torch
 
 from snowsplat import edit
+from snowsplat.camera import Camera
+from snowsplat.camera_list import write_cameras
 from snowsplat.cli.convert import _keep
 from snowsplat.errors import UserError
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
 from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.geometry import look_at
 
 WRITTEN = [f.suffixes[0] for f in FORMATS if f.write]
 READ_BACK = [f for f in FORMATS if f.write and f.read]
@@ -165,3 +169,18 @@ def test_info_tells_versions_and_what_it_does_not_know(run, refused, ply, tmp_pa
     assert "written here, not read" in refused("info", tmp_path / "b.html")
     (tmp_path / "scene.obj").write_text("v 0 0 0")
     assert "not a scene file I know" in refused("info", tmp_path / "scene.obj")
+
+
+def test_a_page_of_a_training_starts_where_a_photo_was_taken(run, ply, tmp_path):
+    folder = tmp_path / "out/point_cloud/iteration_7"
+    folder.mkdir(parents=True)
+    shutil.copy(ply, folder / "point_cloud.ply")
+    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, look_at(*torch.eye(3).double()))
+    write_cameras(tmp_path / "out/cameras.json", [("a.jpg", camera)])
+    assert run("convert", tmp_path / "out", tmp_path / "with.html").code == 0
+    assert run("convert", ply, tmp_path / "without.html").code == 0
+    with_cameras, without = (
+        re.search(r'id="sse-bootstrap">\s*(.*?)\s*</script>', page.read_text(), re.DOTALL)
+        for page in (tmp_path / "with.html", tmp_path / "without.html")
+    )
+    assert json.loads(with_cameras[1])["settings"] != json.loads(without[1])["settings"]

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.scene import scene_file
+from snowsplat.cli.scene import cameras_of, folder_around, scene_file
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
+    from snowsplat.camera import Camera
     from snowsplat.gaussians import Gaussians
     from snowsplat.geometry import Similarity
 
@@ -74,8 +75,12 @@ class Convert:
 
         format = format_for_writing(target)
         movement = self._movement()
-        scene = edit.merge([read_gaussians(scene_file(source)) for source in sources])
-        write_gaussians(target, self._changed(scene, movement))
+        files = [scene_file(source) for source in sources]
+        scene = self._changed(edit.merge([read_gaussians(file) for file in files]), movement)
+        if format.name == "HTML" and len(files) == 1 and movement is None:
+            _write_page(target, scene, cameras_of(folder_around(files[0])))
+        else:
+            write_gaussians(target, scene)
         written = f"{target.stat().st_size:,} bytes of {format.name}"
         print(f"{target}: {written}; lost in this format: {format.loses}")
         return 0
@@ -131,6 +136,14 @@ class Convert:
             quat[0], quat[1 + axis] = math.cos(half), math.sin(half)
             rotation = rotation_from_quat(quat) @ rotation
         return Similarity(self.scale, rotation, torch.tensor(self.translate, dtype=torch.float64))
+
+
+def _write_page(target: Path, scene: Gaussians, cameras: list[Camera]) -> None:
+    """A page that starts where a photo was taken, if it is known where."""
+    from snowsplat.formats.html import write_html
+    from snowsplat.viewer.static_scene import ready
+
+    write_html(target, *ready(scene, cameras))
 
 
 def _keep(text: str, count: int) -> int:

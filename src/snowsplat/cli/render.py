@@ -127,7 +127,7 @@ class Render(SceneFlags):
         The photos themselves are not needed.
         """
         from snowsplat.camera_list import read_cameras
-        from snowsplat.cli.view import folder_around
+        from snowsplat.cli.scene import folder_around
         from snowsplat.formats import read_gaussians
 
         suffix = "_side_by_side" if self.side_by_side else ""

@@ -1,7 +1,8 @@
-"""What `render` and `evaluate` share: the flags that name a scene and its views."""
+"""What the verbs that take a scene share: the flags and paths that name it, and its cameras."""
 
 from __future__ import annotations
 
+import filecmp
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +15,7 @@ from snowsplat.cli.output import OutputFolder
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
+    from snowsplat.camera import Camera
     from snowsplat.capture import Capture
     from snowsplat.gaussians import Gaussians
 
@@ -99,3 +101,30 @@ def scene_file(path: Path) -> Path:
     if not scenes:
         raise UserError(f"{path}: holds no scene (no point_cloud/iteration_N in it)")
     return folder.scene_path(scenes[-1])
+
+
+def folder_around(scene: Path) -> OutputFolder:
+    """The output folder of the training that a scene file comes from; if none, one without scenes.
+
+    That is OUT of OUT/point_cloud/iteration_N/point_cloud.ply, and OUT/scene of OUT/NAME.ply, the
+    copy that `snowsplat make` leaves.
+    """
+    scene = scene.resolve()
+    made, trained = OutputFolder(scene.parent / SCENE), OutputFolder(scene.parent.parent.parent)
+    if scene in map(trained.scene_path, trained.scenes()):
+        return trained
+    if any(filecmp.cmp(scene, made.scene_path(i), shallow=False) for i in made.scenes()[-1:]):
+        return made
+    return OutputFolder(scene)
+
+
+def cameras_of(folder: OutputFolder) -> list[Camera]:
+    """The cameras of the photos that the training in ``folder`` had; none if it does not tell.
+
+    Raises:
+        UserError: the list is damaged.
+    """
+    from snowsplat.camera_list import read_cameras
+
+    file = folder.path / "cameras.json"
+    return read_cameras(file)[1] if file.is_file() else []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import filecmp
 import os
 import signal
 import socket
@@ -15,9 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.making import SCENE
-from snowsplat.cli.output import OutputFolder
-from snowsplat.cli.scene import training_folder
+from snowsplat.cli.scene import cameras_of, folder_around, training_folder
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
@@ -76,7 +73,6 @@ class View:
 
     def _load(self, path: Path) -> tuple[Path, Gaussians, list[Camera], tuple[float, float, float]]:
         """The scene's file, the scene, the cameras of its photos, the background colour."""
-        from snowsplat.camera_list import read_cameras
         from snowsplat.formats import read_gaussians
 
         if not path.exists():
@@ -90,26 +86,9 @@ class View:
                 raise UserError("--iteration chooses a scene of an output folder, not of a file")
             scene, gaussians = path, read_gaussians(path)
             folder = folder_around(path)
-        cameras: list[Camera] = []
-        if (folder.path / "cameras.json").is_file():
-            _, cameras = read_cameras(folder.path / "cameras.json")
+        cameras = cameras_of(folder)
         background = folder.settings()[1] if folder.is_one() else (0.0, 0.0, 0.0)
         return scene, gaussians, cameras, background
-
-
-def folder_around(scene: Path) -> OutputFolder:
-    """The output folder of the training that a scene file comes from; if none, one without scenes.
-
-    That is OUT of OUT/point_cloud/iteration_N/point_cloud.ply, and OUT/scene of OUT/NAME.ply, the
-    copy that `snowsplat make` leaves.
-    """
-    scene = scene.resolve()
-    made, trained = OutputFolder(scene.parent / SCENE), OutputFolder(scene.parent.parent.parent)
-    if scene in map(trained.scene_path, trained.scenes()):
-        return trained
-    if any(filecmp.cmp(scene, made.scene_path(i), shallow=False) for i in made.scenes()[-1:]):
-        return made
-    return OutputFolder(scene)
 
 
 def over_ssh() -> bool:
