@@ -23,6 +23,11 @@ _LARGEST = 100_000  # pixels along a side
 
 def write_cameras(path: Path, cameras: Iterable[tuple[str, Camera]]) -> None:
     """Write names and cameras, atomically."""
+    write_json(path, entries_of(cameras))
+
+
+def entries_of(cameras: Iterable[tuple[str, Camera]]) -> list[dict[str, Any]]:
+    """What stands in such a file: JSON values."""
     entries = []
     for i, (name, camera) in enumerate(cameras):
         pose = camera.world_from_cam.detach()
@@ -38,7 +43,7 @@ def write_cameras(path: Path, cameras: Iterable[tuple[str, Camera]]) -> None:
                 "fx": camera.fx,
             }
         )
-    write_json(path, entries)
+    return entries
 
 
 def read_cameras(path: Path) -> tuple[list[str], list[Camera]]:

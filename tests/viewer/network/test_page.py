@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import snowsplat
+from snowsplat.camera_list import read_cameras
 from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.viewer.network.server import free_port
 
@@ -185,6 +186,29 @@ def test_standing_at_a_photo(training, page):
     page.drag(200, 600, 320, 640)
     page.wait_for("document.body.innerText.includes('stand where its photo was taken')")
     press(page, "Go on")
+
+
+def test_views_are_kept_for_a_film(page, tmp_path):
+    page.evaluate(
+        "(() => { const make = URL.createObjectURL; URL.createObjectURL = "
+        "blob => { if (blob.type.includes('json')) window.kept = blob; "
+        "return make.call(URL, blob); }; })()"
+    )
+    press(page, "Keep this view")
+    page.wait_for("document.body.textContent.includes('1 kept')")
+    page.drag(200, 600, 320, 640)
+    settled_after = time.monotonic() + 1.0
+    wait(lambda: time.monotonic() > settled_after)  # the browser has told where it is now
+    press(page, "Keep this view")
+    page.wait_for("document.body.textContent.includes('2 kept')")
+    press(page, "Download them")
+    page.wait_for("!!window.kept")
+    (tmp_path / "cameras.json").write_text(page.evaluate("window.kept.text()"))
+    names, cameras = read_cameras(tmp_path / "cameras.json")
+    assert names == ["key_000", "key_001"]
+    assert float((cameras[0].position - cameras[1].position).norm()) > 0.01
+    press(page, "Forget the last")
+    page.wait_for("document.body.textContent.includes('1 kept')")
 
 
 def test_two_pages_have_a_camera_each(training, browser, page):

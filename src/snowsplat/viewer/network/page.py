@@ -40,7 +40,7 @@ _NOWHERE = "Show the cameras and click one, to stand where its photo was taken."
 _NEEDS_PHOTO = "Shown where you stand at a photo: click a camera, or Next below."
 
 
-def _note(text: str) -> str:
+def note(text: str) -> str:
     """Lines of small text."""
     style = "font-size:0.85em;padding:0 1em 0.5em 1em;line-height:1.5"
     return f'<div style="{style}">{text}</div>'
@@ -52,7 +52,7 @@ class TrainingPanel:
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         with server.gui.add_folder("Training", order=0):
-            self._status = server.gui.add_html(_note("waiting for the first step"))
+            self._status = server.gui.add_html(note("waiting for the first step"))
             self._bar = server.gui.add_progress_bar(0.0)
             self._pause = server.gui.add_button("Pause")
             self._step = server.gui.add_button("One step")
@@ -93,7 +93,7 @@ class TrainingPanel:
             status: lines about the training.
             share: of its steps that are made, 0..1.
         """
-        self._status.content = _note("<br>".join(map(html.escape, status)))
+        self._status.content = note("<br>".join(map(html.escape, status)))
         self._bar.value = 100.0 * share  # type: ignore[misc]  # viser's setter has another type
         for plot, curve in ((self._loss, loss), (self._psnr, psnr)):
             if len(curve) > 1:
@@ -127,11 +127,11 @@ class ScenePanel:
 
     def __init__(self, server: viser.ViserServer) -> None:
         with server.gui.add_folder("Scene", order=0):
-            self._status = server.gui.add_html(_note("nothing yet"))
+            self._status = server.gui.add_html(note("nothing yet"))
 
     def show(self, status: list[str]) -> None:
         """Lines about the scene."""
-        self._status.content = _note("<br>".join(map(html.escape, status)))
+        self._status.content = note("<br>".join(map(html.escape, status)))
 
 
 class Controls:
@@ -164,7 +164,7 @@ class Controls:
         gui, look = self._client.gui, self._visitor.look
         with gui.add_folder("Picture", order=1):
             self._mode = gui.add_dropdown("Show", list(_MODES))
-            self._legend = gui.add_html(_note(_LEGENDS["color"]))
+            self._legend = gui.add_html(note(_LEGENDS["color"]))
             degree = gui.add_slider(
                 "SH degree", 0, 3, 1, look.sh_degree, hint="How far colours change with direction"
             )
@@ -188,7 +188,7 @@ class Controls:
     def _say_legend(self) -> None:
         mode = _MODES[self._mode.value]
         missing = mode == "error" and self._stand is None
-        self._legend.content = _note(_NEEDS_PHOTO if missing else _LEGENDS[mode])
+        self._legend.content = note(_NEEDS_PHOTO if missing else _LEGENDS[mode])
 
     # Photos
 
@@ -196,7 +196,7 @@ class Controls:
         gui = self._client.gui
         with gui.add_folder("Photos", order=2, visible=bool(self._photos.views)):
             self._shown = gui.add_checkbox("Cameras", False)
-            self._where = gui.add_html(_note(_NOWHERE))
+            self._where = gui.add_html(note(_NOWHERE))
             self._wipe = gui.add_slider(
                 *("Photo (%)", 0, 100, 1, 0), visible=False, hint="From the left, over the render"
             )
@@ -221,7 +221,7 @@ class Controls:
         try:
             self._photos.stand(self._client, self._visitor, index)
         except UserError as error:
-            self._where.content = _note(html.escape(str(error)))
+            self._where.content = note(html.escape(str(error)))
             return
         self.follow()
 
@@ -233,7 +233,7 @@ class Controls:
             return
         self._stand = index
         name = _NOWHERE if index is None else f"At {html.escape(self._photos.views[index].name)}"
-        self._where.content = _note(name)
+        self._where.content = note(name)
         self._wipe.visible = self._flip.visible = index is not None
         self._show_frustums()
         self._say_legend()

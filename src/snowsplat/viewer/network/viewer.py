@@ -13,6 +13,7 @@ import viser
 
 from snowsplat.capture import Capture
 from snowsplat.gaussians import Gaussians
+from snowsplat.viewer.network.keys import KeyCameras
 from snowsplat.viewer.network.look import Pose
 from snowsplat.viewer.network.page import Controls, ScenePanel
 from snowsplat.viewer.network.photos import Photos, placed_photo
@@ -94,6 +95,7 @@ class NetworkViewer:
     def _entered(self, client: viser.ClientHandle) -> None:
         visitor = self.session.enter(client.client_id)
         controls = Controls(client, self.session, visitor, self._photos, self._bounds)
+        KeyCameras(client, visitor)
         with self._lock:
             self._browsers[client.client_id] = client, visitor, controls
         self._photos.begin()
