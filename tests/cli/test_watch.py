@@ -43,12 +43,12 @@ def test_watch_until_ctrl_c(start, trained):
     process = start("watch", trained)
     url = url_of(process)
     assert url.startswith("http://127.0.0.1:")
+    assert "ssh -L" in process.stdout.readline()
+    assert process.stdout.readline() == "Ctrl-C ends it\n"
     assert b"<html" in page_at(url)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
-    assert "ssh -L" in out
-    assert "Ctrl-C ends it" in out
 
 
 def test_the_newest_is_shown_as_it_comes(trained, tmp_path):

@@ -238,8 +238,8 @@ class Train:
         try:
             code = run.run()
             if code == 0 and self.stay:
-                print(f"the scene stays at {run.viewer.viewer.url} until Ctrl-C", flush=True)
                 with suppress(KeyboardInterrupt):
+                    print(f"the scene stays at {run.viewer.viewer.url} until Ctrl-C", flush=True)
                     run.viewer.end(run.trainer.step, run.trainer.gaussians)
             return code
         finally:

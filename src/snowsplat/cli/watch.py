@@ -53,8 +53,8 @@ class Watch(SceneFlags):
         newest()  # what cannot be shown is refused before a page opens
         label = folder.path.absolute().name
         viewer = PageFlags(self.port, self.host).open(capture, background, label)
-        print("Ctrl-C ends it", flush=True)
         try:
+            print("Ctrl-C ends it", flush=True)
             viewer.hold(newest)
         except KeyboardInterrupt:
             pass
