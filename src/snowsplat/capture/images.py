@@ -98,7 +98,8 @@ class ImageLoader:
     @property
     def cached_bytes(self) -> int:
         """Bytes of decoded images held now."""
-        return self._cached_bytes
+        with self._lock:  # not between an image that comes and those that go for it
+            return self._cached_bytes
 
     def close(self) -> None:
         """Stop decoding ahead and forget the images."""
