@@ -7,7 +7,19 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from .scenes import NATIVE_FLOAT32, NATIVE_FLOAT64, TWIN, Variant
+from snowsplat.ops.native import LAUNCHERS
+
+from .engines import launcher
+from .scenes import (
+    CUDA_FLOAT32,
+    CUDA_FLOAT64,
+    EMULATED_FLOAT32,
+    EMULATED_FLOAT64,
+    NATIVE_FLOAT32,
+    NATIVE_FLOAT64,
+    TWIN,
+    Variant,
+)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -19,19 +31,40 @@ def _one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-@pytest.fixture(params=[TWIN, NATIVE_FLOAT32, NATIVE_FLOAT64], ids=str)
-def variant(request: pytest.FixtureRequest) -> Variant:
+def variants(*among: Variant) -> list:
+    """As parameters of a fixture; those for a GPU carry its mark."""
+    marks = {"cuda": pytest.mark.gpu, "emulated": pytest.mark.emulated}
+    return [
+        pytest.param(v, id=str(v), marks=[marks[v.engine]] if v.engine in marks else [])
+        for v in among
+    ]
+
+
+FLOAT64 = (NATIVE_FLOAT64, EMULATED_FLOAT64, CUDA_FLOAT64)
+KERNELS = (NATIVE_FLOAT32, EMULATED_FLOAT32, CUDA_FLOAT32, *FLOAT64)
+
+
+def _running(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
+    """The variant asked for, with the launcher of its engine in place of the CPU's."""
+    variant: Variant = request.param
+    if variant.engine in ("emulated", "cuda"):
+        monkeypatch.setitem(LAUNCHERS, "cpu", launcher(variant.engine))
+    return variant
+
+
+@pytest.fixture(params=variants(TWIN, *KERNELS))
+def variant(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
     """Every implementation: for answers that are known in closed form."""
-    return request.param
+    return _running(request, monkeypatch)
 
 
-@pytest.fixture(params=[NATIVE_FLOAT32, NATIVE_FLOAT64], ids=str)
-def native(request: pytest.FixtureRequest) -> Variant:
-    """The native ops: for comparison with the float64 twin."""
-    return request.param
+@pytest.fixture(params=variants(*KERNELS))
+def native(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
+    """The kernels: for comparison with the float64 twin."""
+    return _running(request, monkeypatch)
 
 
-@pytest.fixture(params=[TWIN, NATIVE_FLOAT64], ids=str)
-def double(request: pytest.FixtureRequest) -> Variant:
+@pytest.fixture(params=variants(TWIN, *FLOAT64))
+def double(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
     """The float64 implementations: for finite differences."""
-    return request.param
+    return _running(request, monkeypatch)

@@ -23,21 +23,32 @@ PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_res
 
 @dataclass(frozen=True)
 class Variant:
-    """One implementation of the ops in one dtype, and the relative errors that it may make."""
+    """One implementation of the ops in one dtype, and the relative errors that it may make.
 
-    ops: ModuleType
+    engine: "twin", "native" (the CPU's kernels), "emulated" (a GPU's kernels, on the CPU) or "cuda"
+    (a GPU's kernels, there). Its tensors are on the CPU in each case: see `engines.py`.
+    """
+
+    engine: str
     dtype: torch.dtype
     forward: float
     backward: float
 
+    @property
+    def ops(self) -> ModuleType:
+        return reference if self.engine == "twin" else ops
+
     def __str__(self) -> str:
-        name = "twin" if self.ops is reference else "native"
-        return f"{name}-{str(self.dtype).removeprefix('torch.')}"
+        return f"{self.engine}-{str(self.dtype).removeprefix('torch.')}"
 
 
-TWIN = Variant(reference, torch.float64, 1e-12, 1e-12)
-NATIVE_FLOAT32 = Variant(ops, torch.float32, 1e-4, 1e-3)
-NATIVE_FLOAT64 = Variant(ops, torch.float64, 1e-10, 1e-9)
+TWIN = Variant("twin", torch.float64, 1e-12, 1e-12)
+NATIVE_FLOAT32 = Variant("native", torch.float32, 1e-4, 1e-3)
+NATIVE_FLOAT64 = Variant("native", torch.float64, 1e-10, 1e-9)
+EMULATED_FLOAT32 = replace(NATIVE_FLOAT32, engine="emulated")
+EMULATED_FLOAT64 = replace(NATIVE_FLOAT64, engine="emulated")
+CUDA_FLOAT32 = replace(NATIVE_FLOAT32, engine="cuda")
+CUDA_FLOAT64 = replace(NATIVE_FLOAT64, engine="cuda")
 
 
 @dataclass(frozen=True)
@@ -58,8 +69,13 @@ class Scene:
         return replace(self, params=params, cam_from_world=pose)
 
     def project(self, module: ModuleType, **changes: Any) -> Splats2D:
+        """Its splats, without empty rows."""
         view = {**self.view, **changes}
-        return module.project(**self.params, cam_from_world=self.cam_from_world, **view)
+        splats = module.project(**self.params, cam_from_world=self.cam_from_world, **view)
+        seen = splats.ids >= 0
+        if bool(seen.all()):
+            return splats
+        return Splats2D(splats.packed[seen], splats.ids[seen], splats.channels)
 
     def leaves(self) -> dict[str, Tensor]:
         return {**self.params, "cam_from_world": self.cam_from_world}

@@ -1,9 +1,11 @@
 // The vocabulary in which the maths headers are written, so that one text serves every `Real`:
-// plain float (CUDA), Simd<float, W> (CPU) and Simd<double, W> (checks). A branch on data is a
-// select(), because in lanes both sides exist.
+// plain float and double (CUDA), Simd<float, W> (CPU) and Simd<double, W> (checks). A branch on data
+// is a select(), because in lanes both sides exist.
 #pragma once
 
+#if !defined(__CUDACC_RTC__)
 #include <cmath>
+#endif
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
 #define SNOW_INLINE __device__ __forceinline__
@@ -19,6 +21,29 @@ SNOW_INLINE float max(float a, float b) { return a > b ? a : b; }
 SNOW_INLINE float sqrt(float a) { return ::sqrtf(a); }
 SNOW_INLINE float exp(float a) { return ::expf(a); }
 SNOW_INLINE float log2(float a) { return ::log2f(a); }
+SNOW_INLINE float exp2_blend(float a) { return ::exp2f(a); }
+
+SNOW_INLINE double select(bool m, double a, double b) { return m ? a : b; }
+SNOW_INLINE double min(double a, double b) { return a < b ? a : b; }
+SNOW_INLINE double max(double a, double b) { return a > b ? a : b; }
+SNOW_INLINE double sqrt(double a) { return ::sqrt(a); }
+SNOW_INLINE double exp(double a) { return ::exp(a); }
+SNOW_INLINE double log2(double a) { return ::log2(a); }
+SNOW_INLINE double exp2_blend(double a) { return ::exp2(a); }
+
+// 1/a and 1/√a. The compiler for a GPU has instructions for those of float.
+SNOW_INLINE double reciprocal(double a) { return 1.0 / a; }
+SNOW_INLINE double rsqrt(double a) { return 1.0 / ::sqrt(a); }
+SNOW_INLINE double reciprocal_estimate(double a) { return 1.0 / a; }
+#if defined(__CUDACC_RTC__)
+SNOW_INLINE float reciprocal(float a) { return __frcp_rn(a); }
+SNOW_INLINE float rsqrt(float a) { return ::rsqrtf(a); }
+SNOW_INLINE float reciprocal_estimate(float a) { return __fdividef(1.f, a); }
+#else
+SNOW_INLINE float reciprocal(float a) { return 1.f / a; }
+SNOW_INLINE float rsqrt(float a) { return 1.f / ::sqrtf(a); }
+SNOW_INLINE float reciprocal_estimate(float a) { return 1.f / a; }
+#endif
 
 constexpr double kLog2E = 1.4426950408889634;
 constexpr double kLn2 = 0.6931471805599453;

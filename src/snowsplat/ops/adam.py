@@ -36,6 +36,7 @@ def adam_step(
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-15,
     visible_only: bool = False,
+    valid: Tensor | None = None,
 ) -> None:
     """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
 
@@ -49,6 +50,9 @@ def adam_step(
     lr: a rate for each name. step: counts from 1 (bias correction).
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
+
+    valid: (1,) bool; where it is False nothing changes. It says so from the device, so that nobody
+        has to wait for what decides it. None: always.
 
     Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
     p −= lr · m̂ / √(v̂ + eps²) (Kingma & Ba 2015, with ε inside the root).
@@ -100,4 +104,5 @@ def adam_step(
         float(betas[1]),
         float(eps),
         visible_only,
+        valid,
     )

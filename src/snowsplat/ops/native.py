@@ -1,9 +1,9 @@
-"""Loads the native library and launches its functions: the only place where the device decides.
+"""Launches native functions, on the CPU or on a GPU: the only place where the device decides.
 
-One shared library per instruction set lies in `snowsplat/_lib`. All have the same entries, plain C
-functions of `(int64 n, pointers, int64s, doubles) -> int64`. The best one that the machine runs is
-loaded at the first launch; the environment variable SNOWSPLAT_ISA (avx512, avx2 or baseline) forces
-one.
+The CPU has one shared library per instruction set in `snowsplat/_lib`. All have the same entries,
+plain C functions of `(int64 n, pointers, int64s, doubles) -> int64`. The best one that the machine
+runs is loaded at the first launch; the environment variable SNOWSPLAT_ISA (avx512, avx2 or
+baseline) forces one. A GPU has the same entries: see `ops/cuda`.
 """
 
 from __future__ import annotations
@@ -12,12 +12,14 @@ import ctypes
 import functools
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
 from snowsplat.errors import UserError
+from snowsplat.ops import cuda
+from snowsplat.ops.cuda.kernels import Argument
 
 # Worst to best. The position of a name is the number that native/cpu/isa.cpp knows it by.
 ISAS = ("baseline", "avx2", "avx512")
@@ -125,55 +127,58 @@ def _function(name: str) -> Callable[..., int]:
     return function
 
 
-def launch(
-    name: str,
-    n: int,
-    *args: torch.Tensor | int | float | None,
-) -> int:
+def launch(name: str, n: int, *args: Argument, device: torch.device | None = None) -> int:
     """Call the native function `name(n, *args)` and return its int64 result.
 
     Tensors go as data pointers, None as a null pointer, int and bool as int64, float as double. The
-    tensors must be contiguous and on one device. Element types are the caller's business: a
-    function for float64 tensors has the suffix `_f64`. The interpreter lock is released during the
-    call.
+    tensors must be contiguous and on one device, which decides where the function runs; `device`
+    names it where no tensor does. Element types are the caller's business: a function for float64
+    tensors has the suffix `_f64`. The interpreter lock is released during the call on the CPU; on
+    a GPU the call is queued on torch's current stream.
 
     Raises UserError for a device without kernels, ValueError for tensors that are not contiguous or
     not on one device, TypeError for any other argument.
     """
+    for position, arg in enumerate(args, start=1):
+        if isinstance(arg, torch.Tensor):
+            if device is None:
+                device = arg.device
+            elif arg.device != device:
+                raise ValueError(
+                    f"{name}: tensors on {device} and on {arg.device}; move them to one device"
+                )
+            if not arg.is_contiguous():
+                raise ValueError(
+                    f"{name}: argument {position} of shape {tuple(arg.shape)} is not contiguous"
+                )
+        elif not (arg is None or isinstance(arg, (int, float))):
+            raise TypeError(
+                f"{name}: argument {position} is a {type(arg).__name__}, "
+                "not a tensor, int, float or None"
+            )
+    launcher = LAUNCHERS.get("cpu" if device is None else device.type)
+    if launcher is None:
+        raise UserError(f"there are no kernels for device {device}; use device cpu or cuda")
+    return launcher(name, n, args)
+
+
+def _launch_cpu(name: str, n: int, args: Sequence[Argument]) -> int:
     function = _functions.get(name) or _function(name)
-    device: torch.device | None = None
     values: list[object] = [_int(n)]
     for arg in args:
         # Wrapped one by one rather than through argtypes: a bare int would be cut to 32 bits.
         if isinstance(arg, torch.Tensor):
-            if arg.device != device:
-                if device is not None:
-                    raise ValueError(
-                        f"{name}: tensors on {device} and on {arg.device}; move them to one device"
-                    )
-                device = arg.device
-                if device.type != "cpu":
-                    raise _no_kernels(device)
-            if not arg.is_contiguous():
-                raise ValueError(
-                    f"{name}: argument {len(values)} of shape {tuple(arg.shape)} is not contiguous"
-                )
             values.append(_pointer(arg.data_ptr()))
         elif arg is None:
             values.append(_pointer())
         elif isinstance(arg, int):
             values.append(_int(arg))
-        elif isinstance(arg, float):
-            values.append(_double(arg))
         else:
-            raise TypeError(
-                f"{name}: argument {len(values)} is a {type(arg).__name__}, "
-                "not a tensor, int, float or None"
-            )
+            values.append(_double(arg))
     return function(*values)
 
 
-def _no_kernels(device: torch.device) -> UserError:
-    if device.type == "cuda":
-        return UserError("CUDA kernels are not built yet; use device cpu")
-    return UserError(f"there are no kernels for device {device.type}; use device cpu")
+LAUNCHERS: dict[str, Callable[[str, int, Sequence[Argument]], int]] = {
+    "cpu": _launch_cpu,
+    "cuda": cuda.launch,
+}

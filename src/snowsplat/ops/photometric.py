@@ -63,8 +63,10 @@ class _Photometric(torch.autograd.Function):
         op: str,
     ) -> Tensor:
         planes, goal = _planar(op, image.detach(), target)
-        grad = scratch.empty(tuple(planes.shape), planes.dtype) if ctx.needs_input_grad[0] else None
-        means = torch.empty(2, dtype=torch.float64)
+        grad = None
+        if ctx.needs_input_grad[0]:
+            grad = scratch.empty(tuple(planes.shape), planes.dtype, planes.device)
+        means = torch.empty(2, dtype=torch.float64, device=planes.device)
         name = "photometric_u8" if goal.dtype == torch.uint8 else "photometric"
         channels, height, width = planes.shape
         launch(
@@ -80,14 +82,14 @@ class _Photometric(torch.autograd.Function):
             means,
         )
         ctx.grad = grad
-        l1, similarity = means.tolist()
-        return planes.new_tensor(l1_weight * l1 + ssim_weight * similarity)
+        l1, similarity = means  # tensors: on a GPU nobody waits for them
+        return (l1_weight * l1 + ssim_weight * similarity).to(planes.dtype)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_value: Tensor) -> tuple[Tensor | None, ...]:
         if ctx.grad is None:
             return None, None, None, None, None
-        scale = float(grad_value)
-        grad = ctx.grad if scale == 1.0 else ctx.grad * scale
+        on_cpu = grad_value.device.type == "cpu"  # elsewhere looking at it means waiting for it
+        grad = ctx.grad if on_cpu and float(grad_value) == 1.0 else ctx.grad * grad_value
         return grad.permute(1, 2, 0), None, None, None, None

@@ -119,13 +119,13 @@ class _Project(torch.autograd.Function):
         parameters = tuple(p.detach().contiguous() for p in parameters)
         means, sh_rest = parameters[0], parameters[5]
         camera: tuple[Tensor | float, ...] = (cam_from_world, *intrinsics)
-        ids = scratch.empty((len(means),), torch.int32)
+        ids = scratch.empty((len(means),), torch.int32, means.device)
         cull = variant("project_cull", means)
-        visible = launch(cull, len(means), *parameters[:4], *camera, ids)
-        ids = ids[:visible]
-        packed = scratch.empty((visible, packed_width(3)), means.dtype)
+        rows = launch(cull, len(means), *parameters[:4], *camera, ids, device=means.device)
+        ids = ids[:rows]
+        packed = scratch.empty((rows, packed_width(3)), means.dtype, means.device)
         shape = (sh_rest.shape[1], sh_degree)
-        launch(variant("project_fwd", means), visible, ids, *parameters, *shape, *camera, packed)
+        launch(variant("project_fwd", means), rows, ids, *parameters, *shape, *camera, packed)
         ctx.mark_non_differentiable(ids)
         ctx.save_for_backward(ids, cam_from_world, *parameters)
         ctx.sh_degree, ctx.intrinsics = sh_degree, intrinsics
@@ -138,7 +138,8 @@ class _Project(torch.autograd.Function):
         grads = [torch.zeros_like(p) for p in parameters]
         pose = None
         if ctx.needs_input_grad[2]:
-            pose = torch.empty(launch("project_pose_blocks", len(ids)), 15, dtype=torch.float64)
+            blocks = launch("project_pose_blocks", len(ids), device=ids.device)
+            pose = torch.empty(blocks, 15, dtype=torch.float64, device=ids.device)
         launch(
             variant("project_bwd", parameters[0]),
             len(ids),
@@ -159,9 +160,8 @@ def _pose_grad(cam_from_world: Tensor, pose: Tensor | None) -> Tensor | None:
     """(3, 4) from the kernel's sums: 9 for R, 3 for t, 3 for the camera's centre c = −Rᵀ t."""
     if pose is None:
         return None
-    total = torch.zeros(15, dtype=torch.float64)
-    for row in pose:  # in order: a reduction by torch depends on its number of threads
-        total += row
+    # Summed in order: a reduction by torch depends on its number of threads.
+    total = torch.cat([pose.new_zeros(1, 15), pose]).cumsum(0)[-1]
     d_rotation, d_translation, d_centre = total[:9].view(3, 3), total[9:12], total[12:]
     rotation, translation = cam_from_world[:, :3].double(), cam_from_world[:, 3].double()
     d_rotation = d_rotation - torch.outer(translation, d_centre)

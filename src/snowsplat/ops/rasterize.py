@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,7 +17,6 @@ from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
 
 TILE = 16
 _GROUP = 4  # channels that one pass of blending carries
-_RECORD_BYTES = {torch.float32: 64, torch.float64: 128}
 _SLOT = 16  # numbers of the gradient of one splat in one tile
 
 
@@ -26,6 +27,7 @@ def rasterize(
     background: Tensor | None = None,
     *,
     with_depth: bool = False,
+    room: Room | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
 
@@ -36,6 +38,9 @@ def rasterize(
     than 1e-4 of the light (Kerbl et al. 2023, section 6). Gradients flow to every column of
     `splats.packed` but the radii, and to `background`.
 
+    `room` spares waiting for a GPU. On a GPU gradients are summed with atomics, in no fixed order,
+    unless `torch.use_deterministic_algorithms` asks for the same bits every time.
+
     Raises ValueError where shapes, dtypes or devices do not fit.
     """
     packed, channels = splats.packed, splats.channels
@@ -44,9 +49,23 @@ def rasterize(
     if background is None:
         background = packed.new_zeros(channels)
     check_tensor("rasterize", "background", background, (channels,), packed)
-    planes, alpha = _Rasterize.apply(packed, background, width, height, channels, with_depth)
+    planes, alpha = _Rasterize.apply(packed, background, width, height, channels, with_depth, room)
     depth = planes[channels] if with_depth else None
     return planes[:channels].permute(1, 2, 0), alpha, depth
+
+
+@dataclass
+class Room:
+    """Room for the instances of a frame: the pairs of a splat and a tile that it touches.
+
+    Blending has to know their number, and the CPU would have to wait for a GPU to count them. With
+    a Room it sets memory aside for `instances` of them and goes on; the GPU writes what it needed
+    into `needed`, (1,) int64. Where that is more, image and gradients are those of a part of the
+    splats: the frame has to be made again with more room. On the CPU there is always enough.
+    """
+
+    instances: int
+    needed: Tensor
 
 
 @torch.no_grad()
@@ -60,8 +79,8 @@ def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
     check_float("count_blended", "splats", splats.packed)
     check_size("count_blended", width, height)
     packed = splats.packed.detach().contiguous()
-    frame = _Frame(packed, width, height, _channel_groups(1, False)[0][1])
-    counts = scratch.empty((height, width), packed.dtype)
+    frame = _Frame(packed, width, height, _channel_groups(1, False, packed.device)[0][1], None)
+    counts = scratch.empty((height, width), packed.dtype, packed.device)
     launch(variant("blend_count", packed), frame.tiles, *frame.blend_args(), counts)
     return counts
 
@@ -69,13 +88,25 @@ def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
 class _Frame:
     """The splats of a frame sorted into tiles: what blending needs, forward and backward."""
 
-    def __init__(self, packed: Tensor, width: int, height: int, columns: Tensor) -> None:
+    def __init__(
+        self, packed: Tensor, width: int, height: int, columns: Tensor, room: Room | None
+    ) -> None:
         count, stride = packed.shape
+        device = packed.device
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         self.size, self.tiles = (width, height), tiles_x * tiles_y
-        integers = torch.int32
-        keys = scratch.empty((count,), integers if packed.dtype == torch.float32 else torch.int64)
-        self.records = scratch.empty((count * _RECORD_BYTES[packed.dtype],), torch.uint8)
+
+        def empty(size: int, dtype: torch.dtype = torch.int32) -> Tensor:
+            return scratch.empty((size,), dtype, device)
+
+        def ask(name: str, *args: int) -> int:
+            return launch(name, *args, device=device)
+
+        self.ordered_sums = ask("blend_sums_in_order", 0) == 1
+        key = torch.int32 if packed.dtype == torch.float32 else torch.int64
+        keys = empty(count, key)
+        record_bytes = ask(variant("splat_record_bytes", packed), 0)
+        self.splats = (packed, stride, columns, empty(count * record_bytes, torch.uint8))
         launch(
             variant("splats_prepare", packed),
             count,
@@ -83,69 +114,69 @@ class _Frame:
             stride,
             float(width),
             float(height),
-            columns,
-            self.records,
+            *self.splats[2:],
             keys,
         )
-        order = scratch.empty((count,), integers)
-        launch(
-            variant("splats_sort", packed),
-            count,
-            keys,
-            scratch.empty((count,), keys.dtype),
-            order,
-            scratch.empty((count,), integers),
-        )
-        parts = launch("tiles_parts", count)
-        counts = scratch.empty((parts * self.tiles,), integers)
-        spans = scratch.empty((count,), torch.int64)
-        part_slots = scratch.empty((parts,), integers)
-        self.tile_start = scratch.empty((self.tiles + 1,), integers)
-        binning = (order, self.records, tiles_x, tiles_y, parts, counts)
+        order = empty(count)
+        launch(variant("splats_sort", packed), count, keys, empty(count, key), order, empty(count))
+        parts = ask("tiles_parts", count)
+        workspace = empty(ask("tiles_workspace_bytes", count, self.tiles, parts), torch.uint8)
+        self.tile_start = empty(self.tiles + 1)
+        binning = (order, packed, stride, self.splats[3], tiles_x, tiles_y, parts, workspace)
+        room = room or Room(-1, torch.empty(1, dtype=torch.int64, device=device))
         self.instances = launch(
             variant("tiles_count", packed),
             count,
             *binning,
             self.tile_start,
-            spans,
-            part_slots,
+            room.instances,
+            room.needed,
         )
-        self.instance_splat = scratch.empty((self.instances,), integers)
-        self.instance_slot = scratch.empty((self.instances,), integers)
-        self.slot_range = scratch.empty((2 * count,), integers)
+        self.instance_splat = empty(self.instances)
+        self.instance_slot = empty(self.instances) if self.ordered_sums else None
+        self.slot_range = empty(2 * count) if self.ordered_sums else None
         launch(
             variant("tiles_fill", packed),
             count,
             *binning,
-            spans,
-            part_slots,
+            self.tile_start,
+            self.instances,
             self.instance_splat,
             self.instance_slot,
             self.slot_range,
         )
-        block_bytes = launch(variant("blend_block_bytes", packed), 0)
-        self.instance_blocks = scratch.empty((self.instances * block_bytes,), torch.uint8)
-        self.tile_end = scratch.empty((self.tiles,), integers)
+        block_bytes = ask(variant("blend_block_bytes", packed), 0)
+        self.instance_blocks = empty(self.instances * block_bytes, torch.uint8)
+        self.tile_end = empty(self.tiles)
 
     def blend_args(self) -> tuple[int | Tensor, ...]:
         return (
             *self.size,
-            self.records,
+            *self.splats,
             self.tile_start,
             self.tile_end,
             self.instance_splat,
             self.instance_blocks,
         )
 
+    def recolor(self, columns: Tensor) -> None:
+        """From now on blend these columns."""
+        packed, stride, _, records = self.splats
+        self.splats = (packed, stride, columns, records)
+        launch(variant("splats_recolor", packed), len(packed), *self.splats)
 
-def _channel_groups(channels: int, with_depth: bool) -> list[tuple[int, Tensor]]:
+
+@functools.cache
+def _channel_groups(
+    channels: int, with_depth: bool, device: torch.device
+) -> list[tuple[int, Tensor]]:
     """The packed columns that become image planes, up to four a pass, with their first plane."""
     columns = [COLORS + c for c in range(channels)] + ([DEPTHS] if with_depth else [])
     groups = []
     for first in range(0, len(columns), _GROUP):
         group = columns[first : first + _GROUP]
         group += [-1] * (_GROUP - len(group))
-        groups.append((first, torch.tensor(group, dtype=torch.int64)))
+        groups.append((first, torch.tensor(group, dtype=torch.int64, device=device)))
     return groups
 
 
@@ -159,17 +190,18 @@ class _Rasterize(torch.autograd.Function):
         height: int,
         channels: int,
         with_depth: bool,
+        room: Room | None,
     ) -> tuple[Tensor, Tensor]:
         packed = packed.detach().contiguous()
-        groups = _channel_groups(channels, with_depth)
+        groups = _channel_groups(channels, with_depth, packed.device)
         count = channels + with_depth
         behind = torch.cat([background.detach(), packed.new_zeros(1)])  # nothing is behind depth
-        planes = scratch.empty((count, height, width), packed.dtype)
-        alpha = scratch.empty((height, width), packed.dtype)
-        frame = _Frame(packed, width, height, groups[0][1])
+        planes = scratch.empty((count, height, width), packed.dtype, packed.device)
+        alpha = scratch.empty((height, width), packed.dtype, packed.device)
+        frame = _Frame(packed, width, height, groups[0][1], room)
         for first, columns in groups:
             if first > 0:
-                _recolor(frame, packed, columns)
+                frame.recolor(columns)
             carried = min(_GROUP, count - first)
             launch(
                 variant("blend_fwd", packed),
@@ -180,7 +212,7 @@ class _Rasterize(torch.autograd.Function):
                 planes[first:],
                 alpha if first == 0 else None,
             )
-        ctx.save_for_backward(packed, planes, alpha)
+        ctx.save_for_backward(planes, alpha)
         ctx.frame, ctx.groups, ctx.channels = frame, groups, channels
         ctx.set_materialize_grads(False)
         return planes, alpha
@@ -190,17 +222,23 @@ class _Rasterize(torch.autograd.Function):
     def backward(
         ctx: Any, grad_planes: Tensor | None, grad_alpha: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        packed, planes, alpha = ctx.saved_tensors
+        planes, alpha = ctx.saved_tensors
         frame, count = ctx.frame, len(planes)
+        packed, stride = frame.splats[:2]
         if grad_planes is None:
             grad_planes = torch.zeros_like(planes)
         grad_planes = grad_planes.contiguous()
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-        grad_packed = scratch.empty(tuple(packed.shape), packed.dtype)
-        slots = scratch.empty((frame.instances, _SLOT), packed.dtype)
+        # Sums in a fixed order come from slots, one an instance; the others grow where they belong.
+        grad_packed = scratch.empty(tuple(packed.shape), packed.dtype, packed.device)
+        slots = None
+        if frame.ordered_sums:
+            slots = scratch.empty((frame.instances, _SLOT), packed.dtype, packed.device)
+        else:
+            grad_packed.zero_()
         for first, columns in ctx.groups:
             if len(ctx.groups) > 1:
-                _recolor(frame, packed, columns)
+                frame.recolor(columns)
             carried = min(_GROUP, count - first)
             launch(
                 variant("blend_bwd", packed),
@@ -213,34 +251,31 @@ class _Rasterize(torch.autograd.Function):
                 alpha,
                 grad_alpha if first == 0 else None,
                 slots,
-            )
-            launch(
-                variant("splats_reduce", packed),
-                len(packed),
-                slots,
-                frame.slot_range,
-                packed,
-                packed.shape[1],
-                carried,
-                columns,
-                first > 0,
                 grad_packed,
             )
+            if slots is not None:
+                launch(
+                    variant("splats_reduce", packed),
+                    len(packed),
+                    slots,
+                    frame.slot_range,
+                    packed,
+                    stride,
+                    carried,
+                    columns,
+                    first > 0,
+                    grad_packed,
+                )
         grad_background = None
         if ctx.needs_input_grad[1]:
             grad_background = _background_grad(grad_planes[: ctx.channels], alpha)
-        return grad_packed, grad_background, None, None, None, None
-
-
-def _recolor(frame: _Frame, packed: Tensor, columns: Tensor) -> None:
-    name = variant("splats_recolor", packed)
-    launch(name, len(packed), packed, packed.shape[1], columns, frame.records)
+        return grad_packed, grad_background, None, None, None, None, None
 
 
 def _background_grad(grad_image: Tensor, alpha: Tensor) -> Tensor:
     """(C,): the sum over pixels of ∂L/∂image · (1 − alpha)."""
     channels, height, width = grad_image.shape
-    rows = torch.empty(height, channels, dtype=torch.float64)
+    rows = torch.empty(height, channels, dtype=torch.float64, device=alpha.device)
     launch(
         variant("background_bwd", alpha),
         height,
@@ -250,7 +285,4 @@ def _background_grad(grad_image: Tensor, alpha: Tensor) -> Tensor:
         alpha,
         rows,
     )
-    total = torch.zeros(channels, dtype=torch.float64)
-    for row in rows:  # in order, whatever torch's number of threads
-        total += row
-    return total.to(alpha.dtype)
+    return rows.cumsum(0)[-1].to(alpha.dtype)  # in order, whatever torch's number of threads

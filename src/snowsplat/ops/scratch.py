@@ -45,8 +45,13 @@ class _Loan(np.ndarray):
             del _free[: max(0, len(_free) - _KEEP)]
 
 
-def empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """An uninitialised contiguous CPU tensor, 64-byte aligned."""
+def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
+    """An uninitialised contiguous tensor on `device` (default: CPU), 64-byte aligned.
+
+    On a GPU torch's own allocator does what this one is for.
+    """
+    if device is not None and device.type != "cpu":
+        return torch.empty(shape, dtype=dtype, device=device)
     size = dtype.itemsize
     for extent in shape:
         size *= extent

@@ -38,7 +38,9 @@ class Splats2D:
               6   `depths`    camera z: the blending order, nearest first, equal depths by row
               7   `radii`     3 σ of the major axis (information only, never has a gradient)
               8:8+C `colors`; the rest is padding (zero)
-    ids:      (M,) int32, ascending: the Gaussian that each row came from.
+    ids:      (M,) int32: the Gaussian that each row came from; ascending, but for −1, which marks
+              an empty row that draws nothing. On a GPU `project` gives every Gaussian its row, so
+              that nobody waits to be told how many are visible; on the CPU none is empty.
               None: the rows are the Gaussians themselves (2D fitting).
     channels: C, at least 1.
 

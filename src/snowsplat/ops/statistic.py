@@ -18,13 +18,15 @@ def accumulate_screen_statistics(
     norm_sum: Tensor,
     views: Tensor,
     max_radii: Tensor | None = None,
+    valid: Tensor | None = None,
 ) -> None:
     """Adds one view to the statistics of the N Gaussians, at the rows that it sees, in place.
 
     With the gradient in `splats.packed.grad` and distinct `splats.ids`:
     norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|, views (N,) += 1, and
     max_radii (N,) = max(max_radii, `splats.radii`) unless None. The factor states the gradient for
-    a screen that spans [-1, 1], as the paper's threshold is (section 5.2).
+    a screen that spans [-1, 1], as the paper's threshold is (section 5.2). Rows of id −1 are
+    passed over, and where `valid` (1,) bool is False all are.
 
     Raises ValueError where there is no gradient, no ids, or shapes or dtypes do not fit.
     """
@@ -50,4 +52,5 @@ def accumulate_screen_statistics(
         norm_sum,
         views,
         max_radii,
+        valid,
     )

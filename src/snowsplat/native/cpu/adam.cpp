@@ -137,7 +137,8 @@ void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& te
 using namespace snow;
 
 // Per parameter, in the order means, log_scales, quats, opacity_logits, sh_dc, sh_rest: value,
-// first and second moment, extra gradient or null, and learning rate.
+// first and second moment, extra gradient or null, and learning rate. Where *valid is false nothing
+// changes.
 #define SNOW_ADAM_ENTRY(NAME, V)                                                                   \
   SNOW_EXPORT int64_t NAME(                                                                        \
       int64_t n, int64_t m, const int32_t* ids, const V::Scalar* grad_packed,                      \
@@ -149,7 +150,8 @@ using namespace snow;
       const V::Scalar* e3, double lr3, V::Scalar* p4, V::Scalar* m4, V::Scalar* v4,                \
       const V::Scalar* e4, double lr4, V::Scalar* p5, V::Scalar* m5, V::Scalar* v5,                \
       const V::Scalar* e5, double lr5, int64_t adam_step, double beta1, double beta2, double eps,  \
-      int64_t visible_only) {                                                                      \
+      int64_t visible_only, const bool* valid) {                                                   \
+    if (valid && !*valid) return 0;                                                                \
     using T = V::Scalar;                                                                           \
     const double c1 = 1 - std::pow(beta1, double(adam_step));                                      \
     const double c2 = 1 - std::pow(beta2, double(adam_step));                                      \

@@ -385,10 +385,10 @@ using namespace snow;
 
 #define SNOW_BLEND_ENTRIES(SUFFIX, V)                                                             \
   SNOW_EXPORT int64_t blend_fwd##SUFFIX(                                                          \
-      int64_t tiles, int64_t width, int64_t height, const SplatRecord<V::Scalar>* records,        \
-      const uint32_t* tile_start, uint32_t* tile_end, const uint32_t* instance_splat,             \
-      Tile<V>::Bits* instance_blocks, int64_t channels, const V::Scalar* background,              \
-      V::Scalar* image, V::Scalar* alpha) {                                                       \
+      int64_t tiles, int64_t width, int64_t height, const V::Scalar*, int64_t, const int64_t*,    \
+      const SplatRecord<V::Scalar>* records, const uint32_t* tile_start, uint32_t* tile_end,      \
+      const uint32_t* instance_splat, Tile<V>::Bits* instance_blocks, int64_t channels,           \
+      const V::Scalar* background, V::Scalar* image, V::Scalar* alpha) {                          \
     const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
                         records,  tile_start,     instance_splat,                                 \
                         tile_end, instance_blocks};                                               \
@@ -401,9 +401,9 @@ using namespace snow;
     return 0;                                                                                     \
   }                                                                                               \
   SNOW_EXPORT int64_t blend_count##SUFFIX(                                                        \
-      int64_t tiles, int64_t width, int64_t height, const SplatRecord<V::Scalar>* records,        \
-      const uint32_t* tile_start, uint32_t* tile_end, const uint32_t* instance_splat,             \
-      Tile<V>::Bits* instance_blocks, V::Scalar* counts) {                                        \
+      int64_t tiles, int64_t width, int64_t height, const V::Scalar*, int64_t, const int64_t*,    \
+      const SplatRecord<V::Scalar>* records, const uint32_t* tile_start, uint32_t* tile_end,      \
+      const uint32_t* instance_splat, Tile<V>::Bits* instance_blocks, V::Scalar* counts) {        \
     const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
                         records,  tile_start,     instance_splat,                                 \
                         tile_end, instance_blocks};                                               \
@@ -414,11 +414,11 @@ using namespace snow;
     return 0;                                                                                     \
   }                                                                                               \
   SNOW_EXPORT int64_t blend_bwd##SUFFIX(                                                          \
-      int64_t tiles, int64_t width, int64_t height, const SplatRecord<V::Scalar>* records,        \
-      const uint32_t* tile_start, uint32_t* tile_end, const uint32_t* instance_splat,             \
-      Tile<V>::Bits* instance_blocks, int64_t channels, const uint32_t* instance_slot,            \
-      const V::Scalar* image, const V::Scalar* grad_image, const V::Scalar* alpha,                \
-      const V::Scalar* grad_alpha, V::Scalar* slots) {                                            \
+      int64_t tiles, int64_t width, int64_t height, const V::Scalar*, int64_t, const int64_t*,    \
+      const SplatRecord<V::Scalar>* records, const uint32_t* tile_start, uint32_t* tile_end,      \
+      const uint32_t* instance_splat, Tile<V>::Bits* instance_blocks, int64_t channels,           \
+      const uint32_t* instance_slot, const V::Scalar* image, const V::Scalar* grad_image,         \
+      const V::Scalar* alpha, const V::Scalar* grad_alpha, V::Scalar* slots, V::Scalar*) {        \
     const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
                         records,  tile_start,     instance_splat,                                 \
                         tile_end, instance_blocks};                                               \
@@ -443,3 +443,6 @@ using namespace snow;
 
 SNOW_BLEND_ENTRIES(, VecF)
 SNOW_BLEND_ENTRIES(_f64, VecD)
+
+// 1 where gradients are summed in slots, in order; 0 where they are added up where they belong.
+SNOW_EXPORT int64_t blend_sums_in_order(int64_t) { return 1; }

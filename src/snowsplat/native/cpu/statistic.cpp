@@ -35,7 +35,8 @@ void accumulate(int64_t m, const int32_t* ids, const T* packed, const T* grad_pa
 #define SNOW_STATISTIC_ENTRY(NAME, T)                                                            \
   SNOW_EXPORT int64_t NAME(int64_t m, const int32_t* ids, const T* packed, const T* grad_packed, \
                            int64_t stride, double width, double height, T* norm_sum, T* views,   \
-                           T* max_radii) {                                                       \
+                           T* max_radii, const bool* valid) {                                    \
+    if (valid && !*valid) return 0;                                                              \
     snow::accumulate(m, ids, packed, grad_packed, stride, width, height, norm_sum, views,        \
                      max_radii);                                                                 \
     return 0;                                                                                    \

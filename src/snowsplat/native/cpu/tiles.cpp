@@ -199,6 +199,21 @@ SNOW_INLINE void for_each_tile_of_large(const SplatRecord<T>& r, int64_t tiles_x
     }
 }
 
+// What tiles_count leaves for tiles_fill, carved from one block of memory: the tiles of every
+// splat, the first slot of every part, and per part a count of every tile.
+struct TileWork {
+  TileSpan* spans;
+  uint32_t* part_slots;
+  uint32_t* counts;
+
+  TileWork(void* memory, int64_t m, int64_t parts)
+      : spans(static_cast<TileSpan*>(memory)), part_slots((uint32_t*)(spans + m)),
+        counts(part_slots + parts) {}
+  static int64_t bytes(int64_t m, int64_t tiles, int64_t parts) {
+    return m * int64_t(sizeof(TileSpan)) + parts * (tiles + 1) * int64_t(sizeof(uint32_t));
+  }
+};
+
 struct SmallOffsets {  // tile offset of bit k in a span `width` wide
   uint32_t at[17][16];
   explicit SmallOffsets(int64_t tiles_x) {
@@ -353,21 +368,28 @@ using namespace snow;
     radix_sort(m, keys, keys2, order, order2);                                                   \
     return 0;                                                                                    \
   }                                                                                              \
+  /* Gives the number of instances, in *needed too. A GPU makes room for `capacity` instead. */  \
   SNOW_EXPORT int64_t tiles_count##SUFFIX(                                                       \
-      int64_t m, const uint32_t* order, const SplatRecord<V::Scalar>* records, int64_t tiles_x,  \
-      int64_t tiles_y, int64_t parts, uint32_t* counts, uint32_t* tile_start, TileSpan* spans,   \
-      uint32_t* part_slots) {                                                                    \
-    return count_tiles<V>(m, order, records, tiles_x, tiles_y, parts, counts, tile_start, spans, \
-                          part_slots);                                                           \
+      int64_t m, const uint32_t* order, const V::Scalar*, int64_t,                               \
+      const SplatRecord<V::Scalar>* records, int64_t tiles_x, int64_t tiles_y, int64_t parts,    \
+      void* workspace, uint32_t* tile_start, int64_t /* capacity */, int64_t* needed) {          \
+    const TileWork w(workspace, m, parts);                                                       \
+    *needed = count_tiles<V>(m, order, records, tiles_x, tiles_y, parts, w.counts, tile_start,   \
+                             w.spans, w.part_slots);                                             \
+    return *needed;                                                                              \
   }                                                                                              \
   SNOW_EXPORT int64_t tiles_fill##SUFFIX(                                                        \
-      int64_t m, const uint32_t* order, const SplatRecord<V::Scalar>* records, int64_t tiles_x,  \
-      int64_t tiles_y, int64_t parts, uint32_t* counts, const TileSpan* spans,                   \
-      const uint32_t* part_slots, uint32_t* instance_splat, uint32_t* instance_slot,             \
-      uint32_t* slot_range) {                                                                    \
-    fill_tiles<V>(m, order, records, tiles_x, tiles_y, parts, counts, spans, part_slots,         \
+      int64_t m, const uint32_t* order, const V::Scalar*, int64_t,                               \
+      const SplatRecord<V::Scalar>* records, int64_t tiles_x, int64_t tiles_y, int64_t parts,    \
+      void* workspace, uint32_t*, int64_t /* capacity */, uint32_t* instance_splat,              \
+      uint32_t* instance_slot, uint32_t* slot_range) {                                           \
+    const TileWork w(workspace, m, parts);                                                       \
+    fill_tiles<V>(m, order, records, tiles_x, tiles_y, parts, w.counts, w.spans, w.part_slots,   \
                   instance_splat, instance_slot, slot_range);                                    \
     return 0;                                                                                    \
+  }                                                                                              \
+  SNOW_EXPORT int64_t splat_record_bytes##SUFFIX(int64_t) {                                      \
+    return sizeof(SplatRecord<V::Scalar>);                                                       \
   }                                                                                              \
   SNOW_EXPORT int64_t splats_reduce##SUFFIX(                                                     \
       int64_t m, const V::Scalar* slots, const uint32_t* slot_range, const V::Scalar* packed,    \
@@ -381,3 +403,7 @@ SNOW_TILE_ENTRIES(_f64, VecD)
 
 // How many parts tiles_count and tiles_fill should be given for m splats.
 SNOW_EXPORT int64_t tiles_parts(int64_t m) { return part_count(m); }
+// Bytes of their workspace.
+SNOW_EXPORT int64_t tiles_workspace_bytes(int64_t m, int64_t tiles, int64_t parts) {
+  return TileWork::bytes(m, tiles, parts);
+}

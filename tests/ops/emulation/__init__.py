@@ -1,0 +1,78 @@
+"""Runs the CUDA kernels on the CPU: each `.cu` file compiled as C++, a fibre for each thread.
+
+The environment variable SNOWSPLAT_EMULATION=sanitized compiles with AddressSanitizer and
+UndefinedBehaviorSanitizer (Python then needs LD_PRELOAD; `make sanitized` knows how), and
+SNOWSPLAT_ORDER is the order in which the threads of a block run: see cuda_emulation.h.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import functools
+import os
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from snowsplat.ops.cuda.kernels import Argument, Kernel
+
+_HERE = Path(__file__).parent
+_ROOT = _HERE.parents[2]
+_NATIVE = _ROOT / "src" / "snowsplat" / "native"
+_FLAGS = {
+    "": ["-O2", "-g1"],
+    "sanitized": ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"],
+}
+
+
+@functools.cache
+def library(file: str) -> ctypes.CDLL:
+    """`native/cuda/<file>.cu` compiled for the CPU, anew where a source has changed."""
+    kind = os.environ.get("SNOWSPLAT_EMULATION", "")
+    folder = _ROOT / "build" / "emulation" / (kind or "plain")
+    folder.mkdir(parents=True, exist_ok=True)
+    target, source = folder / f"{file}.so", _NATIVE / "cuda" / f"{file}.cu"
+    headers = [*_NATIVE.glob("*.h"), *_NATIVE.glob("cuda/*.h"), *_HERE.glob("*.[hc]*")]
+    with (folder / f"{file}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        newest = max(path.stat().st_mtime for path in [source, *headers])
+        if not target.exists() or target.stat().st_mtime < newest:
+            command = [os.environ.get("CXX", "c++"), "-std=c++17", *_FLAGS[kind]]
+            command += ["-Wall", "-Wextra", "-Werror", "-fPIC", "-shared", "-ffp-contract=fast"]
+            command += ["-DSNOWSPLAT_EMULATION", f"-I{_HERE}", f"-I{_NATIVE}"]
+            command += [str(_HERE / "block.cpp"), "-x", "c++", str(source), "-o", str(target)]
+            made = subprocess.run(command, capture_output=True, text=True)
+            assert made.returncode == 0, f"{source.name} does not compile as C++:\n{made.stderr}"
+    loaded = ctypes.CDLL(str(target))
+    loaded.emulate.restype = ctypes.c_char_p
+    return loaded
+
+
+def execute(kernel: Kernel, name: str, blocks: int, args: Sequence[Argument]) -> None:
+    """Runs a kernel on CPU tensors, to its end.
+
+    Raises:
+        RuntimeError: a divergent barrier, and what else the emulation finds.
+    """
+    loaded = library(kernel.file)
+    built = getattr(loaded, f"{name}_threads")()
+    assert built == kernel.threads, f"{name} has {built} threads, its Kernel says {kernel.threads}"
+    values: list[ctypes.c_void_p | ctypes.c_int64 | ctypes.c_double] = []
+    for arg in args:
+        if isinstance(arg, torch.Tensor):
+            assert arg.device.type == "cpu"
+            values.append(ctypes.c_void_p(arg.data_ptr()))
+        elif arg is None:
+            values.append(ctypes.c_void_p())
+        elif isinstance(arg, int):
+            values.append(ctypes.c_int64(arg))
+        else:
+            values.append(ctypes.c_double(arg))
+    pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
+    call = getattr(loaded, f"{name}_call")
+    wrong = loaded.emulate(call, ctypes.c_int64(blocks), ctypes.c_int64(kernel.threads), pointers)
+    if wrong is not None:
+        raise RuntimeError(f"{name}: {wrong.decode()}")

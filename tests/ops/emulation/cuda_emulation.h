@@ -1,0 +1,257 @@
+// CUDA's vocabulary for the C++ compiler, so that the .cu files run on a CPU, a block at a time, each
+// thread of the block a fibre (see block.cpp). Written for checking kernels, not for speed:
+//
+// - Threads of a block run one at a time, each until a barrier, a shuffle or a vote; SNOWSPLAT_ORDER
+//   (forward, backward or a seed of shuffles) says in which order, so that a missing barrier shows.
+// - A barrier that only a part of the threads reach, a lane of a mask that never comes, and threads
+//   that wait at different places are errors with their names and lines.
+// - A shared array is memory of its own, full of NaN when a block begins, so that AddressSanitizer
+//   sees what reaches beyond it, and the tests see what was read and never written.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+#include <utility>
+
+#define __device__
+#define __host__
+#define __forceinline__ inline __attribute__((always_inline))
+#define __restrict__ __restrict
+
+struct EmulatedIndex {
+  unsigned x, y, z;
+};
+
+namespace emulation {
+
+extern EmulatedIndex thread_index, block_index, block_size, grid_size;
+
+// A line of a kernel, where its threads wait for each other.
+struct Place {
+  const char* file;
+  int line;
+  bool operator==(const Place& o) const { return line == o.line && !std::strcmp(file, o.file); }
+};
+inline Place here(const char* file = __builtin_FILE(), int line = __builtin_LINE()) {
+  return {file, line};
+}
+
+// Memory that the threads of the running block share, the same for the same `site`.
+void* shared(const void* site, int64_t bytes);
+// Waits until all running threads of the block are here.
+void block_barrier(Place);
+// The same, and gives the sum of the values.
+int block_sum(int value, Place);
+// Waits until all lanes of `mask` are here, and gives the value that each brought (of ≤ 8 bytes).
+const uint64_t* warp_exchange(unsigned mask, uint64_t value, Place);
+
+template <class T, int64_t kCount, class Site>
+T* shared_array(Site) {
+  static_assert(std::is_trivially_destructible<T>::value, "nobody destroys it");
+  static const char site = 0;
+  return static_cast<T*>(shared(&site, int64_t(sizeof(T)) * kCount));
+}
+
+// Calls a kernel with pointers to its arguments, as the driver of a GPU does.
+template <class... A, size_t... I>
+void call(void (*kernel)(A...), void** args, std::index_sequence<I...>) {
+  kernel(*static_cast<std::remove_reference_t<A>*>(args[I])...);
+}
+template <class... A>
+void call(void (*kernel)(A...), void** args) {
+  call(kernel, args, std::index_sequence_for<A...>());
+}
+
+template <class T>
+uint64_t to_bits(T value) {
+  static_assert(sizeof(T) <= 8 && std::is_trivially_copyable<T>::value, "a lane's value");
+  uint64_t bits = 0;
+  std::memcpy(&bits, &value, sizeof value);
+  return bits;
+}
+template <class T>
+T from_bits(uint64_t bits) {
+  T value;
+  std::memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+inline int lane() { return int(thread_index.x % 32); }
+
+}  // namespace emulation
+
+#define threadIdx (emulation::thread_index)
+#define blockIdx (emulation::block_index)
+#define blockDim (emulation::block_size)
+#define gridDim (emulation::grid_size)
+
+#define SNOW_EMULATION_EXPORT extern "C" __attribute__((visibility("default")))
+#define SNOW_KERNEL(NAME, THREADS, PARAMETERS)                                          \
+  static void NAME PARAMETERS;                                                          \
+  SNOW_EMULATION_EXPORT void NAME##_call(void** args) { emulation::call(&NAME, args); } \
+  SNOW_EMULATION_EXPORT int NAME##_threads() { return THREADS; }                        \
+  static void NAME PARAMETERS
+#define SNOW_SHARED(TYPE, NAME, COUNT) \
+  using NAME##_element = TYPE;         \
+  NAME##_element* const NAME = emulation::shared_array<NAME##_element, (COUNT)>([] {})
+
+inline void __syncthreads(emulation::Place at = emulation::here()) { emulation::block_barrier(at); }
+inline void __syncwarp(unsigned mask = 0xffffffffu, emulation::Place at = emulation::here()) {
+  emulation::warp_exchange(mask, 0, at);
+}
+inline int __syncthreads_count(int predicate, emulation::Place at = emulation::here()) {
+  return emulation::block_sum(predicate != 0, at);
+}
+inline int __syncthreads_or(int predicate, emulation::Place at = emulation::here()) {
+  return emulation::block_sum(predicate != 0, at) != 0;
+}
+inline int __syncthreads_and(int predicate, emulation::Place at = emulation::here()) {
+  return emulation::block_sum(predicate == 0, at) == 0;
+}
+
+template <class T>
+T __shfl_sync(unsigned mask, T value, int source, int width = 32,
+              emulation::Place at = emulation::here()) {
+  const int lane = emulation::lane(), first = lane & ~(width - 1);
+  const uint64_t* all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
+  return emulation::from_bits<T>(all[first + (source & (width - 1))]);
+}
+template <class T>
+T __shfl_up_sync(unsigned mask, T value, unsigned delta, int width = 32,
+                 emulation::Place at = emulation::here()) {
+  const int lane = emulation::lane(), first = lane & ~(width - 1), from = lane - int(delta);
+  const uint64_t* all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
+  return from < first ? value : emulation::from_bits<T>(all[from]);
+}
+template <class T>
+T __shfl_down_sync(unsigned mask, T value, unsigned delta, int width = 32,
+                   emulation::Place at = emulation::here()) {
+  const int lane = emulation::lane(), last = lane | (width - 1), from = lane + int(delta);
+  const uint64_t* all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
+  return from > last ? value : emulation::from_bits<T>(all[from]);
+}
+template <class T>
+T __shfl_xor_sync(unsigned mask, T value, int bits, int width = 32,
+                  emulation::Place at = emulation::here()) {
+  const int lane = emulation::lane(), last = lane | (width - 1), from = lane ^ bits;
+  const uint64_t* all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
+  return from > last ? value : emulation::from_bits<T>(all[from]);
+}
+inline unsigned __ballot_sync(unsigned mask, int predicate,
+                              emulation::Place at = emulation::here()) {
+  const uint64_t* all = emulation::warp_exchange(mask, predicate != 0, at);
+  unsigned votes = 0;
+  for (int l = 0; l < 32; l++)
+    if (mask >> l & 1 && all[l]) votes |= 1u << l;
+  return votes;
+}
+inline int __any_sync(unsigned mask, int predicate, emulation::Place at = emulation::here()) {
+  const uint64_t* all = emulation::warp_exchange(mask, predicate != 0, at);
+  for (int l = 0; l < 32; l++)
+    if (mask >> l & 1 && all[l]) return 1;
+  return 0;
+}
+inline int __all_sync(unsigned mask, int predicate, emulation::Place at = emulation::here()) {
+  const uint64_t* all = emulation::warp_exchange(mask, predicate != 0, at);
+  for (int l = 0; l < 32; l++)
+    if (mask >> l & 1 && !all[l]) return 0;
+  return 1;
+}
+template <class T>
+unsigned __match_any_sync(unsigned mask, T value, emulation::Place at = emulation::here()) {
+  const uint64_t own = emulation::to_bits(value);
+  const uint64_t* all = emulation::warp_exchange(mask, own, at);
+  unsigned same = 0;
+  for (int l = 0; l < 32; l++)
+    if (mask >> l & 1 && all[l] == own) same |= 1u << l;
+  return same;
+}
+
+inline void __threadfence() {}
+inline void __threadfence_block() {}
+inline void __nanosleep(unsigned) {}
+
+// Nothing runs at the same time as something else, so a plain change is atomic.
+template <class T>
+T atomicAdd(T* at, std::common_type_t<T> value) {
+  const T before = *at;
+  *at = before + value;
+  return before;
+}
+template <class T>
+T atomicMax(T* at, std::common_type_t<T> value) {
+  const T before = *at;
+  if (value > before) *at = value;
+  return before;
+}
+template <class T>
+T atomicMin(T* at, std::common_type_t<T> value) {
+  const T before = *at;
+  if (value < before) *at = value;
+  return before;
+}
+template <class T>
+T atomicOr(T* at, std::common_type_t<T> value) {
+  const T before = *at;
+  *at = before | value;
+  return before;
+}
+template <class T>
+T atomicExch(T* at, std::common_type_t<T> value) {
+  const T before = *at;
+  *at = value;
+  return before;
+}
+template <class T>
+T atomicCAS(T* at, std::common_type_t<T> expected, std::common_type_t<T> value) {
+  const T before = *at;
+  if (before == expected) *at = value;
+  return before;
+}
+
+template <class T>
+T __ldg(const T* at) {
+  return *at;
+}
+inline int __popc(unsigned x) { return __builtin_popcount(x); }
+inline int __popcll(unsigned long long x) { return __builtin_popcountll(x); }
+inline int __ffs(int x) { return __builtin_ffs(x); }
+inline int __ffsll(long long x) { return __builtin_ffsll(x); }
+inline int __clz(int x) { return x ? __builtin_clz(unsigned(x)) : 32; }
+inline unsigned __float_as_uint(float x) {
+  return emulation::from_bits<unsigned>(emulation::to_bits(x));
+}
+inline float __uint_as_float(unsigned x) { return emulation::from_bits<float>(x); }
+inline int __float_as_int(float x) { return int(__float_as_uint(x)); }
+inline float __int_as_float(int x) { return __uint_as_float(unsigned(x)); }
+inline long long __double_as_longlong(double x) {
+  return emulation::from_bits<long long>(emulation::to_bits(x));
+}
+inline double __longlong_as_double(long long x) {
+  return emulation::from_bits<double>(uint64_t(x));
+}
+inline float __fdividef(float a, float b) { return a / b; }
+inline float __frcp_rn(float a) { return 1.f / a; }
+inline float rsqrtf(float a) { return 1.f / sqrtf(a); }
+
+struct alignas(8) float2 {
+  float x, y;
+};
+struct alignas(16) float4 {
+  float x, y, z, w;
+};
+struct alignas(8) uint2 {
+  unsigned x, y;
+};
+struct alignas(16) uint4 {
+  unsigned x, y, z, w;
+};
+struct alignas(16) double2 {
+  double x, y;
+};
+inline float2 make_float2(float x, float y) { return {x, y}; }
+inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
+inline uint2 make_uint2(unsigned x, unsigned y) { return {x, y}; }
+inline double2 make_double2(double x, double y) { return {x, y}; }
