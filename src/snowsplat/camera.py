@@ -62,6 +62,10 @@ class Camera:
             cy=self.cy * sy,
         )
 
+    def to(self, device: torch.device) -> Camera:
+        """With its pose on a device, where rendering there finds it."""
+        return dataclasses.replace(self, cam_from_world=self.cam_from_world.to(device))
+
     def downscaled(self, factor: int) -> Camera:
         """The camera of the image that `ImageLoader.get` gives at ``downscale=factor``."""
         return self.scaled(max(1, self.width // factor), max(1, self.height // factor))

@@ -119,9 +119,10 @@ def evaluate_views(
     Raises:
         UserError: a photo is absent or damaged.
     """
-    color = torch.tensor(background, dtype=torch.float32)
+    device = gaussians.means.device
+    color = torch.tensor(background, dtype=torch.float32, device=device)
     results = []
-    with ImageLoader(views) as loader:
+    with ImageLoader(views, device=device) as loader:
         loader.prefetch(views)
         for view in views:
             photo = loader.get(view)

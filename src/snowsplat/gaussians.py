@@ -184,10 +184,10 @@ class Gaussians:
         return Gaussians(
             means=means.clone(),
             log_scales=_spacing(means).log()[:, None].repeat(1, 3),
-            quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-            opacity_logits=torch.full((n,), logit),
+            quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            opacity_logits=means.new_full((n,), logit),
             sh_dc=sh_dc[:, None, :].contiguous(),
-            sh_rest=torch.zeros(n, SH_REST_COUNTS[sh_degree], 3),
+            sh_rest=means.new_zeros(n, SH_REST_COUNTS[sh_degree], 3),
         )
 
     @staticmethod
@@ -215,7 +215,7 @@ def _spacing(points: Tensor) -> Tensor:
     """(N,) mean distance of each point to its 3 nearest others (fewer where there are fewer)."""
     k = min(3, points.shape[0] - 1)
     if k == 0:
-        return torch.ones(1)
+        return points.new_ones(1)
     spacing = ops.neighbours(points, k=k).mean(dim=1)
     # Points that coincide would start as Gaussians of no size, whose logarithm is -inf. The floor
     # is relative to the cloud, so that the unit of length of the capture does not matter.

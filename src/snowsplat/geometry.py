@@ -228,7 +228,7 @@ def morton_order(points: Tensor) -> Tensor:
     Gaussians). Equal codes keep their order: the result is a function of the points alone.
     """
     if len(points) == 0:
-        return torch.empty(0, dtype=torch.int64)
+        return torch.empty(0, dtype=torch.int64, device=points.device)
     low = points.amin(dim=0).double()
     size = (points.amax(dim=0).double() - low).max().clamp_min(torch.finfo(torch.float64).tiny)
     cells = ((points.double() - low) / size * (2**MORTON_BITS - 1)).long()

@@ -88,12 +88,18 @@ class Adam:
         return self.rates.at(step, self.schedule, self.extent)
 
     def step(
-        self, gaussians: Gaussians, splats: Splats2D, camera: Camera, sh_degree: int, step: int
+        self,
+        gaussians: Gaussians,
+        splats: Splats2D,
+        camera: Camera,
+        sh_degree: int,
+        step: int,
+        valid: Tensor | None = None,
     ) -> None:
         """Update ``gaussians`` in place from ``splats.packed.grad``; ``step`` counts from 1.
 
         A ``.grad`` on a parameter (of a regulariser) is added to its gradient, and cleared
-        afterwards.
+        afterwards. ``valid``: as of `ops.adam_step`.
         """
         parameters = gaussians.parameters()
         assert splats.ids is not None
@@ -115,6 +121,7 @@ class Adam:
             lr=self.rates_at(step),
             step=step,
             visible_only=self.visible_only,
+            valid=valid,
         )
         for parameter in parameters.values():
             parameter.grad = None
@@ -143,6 +150,6 @@ class Adam:
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Take over (copy) what `state_tensors` gave."""
-        for name in self.exp_avg:
-            self.exp_avg[name] = tensors[f"exp_avg.{name}"].clone()
-            self.exp_avg_sq[name] = tensors[f"exp_avg_sq.{name}"].clone()
+        for name, average in self.exp_avg.items():
+            for moments, key in ((self.exp_avg, "exp_avg"), (self.exp_avg_sq, "exp_avg_sq")):
+                moments[name] = tensors[f"{key}.{name}"].to(average.device, copy=True)

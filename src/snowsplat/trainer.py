@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from snowsplat.evaluate import Evaluation, evaluate_views
 from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import morton_order
 from snowsplat.losses import view_loss
+from snowsplat.ops.readback import Readback
 from snowsplat.optim import Adam
 from snowsplat.process import interrupts_between_steps, single_threaded
 from snowsplat.render import project
@@ -55,9 +57,14 @@ class Trainer:
     """
 
     def __init__(
-        self, capture: Capture, config: TrainConfig, schedule: Schedule | None = None
+        self,
+        capture: Capture,
+        config: TrainConfig,
+        schedule: Schedule | None = None,
+        device: torch.device | None = None,
     ) -> None:
         """``schedule``: of a training that goes on and was stretched, or ``config.iterations``.
+        ``device``: to train on; default: the CPU.
 
         Raises:
             UserError: a capture without training views.
@@ -76,9 +83,14 @@ class Trainer:
         }
         self._order: list[int] = []  # the views to come
         fixed = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}.get(config.background)
-        self._background = None if fixed is None else torch.tensor(fixed)
+        self.device = device or torch.device("cpu")
+        self._cameras = [view.camera.to(self.device) for view in capture.train]
+        self._background = None if fixed is None else torch.tensor(fixed, device=self.device)
         self._images = ImageLoader(
-            capture.train, background=fixed, budget_bytes=config.image_memory or None
+            capture.train,
+            background=fixed,
+            budget_bytes=config.image_memory or None,
+            device=self.device,
         )
         with single_threaded():
             self.gaussians = self._start()
@@ -95,7 +107,12 @@ class Trainer:
             extent=capture.extent,
             random_start=capture.points is None,
             generator=self._generators["density"],
+            device=self.device,
         )
+        # The CPU makes the room that it needs; a GPU is told how much there is: a guess at first.
+        enough = sys.maxsize if self.device.type == "cpu" else 4 * len(self.gaussians)
+        self._room = ops.Room(enough, torch.zeros(1, dtype=torch.int64, device=self.device))
+        self._readback = Readback(2, self.device)
 
     def _start(self) -> Gaussians:
         """One Gaussian a point: those of the capture, or random ones; no more than the cap."""
@@ -111,7 +128,9 @@ class Trainer:
             if len(points) > cap:
                 chosen = torch.randperm(len(points), generator=generator)[: int(cap)]
                 points = Points(points.xyz[chosen], points.rgb[chosen])
+            points = points.to(self.device)
             gaussians = Gaussians.from_points(points, config.sh_degree, config.initial_opacity)
+        gaussians = gaussians.to(self.device)
         gaussians.log_scales += math.log(config.initial_scale)
         return gaussians.select(morton_order(gaussians.means))
 
@@ -154,24 +173,43 @@ class Trainer:
             background = self._background
             if background is None:
                 background = torch.rand(3, generator=self._generators["background"])
-            sh_degree = self.config.sh_degree_at(step)
-
-            splats = project(self.gaussians, camera, sh_degree)
-            with torch.enable_grad():  # of the splats; the optimiser carries it on to the Gaussians
-                splats.packed.requires_grad_()
-                image, _, _ = ops.rasterize(splats, camera.width, camera.height, background)
-                loss = view_loss(image, photo, background, self.config.ssim_weight)
-                loss.backward()
-            value = float(loss.detach())
-            if not math.isfinite(value):
+                background = background.to(self.device, non_blocking=True)
+            while True:
+                self._queue_step(step, camera, photo, background)
+                # All of the step is queued by now: a GPU works on it while this waits for the loss.
+                loss, needed = self._readback.wait()
+                enough = needed <= self._room.instances
+                if needed > 0.9 * self._room.instances:
+                    self._room = replace(self._room, instances=int(1.3 * needed))
+                if enough:
+                    break
+            if not math.isfinite(loss):
                 raise UserError(
-                    f"the loss is {value} at step {step}: training has diverged; "
+                    f"the loss is {loss} at step {step}: training has diverged; "
                     "lower the learning rates, or go on from an earlier checkpoint"
                 )
-            self._density.after_backward(step, self.gaussians, splats, camera.width, camera.height)
-            self._optimizer.step(self.gaussians, splats, camera, sh_degree, step)
             self.step = step
-            return value
+            return loss
+
+    def _queue_step(
+        self, step: int, camera: Camera, photo: LoadedImage, background: Tensor
+    ) -> None:
+        """One iteration, from the splats to the new parameters; nothing here waits for a GPU.
+
+        Nothing changes where the loss is not finite, or the room was too small: `_readback` tells.
+        """
+        sh_degree = self.config.sh_degree_at(step)
+        splats = project(self.gaussians, camera, sh_degree)
+        size = camera.width, camera.height
+        with torch.enable_grad():  # of the splats; the optimiser carries it on to the Gaussians
+            splats.packed.requires_grad_()
+            image, _, _ = ops.rasterize(splats, *size, background, room=self._room)
+            loss = view_loss(image, photo, background, self.config.ssim_weight)
+            self._readback.post(loss, self._room.needed)
+            valid = loss.detach().isfinite() & (self._room.needed <= self._room.instances)
+            loss.backward()
+        self._density.after_backward(step, self.gaussians, splats, *size, valid)
+        self._optimizer.step(self.gaussians, splats, camera, sh_degree, step, valid)
 
     def evaluate(self) -> Evaluation:
         """Figures of the test views as the scene is now; a random background counts as black."""
@@ -189,8 +227,9 @@ class Trainer:
             self._prefetch(downscale)
         elif downscale != self._downscale(step - 1):
             self._prefetch(downscale)
-        view = self.capture.train[self._order.pop(0)]
-        return view.camera.downscaled(downscale), self._images.get(view, downscale)
+        view = self._order.pop(0)
+        photo = self._images.get(self.capture.train[view], downscale)
+        return self._cameras[view].downscaled(downscale), photo
 
     def _downscale(self, step: int) -> int:
         return self.config.downscale_at(step, self.schedule)
@@ -229,7 +268,7 @@ class Trainer:
         for name, tensor in tensors.items():
             part, _, key = name.partition(".")
             parts.setdefault(part, {})[key] = tensor
-        self.gaussians = Gaussians(**parts["gaussians"]).clone()
+        self.gaussians = Gaussians(**parts["gaussians"]).clone().to(self.device)
         self._optimizer.load_state(parts["optimizer"])
         self._density.load_state(parts.get("density", {}))
         for name, random in self._generators.items():

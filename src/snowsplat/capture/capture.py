@@ -24,6 +24,10 @@ class Points:
     def __len__(self) -> int:
         return self.xyz.shape[0]
 
+    def to(self, device: torch.device) -> Points:
+        """On another device; no copy where they are there already."""
+        return Points(self.xyz.to(device), self.rgb.to(device))
+
 
 @dataclass(frozen=True, eq=False)
 class View:

@@ -62,6 +62,11 @@ class LoadedImage:
             planes = planes[:3] + (1.0 - planes[3]) * background.to(torch.float32)[:, None, None]
         return planes.permute(1, 2, 0)
 
+    def to(self, device: torch.device) -> LoadedImage:
+        """On another device; no copy where it is there already."""
+        mask = None if self.mask is None else self.mask.to(device)
+        return LoadedImage(self.planes.to(device), mask)
+
     @property
     def nbytes(self) -> int:
         return self.planes.nbytes + (0 if self.mask is None else self.mask.nbytes)

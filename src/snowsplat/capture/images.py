@@ -14,6 +14,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
+import torch
+
 from snowsplat.capture.capture import View
 from snowsplat.capture.decode import ImageSource, LoadedImage, box_downscale, load_image, load_mask
 
@@ -33,6 +35,7 @@ class ImageLoader:
         level: the downscale (1, 2 or 4) that is meant where a call names none.
         background: colour in 0..1 to compose transparent images over; None keeps their alpha.
         budget_bytes: memory for decoded images; None takes half of what is available now.
+        device: where they are kept, and what `get` gives them on.
         threads: that decode ahead; None takes up to four.
     """
 
@@ -43,11 +46,15 @@ class ImageLoader:
         level: int = 1,
         background: Sequence[float] | None = None,
         budget_bytes: int | None = None,
+        device: torch.device | None = None,
         threads: int | None = None,
     ) -> None:
         self.views = list(views)
         self.level = level
-        self.budget_bytes = available_memory() // 2 if budget_bytes is None else budget_bytes
+        self._device = device or torch.device("cpu")
+        if budget_bytes is None:
+            budget_bytes = available_memory(self._device) // 2
+        self.budget_bytes = budget_bytes
         self._background = None if background is None else tuple(float(c) for c in background)
         self._threads = threads or min(4, os.cpu_count() or 1)
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="snowsplat-images")
@@ -125,10 +132,10 @@ class ImageLoader:
         source, mask, factor = key
         with self._lock:
             image = self._cache.get((source, mask, 1))
-        if image is None:
+        if image is None or image.planes.device.type != "cpu":
             planes = load_image(source, self._background)
             image = LoadedImage(planes, None if mask is None else load_mask(mask))
-        return box_downscale(image, factor)
+        return box_downscale(image, factor).to(self._device)
 
     def _keep(self, key: _Key, image: LoadedImage) -> None:
         if key not in self._cache:
@@ -175,8 +182,13 @@ def _estimated_bytes(key: _Key) -> int:
     return planes * (source.width // factor) * (source.height // factor)
 
 
-def available_memory() -> int:
-    """Bytes that this process may still take without swapping; the container's limit counts."""
+def available_memory(device: torch.device | None = None) -> int:
+    """Bytes that this process may still take: of a GPU, or (default) of the computer.
+
+    There without swapping; the container's limit counts.
+    """
+    if device is not None and device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
     available = 4 << 30  # where nothing tells
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()

@@ -158,7 +158,8 @@ class Render(SceneFlags):
         from snowsplat.files import write_json
         from snowsplat.render import render
 
-        color = torch.tensor(background)
+        device = gaussians.means.device
+        color = torch.tensor(background, device=device)
         with_depth = self.depth != "none"
 
         def depth_of(view: View) -> np.ndarray:
@@ -169,7 +170,7 @@ class Render(SceneFlags):
         for name in ("renders", "gt", *(["depth"] if with_depth else [])):
             (target / name).mkdir(parents=True, exist_ok=True)
         steps: dict[str, float] = {}
-        with PngQueue() as queue, ImageLoader(views) as loader, torch.no_grad():
+        with PngQueue() as queue, ImageLoader(views, device=device) as loader, torch.no_grad():
             loader.prefetch(views)
             if self.depth == "color":  # one range for all pictures, from some of them
                 some = views[:: -(-len(views) // 8)]

@@ -27,12 +27,19 @@ class DensityControl(Protocol):
     """The state of a density control: statistics in the rows' order, and two hooks."""
 
     def after_backward(
-        self, step: int, gaussians: Gaussians, splats: Splats2D, width: int, height: int
+        self,
+        step: int,
+        gaussians: Gaussians,
+        splats: Splats2D,
+        width: int,
+        height: int,
+        valid: Tensor | None = None,
     ) -> None:
         """Before the optimiser: gather statistics of ``splats.packed.grad``, or add regularisers.
 
         ``width`` and ``height`` (pixels) are those of this step's image, coarse or fine. The
-        gradient of a regulariser goes to ``.grad`` of the parameters.
+        gradient of a regulariser goes to ``.grad`` of the parameters. ``valid``: as of
+        `ops.adam_step`, (1,) bool on the device; where it is False the step will not count.
         """
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
@@ -84,9 +91,11 @@ class DensityConfig(Protocol):
         extent: float,
         random_start: bool,
         generator: torch.Generator,
+        device: torch.device | None = None,
     ) -> DensityControl:
         """Fresh state for ``count`` Gaussians in a scene of ``extent`` world units.
 
-        ``random_start``: they are random points, not those of a capture.
+        ``random_start``: they are random points, not those of a capture. ``generator``: of the CPU.
+        ``device``: where the Gaussians are; default: the CPU.
         """
         ...

@@ -75,6 +75,7 @@ class AdaptiveDensity:
         extent: float,
         random_start: bool,
         generator: torch.Generator,
+        device: torch.device | None = None,
     ) -> AdaptiveDensityControl:
         """Fresh state for ``count`` Gaussians in a scene of ``extent`` world units."""
         return AdaptiveDensityControl(
@@ -83,9 +84,9 @@ class AdaptiveDensity:
             first_reset=self.reset_random_start and random_start,
             extent=extent,
             generator=generator,
-            grad_sum=torch.zeros(count),
-            views=torch.zeros(count),
-            max_radii=torch.zeros(count),
+            grad_sum=torch.zeros(count, device=device),
+            views=torch.zeros(count, device=device),
+            max_radii=torch.zeros(count, device=device),
         )
 
 
@@ -120,13 +121,21 @@ class AdaptiveDensityControl:
         return min(self.schedule.step_of(self.knobs.densify_until), self.schedule.iterations)
 
     def after_backward(
-        self, step: int, gaussians: Gaussians, splats: Splats2D, width: int, height: int
+        self,
+        step: int,
+        gaussians: Gaussians,
+        splats: Splats2D,
+        width: int,
+        height: int,
+        valid: Tensor | None = None,
     ) -> None:
         """Accumulate the statistics of the Gaussians that this view sees."""
         if step > self.last:
             return
         radii = self.max_radii if self.knobs.prune_screen_size > 0 else None
-        ops.accumulate_screen_statistics(splats, width, height, self.grad_sum, self.views, radii)
+        ops.accumulate_screen_statistics(
+            splats, width, height, self.grad_sum, self.views, radii, valid
+        )
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         """Densify, prune and reset where this step is one that does."""
@@ -167,16 +176,16 @@ class AdaptiveDensityControl:
         )
 
         index = torch.cat([kept, clones, parents, parents])
-        fresh = torch.arange(len(index)) >= len(kept)
-        child = torch.arange(len(index)) >= len(kept) + len(clones)
+        row = torch.arange(len(index), device=index.device)
+        fresh, child = row >= len(kept), row >= len(kept) + len(clones)
         means = gaussians.means[index]
         means[child] += self._offsets(gaussians, index[child])
 
         order = morton_order(means)
         index, fresh, child = index[order], fresh[order], child[order]
         optimizer.select(index, fresh)
-        for name in self.state_tensors():
-            setattr(self, name, torch.zeros(len(index)))
+        for name, tensor in self.state_tensors().items():
+            setattr(self, name, tensor.new_zeros(len(index)))
         refined = gaussians.select(index)
         refined.means = means[order]
         refined.log_scales[child] -= math.log(SPLIT_SHRINK)
@@ -195,7 +204,7 @@ class AdaptiveDensityControl:
     def _offsets(self, gaussians: Gaussians, parents: Tensor) -> Tensor:
         """(M, 3) draws from N(0, Σ) of the Gaussians ``parents`` (M,): R S ε, in world units."""
         scales = gaussians.log_scales[parents].exp()
-        offsets = scales * torch.randn(scales.shape, generator=self.generator)
+        offsets = scales * torch.randn(scales.shape, generator=self.generator).to(scales)
         return (rotation_from_quat(gaussians.quats[parents]) @ offsets[:, :, None])[:, :, 0]
 
     def state_tensors(self) -> dict[str, Tensor]:
@@ -204,5 +213,5 @@ class AdaptiveDensityControl:
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Take over (copy) what `state_tensors` gave."""
-        for name in self.state_tensors():
-            setattr(self, name, tensors[name].clone())
+        for name, tensor in self.state_tensors().items():
+            setattr(self, name, tensors[name].to(tensor.device, copy=True))

@@ -65,6 +65,7 @@ class McmcDensity:
         extent: float,
         random_start: bool,
         generator: torch.Generator,
+        device: torch.device | None = None,
     ) -> McmcDensityControl:
         """Fresh state, which depends on ``schedule`` and ``generator`` alone."""
         if self.max_gaussians <= 0:
@@ -93,7 +94,13 @@ class McmcDensityControl:
         return min(self.schedule.step_of(self.knobs.densify_until), self.schedule.iterations)
 
     def after_backward(
-        self, step: int, gaussians: Gaussians, splats: Splats2D, width: int, height: int
+        self,
+        step: int,
+        gaussians: Gaussians,
+        splats: Splats2D,
+        width: int,
+        height: int,
+        valid: Tensor | None = None,
     ) -> None:
         """Add the gradients of λ_o · mean(opacity) and λ_Σ · mean(scale), section 3.4."""
         opacities, scales = gaussians.opacities, gaussians.scales
@@ -111,8 +118,14 @@ class McmcDensityControl:
     def _add_noise(self, gaussians: Gaussians, rate: float) -> None:
         """μ += rate · noise · σ(−k (o − t)) · Σ η, η ~ N(0, I), t the opacity of death (eq. 8)."""
         gate = torch.sigmoid(NOISE_SHARPNESS * (self.knobs.prune_opacity - gaussians.opacities))
-        rows = torch.nonzero(gate > NOISE_NEGLIGIBLE)[:, 0]
-        eta = torch.randn(len(rows), 3, 1, generator=self.generator)
+        if gate.device.type == "cpu":
+            rows: Tensor | slice = torch.nonzero(gate > NOISE_NEGLIGIBLE)[:, 0]
+            eta = torch.randn(len(gate[rows]), 3, 1, generator=self.generator)
+        else:  # noise is cheap there, and to count rows is to wait
+            rows = slice(None)
+            there = torch.Generator(gate.device)
+            there.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
+            eta = torch.randn(len(gate), 3, 1, generator=there, device=gate.device)
         rotations = rotation_from_quat(gaussians.quats[rows])
         variances = (2.0 * gaussians.log_scales[rows]).exp()[:, :, None]
         noise = (rotations @ (variances * (rotations.mT @ eta)))[:, :, 0]

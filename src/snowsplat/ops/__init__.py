@@ -9,10 +9,12 @@ from snowsplat.ops.neighbours import neighbours
 from snowsplat.ops.photometric import photometric_loss, ssim
 from snowsplat.ops.project import project
 from snowsplat.ops.rasterize import count_blended, rasterize
+from snowsplat.ops.room import Room
 from snowsplat.ops.splats import Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
 
 __all__ = [
+    "Room",
     "Splats2D",
     "accumulate_screen_statistics",
     "adam_step",

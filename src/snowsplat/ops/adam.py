@@ -88,7 +88,8 @@ def adam_step(
         check_tensor("adam_step", f"exp_avg_sq[{name!r}]", v, shape, value)
         extra = None if value.grad is None else value.grad.contiguous()
         per_parameter += [value.detach(), m, v, extra, float(lr[name])]
-    camera = camera_args("adam_step", cam_from_world.to(means.dtype), width, height, fx, fy, cx, cy)
+    pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
+    camera = camera_args("adam_step", pose, width, height, fx, fy, cx, cy)
     launch(
         variant("adam_step", means),
         len(means),

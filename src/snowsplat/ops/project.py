@@ -46,7 +46,7 @@ def project(
 
     Raises ValueError where shapes, dtypes or devices do not fit.
     """
-    pose = cam_from_world.to(means.dtype)
+    pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
     camera = camera_args("project", pose, width, height, fx, fy, cx, cy, near)
     check_parameters("project", means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_degree)
     parameters = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
+from snowsplat.ops.room import Room
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
 
 TILE = 16
@@ -52,20 +52,6 @@ def rasterize(
     planes, alpha = _Rasterize.apply(packed, background, width, height, channels, with_depth, room)
     depth = planes[channels] if with_depth else None
     return planes[:channels].permute(1, 2, 0), alpha, depth
-
-
-@dataclass
-class Room:
-    """Room for the instances of a frame: the pairs of a splat and a tile that it touches.
-
-    Blending has to know their number, and the CPU would have to wait for a GPU to count them. With
-    a Room it sets memory aside for `instances` of them and goes on; the GPU writes what it needed
-    into `needed`, (1,) int64. Where that is more, image and gradients are those of a part of the
-    splats: the frame has to be made again with more room. On the CPU there is always enough.
-    """
-
-    instances: int
-    needed: Tensor
 
 
 @torch.no_grad()

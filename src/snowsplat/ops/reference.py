@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from snowsplat.ops.room import Room
 from snowsplat.ops.splats import Splats2D
 
 LOW_PASS = 0.3  # pixels²: every splat is blurred by it, so that none slips between pixel centres
@@ -222,12 +223,14 @@ def rasterize(
     background: Tensor | None = None,
     *,
     with_depth: bool = False,
+    room: Room | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
 
     Returns image (H, W, C) of planar storage, alpha (H, W) and depth (H, W) or None. With T the
     light that the splats in front let through, image = Σ T α c + T_end · background,
     alpha = 1 − T_end, depth = Σ T α z (not divided by alpha). Conics must be positive definite.
+    There is always room.
     """
     order = torch.argsort(splats.depths.detach(), stable=True)
     splats = Splats2D(splats.packed[order], None, splats.channels)
@@ -377,11 +380,15 @@ def accumulate_screen_statistics(
     norm_sum: Tensor,
     views: Tensor,
     max_radii: Tensor | None = None,
+    valid: Tensor | None = None,
 ) -> None:
     """Adds one view to what density control (section 5.2) knows of the Gaussians that it sees.
 
     The gradient of the position (M, 2) is stated for a screen that spans [-1, 1] in x and y.
+    Nothing is added where `valid` (1,) is False.
     """
+    if valid is not None and not valid:
+        return
     assert splats.ids is not None
     assert splats.packed.grad is not None
     rows, grad = splats.ids.long(), splats.packed.grad
@@ -415,6 +422,7 @@ def adam_step(
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-15,
     visible_only: bool = False,
+    valid: Tensor | None = None,
 ) -> None:
     """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
 
@@ -425,11 +433,14 @@ def adam_step(
     lr: a rate for each name. step: counts from 1.
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
+    valid: (1,) bool; where it is False nothing changes.
 
     Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
     p −= lr · m̂ / √(v̂ + eps²), where the paper has √v̂ + eps. The two agree for v̂ ≫ eps² and at
     m̂ = v̂ = 0, and this one is a single reciprocal square root.
     """
+    if valid is not None and not valid:
+        return
     rows = ids.long()
     with torch.enable_grad():
         selected = [params[name].detach()[rows].requires_grad_() for name in PARAMETERS]

@@ -44,7 +44,7 @@ def compared(
     Raises:
         UserError: a photo is absent or damaged.
     """
-    color = torch.tensor(background)
+    color = torch.tensor(background, device=gaussians.means.device)
     order = sorted(evaluation.views, key=lambda figures: figures.psnr)
     if len(order) <= _WORST + _BEST:
         groups = [("Photo, render, error", order)]
@@ -55,7 +55,7 @@ def compared(
         ]
     by_name = {view.name: view for view in views}
     parts = []
-    with ImageLoader(views) as loader:
+    with ImageLoader(views, device=gaussians.means.device) as loader:
         for title, chosen in groups:
             figures = "\n".join(
                 _triple(gaussians, color, by_name[one.name], one, loader)
