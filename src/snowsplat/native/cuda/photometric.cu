@@ -1,0 +1,266 @@
+// photometric: L1 and SSIM between two images, and the gradient of their weighted sum.
+//
+// Images are planar, (channels, H, W). A block does a tile of one channel, 32 columns wide: it loads
+// the tile with a margin of 5, filters the rows into shared memory, then the columns from there. The
+// Gaussian window is separable and symmetric, and sees zeros outside of the image, so the same two
+// passes, over the maps of derivatives, are its adjoint.
+//
+//   photometric_similarity   SSIM a pixel; sums a block; the three derivatives of SSIM, as maps
+//   photometric_gradient     the filtered maps make the gradient, L1 is added
+//   photometric_means        adds the sums of the blocks, in order: the same bits in every run
+//
+// The maps go through memory. To do without them, a tile would be recomputed with a margin of 10:
+// 1.4 times the arithmetic, which is what bounds these kernels, and more shared memory than a block
+// may have without asking (48 kB). Instead photometric.py takes few channels at a time where images
+// are large (a channel of 1920×1080: 25 MB), and the caches of larger GPUs hold most of the maps.
+#include "cuda/device.h"
+#include "ssim.h"
+
+namespace snow {
+namespace {
+
+constexpr int kThreads = 192, kWarps = kThreads / kWarp;
+constexpr int kTaps = 2 * kSsimRadius + 1;
+
+constexpr int kColumns = kWarp;                           // of a tile: a lane a column
+constexpr int kWideColumns = kColumns + 2 * kSsimRadius;  // with its margins
+// Odd, so that the lanes of a warp, in 8 rows × every 8th column, use different banks.
+constexpr int kWidePitch = kWideColumns + 1, kPitch = kColumns + 1;
+constexpr int kRun = 8;  // neighbouring pixels of a row that a thread filters together
+constexpr int kRuns = kColumns / kRun;
+
+// Rows of a tile: in float as many as leave room for two blocks on the smallest of the GPUs, in
+// double as many as fit. photometric.py knows them too.
+template <class T>
+struct Tile {
+  static constexpr int kOwnRows = sizeof(T) == 4 ? 4 : 2;  // of a thread, in the second pass
+  static constexpr int kRows = kWarps * kOwnRows;
+  static constexpr int kWideRows = kRows + 2 * kSsimRadius;
+  static constexpr int kWideCount = kWideRows * kWidePitch, kCount = kWideRows * kPitch;
+
+  int channel, x, y;  // of its first pixel
+  SNOW_INLINE Tile(int width, int height) {
+    const int across = (width + kColumns - 1) / kColumns, down = (height + kRows - 1) / kRows;
+    const int row = int(blockIdx.x) / across;
+    channel = row / down;
+    x = (int(blockIdx.x) - row * across) * kColumns, y = (row - channel * down) * kRows;
+  }
+};
+
+// exp(−x²/(2·1.5²)) / Σ for x = k − 5. Everything that calls it is unrolled: a constant.
+SNOW_INLINE double window_tap(int k) {
+  const int x = k < kSsimRadius ? kSsimRadius - k : k - kSsimRadius;
+  return x == 0   ? 0.26601172486179436
+         : x == 1 ? 0.2130055377112537
+         : x == 2 ? 0.10936068950970002
+         : x == 3 ? 0.03600077212843083
+         : x == 4 ? 0.007598758135239185
+                  : 0.00102838008447911;
+}
+
+template <class T>
+SNOW_INLINE T pixel(const T* p, int64_t at) {
+  return p[at];
+}
+template <class T>
+SNOW_INLINE T pixel(const uint8_t* p, int64_t at) {
+  return T(p[at]) * T(1.0 / 255.0);
+}
+
+// Calls load(place in a wide tile, pixel in the plane or −1) for every pixel of the wide tile.
+template <class T, class Load>
+SNOW_INLINE void load_tile(const Tile<T>& tile, int width, int height, Load load) {
+  constexpr int kPixels = Tile<T>::kWideRows * kWideColumns;
+#pragma unroll
+  for (int i = 0; i < (kPixels + kThreads - 1) / kThreads; i++) {
+    const int at = i * kThreads + int(threadIdx.x);
+    if (at >= kPixels) break;
+    const int row = at / kWideColumns, column = at - row * kWideColumns;
+    const int x = tile.x + column - kSsimRadius, y = tile.y + row - kSsimRadius;
+    const bool inside = x >= 0 && x < width && y >= 0 && y < height;
+    load(row * kWidePitch + column, inside ? int64_t(y) * width + x : int64_t(-1));
+  }
+}
+
+// Filters the rows of a wide tile: from what values(place in it, kMaps values) gives to `rows`.
+template <int kMaps, class T, class Values>
+SNOW_INLINE void filter_rows(T* rows, Values values) {
+  for (int run = int(threadIdx.x); run < Tile<T>::kWideRows * kRuns; run += kThreads) {
+    const int row = run / kRuns, x = run % kRuns * kRun;
+    T sums[kMaps][kRun] = {};
+#pragma unroll
+    for (int j = 0; j < kRun + 2 * kSsimRadius; j++) {
+      T value[kMaps];
+      values(row * kWidePitch + x + j, value);
+#pragma unroll
+      for (int i = 0; i < kRun; i++) {
+        const int k = j - i;
+        if (k < 0 || k >= kTaps) continue;
+#pragma unroll
+        for (int m = 0; m < kMaps; m++) sums[m][i] += T(window_tap(k)) * value[m];
+      }
+    }
+#pragma unroll
+    for (int m = 0; m < kMaps; m++)
+#pragma unroll
+      for (int i = 0; i < kRun; i++) rows[m * Tile<T>::kCount + row * kPitch + x + i] = sums[m][i];
+  }
+}
+
+// Filters a column of those: the pixels of this thread, from row `first` of the tile on.
+template <int kMaps, class T>
+SNOW_INLINE void filter_column(const T* rows, int first, T (&sums)[kMaps][Tile<T>::kOwnRows]) {
+#pragma unroll
+  for (int m = 0; m < kMaps; m++) {
+#pragma unroll
+    for (int i = 0; i < Tile<T>::kOwnRows; i++) sums[m][i] = T(0);
+#pragma unroll
+    for (int j = 0; j < Tile<T>::kOwnRows + 2 * kSsimRadius; j++) {
+      const T value = rows[m * Tile<T>::kCount + (first + j) * kPitch + lane_id()];
+#pragma unroll
+      for (int i = 0; i < Tile<T>::kOwnRows; i++)
+        if (j - i >= 0 && j - i < kTaps) sums[m][i] += T(window_tap(j - i)) * value;
+    }
+  }
+}
+
+// Over the lanes of a warp; all have it.
+template <class T>
+SNOW_INLINE T warp_sum(T value) {
+#pragma unroll
+  for (int bits = kWarp / 2; bits > 0; bits /= 2) value += __shfl_xor_sync(kAllLanes, value, bits);
+  return value;
+}
+
+// maps: (channels, 3, H, W), the derivatives by the mean of a, of a² + b² and of ab; may be null.
+// sums: (blocks, 2), of |a − b| and of SSIM.
+template <class T, class Target>
+SNOW_INLINE void similarity(int width, int height, const T* image, const Target* target, T* maps,
+                            double* sums) {
+  SNOW_SHARED(T, a, Tile<T>::kWideCount);
+  SNOW_SHARED(T, b, Tile<T>::kWideCount);
+  SNOW_SHARED(T, rows, 4 * Tile<T>::kCount);
+  SNOW_SHARED(T, warp_sums, 2 * kWarps);
+  const Tile<T> tile(width, height);
+  const int64_t plane = int64_t(width) * height;
+  image += tile.channel * plane, target += tile.channel * plane;
+
+  load_tile(tile, width, height, [&](int place, int64_t at) {
+    a[place] = at >= 0 ? pixel<T>(image, at) : T(0);
+    b[place] = at >= 0 ? pixel<T>(target, at) : T(0);
+  });
+  __syncthreads();
+  filter_rows<4>(rows, [&](int place, T(&value)[4]) {
+    const T p = a[place], q = b[place];
+    value[0] = p, value[1] = q, value[2] = p * p + q * q, value[3] = p * q;
+  });
+  __syncthreads();
+
+  const int first = warp_id() * Tile<T>::kOwnRows;
+  const int x = tile.x + lane_id();
+  T means[4][Tile<T>::kOwnRows];
+  filter_column<4>(rows, first, means);
+  T differences = T(0), similarities = T(0);
+#pragma unroll
+  for (int i = 0; i < Tile<T>::kOwnRows; i++) {
+    const int y = tile.y + first + i;
+    if (x >= width || y >= height) continue;
+    const int place = (first + i + kSsimRadius) * kWidePitch + lane_id() + kSsimRadius;
+    const T difference = a[place] - b[place];
+    SsimDerivatives<T> d;
+    similarities += ssim_pixel(means[0][i], means[1][i], means[2][i], means[3][i], d);
+    differences += max(difference, -difference);
+    if (maps) {
+      T* const map = maps + 3 * tile.channel * plane + int64_t(y) * width + x;
+      map[0] = d.mean_a, map[plane] = d.mean_aa, map[2 * plane] = d.mean_ab;
+    }
+  }
+  differences = warp_sum(differences), similarities = warp_sum(similarities);
+  if (lane_id() == 0)
+    warp_sums[warp_id()] = differences, warp_sums[kWarps + warp_id()] = similarities;
+  __syncthreads();
+  if (threadIdx.x < 2) {
+    double sum = 0;
+    for (int w = 0; w < kWarps; w++) sum += double(warp_sums[int(threadIdx.x) * kWarps + w]);
+    sums[2 * int64_t(blockIdx.x) + threadIdx.x] = sum;
+  }
+}
+
+// The weights are already divided by the number of values.
+template <class T, class Target>
+SNOW_INLINE void gradient(int width, int height, const T* image, const Target* target,
+                          const T* maps, T l1_weight, T ssim_weight, T* grad) {
+  SNOW_SHARED(T, derivatives, 3 * Tile<T>::kWideCount);
+  SNOW_SHARED(T, rows, 3 * Tile<T>::kCount);
+  const Tile<T> tile(width, height);
+  const int64_t plane = int64_t(width) * height;
+  image += tile.channel * plane, target += tile.channel * plane, grad += tile.channel * plane;
+  maps += 3 * tile.channel * plane;
+
+  // Windows are centred on pixels of the image only: outside of it the derivatives are 0.
+  load_tile(tile, width, height, [&](int place, int64_t at) {
+#pragma unroll
+    for (int m = 0; m < 3; m++)
+      derivatives[m * Tile<T>::kWideCount + place] = at >= 0 ? maps[m * plane + at] : T(0);
+  });
+  __syncthreads();
+  filter_rows<3>(rows, [&](int place, T(&value)[3]) {
+#pragma unroll
+    for (int m = 0; m < 3; m++) value[m] = derivatives[m * Tile<T>::kWideCount + place];
+  });
+  __syncthreads();
+
+  const int first = warp_id() * Tile<T>::kOwnRows;
+  const int x = tile.x + lane_id();
+  T filtered[3][Tile<T>::kOwnRows];
+  filter_column<3>(rows, first, filtered);
+#pragma unroll
+  for (int i = 0; i < Tile<T>::kOwnRows; i++) {
+    const int y = tile.y + first + i;
+    if (x >= width || y >= height) continue;
+    const int64_t at = int64_t(y) * width + x;
+    const T p = pixel<T>(image, at), q = pixel<T>(target, at);
+    const T sign = p > q ? l1_weight : q > p ? -l1_weight : T(0);
+    grad[at] =
+        sign + ssim_weight * (filtered[0][i] + T(2) * p * filtered[1][i] + q * filtered[2][i]);
+  }
+}
+
+}  // namespace
+}  // namespace snow
+
+#define SNOW_PHOTOMETRIC_KERNELS(SUFFIX, T, TARGET)                                               \
+  SNOW_KERNEL(                                                                                    \
+      photometric_similarity##SUFFIX, 192,                                                        \
+      (int64_t, int64_t width, int64_t height, const T* __restrict__ image,                       \
+       const TARGET* __restrict__ target, T* __restrict__ maps, double* __restrict__ sums)) {     \
+    snow::similarity<T>(int(width), int(height), image, target, maps, sums);                      \
+  }                                                                                               \
+  SNOW_KERNEL(photometric_gradient##SUFFIX, 192,                                                  \
+              (int64_t, int64_t width, int64_t height, const T* __restrict__ image,               \
+               const TARGET* __restrict__ target, const T* __restrict__ maps, double l1_weight,   \
+               double ssim_weight, T* __restrict__ grad)) {                                       \
+    snow::gradient<T>(int(width), int(height), image, target, maps, T(l1_weight), T(ssim_weight), \
+                      grad);                                                                      \
+  }
+
+SNOW_PHOTOMETRIC_KERNELS(, float, float)
+SNOW_PHOTOMETRIC_KERNELS(_u8, float, uint8_t)
+SNOW_PHOTOMETRIC_KERNELS(_f64, double, double)
+SNOW_PHOTOMETRIC_KERNELS(_u8_f64, double, uint8_t)
+
+// One block: means[0] = Σ |a − b| / values, means[1] = Σ SSIM / values.
+SNOW_KERNEL(photometric_means, 256,
+            (int64_t n, const double* __restrict__ sums, int64_t values, double* means)) {
+  SNOW_SHARED(double, partial, 256 * 2);
+  const int t = int(threadIdx.x);
+  double l1 = 0, ssim = 0;
+  for (int64_t i = t; i < n; i += 256) l1 += sums[2 * i], ssim += sums[2 * i + 1];
+  partial[t] = l1, partial[256 + t] = ssim;
+  __syncthreads();
+  for (int half = 128; half > 0; half /= 2) {
+    if (t < half) partial[t] += partial[t + half], partial[256 + t] += partial[256 + t + half];
+    __syncthreads();
+  }
+  if (t < 2) means[t] = partial[256 * t] / double(values);
+}
