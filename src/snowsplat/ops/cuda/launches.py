@@ -19,11 +19,12 @@ from snowsplat.ops.cuda import (
     neighbours,
     photometric,
     projection,
+    sorting,
     tiling,
 )
 from snowsplat.ops.cuda.kernels import Argument, Kernel
 
-_PARTS = (projection, adam, tiling, blending, photometric, neighbours)
+_PARTS = (projection, adam, sorting, tiling, blending, photometric, neighbours)
 KERNELS: dict[str, Kernel] = {n: k for part in _PARTS for n, k in part.KERNELS.items()}
 SEQUENCES: dict[str, Callable[..., int]] = {
     name: sequence for part in _PARTS for name, sequence in part.SEQUENCES.items()
