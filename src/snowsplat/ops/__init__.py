@@ -4,6 +4,7 @@
 """
 
 from snowsplat.ops.adam import adam_step
+from snowsplat.ops.devices import default_device, resolve_device
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.neighbours import neighbours
 from snowsplat.ops.photometric import photometric_loss, ssim
@@ -19,11 +20,13 @@ __all__ = [
     "accumulate_screen_statistics",
     "adam_step",
     "count_blended",
+    "default_device",
     "get_num_threads",
     "neighbours",
     "photometric_loss",
     "project",
     "rasterize",
+    "resolve_device",
     "set_num_threads",
     "ssim",
 ]

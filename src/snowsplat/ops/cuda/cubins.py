@@ -1,0 +1,120 @@
+"""The machine code of the kernels for a card: built with the wheel, or else compiled here and kept.
+
+A cubin runs on cards of its own compute capability, and of later ones of the same major version.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from snowsplat.errors import UserError
+from snowsplat.files import atomic_path
+from snowsplat.ops.cuda import nvrtc
+
+Capability = tuple[int, int]
+
+_BUILT = Path(__file__).resolve().parents[2] / "_lib" / "cuda"
+
+
+def candidates(file: str, capability: Capability, cuda_major: int) -> Iterator[bytes]:
+    """What may run on this card, best first: cubins, then what is compiled for it on the spot.
+
+    Args:
+        file: of the `Kernel`.
+        cuda_major: the newest CUDA that the driver knows; it loads nothing that a later one made.
+
+    Raises:
+        UserError: none is built and there is no compiler.
+    """
+    major, minor = capability
+    for lower in range(minor, -1, -1):
+        path = _BUILT / f"sm_{10 * major + lower}" / f"{file}.cubin"
+        if path.exists():
+            yield path.read_bytes()
+            break
+    yield _compiled_here(file, capability, cuda_major)
+
+
+@functools.cache
+def _nvrtc(cuda_major: int) -> nvrtc.Nvrtc:
+    # Newest first: it knows the most cards.
+    return nvrtc.Nvrtc(nvrtc.find(range(min(cuda_major, 13), 11, -1)))
+
+
+def _compiled_here(file: str, capability: Capability, cuda_major: int) -> bytes:
+    shown = f"{capability[0]}.{capability[1]}"
+    try:
+        compiler = _nvrtc(cuda_major)
+    except nvrtc.NotFound:
+        package = "nvidia-cuda-nvrtc" + ("-cu12" if cuda_major < 13 else "")
+        raise UserError(
+            f"no kernels are built for a GPU of compute capability {shown}, and NVRTC, which could "
+            f"compile them, is missing: pip install {package}"
+        ) from None
+    number = 10 * capability[0] + capability[1]
+    if number in compiler.architectures:
+        target = f"sm_{number}"
+    else:  # a card newer than this compiler: PTX, which the driver translates
+        older = [known for known in compiler.architectures if known < number]
+        if not older:
+            raise UserError(
+                f"NVRTC {compiler.version} has no kernels for compute capability {shown}"
+            )
+        target = f"compute_{max(older)}"
+    source = nvrtc.path_of(file)
+    path = _cache_path(file, target, _key(compiler.version, target, source))
+    code = _read(path)
+    if code is None:
+        code, _ = compiler.compile(source, target)
+        _write(path, code)
+    return code
+
+
+def _key(version: tuple[int, int], target: str, source: Path) -> str:
+    """Another one for all that may give other code."""
+    digest = hashlib.sha256(repr((version, target, nvrtc.OPTIONS)).encode())
+    for path in nvrtc.sources(source):
+        content = path.read_bytes()
+        digest.update(f"\n{path.name} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:32]
+
+
+def _cache_path(file: str, target: str, key: str) -> Path | None:
+    """By the custom of the system; None where there is no such place."""
+    try:
+        if sys.platform == "win32":
+            base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+        else:
+            base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:  # nobody's home
+        return None
+    return Path(base, "snowsplat", "kernels", f"{file}-{target}-{key}")
+
+
+# A file is its SHA-256 and the code, so that a damaged one is known.
+
+
+def _read(path: Path | None) -> bytes | None:
+    if path is None:
+        return None
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    code = content[32:]
+    return code if hashlib.sha256(code).digest() == content[:32] else None
+
+
+def _write(path: Path | None, code: bytes) -> None:
+    if path is None:
+        return
+    with contextlib.suppress(OSError):  # then it is compiled again the next time
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(hashlib.sha256(code).digest() + code)

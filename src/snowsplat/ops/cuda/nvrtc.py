@@ -1,0 +1,180 @@
+"""Compiles kernels with NVRTC, NVIDIA's compiler in a library, which needs neither toolkit nor GPU.
+
+Imports nothing of snowsplat and no torch: the build of a wheel runs this file as a script, in an
+environment that has neither (see CMakeLists.txt).
+
+    python nvrtc.py --find
+    python nvrtc.py SOURCE --target sm_90 --output FILE
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+# Fast where it costs no accuracy that matters: tiny numbers are zero, as on the CPU. Divisions and
+# roots stay exact.
+OPTIONS = ("--std=c++17", "--ftz=true")
+
+_NATIVE = Path(__file__).resolve().parents[2] / "native"
+
+# Where packages put the library, below a folder of sys.path, and what it is called.
+_FOLDERS = {
+    12: ("nvidia/cuda_nvrtc/lib", "nvidia/cuda_nvrtc/bin", "torch/lib"),
+    13: ("nvidia/cu13/lib", "nvidia/cu13/bin/x86_64", "nvidia/cu13/bin", "torch/lib"),
+}
+_NAMES = {
+    12: ("libnvrtc.so.12", "nvrtc64_120_0.dll"),
+    13: ("libnvrtc.so.13", "nvrtc64_130_0.dll"),
+}
+
+
+class NotFound(Exception):
+    """There is no NVRTC here."""
+
+
+class CompileError(Exception):
+    """A kernel does not compile; the text is the compiler's."""
+
+
+def path_of(file: str) -> Path:
+    """The source of a `Kernel.file`."""
+    return _NATIVE / "cuda" / f"{file}.cu"
+
+
+def sources(path: Path) -> list[Path]:
+    """A source file and all that it includes, itself first.
+
+    Both sides of an #if count; what is not there (the emulation's header) is on the other side.
+    """
+    found = [path]
+    for file in found:
+        for name in re.findall(r'^\s*#\s*include\s+"(.+)"', file.read_text("utf-8"), re.MULTILINE):
+            places = (place / name for place in (file.parent, _NATIVE))
+            header = next((p.resolve() for p in places if p.exists()), None)
+            if header is not None and header not in found:
+                found.append(header)
+    return found
+
+
+def find(majors: Sequence[int] = (12, 13)) -> str:
+    """The library's path, or its name if the loader knows it, of the first of these major versions.
+
+    Raises:
+        NotFound: none of them is here.
+    """
+    for major in majors:
+        for entry in sys.path:
+            for folder in _FOLDERS[major]:
+                for name in _NAMES[major]:
+                    path = Path(entry, folder, name)
+                    if path.exists():
+                        return str(path.resolve())
+        for name in _NAMES[major]:
+            try:
+                ctypes.CDLL(name)
+            except OSError:
+                continue
+            return name
+    raise NotFound("NVRTC is not installed")
+
+
+class Nvrtc:
+    """One NVRTC: what it can do, and `compile`. May be used by several threads."""
+
+    def __init__(self, library: str) -> None:
+        if sys.platform == "win32" and os.path.isabs(library):
+            os.add_dll_directory(os.path.dirname(library))  # it loads a second one from there
+        self._library = ctypes.CDLL(library)
+        self._library.nvrtcGetErrorString.restype = ctypes.c_char_p
+        major, minor = ctypes.c_int(), ctypes.c_int()
+        self._check(self._library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
+        self.version = (major.value, minor.value)
+        count = ctypes.c_int()
+        self._check(self._library.nvrtcGetNumSupportedArchs(ctypes.byref(count)))
+        numbers = (ctypes.c_int * count.value)()
+        self._check(self._library.nvrtcGetSupportedArchs(numbers))
+        self.architectures = tuple(numbers)  # 75, 80, …: it makes machine code for these
+
+    def compile(self, source: Path, target: str, lineinfo: bool = False) -> tuple[bytes, str]:
+        """The compiled file, and the compiler's warnings ("" for none).
+
+        Args:
+            target: "sm_90" for machine code (a cubin), "compute_90" for PTX.
+            lineinfo: profilers and checkers can then name lines of the source.
+
+        Raises:
+            CompileError: with all that the compiler says.
+        """
+        options = [f"--gpu-architecture={target}", *OPTIONS, f"--include-path={_NATIVE}"]
+        if lineinfo:
+            options.append("--generate-line-info")
+        encoded = [os.fsencode(option) for option in options]
+        library, program = self._library, ctypes.c_void_p()
+        text, name = source.read_bytes(), os.fsencode(source)
+        self._check(library.nvrtcCreateProgram(ctypes.byref(program), text, name, 0, None, None))
+        try:
+            array = (ctypes.c_char_p * len(encoded))(*encoded)
+            result = library.nvrtcCompileProgram(program, len(encoded), array)
+            log = self._text("ProgramLog", program).rstrip(b"\0").decode(errors="replace").strip()
+            if result:
+                raise CompileError(
+                    f"{source.name} does not compile for {target}: {self._error(result)}\n{log}"
+                )
+            return self._text("CUBIN" if target.startswith("sm_") else "PTX", program), log
+        finally:
+            library.nvrtcDestroyProgram(ctypes.byref(program))
+
+    def _text(self, what: str, program: ctypes.c_void_p) -> bytes:
+        size = ctypes.c_size_t()
+        self._check(getattr(self._library, f"nvrtcGet{what}Size")(program, ctypes.byref(size)))
+        content = ctypes.create_string_buffer(size.value)
+        self._check(getattr(self._library, f"nvrtcGet{what}")(program, content))
+        return content.raw
+
+    def _error(self, result: int) -> str:
+        return str(self._library.nvrtcGetErrorString(result).decode())
+
+    def _check(self, result: int) -> None:
+        if result:
+            raise CompileError(f"NVRTC: {self._error(result)}")
+
+
+def _main() -> int:
+    parser = argparse.ArgumentParser(description="Compile a CUDA source file with NVRTC.")
+    parser.add_argument("source", type=Path, nargs="?")
+    parser.add_argument("--find", action="store_true", help="print the library's path")
+    parser.add_argument("--target", help="sm_90 and so on")
+    parser.add_argument("--output", type=Path)
+    parser.add_argument("--depfile", type=Path, help="what it was made of, for Ninja")
+    parser.add_argument("--library", help="the NVRTC to use")
+    parser.add_argument("--lineinfo", action="store_true")
+    asked = parser.parse_args()
+    try:
+        library = asked.library or find()
+        nvrtc = Nvrtc(library)
+        if asked.find:
+            print(library)
+            return 0
+        code, log = nvrtc.compile(asked.source.resolve(), asked.target, asked.lineinfo)
+    except (NotFound, CompileError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    if log:
+        print(log, file=sys.stderr)
+    asked.output.parent.mkdir(parents=True, exist_ok=True)
+    asked.output.write_bytes(code)
+    if asked.depfile:
+        paths = (asked.output, *sources(asked.source.resolve()))
+        target, *names = (str(path).replace(" ", r"\ ") for path in paths)
+        asked.depfile.write_text(f"{target}: {' '.join(names)}\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main())
