@@ -5,6 +5,7 @@
 
 #if !defined(__CUDACC_RTC__)
 #include <cmath>
+#include <cstdint>
 #endif
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)

@@ -13,6 +13,15 @@
 
 namespace snow {
 
+constexpr int kPackedHeader = 8;   // columns of Splats2D before the colours, see ops/splats.py
+constexpr int kPackedStride = 16;  // columns of Splats2D with 3 colours
+
+template <class T>
+struct GaussianTensors {  // (N, 3), (N, 3), (N, 4), (N,), (N, 1, 3), (N, K, 3)
+  const T *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;
+  int64_t sh_rest_rows;  // K as stored; `degree` says how many of them are active
+};
+
 // A pinhole camera. Pixel (i, j) has its centre at (i + 0.5, j + 0.5); z points forward.
 template <class T>
 struct PinholeCamera {
@@ -23,8 +32,11 @@ struct PinholeCamera {
   // projection would otherwise blow up.
   T min_tx, max_tx, min_ty, max_ty;
 
-  SNOW_INLINE PinholeCamera(const T* cam_from_world, double width_, double height_, double fx_,
-                            double fy_, double cx_, double cy_, double near_)
+  // Real: in what the limits are reckoned; double on a CPU, where one camera serves a call. On a GPU
+  // each thread makes its own.
+  template <class Real>
+  SNOW_INLINE PinholeCamera(const T* cam_from_world, Real width_, Real height_, Real fx_, Real fy_,
+                            Real cx_, Real cy_, Real near_)
       : fx(T(fx_)), fy(T(fy_)), cx(T(cx_)), cy(T(cy_)), width(T(width_)), height(T(height_)),
         near(T(near_)) {
     for (int i = 0; i < 3; i++) {
@@ -35,8 +47,9 @@ struct PinholeCamera {
       position[k] = -(rotation[k] * translation[0] + rotation[3 + k] * translation[1] +
                       rotation[6 + k] * translation[2]);
     }
-    min_tx = T(-(cx_ + 0.15 * width_) / fx_), max_tx = T((width_ - cx_ + 0.15 * width_) / fx_);
-    min_ty = T(-(cy_ + 0.15 * height_) / fy_), max_ty = T((height_ - cy_ + 0.15 * height_) / fy_);
+    const Real beyond_x = Real(0.15) * width_, beyond_y = Real(0.15) * height_;
+    min_tx = T(-(cx_ + beyond_x) / fx_), max_tx = T((width_ - cx_ + beyond_x) / fx_);
+    min_ty = T(-(cy_ + beyond_y) / fy_), max_ty = T((height_ - cy_ + beyond_y) / fy_);
   }
 };
 
@@ -231,6 +244,31 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
 template <class Real>
 SNOW_INLINE Real squared_cutoff(Real opacity) {
   return Real(2 * kLn2) * (log2(opacity) - Real(kLog2MinAlpha));
+}
+
+// Exactly: in front of the near plane, at least 1/255 opaque, and the box of the ellipse
+// {α ≥ 1/255} holds a pixel centre's range. Anything not finite fails a comparison.
+template <class Real, class T>
+SNOW_INLINE auto is_visible(const ProjectedGaussian<Real>& p, const PinholeCamera<T>& c) {
+  Real k2 = squared_cutoff(p.opacity);
+  Real ex = sqrt(max(k2, Real(0.f)) * p.cov_xx), ey = sqrt(max(k2, Real(0.f)) * p.cov_yy);
+  const Real half(0.5f);
+  return (p.z > Real(c.near)) & (k2 >= Real(0.f)) & (p.inv_det > Real(0.f)) &
+         (p.mean2d[0] + ex >= half) & (Real(c.width) - half >= p.mean2d[0] - ex) &
+         (p.mean2d[1] + ey >= half) & (Real(c.height) - half >= p.mean2d[1] - ey);
+}
+
+// The columns of Splats2D before the colours.
+template <class Real>
+SNOW_INLINE void splat_header(const ProjectedGaussian<Real>& p, Real* column) {
+  column[0] = p.mean2d[0], column[1] = p.mean2d[1];
+  for (int k = 0; k < 3; k++) column[2 + k] = p.conic[k];
+  column[5] = p.opacity, column[6] = p.z;
+  // Larger eigenvalue of Σ': mean of the diagonal + sqrt(half difference² + off-diagonal²).
+  Real mid = Real(0.5f) * (p.cov_xx + p.cov_yy), dif = Real(0.5f) * (p.cov_xx - p.cov_yy);
+  dif = dif / mid;  // relative to the mean, since the squares would overflow
+  Real off = p.cov_xy / mid;
+  column[7] = Real(3.f) * sqrt(mid + mid * sqrt(dif * dif + off * off));
 }
 
 }  // namespace snow

@@ -8,6 +8,9 @@ namespace snow {
 
 constexpr int kMaxShCoefficients = 16;
 
+// Columns of sh_rest that are active at a degree.
+SNOW_INLINE int sh_columns(int degree) { return 3 * ((degree + 1) * (degree + 1) - 1); }
+
 constexpr double kSH0 = 0.28209479177387814;
 constexpr double kSH1 = 0.4886025119029199;
 constexpr double kSH2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005,

@@ -9,15 +9,6 @@
 
 namespace snow {
 
-constexpr int kPackedHeader = 8;   // columns of Splats2D before the colours, see ops/splats.py
-constexpr int kPackedStride = 16;  // columns of Splats2D with 3 colours
-
-template <class T>
-struct GaussianTensors {  // (N, 3), (N, 3), (N, 4), (N,), (N, 1, 3), (N, K, 3)
-  const T *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;
-  int64_t sh_rest_rows;  // K as stored; `degree` says how many of them are active
-};
-
 // Rows of the W Gaussians of a group. A last, shorter group repeats its final row in the idle
 // lanes.
 template <int W>
@@ -36,9 +27,6 @@ struct RowIndex {
   }
   static RowIndex contiguous(int64_t first, int64_t end) { return of(nullptr, first, end); }
 };
-
-// Active columns of sh_rest.
-SNOW_INLINE int sh_columns(int degree) { return 3 * ((degree + 1) * (degree + 1) - 1); }
 
 template <class V>
 struct GaussianGroup {

@@ -32,18 +32,6 @@ SNOW_INLINE typename V::Mask may_touch_image(const GaussianShape<V>& g, const Pi
          (V(c.height) >= py - ey);
 }
 
-// Exactly: in front of the near plane, at least 1/255 opaque, and the box of the ellipse
-// {α ≥ 1/255} holds a pixel centre's range. Anything not finite fails a comparison.
-template <class V, class T>
-SNOW_INLINE typename V::Mask is_visible(const ProjectedGaussian<V>& p, const PinholeCamera<T>& c) {
-  V k2 = squared_cutoff(p.opacity);
-  V ex = sqrt(max(k2, V(0.f)) * p.cov_xx), ey = sqrt(max(k2, V(0.f)) * p.cov_yy);
-  const V half(0.5f);
-  return (p.z > V(c.near)) & (k2 >= V(0.f)) & (p.inv_det > V(0.f)) & (p.mean2d[0] + ex >= half) &
-         (V(c.width) - half >= p.mean2d[0] - ex) & (p.mean2d[1] + ey >= half) &
-         (V(c.height) - half >= p.mean2d[1] - ey);
-}
-
 template <class V, class T = typename V::Scalar>
 int64_t cull(int64_t n, const GaussianTensors<T>& tensors, const PinholeCamera<T>& cam,
              int32_t* ids) {
@@ -88,14 +76,7 @@ void forward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, i
       project_gaussian(g.shape, cam, p);
       V column[kPackedStride], *color = column + kPackedHeader;
       sh_color(degree, view_direction(g.shape.mean, cam.position), g.dc, g.rest, color);
-      column[0] = p.mean2d[0], column[1] = p.mean2d[1];
-      for (int k = 0; k < 3; k++) column[2 + k] = p.conic[k];
-      column[5] = p.opacity, column[6] = p.z;
-      // Larger eigenvalue of Σ': mean of the diagonal + sqrt(half difference² + off-diagonal²).
-      V mid = V(0.5f) * (p.cov_xx + p.cov_yy), dif = V(0.5f) * (p.cov_xx - p.cov_yy);
-      dif = dif / mid;  // relative to the mean, since the squares would overflow
-      V off = p.cov_xy / mid;
-      column[7] = V(3.f) * sqrt(mid + mid * sqrt(dif * dif + off * off));
+      splat_header(p, column);
       for (int k = 0; k < 3; k++) color[k] = max(color[k], V(0.f));
       for (int k = kPackedHeader + 3; k < kPackedStride; k++) column[k] = V(0.f);
       const auto splats = RowIndex<W>::contiguous(i, end);
