@@ -1,18 +1,18 @@
 // photometric: L1 and SSIM between two images, and the gradient of their weighted sum.
 //
-// Images are planar, (channels, H, W). A block does a tile of one channel, 32 columns wide: it loads
-// the tile with a margin of 5, filters the rows into shared memory, then the columns from there. The
-// Gaussian window is separable and symmetric, and sees zeros outside of the image, so the same two
-// passes, over the maps of derivatives, are its adjoint.
+// Images are planar, (channels, H, W), each plane of fewer than 2³¹ pixels. A block does a tile of one
+// channel, 32 columns wide: it loads the tile with a margin of 5, filters the rows into shared
+// memory, then the columns from there. The Gaussian window is separable and symmetric, and sees
+// zeros outside of the image, so the same two passes, over the maps of derivatives, are its adjoint.
 //
 //   photometric_similarity   SSIM a pixel; sums a block; the three derivatives of SSIM, as maps
 //   photometric_gradient     the filtered maps make the gradient, L1 is added
 //   photometric_means        adds the sums of the blocks, in order: the same bits in every run
 //
-// The maps go through memory. To do without them, a tile would be recomputed with a margin of 10:
-// 1.4 times the arithmetic, which is what bounds these kernels, and more shared memory than a block
+// The maps go through memory. To do without them, a block would load its tile with a margin of 10
+// and filter all of it: by count half as much arithmetic again, and more shared memory than a block
 // may have without asking (48 kB). Instead photometric.py takes few channels at a time where images
-// are large (a channel of 1920×1080: 25 MB), and the caches of larger GPUs hold most of the maps.
+// are large (one of 1920×1080: maps of 25 MB), and the caches of larger GPUs hold most of that.
 #include "cuda/device.h"
 #include "ssim.h"
 
@@ -59,11 +59,11 @@ SNOW_INLINE double window_tap(int k) {
 }
 
 template <class T>
-SNOW_INLINE T pixel(const T* p, int64_t at) {
+SNOW_INLINE T pixel(const T* p, int at) {
   return p[at];
 }
 template <class T>
-SNOW_INLINE T pixel(const uint8_t* p, int64_t at) {
+SNOW_INLINE T pixel(const uint8_t* p, int at) {
   return T(p[at]) * T(1.0 / 255.0);
 }
 
@@ -78,14 +78,16 @@ SNOW_INLINE void load_tile(const Tile<T>& tile, int width, int height, Load load
     const int row = at / kWideColumns, column = at - row * kWideColumns;
     const int x = tile.x + column - kSsimRadius, y = tile.y + row - kSsimRadius;
     const bool inside = x >= 0 && x < width && y >= 0 && y < height;
-    load(row * kWidePitch + column, inside ? int64_t(y) * width + x : int64_t(-1));
+    load(row * kWidePitch + column, inside ? y * width + x : -1);
   }
 }
 
 // Filters the rows of a wide tile: from what values(place in it, kMaps values) gives to `rows`.
 template <int kMaps, class T, class Values>
 SNOW_INLINE void filter_rows(T* rows, Values values) {
-  for (int run = int(threadIdx.x); run < Tile<T>::kWideRows * kRuns; run += kThreads) {
+  static_assert(Tile<T>::kWideRows * kRuns <= kThreads, "a thread does one run at most");
+  const int run = int(threadIdx.x);
+  if (run < Tile<T>::kWideRows * kRuns) {
     const int row = run / kRuns, x = run % kRuns * kRun;
     T sums[kMaps][kRun] = {};
 #pragma unroll
@@ -145,7 +147,7 @@ SNOW_INLINE void similarity(int width, int height, const T* image, const Target*
   const int64_t plane = int64_t(width) * height;
   image += tile.channel * plane, target += tile.channel * plane;
 
-  load_tile(tile, width, height, [&](int place, int64_t at) {
+  load_tile(tile, width, height, [&](int place, int at) {
     a[place] = at >= 0 ? pixel<T>(image, at) : T(0);
     b[place] = at >= 0 ? pixel<T>(target, at) : T(0);
   });
@@ -171,7 +173,7 @@ SNOW_INLINE void similarity(int width, int height, const T* image, const Target*
     similarities += ssim_pixel(means[0][i], means[1][i], means[2][i], means[3][i], d);
     differences += max(difference, -difference);
     if (maps) {
-      T* const map = maps + 3 * tile.channel * plane + int64_t(y) * width + x;
+      T* const map = maps + 3 * tile.channel * plane + (y * width + x);
       map[0] = d.mean_a, map[plane] = d.mean_aa, map[2 * plane] = d.mean_ab;
     }
   }
@@ -180,28 +182,32 @@ SNOW_INLINE void similarity(int width, int height, const T* image, const Target*
     warp_sums[warp_id()] = differences, warp_sums[kWarps + warp_id()] = similarities;
   __syncthreads();
   if (threadIdx.x < 2) {
-    double sum = 0;
-    for (int w = 0; w < kWarps; w++) sum += double(warp_sums[int(threadIdx.x) * kWarps + w]);
-    sums[2 * int64_t(blockIdx.x) + threadIdx.x] = sum;
+    T sum = T(0);
+    for (int w = 0; w < kWarps; w++) sum += warp_sums[int(threadIdx.x) * kWarps + w];
+    sums[2 * int64_t(blockIdx.x) + threadIdx.x] = double(sum);
   }
 }
 
 // The weights are already divided by the number of values.
 template <class T, class Target>
 SNOW_INLINE void gradient(int width, int height, const T* image, const Target* target,
-                          const T* maps, T l1_weight, T ssim_weight, T* grad) {
+                          const T* maps, double l1_weight, double ssim_weight, T* grad) {
   SNOW_SHARED(T, derivatives, 3 * Tile<T>::kWideCount);
   SNOW_SHARED(T, rows, 3 * Tile<T>::kCount);
+  // Converted once a block: GPUs for graphics are slow at anything with double.
+  SNOW_SHARED(T, weights, 2);
+  if (threadIdx.x == 0) weights[0] = T(l1_weight), weights[1] = T(ssim_weight);
   const Tile<T> tile(width, height);
   const int64_t plane = int64_t(width) * height;
   image += tile.channel * plane, target += tile.channel * plane, grad += tile.channel * plane;
   maps += 3 * tile.channel * plane;
+  const T* const map[3] = {maps, maps + plane, maps + 2 * plane};
 
   // Windows are centred on pixels of the image only: outside of it the derivatives are 0.
-  load_tile(tile, width, height, [&](int place, int64_t at) {
+  load_tile(tile, width, height, [&](int place, int at) {
 #pragma unroll
     for (int m = 0; m < 3; m++)
-      derivatives[m * Tile<T>::kWideCount + place] = at >= 0 ? maps[m * plane + at] : T(0);
+      derivatives[m * Tile<T>::kWideCount + place] = at >= 0 ? map[m][at] : T(0);
   });
   __syncthreads();
   filter_rows<3>(rows, [&](int place, T(&value)[3]) {
@@ -218,30 +224,29 @@ SNOW_INLINE void gradient(int width, int height, const T* image, const Target* t
   for (int i = 0; i < Tile<T>::kOwnRows; i++) {
     const int y = tile.y + first + i;
     if (x >= width || y >= height) continue;
-    const int64_t at = int64_t(y) * width + x;
+    const int at = y * width + x;
     const T p = pixel<T>(image, at), q = pixel<T>(target, at);
-    const T sign = p > q ? l1_weight : q > p ? -l1_weight : T(0);
+    const T sign = p > q ? weights[0] : q > p ? -weights[0] : T(0);
     grad[at] =
-        sign + ssim_weight * (filtered[0][i] + T(2) * p * filtered[1][i] + q * filtered[2][i]);
+        sign + weights[1] * (filtered[0][i] + T(2) * p * filtered[1][i] + q * filtered[2][i]);
   }
 }
 
 }  // namespace
 }  // namespace snow
 
-#define SNOW_PHOTOMETRIC_KERNELS(SUFFIX, T, TARGET)                                               \
-  SNOW_KERNEL(                                                                                    \
-      photometric_similarity##SUFFIX, 192,                                                        \
-      (int64_t, int64_t width, int64_t height, const T* __restrict__ image,                       \
-       const TARGET* __restrict__ target, T* __restrict__ maps, double* __restrict__ sums)) {     \
-    snow::similarity<T>(int(width), int(height), image, target, maps, sums);                      \
-  }                                                                                               \
-  SNOW_KERNEL(photometric_gradient##SUFFIX, 192,                                                  \
-              (int64_t, int64_t width, int64_t height, const T* __restrict__ image,               \
-               const TARGET* __restrict__ target, const T* __restrict__ maps, double l1_weight,   \
-               double ssim_weight, T* __restrict__ grad)) {                                       \
-    snow::gradient<T>(int(width), int(height), image, target, maps, T(l1_weight), T(ssim_weight), \
-                      grad);                                                                      \
+#define SNOW_PHOTOMETRIC_KERNELS(SUFFIX, T, TARGET)                                                \
+  SNOW_KERNEL(                                                                                     \
+      photometric_similarity##SUFFIX, 192,                                                         \
+      (int64_t, int64_t width, int64_t height, const T* __restrict__ image,                        \
+       const TARGET* __restrict__ target, T* __restrict__ maps, double* __restrict__ sums)) {      \
+    snow::similarity<T>(int(width), int(height), image, target, maps, sums);                       \
+  }                                                                                                \
+  SNOW_KERNEL(photometric_gradient##SUFFIX, 192,                                                   \
+              (int64_t, int64_t width, int64_t height, const T* __restrict__ image,                \
+               const TARGET* __restrict__ target, const T* __restrict__ maps, double l1_weight,    \
+               double ssim_weight, T* __restrict__ grad)) {                                        \
+    snow::gradient<T>(int(width), int(height), image, target, maps, l1_weight, ssim_weight, grad); \
   }
 
 SNOW_PHOTOMETRIC_KERNELS(, float, float)
