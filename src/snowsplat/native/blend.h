@@ -50,6 +50,9 @@ SNOW_INLINE Real peak_over_rectangle(const SplatTerms<Real>& s, Real x0, Real y0
   return max(on_row, on_column);
 }
 
+constexpr int kGroupChannels = 4;  // channels that one blending pass carries at most
+constexpr int kSlotWidth = 16;     // scalars of one (tile, splat) gradient: ≤ 4 colours, 6 moments
+
 // Culling keeps this much more than the exact threshold, for rounding.
 constexpr double kCullSlack = 1e-3;
 

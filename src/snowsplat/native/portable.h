@@ -23,6 +23,7 @@ SNOW_INLINE float sqrt(float a) { return ::sqrtf(a); }
 SNOW_INLINE float exp(float a) { return ::expf(a); }
 SNOW_INLINE float log2(float a) { return ::log2f(a); }
 SNOW_INLINE float exp2_blend(float a) { return ::exp2f(a); }
+SNOW_INLINE float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
 
 SNOW_INLINE double select(bool m, double a, double b) { return m ? a : b; }
 SNOW_INLINE double min(double a, double b) { return a < b ? a : b; }
@@ -31,6 +32,7 @@ SNOW_INLINE double sqrt(double a) { return ::sqrt(a); }
 SNOW_INLINE double exp(double a) { return ::exp(a); }
 SNOW_INLINE double log2(double a) { return ::log2(a); }
 SNOW_INLINE double exp2_blend(double a) { return ::exp2(a); }
+SNOW_INLINE double fma(double a, double b, double c) { return ::fma(a, b, c); }
 
 // 1/a and 1/√a. The compiler for a GPU has instructions for those of float.
 SNOW_INLINE double reciprocal(double a) { return 1.0 / a; }

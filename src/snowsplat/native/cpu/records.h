@@ -7,8 +7,6 @@
 
 namespace snow {
 
-constexpr int kGroupChannels = 4;  // channels that one blending pass carries at most
-
 template <class T>
 struct alignas(64) SplatRecord {
   SplatTerms<T> terms;
@@ -16,7 +14,5 @@ struct alignas(64) SplatRecord {
   uint16_t tile_x0, tile_y0, tile_x1, tile_y1;  // inclusive; x1 < x0 when the splat is nowhere
 };
 static_assert(sizeof(SplatRecord<float>) == 64, "one cache line");
-
-constexpr int kSlotWidth = 16;  // scalars of one (tile, splat) gradient: ≤ 4 colours, 6 moments
 
 }  // namespace snow
