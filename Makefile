@@ -52,12 +52,13 @@ compiler:
 	@command -v "$${CXX:-c++}" >/dev/null 2>&1 || command -v g++ >/dev/null 2>&1 || \
 	    command -v clang++ >/dev/null 2>&1 || { echo "$(NO_COMPILER)" >&2; exit 1; }
 
-# One library for each instruction set, into src/snowsplat/_lib, and the viewer's page, into _viewer;
-# only what changed is compiled.
+# One library for each instruction set, and the kernels for each kind of GPU, into src/snowsplat/_lib,
+# and the viewer's page, into _viewer; only what changed is compiled.
 native: $(ENVIRONMENT) | compiler
 	@mkdir -p $(BUILD)
 	@$(LOCK) sh -ec ' \
-	    test -f $(BUILD)/build.ninja || cmake -G Ninja -S . -B $(BUILD) --log-level=WARNING >/dev/null; \
+	    cmake -G Ninja -S . -B $(BUILD) --log-level=NOTICE \
+	        -DPython3_EXECUTABLE="$(abspath $(shell command -v $(PYTHON)))" >/dev/null; \
 	    cmake --build $(BUILD) -- --quiet; \
 	    cmake --install $(BUILD) --prefix src >/dev/null'
 
