@@ -64,13 +64,15 @@ class Optimised:
         assert ids is not None
         return ids
 
-    def step(self, packed_grad: Tensor, step: int = 1, **options: Any) -> None:
+    def step(
+        self, packed_grad: Tensor, step: int = 1, ids: Tensor | None = None, **options: Any
+    ) -> None:
         arguments = {**self.scene.view, "lr": RATES, **options}
         self.variant.ops.adam_step(
             self.params,
             self.m,
             self.v,
-            self.visible(),
+            self.visible() if ids is None else ids,
             packed_grad.to(self.variant.dtype),
             self.scene.cam_from_world,
             step=step,
@@ -154,7 +156,7 @@ def test_native_is_the_twin(
         assert_close(change, wanted_change, native.backward, f"change of {name}")
 
 
-@pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 17, 33, 300, 5000])
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 16, 17, 33, 63, 64, 65, 129, 300, 5000])
 def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
     states = [Optimised(v, random_scene(50 + count, count)) for v in (TWIN, native)]
     before = states[0].copy()
@@ -248,6 +250,44 @@ def test_nothing_visible(variant: Variant) -> None:
     assert all(torch.equal(tensor, before[name]) for name, tensor in state.tensors().items())
     state.step(packed_grads(0, 0), step=2)
     assert_close(state.m["means"], 0.9 * before["m of means"], 1e-6)
+
+
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_rows_without_a_gaussian(native: Variant, visible_only: bool) -> None:
+    """A GPU's splats of the id -1 are passed over; the CPU, which makes none, refuses them."""
+    states = [Optimised(native, random_scene(3, 130)) for _ in range(2)]
+    before = states[0].copy()
+    ids = states[0].visible()
+    grad = packed_grads(0, len(ids)).to(native.dtype)
+    every_id = torch.full((130,), -1, dtype=torch.int32)
+    every_id[ids.long()] = ids
+    every_grad = torch.full((130, 16), math.nan, dtype=native.dtype)
+    every_grad[ids.long()] = grad
+    for state, rows, of_rows in zip(states, (ids, every_id), (grad, every_grad), strict=True):
+        if native.engine == "native" and rows is every_id:
+            with pytest.raises(ValueError, match="adam_step") as caught:
+                state.step(of_rows, ids=rows, visible_only=visible_only)
+            assert one_line(caught.value)
+            assert all(torch.equal(t, before[name]) for name, t in state.tensors().items())
+            return
+        state.step(of_rows, ids=rows, visible_only=visible_only)
+    for name, tensor in states[0].tensors().items():
+        assert torch.equal(states[1].tensors()[name], tensor), name
+
+
+def test_not_valid(variant: Variant) -> None:
+    """`valid` says so where the tensors are."""
+    states = [Optimised(variant, random_scene(3, 70)) for _ in range(3)]
+    before = states[0].copy()
+    grad = packed_grads(0, len(states[0].visible()))
+    for state, valid in zip(
+        states, (None, torch.tensor([True]), torch.tensor([False])), strict=True
+    ):
+        state.step(grad, valid=valid)
+    for name, old in before.items():
+        stepped, same, still = (state.tensors()[name] for state in states)
+        assert torch.equal(same, stepped), name
+        assert torch.equal(still, old), name
 
 
 def test_values_at_rest_stay(variant: Variant) -> None:

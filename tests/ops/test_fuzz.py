@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from .scenes import (
+    PARAMETERS,
     Scene,
     Variant,
     as_float32,
@@ -89,23 +92,29 @@ def check(variant: Variant, scene: Scene) -> None:
     assert outputs[1].min() >= 0
     assert outputs[1].max() <= 1
 
+    assert splats.ids is not None
+    assert_finite(step(variant, scene, splats.ids, splats.packed.grad))
+
+
+def step(
+    variant: Variant, scene: Scene, ids: Tensor, packed_grad: Tensor
+) -> dict[str, Tensor | None]:
+    """A first step of Adam: the parameters after it, and their first moments."""
     stepped = scene.to(variant.dtype, requires_grad=False)
     m = {name: torch.zeros_like(p) for name, p in stepped.params.items()}
     v = {name: torch.zeros_like(p) for name, p in stepped.params.items()}
-    assert splats.ids is not None
     variant.ops.adam_step(
         stepped.params,
         m,
         v,
-        splats.ids,
-        splats.packed.grad,
+        ids,
+        packed_grad,
         stepped.cam_from_world,
         lr=dict.fromkeys(m, 1e-3),
         step=1,
         **stepped.view,
     )
-    assert_finite(stepped.params)
-    assert_finite({f"m of {name}": tensor for name, tensor in m.items()})
+    return {**stepped.params, **{f"m of {name}": tensor for name, tensor in m.items()}}
 
 
 def assert_finite(tensors: dict[str, Tensor | None]) -> None:
@@ -131,6 +140,34 @@ def test_extremes_together(variant: Variant, seed: int) -> None:
             taken = torch.rand(COUNT, generator=g) < 0.15
             scene.params[name][taken] = as_float32(cases[case].double())[taken]
     check(variant, scene)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_what_is_not_finite_harms_itself_alone(variant: Variant, name: str, value: float) -> None:
+    """The ids stay in order and in range, and every other Gaussian keeps all of its bits."""
+    clean, broken = random_scene(6, 130), random_scene(6, 130)
+    healthy = torch.ones(130, dtype=torch.bool)
+    healthy[::5] = False
+    for row in (~healthy).nonzero()[:, 0].tolist():
+        broken.params[name][row].view(-1)[row % broken.params[name][row].numel()] = value
+    found = []
+    for scene in (clean, broken):
+        leaf = scene.to(variant.dtype)
+        splats = leaf.project(variant.ops)
+        assert splats.ids is not None
+        ids = splats.ids.long()
+        assert ids.tolist() == sorted({i for i in ids.tolist() if 0 <= i < 130})
+        if math.isnan(value) and not name.startswith("sh"):
+            assert scene is clean or healthy[ids].all()
+        grad = normal(generator(2), 130, 16).to(variant.dtype)[ids]
+        splats.packed.backward(grad)
+        state = step(variant, scene, splats.ids, grad)
+        state.update({f"gradient of {n}": p.grad for n, p in leaf.params.items()})
+        rows = {n: t[healthy] for n, t in state.items() if t is not None}
+        found.append({"ids": ids[healthy[ids]], "packed": splats.packed[healthy[ids]], **rows})
+    for key, expected in found[0].items():
+        assert torch.equal(found[1][key], expected), key
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -256,7 +256,9 @@ def test_native_is_the_twin(native: Variant, degree: int, rest: int) -> None:
     compare(native, random_scene(degree, 67, sh_degree=degree, rest=rest))
 
 
-@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 15, 16, 17, 31, 33, 64, 300, 5000])
+@pytest.mark.parametrize(
+    "count", [0, 1, 2, 7, 8, 9, 15, 16, 17, 31, 33, 63, 64, 65, 129, 257, 5000]
+)
 def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
     compare(native, random_scene(40 + count, count))
 
@@ -321,12 +323,41 @@ def test_rows_beyond_the_degree_get_no_gradient(variant: Variant) -> None:
     assert grad[:, 3:].norm() == 0
 
 
+def test_rows_of_the_unseen_are_empty(native: Variant) -> None:
+    """On a GPU, which keeps a row for each Gaussian: zeros, and nothing of their gradient is used.
+
+    On the CPU there are none.
+    """
+    scene = random_scene(9, 130).to(native.dtype)
+    splats = native.ops.project(**scene.leaves(), **scene.view)
+    expected = scene.to(torch.float64).project(reference).ids
+    assert splats.ids is not None
+    assert expected is not None
+    seen = splats.ids >= 0
+    assert splats.ids[seen].tolist() == expected.tolist()
+    if native.engine == "native":
+        assert seen.all()
+    else:
+        assert splats.ids.tolist() == torch.where(seen, torch.arange(130), -1).tolist()
+        assert 0 < seen.sum() < 130
+        assert (splats.packed[~seen] == 0).all()
+    cotangent = normal(generator(1), len(splats), 16).to(native.dtype)
+    cotangent[~seen] = math.nan
+    splats.packed.backward(cotangent)
+    hidden = torch.ones(130, dtype=torch.bool)
+    hidden[expected.long()] = False
+    for name, leaf in scene.leaves().items():
+        assert leaf.grad is not None
+        assert leaf.grad.isfinite().all(), name
+        assert name == "cam_from_world" or (leaf.grad[hidden] == 0).all(), name
+
+
 def test_native_takes_any_strides(native: Variant) -> None:
     """A transposed or sliced tensor is as good as a contiguous one."""
     scene = random_scene(8, 20).to(native.dtype, requires_grad=False)
     strided = {n: torch.stack([p, p], dim=-1)[..., 0] for n, p in scene.params.items()}
     assert not strided["means"].is_contiguous()
-    got = native.ops.project(**strided, cam_from_world=scene.cam_from_world, **scene.view)
+    got = replace(scene, params=strided).project(native.ops)
     assert torch.equal(got.packed, scene.project(native.ops).packed)
 
 

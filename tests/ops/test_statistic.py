@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -54,6 +56,19 @@ def test_native_is_the_twin(native: Variant, with_radii: bool) -> None:
         found = accumulate(native.ops, native.dtype)
         for row in range(3):
             assert_close(found[row].double(), expected[row], 1e-6)
+
+
+def test_rows_without_a_gaussian(native: Variant) -> None:
+    """Splats of the id -1 are passed over, and where `valid` is False all are."""
+    packed, grad = torch.ones(2, 3, 16, dtype=native.dtype)
+    packed[::2], grad[::2] = math.nan, math.nan
+    splats = splats_of(torch.tensor([-1, 2, -1]), packed, grad)
+    sums = torch.zeros(3, 4, dtype=native.dtype)
+    for valid, views in ((torch.tensor([False]), 0.0), (torch.tensor([True]), 1.0)):
+        native.ops.accumulate_screen_statistics(splats, 2, 2, *sums, valid=valid)
+        assert sums[1].tolist() == [0.0, 0.0, views, 0.0]
+        assert sums[2].tolist() == [0.0, 0.0, views, 0.0]
+    assert_close(sums[0], torch.tensor([0.0, 0.0, math.sqrt(2), 0.0]), 1e-6)
 
 
 def test_wrong_input() -> None:

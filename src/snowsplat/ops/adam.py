@@ -46,7 +46,8 @@ def adam_step(
     params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, shaped as for `project`,
         contiguous. A `.grad` that is not None (of a regulariser) is added to the gradient.
     exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
-    ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, 16).
+    ids, packed_grad: `splats.ids` (M,), which ascends, and `splats.packed.grad` (M, 16). On a GPU
+        as `project` gave them, with ids of -1, or without those rows.
     lr: a rate for each name. step: counts from 1 (bias correction).
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
@@ -90,7 +91,7 @@ def adam_step(
         per_parameter += [value.detach(), m, v, extra, float(lr[name])]
     pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
     camera = camera_args("adam_step", pose, width, height, fx, fy, cx, cy)
-    launch(
+    done = launch(
         variant("adam_step", means),
         len(means),
         len(ids),
@@ -107,3 +108,7 @@ def adam_step(
         visible_only,
         valid,
     )
+    if done < 0:
+        raise ValueError(
+            "adam_step: on the CPU ids must be rows of the parameters; drop the splats of id -1"
+        )

@@ -35,6 +35,8 @@ def project(
 ) -> Splats2D:
     """The splats that N Gaussians leave on a camera's image plane; the invisible are left out.
 
+    On a GPU, where leaving out would mean waiting, their rows are empty: zeros, of the id -1.
+
     means (N, 3) in world units, log_scales (N, 3), quats (N, 4) wxyz of any length (zero: no
     rotation), opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, K, 3), of which degree `sh_degree`
     uses the first (sh_degree + 1)² − 1; cam_from_world (3, 4), OpenCV axes; fx, fy, cx, cy in

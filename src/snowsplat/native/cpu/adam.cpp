@@ -138,7 +138,7 @@ using namespace snow;
 
 // Per parameter, in the order means, log_scales, quats, opacity_logits, sh_dc, sh_rest: value,
 // first and second moment, extra gradient or null, and learning rate. Where *valid is false nothing
-// changes.
+// changes. −1 where an id is negative, which is a row of a GPU: nothing changes then, either.
 #define SNOW_ADAM_ENTRY(NAME, V)                                                                   \
   SNOW_EXPORT int64_t NAME(                                                                        \
       int64_t n, int64_t m, const int32_t* ids, const V::Scalar* grad_packed,                      \
@@ -152,6 +152,7 @@ using namespace snow;
       const V::Scalar* e5, double lr5, int64_t adam_step, double beta1, double beta2, double eps,  \
       int64_t visible_only, const bool* valid) {                                                   \
     if (valid && !*valid) return 0;                                                                \
+    if (std::any_of(ids, ids + m, [](int32_t id) { return id < 0; })) return -1;                   \
     using T = V::Scalar;                                                                           \
     const double c1 = 1 - std::pow(beta1, double(adam_step));                                      \
     const double c2 = 1 - std::pow(beta2, double(adam_step));                                      \

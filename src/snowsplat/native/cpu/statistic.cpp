@@ -17,12 +17,14 @@ void accumulate(int64_t m, const int32_t* ids, const T* packed, const T* grad_pa
   const T half_width = T(0.5 * width), half_height = T(0.5 * height);
   parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
     for (int64_t i = block * kBlock; i < m && i < (block + 1) * kBlock; i++) {
+      const int32_t row = ids[i];
+      if (row < 0) continue;
       const T* g = grad_packed + i * stride;
       const T x = g[0] * half_width, y = g[1] * half_height;
-      norm_sum[ids[i]] += std::sqrt(x * x + y * y);
-      views[ids[i]] += T(1);
+      norm_sum[row] += std::sqrt(x * x + y * y);
+      views[row] += T(1);
       if (max_radii) {
-        T& largest = max_radii[ids[i]];
+        T& largest = max_radii[row];
         largest = packed[i * stride + 7] > largest ? packed[i * stride + 7] : largest;
       }
     }
