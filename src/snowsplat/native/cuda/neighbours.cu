@@ -103,7 +103,7 @@ SNOW_INLINE void codes(int n, const T* points, const T* low, const T* high, uint
   for (int axis = 0; axis < 3; axis++) {
     const T offset = points[3 * i + axis] * T(0.5) - low[axis] * T(0.5);
     const T along = extent > T(0) ? min(offset / extent, T(1)) : T(0);
-    code |= spread(uint64_t(along * T((1 << kAxisBits) - 1))) << axis;
+    code |= spread(uint32_t(along * T((1 << kAxisBits) - 1))) << axis;
   }
   out[i] = code;
 }
@@ -180,7 +180,7 @@ SNOW_INLINE void search(int n, const T* points, const int32_t* order, const Box<
     chunk_points[lane_id()] = load(chunk * kWarp + lane_id());
     __syncwarp();
     const int skip = self - chunk * kWarp;
-#pragma unroll 8
+#pragma unroll(kBest > 8 ? 1 : 4)
     for (int j = 0; j < kWarp; j++) {
       const T distance = away(query, chunk_points[j]);
       best.offer(j == skip ? inf : distance);
