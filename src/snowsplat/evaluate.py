@@ -24,6 +24,9 @@ from snowsplat.gaussians import Gaussians
 from snowsplat.lpips import Lpips
 from snowsplat.render import render
 
+# Each photo is used once, so memory for some that are decoded ahead is enough.
+_PHOTOS_AHEAD = 128 << 20
+
 
 @dataclass(frozen=True)
 class ViewMetrics:
@@ -122,7 +125,7 @@ def evaluate_views(
     device = gaussians.means.device
     color = torch.tensor(background, dtype=torch.float32, device=device)
     results = []
-    with ImageLoader(views, device=device) as loader:
+    with ImageLoader(views, budget_bytes=_PHOTOS_AHEAD, device=device) as loader:
         loader.prefetch(views)
         for view in views:
             photo = loader.get(view)

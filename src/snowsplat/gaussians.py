@@ -138,6 +138,11 @@ class Gaussians:
         """The rows ``index``: (M,) integers in any order, or an (N,) bool mask."""
         return self.map(lambda tensor: take_rows(tensor, index))
 
+    def select_(self, index: Tensor) -> None:
+        """`select` in place, a tensor at a time: memory never holds two of all."""
+        for name in tuple(self.parameters()):
+            setattr(self, name, take_rows(getattr(self, name), index))
+
     def append(self, other: Gaussians) -> Gaussians:
         """This set's rows, then the other's."""
         return Gaussians.cat([self, other])

@@ -11,6 +11,8 @@ import statistics
 import time
 from dataclasses import dataclass, replace
 
+import torch
+
 from snowsplat.capture.capture import Capture, Points
 from snowsplat.config import TrainConfig, changed
 from snowsplat.pace import Work
@@ -112,8 +114,13 @@ def make_plan(
     return best
 
 
-def measure_slowness(capture: Capture, config: TrainConfig) -> float:
-    """How many times as long as reckoned a step takes on this machine, by a few real ones."""
+def measure_slowness(
+    capture: Capture, config: TrainConfig, device: torch.device | None = None
+) -> float:
+    """How many times as long as reckoned a step takes on this machine, by a few real ones.
+
+    ``device``: to train on; default: the CPU.
+    """
     camera = capture.train[0].camera
     downscale = 1 if camera.width * camera.height < 500_000 else 2
     points = capture.points
@@ -130,6 +137,7 @@ def measure_slowness(capture: Capture, config: TrainConfig) -> float:
             sh_interval=0,
             test_iterations=(),
         ),
+        device=device,
     )
     work = Work(trainer.config, camera.width * camera.height, 0)
     end = time.monotonic() + _SECONDS

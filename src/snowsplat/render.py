@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from snowsplat import ops
@@ -62,8 +61,8 @@ def render(
     with respect to every parameter of the Gaussians, `camera.cam_from_world` and `background`.
     """
     splats = project(gaussians, camera, sh_degree)
-    if background is None:
-        background = torch.zeros(3, dtype=gaussians.means.dtype, device=gaussians.means.device)
+    if background is not None:
+        background = background.to(splats.packed.device)
     image, alpha, depth = ops.rasterize(
         splats, camera.width, camera.height, background, with_depth=with_depth
     )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from snowsplat.cli.computing import check_threads
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.stages import StageProgress
 from snowsplat.errors import UserError
@@ -113,8 +114,7 @@ class Capture:
         from snowsplat.photos.inputs import GatherOptions
         from snowsplat.photos.sfm import SfmOptions
 
-        if self.threads is not None and self.threads < 1:
-            raise UserError(f"--threads is {self.threads}; it must be at least 1")
+        check_threads(self.threads)
         lens: dict[str, Any] = {}
         if self.camera_model is not None:
             lens["camera_model"] = self.camera_model

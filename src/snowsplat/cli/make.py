@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from snowsplat.cli.computing import check_threads, compute_with
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.making import CAPTURE, STAGES, Making, TrainingStopped
 from snowsplat.cli.presets import Quality, quality_within
@@ -52,7 +53,11 @@ class Make:
     """Be ready after this time. What earlier runs have finished takes none of it; an interrupted
     training goes on with the time that it had left."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Threads to compute with."""
+    """Threads to compute with, on the CPU."""
+    device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
+    """What to train on."""
+    memory: Annotated[str | None, flag("BYTES", default="what is there")] = None
+    """Memory to train in, like 4GB: see train --help."""
     overwrite: Annotated[bool, switch()] = False
     """Replace a scene of other photos that is in OUT."""
     view: Annotated[bool, switch()] = False
@@ -68,8 +73,9 @@ class Make:
         name, out = self._where()
         if self.minutes is not None and not 0.0 < self.minutes < float("inf"):
             raise UserError(f"--minutes is {self.minutes:g}; it must be more than 0")
-        if self.threads is not None and self.threads < 1:
-            raise UserError(f"--threads is {self.threads}; it must be at least 1")
+        check_threads(self.threads)
+        if self.device is not None:  # before hours of work
+            compute_with(self.threads, self.device)
         _check_free(out)
         page = PageFlags(self.port, self.host)
         page.check(self.view)
@@ -88,6 +94,8 @@ class Make:
                 *(self.inputs, name, out, quality, stages, self._command()),
                 minutes=self.minutes,
                 threads=self.threads,
+                device=self.device,
+                memory=self.memory,
                 overwrite=self.overwrite,
                 started=started,
                 page=page if self.view else None,
@@ -128,7 +136,16 @@ class Make:
 
     def _command(self) -> str:
         words = ["snowsplat", "make", *map(str, self.inputs)]
-        for flag_name in ("output", "quality", "minutes", "threads", "port", "host"):
+        for flag_name in (
+            "output",
+            "quality",
+            "minutes",
+            "threads",
+            "device",
+            "memory",
+            "port",
+            "host",
+        ):
             value = getattr(self, flag_name)
             words += [] if value is None else [f"--{flag_name}", str(value)]
         words += ["--view"] if self.view else []

@@ -47,7 +47,7 @@ class Making:
         out: the folder for all, which is there.
         stages: their record.
         command: that goes on, for people.
-        minutes, threads, overwrite: as the flags of the verb.
+        minutes, threads, device, memory, overwrite: as the flags of the verb.
         started: when it was, by `time.monotonic`.
         page: where the training is to be watched, and the scene in the end.
     """
@@ -60,6 +60,8 @@ class Making:
     command: str
     minutes: float | None
     threads: int | None
+    device: str | None
+    memory: str | None
     overwrite: bool
     started: float
     page: PageFlags | None = None
@@ -157,7 +159,13 @@ class Making:
         """Show the scene until Ctrl-C."""
         from snowsplat.cli.watch import Watch
 
-        Watch(output=folder, threads=self.threads, port=page.port, host=page.host).run()
+        Watch(
+            output=folder,
+            threads=self.threads,
+            device=self.device,
+            port=page.port,
+            host=page.host,
+        ).run()
 
     def _viewed(self, train: Train) -> Train:
         """With the page of the training, which makes way for that of the scene."""
@@ -173,6 +181,8 @@ class Making:
             output=folder,
             resume=True,
             threads=self.threads,
+            device=self.device,
+            memory=self.memory,
             checkpoint_seconds=_CHECKPOINT_SECONDS,
             again=self.command,
         )
@@ -186,6 +196,8 @@ class Making:
             output=folder,
             eval=True,
             threads=self.threads,
+            device=self.device,
+            memory=self.memory,
             checkpoint_seconds=_CHECKPOINT_SECONDS,
             again=self.command,
         )
@@ -216,7 +228,9 @@ class Making:
     def _render(self) -> dict[str, Any]:
         from snowsplat.cli.render import Render
 
-        Render(output=self.out / SCENE, split="test", threads=self.threads).run()
+        Render(
+            output=self.out / SCENE, split="test", threads=self.threads, device=self.device
+        ).run()
         return {}
 
 

@@ -104,13 +104,13 @@ class Render(SceneFlags):
         fps = 30.0 if self.fps is None else self.fps
         frames = frames_in(10.0 if self.seconds is None else self.seconds, fps)
         size = FilmSize.parse(self.size)
-        self.use_threads()
+        device = self.computing()
         name = way if Path(way).suffix == "" else Path(way).stem
         gaussians, trained, background, file = self._film_source(name)
         cameras = cameras_along(way, gaussians, trained, frames, size)
         depth = self.depth == "color"
         Film(
-            *(gaussians, cameras, background, self.film or file, fps, depth),
+            *(gaussians.to(device), cameras, background, self.film or file, fps, depth),
             side_by_side=self.side_by_side,
         ).make()
 

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from snowsplat.cli.computing import compute_with
 from snowsplat.cli.flags import flag
 from snowsplat.cli.making import SCENE
 from snowsplat.cli.output import OutputFolder
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
+    import torch
+
     from snowsplat.camera import Camera
     from snowsplat.capture import Capture
     from snowsplat.gaussians import Gaussians
@@ -37,7 +40,9 @@ class SceneFlags:
     resolution: Annotated[int | None, flag("N", "-r", default="as trained")] = None
     """1, 2, 4 or 8 divide the size of the photos; any other number is a width."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Threads to compute with."""
+    """Threads to compute with, on the CPU."""
+    device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
+    """What to compute on."""
 
     def folder(self) -> OutputFolder:
         """Raises: UserError: none named, or two."""
@@ -56,10 +61,10 @@ class SceneFlags:
         """
         capture, background = self.load_capture()
         iteration, gaussians = self.folder().read_scene(self.iteration)
-        return iteration, gaussians, capture, background
+        return iteration, gaussians.to(self.computing()), capture, background
 
     def load_capture(self) -> tuple[Capture, tuple[float, float, float]]:
-        """Capture and background colour; sets the number of threads.
+        """Capture and background colour.
 
         Raises:
             UserError: there is none, or it is damaged.
@@ -69,17 +74,15 @@ class SceneFlags:
             settings = replace(settings, path=str(self.capture))
         if self.resolution is not None:
             settings = replace(settings, resolution=self.resolution)
-        self.use_threads()
         return settings.load(), background
 
-    def use_threads(self) -> None:
-        """Raises: UserError: none at all."""
-        if self.threads is not None:
-            from snowsplat import ops
+    def computing(self) -> torch.device:
+        """What to compute on; sets the number of threads.
 
-            if self.threads < 1:
-                raise UserError(f"--threads is {self.threads}; it must be at least 1")
-            ops.set_num_threads(self.threads)
+        Raises:
+            UserError: a device that cannot be used, or no threads at all.
+        """
+        return compute_with(self.threads, self.device)
 
 
 def training_folder(path: Path) -> OutputFolder:

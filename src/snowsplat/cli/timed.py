@@ -10,6 +10,8 @@ from snowsplat.cli.progress import duration
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
+    import torch
+
     from snowsplat.capture import Capture
     from snowsplat.config import TrainConfig
     from snowsplat.pace import Pace
@@ -61,11 +63,13 @@ class TimeBudget:
         """For a checkpoint."""
         return {"seconds": self.seconds, "spent": self.seconds - self.left}
 
-    def plan(self, capture: Capture, config: TrainConfig, **may: bool) -> Plan:
+    def plan(
+        self, capture: Capture, config: TrainConfig, device: torch.device, **may: bool
+    ) -> Plan:
         """What to train. ``capture`` is at full resolution; ``may``: see `make_plan`."""
         from snowsplat.plan import make_plan, measure_slowness
 
-        slowness = measure_slowness(capture, config)
+        slowness = measure_slowness(capture, config, device)
         return make_plan(capture, config, self.left, slowness, **may)
 
     def described(self, plan: Plan) -> str:

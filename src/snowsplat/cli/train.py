@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from snowsplat.cli.computing import ask_for_the_same_bits, compute_with
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.memory_budget import MemoryBudget
 from snowsplat.cli.output import CaptureSettings, OutputFolder
+from snowsplat.cli.progress import resident_bytes
 from snowsplat.cli.timed import TimeBudget
 from snowsplat.cli.training_run import TrainingRun
 from snowsplat.cli.viewing import PageFlags
@@ -96,16 +99,24 @@ class Train:
 
     max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Most Gaussians that the scene may have: memory and time follow it. 0: no limit."""
+    memory: Annotated[str | None, flag("BYTES", default="what is there")] = None
+    """Memory to train in, like 4GB: of the GPU, or of the computer, beside what Python and PyTorch
+    take for themselves. Photos are read anew for each use, and Gaussians are fewer, as needed."""
     checkpoint_every: Annotated[int | None, flag("N", default="none")] = None
     """Steps between checkpoints, from which --resume goes on exactly."""
     resume: Annotated[bool, switch()] = False
     """Go on from the newest checkpoint in OUT, to the same result as without the stop."""
     overwrite: Annotated[bool, switch()] = False
     """Replace a training that is in OUT."""
+    device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
+    """What to compute on."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Threads to compute with. The result is the same with any number."""
+    """Threads to compute with, on the CPU. The result is the same with any number."""
+    deterministic: Annotated[bool, switch()] = False
+    """On a GPU: the same scene to the bit every time, which takes more time and memory."""
     seed: Annotated[int | None, flag("N", default="0")] = None
-    """Of all random choices. The same seed gives the same scene, to the bit."""
+    """Of all random choices. The same seed gives the same scene: on the CPU, and on a GPU with
+    --deterministic, to the bit."""
     test_iterations: Annotated[tuple[int, ...] | None, flag("[N ...]", default=RECIPE)] = None
     """Steps after which to measure on the held-out photos as well; -1 or nothing for none."""
     save_iterations: Annotated[tuple[int, ...], flag("[N ...]")] = ()
@@ -185,13 +196,12 @@ class Train:
                 "train needs a capture; name the folder of the photos and their cameras"
             )
 
-        from snowsplat import ops
         from snowsplat.trainer import Trainer
 
-        if self.threads is not None:
-            if self.threads < 1:
-                raise UserError(f"--threads is {self.threads}; it must be at least 1")
-            ops.set_num_threads(self.threads)
+        device = compute_with(self.threads, self.device)
+        before = resident_bytes()
+        if self.deterministic:
+            ask_for_the_same_bits()
         start = self._checkpoint(out) if self.resume else None
         budget, schedule = self._length(start, started)
         slowness = 1.0
@@ -204,7 +214,7 @@ class Train:
         capture = settings.load()
         if budget is not None and start is None:
             plan = budget.plan(
-                *(capture, config),
+                *(capture, config, device),
                 resize=self.resolution is None,
                 more_gaussians=self.max_gaussians is None,
                 more_often=self.densify_interval is None and self.densify_from is None,
@@ -213,7 +223,9 @@ class Train:
             if plan.resolution is not None:
                 settings = replace(settings, resolution=plan.resolution)
                 capture = settings.load()
-        trainer = Trainer(capture, config, schedule)
+        memory = MemoryBudget.of(self.memory, capture, config, device, before)
+        config = memory.plan.config
+        trainer = Trainer(capture, config, schedule, device)
         if start is None:
             out.begin(capture, settings, config)
         else:
@@ -222,9 +234,10 @@ class Train:
         self._describe(capture, trainer, start)
         if budget is not None and start is None:
             self._say(budget.described(plan))
+        self._say(str(memory))
         pace = None if budget is None else budget.pace(trainer, slowness)
         run = TrainingRun(
-            *(out, settings, recipe, trainer, budget, pace),
+            *(out, settings, recipe, trainer, budget, pace, memory),
             save_iterations=self.save_iterations,
             checkpoint_seconds=self.checkpoint_seconds,
             again=self.again or f"snowsplat train -o {self.output} --resume",

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from snowsplat.cli.memory_budget import MemoryBudget
 from snowsplat.cli.output import CaptureSettings, OutputFolder
 from snowsplat.cli.progress import TrainingProgress, duration, held_out_line, peak_bytes
 from snowsplat.cli.timed import TimeBudget
@@ -27,6 +28,7 @@ class TrainingRun:
     Attributes:
         settings, recipe: as they are written down.
         budget, pace: of a training with a time.
+        memory: what it takes, and may take.
         save_iterations: steps after which the scene is written too.
         checkpoint_seconds: between checkpoints, where the configuration names no steps.
         again: the command that goes on where Ctrl-C stopped.
@@ -39,6 +41,7 @@ class TrainingRun:
     trainer: Trainer
     budget: TimeBudget | None
     pace: Pace | None
+    memory: MemoryBudget
     save_iterations: tuple[int, ...] = ()
     checkpoint_seconds: float | None = None
     again: str = ""
@@ -142,8 +145,10 @@ class TrainingRun:
         steps = f"{step - self.first_step} more steps" if self.first_step else f"{step} steps"
         print(
             f"{path}: {len(self.trainer.gaussians):,} Gaussians, {steps} in "
-            f"{duration(self.progress.seconds)}, at most {peak_bytes() / 1e6:.0f} MB"
+            f"{duration(self.progress.seconds)}, {self.memory.taken()}"
         )
+        for line in self.memory.plan.given_up:
+            print(f"for lack of memory: {line}")
         if self.trainer.capture.test:
             if self.evaluation is None or self.evaluation[0] != step:
                 self._measured(step, self.trainer.evaluate())

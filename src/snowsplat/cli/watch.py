@@ -14,6 +14,8 @@ from snowsplat.cli.viewing import PageFlags
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:
+    import torch
+
     from snowsplat.gaussians import Gaussians
     from snowsplat.viewer.network.viewer import Scene
 
@@ -49,7 +51,7 @@ class Watch(SceneFlags):
         """Gives the exit code: 0, after Ctrl-C."""
         folder = self.folder()
         capture, background = self.load_capture()
-        newest = NewestScene(folder, self.iteration)
+        newest = NewestScene(folder, self.iteration, self.computing())
         newest()  # what cannot be shown is refused before a page opens
         label = folder.path.absolute().name
         viewer = PageFlags(self.port, self.host).open(capture, background, label)
@@ -66,9 +68,11 @@ class Watch(SceneFlags):
 class NewestScene:
     """What a folder holds now; a file is read once."""
 
-    def __init__(self, folder: OutputFolder, iteration: int | None) -> None:
-        """``iteration``: show this one, whatever comes."""
-        self._folder, self._iteration = folder, iteration
+    def __init__(
+        self, folder: OutputFolder, iteration: int | None, device: torch.device | None = None
+    ) -> None:
+        """``iteration``: show this one, whatever comes. ``device``: where to; default: the CPU."""
+        self._folder, self._iteration, self._device = folder, iteration, device
         self._read: tuple[Path, int] | None = None  # the file shown, and when it was written
         self._scene: Scene | None = None
 
@@ -86,7 +90,7 @@ class NewestScene:
                 return self._scene or Scene(None, -1, _NOTHING)
             found = path, path.stat().st_mtime_ns
             if self._scene is None or self._read != found:
-                gaussians = self._gaussians(path)
+                gaussians = self._gaussians(path).to(self._device)
                 name = path.relative_to(self._folder.path).as_posix()
                 about = [f"After {step:,} steps", f"{len(gaussians):,} Gaussians", name]
                 self._scene, self._read = Scene(gaussians, found[1], about), found

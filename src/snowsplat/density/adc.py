@@ -186,10 +186,10 @@ class AdaptiveDensityControl:
         optimizer.select(index, fresh)
         for name, tensor in self.state_tensors().items():
             setattr(self, name, tensor.new_zeros(len(index)))
-        refined = gaussians.select(index)
-        refined.means = means[order]
-        refined.log_scales[child] -= math.log(SPLIT_SHRINK)
-        return refined
+        gaussians.select_(index)
+        gaussians.means = means[order]
+        gaussians.log_scales[child] -= math.log(SPLIT_SHRINK)
+        return gaussians
 
     def _densified(self, grads: Tensor, alive: Tensor) -> Tensor:
         """(N,) bool: whom to clone or split. Each adds one Gaussian, so the cap says how many."""

@@ -151,13 +151,13 @@ class McmcDensityControl:
         index = torch.cat([survivors, sources])
         index = index[morton_order(gaussians.means[index])]
         shared = copies[index] > 1
-        relocated = gaussians.select(index)
-        new_opacities, shrink = shared_opacity(relocated.opacities[shared], copies[index][shared])
+        gaussians.select_(index)
+        new_opacities, shrink = shared_opacity(gaussians.opacities[shared], copies[index][shared])
         new_opacities = new_opacities.clamp(self.knobs.prune_opacity, 1.0 - 1e-6)
-        relocated.opacity_logits[shared] = torch.logit(new_opacities)
-        relocated.log_scales[shared] += shrink.log()[:, None]
+        gaussians.opacity_logits[shared] = torch.logit(new_opacities)
+        gaussians.log_scales[shared] += shrink.log()[:, None]
         optimizer.select(index, shared)
-        return relocated
+        return gaussians
 
     def state_tensors(self) -> dict[str, Tensor]:
         """Nothing."""

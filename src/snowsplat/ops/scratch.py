@@ -7,6 +7,7 @@ last tensor that uses it is gone, and serves the next frame. Large blocks ask fo
 
 from __future__ import annotations
 
+import math
 import mmap
 import threading
 from typing import Any
@@ -52,15 +53,17 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | Non
     """
     if device is not None and device.type != "cpu":
         return torch.empty(shape, dtype=dtype, device=device)
-    size = dtype.itemsize
-    for extent in shape:
-        size *= extent
+    size = _bytes(shape, dtype)
     if size < _PAGE:
         return torch.empty(shape, dtype=dtype)
     block = _take(size)
     loan = block[:size].view(_Loan)
     loan.block = block
     return torch.from_numpy(loan).view(dtype).view(shape)
+
+
+def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
+    return math.prod(shape) * dtype.itemsize
 
 
 def _take(size: int) -> np.ndarray:
@@ -87,8 +90,16 @@ def _make(size: int) -> np.ndarray:
 
 
 def take_rows(tensor: Tensor, index: Tensor) -> Tensor:
-    """`tensor[index]` along the first dimension, in a block of this pool."""
+    """`tensor[index]` along the first dimension, for tensors that stay: parameters, moments.
+
+    In a block like those of this pool, whose huge pages and places suit them too, but of its own:
+    it goes back to the operating system, since the next one will be of another size.
+    """
     if tensor.requires_grad or tensor.device.type != "cpu" or index.dtype == torch.bool:
         return tensor[index]
-    rows = empty((len(index), *tensor.shape[1:]), tensor.dtype)
+    shape = (len(index), *tensor.shape[1:])
+    size = _bytes(shape, tensor.dtype)
+    if size < _PAGE:
+        return tensor[index]
+    rows = torch.from_numpy(_make(size)[:size]).view(tensor.dtype).view(shape)
     return torch.index_select(tensor, 0, index, out=rows)

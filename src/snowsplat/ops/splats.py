@@ -71,6 +71,13 @@ class Splats2D:
     def __len__(self) -> int:
         return self.packed.shape[0]
 
+    def without_empty_rows(self) -> Splats2D:
+        """The same splats, each row one that draws something; waits for a GPU."""
+        if self.ids is None or self.packed.device.type == "cpu":
+            return self
+        rows = (self.ids >= 0).nonzero()[:, 0]
+        return Splats2D(self.packed[rows], self.ids[rows], self.channels)
+
     @property
     def means2d(self) -> Tensor:
         """(M, 2) centres in pixels."""

@@ -92,7 +92,7 @@ class Gauge:
                 self.can_measure = False  # whoever needs the photo will say so
                 return
             image = render(gaussians, view.camera.scaled(*size), self._background).image
-            self._newest.append(psnr(image.clamp(0.0, 1.0), photo, mask))
+            self._newest.append(psnr(image.clamp(0.0, 1.0).cpu(), photo, mask))
 
     def _photo(self, view: View, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
         if view not in self._photos:

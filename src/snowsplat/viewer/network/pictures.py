@@ -64,17 +64,19 @@ def draw(
         picture = _modes(gaussians, camera, look, background, photo)
         if photo is not None:
             picture = _beside(picture, photo, look)
-        return picture.contiguous().numpy()
+        return picture.contiguous().numpy()  # on the CPU, whatever the Gaussians are on
 
 
 def _modes(
     gaussians: Gaussians, camera: Camera, look: Look, background: Tensor | None, photo: Photo | None
 ) -> Tensor:
-    """(H, W, 3) uint8."""
+    """(H, W, 3) uint8, on the CPU."""
+    if background is not None:
+        background = background.to(gaussians.means.device)
     if look.scale != 1.0 and look.mode != "points":
         log_scales = gaussians.log_scales + math.log(look.scale)
         gaussians = dataclasses.replace(gaussians, log_scales=log_scales)
-    splats = project(gaussians, camera, look.sh_degree)
+    splats = project(gaussians, camera, look.sh_degree).without_empty_rows()
     if look.crop is not None:
         splats = _cropped(splats, gaussians, look.crop)
     size = camera.width, camera.height
@@ -96,13 +98,13 @@ def _modes(
         return palette.HEAT[_steps(torch.log1p(counts) / math.log1p(_MANY))]
     image, _, _ = ops.rasterize(splats, *size, background)
     if look.mode == "error" and photo is not None:
-        return _error(image, photo)
+        return _error(image.cpu(), photo)
     return _bytes(image)
 
 
 def _bytes(values: Tensor) -> Tensor:
-    """0..1 to uint8, rounded to the nearest."""
-    return values.clamp(0.0, 1.0).mul_(255.0).add_(0.5).to(torch.uint8)
+    """0..1 to uint8, rounded to the nearest, on the CPU."""
+    return values.clamp(0.0, 1.0).mul_(255.0).add_(0.5).to(torch.uint8).cpu()
 
 
 def _steps(values: Tensor) -> Tensor:
@@ -116,7 +118,7 @@ def _cropped(
     crop: tuple[tuple[float, float, float], tuple[float, float, float]],
 ) -> Splats2D:
     """Those whose centres lie in the box."""
-    low, high = (torch.tensor(corner, dtype=gaussians.means.dtype) for corner in crop)
+    low, high = (gaussians.means.new_tensor(corner) for corner in crop)
     assert splats.ids is not None
     means = gaussians.means[splats.ids.long()]
     inside = ((means >= low) & (means <= high)).all(1).nonzero()[:, 0]
@@ -130,9 +132,9 @@ def _depth(depth: Tensor, alpha: Tensor) -> Tensor:
     some = disparity[::4, ::4][shown[::4, ::4]]
     if not len(some):
         return torch.zeros(*depth.shape, 3, dtype=torch.uint8)
-    far, near = torch.quantile(some[:: 1 + len(some) // 10_000], torch.tensor([0.01, 0.99]))
+    far, near = torch.quantile(some[:: 1 + len(some) // 10_000], some.new_tensor([0.01, 0.99]))
     share = (disparity - far) / (near - far).clamp_min(1e-6 * float(near))
-    return palette.DEPTH[_steps(share)] * shown[:, :, None]
+    return palette.DEPTH[_steps(share)] * shown[:, :, None].cpu()
 
 
 def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -140,13 +142,14 @@ def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tenso
     straight it points there, (M,) in 0..1."""
     assert splats.ids is not None
     ids = splats.ids.long()
-    shortest = torch.eye(3)[gaussians.log_scales[ids].argmin(1)].to(gaussians.quats)
+    unit = torch.eye(3, dtype=gaussians.quats.dtype, device=gaussians.quats.device)
+    shortest = unit[gaussians.log_scales[ids].argmin(1)]
     axes = _rotated(gaussians.rotations[ids], shortest)
-    to_camera = camera.position.to(axes.dtype) - gaussians.means[ids]
+    to_camera = camera.position.to(axes) - gaussians.means[ids]
     facing = (axes * to_camera).sum(1)
     axes = torch.where(facing[:, None] < 0, -axes, axes)
     straight = facing.abs() / to_camera.norm(dim=1).clamp_min(1e-9)
-    return axes @ camera.cam_from_world[:, :3].T.to(axes.dtype), straight
+    return axes @ camera.cam_from_world[:, :3].T.to(axes), straight
 
 
 def _rotated(quats: Tensor, vectors: Tensor) -> Tensor:

@@ -1,0 +1,95 @@
+"""What a training takes: words for it, what is given up for a budget, and that it is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.camera import Camera
+from snowsplat.capture import Capture, View
+from snowsplat.capture.decode import ImageSource
+from snowsplat.errors import UserError
+from snowsplat.memory import CPU, GPU, in_words, parse_bytes, plan_memory
+from snowsplat.recipes import recipe
+
+DEVICE = torch.device("cpu")
+
+
+def capture_of(photos: int, width: int, height: int) -> Capture:
+    pose = torch.eye(4, dtype=torch.float64)[:3]
+    camera = Camera(width, height, width, width, width / 2, height / 2, pose)
+    source = ImageSource(Path("photo.jpg"), width, height)
+    return Capture([View(str(i), camera, source) for i in range(photos)], [], None, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("4GB", 4 * 10**9),
+        ("800 mb", 800 * 10**6),
+        ("1.5g", 1_500_000_000),
+        ("2GiB", 2 * 1024**3),
+        ("512MiB", 512 * 1024**2),
+        ("1000000", 10**6),
+        (".5G", 5 * 10**8),
+    ],
+)
+def test_bytes(text: str, count: int) -> None:
+    assert parse_bytes(text) == count
+
+
+@pytest.mark.parametrize("text", ["", "much", "-1GB", "0", "4 GBs", "4ib", "1e9", "nan", "GB"])
+def test_no_bytes(text: str) -> None:
+    with pytest.raises(UserError, match="must be like 4GB or 800MB"):
+        parse_bytes(text)
+
+
+def test_words() -> None:
+    assert in_words(1_300_000_000) == "1.3 GB"
+    assert in_words(240_000_000) == "240 MB"
+    assert in_words(0) == "1 MB"
+
+
+def test_without_a_budget_nothing_is_given_up() -> None:
+    config = recipe("default")
+    plan = plan_memory(capture_of(100, 1000, 500), config, DEVICE, available=10**10)
+    assert plan.given_up == ()
+    assert plan.photos == 100 * 3 * 1000 * 500
+    assert plan.config.image_memory == config.image_memory
+    assert plan.limit is not None
+    assert plan.total == plan.photos + CPU.of(plan.limit, 500_000, 3)
+
+
+def test_without_a_limit_it_says_what_a_million_takes() -> None:
+    config = recipe("paper")
+    assert config.density.max_gaussians == 0
+    plan = plan_memory(capture_of(9, 100, 100), config, DEVICE, available=10**10)
+    assert plan.limit is None
+    assert "for each million Gaussians" in str(plan)
+
+
+def test_photos_go_first_then_gaussians() -> None:
+    capture = capture_of(200, 1000, 1000)  # 600 MB of photos
+    config = recipe("default", max_gaussians=200_000)
+    wide = plan_memory(capture, config, DEVICE, available=10**10, budget=2 * 10**9)
+    assert wide.given_up == ()
+    narrow = plan_memory(capture, config, DEVICE, available=10**10, budget=700_000_000)
+    assert len(narrow.given_up) == 1
+    assert narrow.config.density.max_gaussians == 200_000
+    assert narrow.config.image_memory == narrow.photos < 600_000_000
+    least = plan_memory(capture, config, DEVICE, available=10**10, budget=300_000_000)
+    assert len(least.given_up) == 2
+    assert 1000 <= least.config.density.max_gaussians < 200_000
+    for plan, budget in ((wide, 2e9), (narrow, 7e8), (least, 3e8)):
+        assert plan.total <= budget
+
+
+def test_too_little_says_how_much_it_takes() -> None:
+    with pytest.raises(UserError, match=r"--memory 50 MB is too little .* take \d+ MB; .* -r"):
+        plan_memory(capture_of(9, 2000, 1000), recipe("default"), DEVICE, 10**10, 50_000_000)
+
+
+def test_a_gpu_takes_less_than_a_gigabyte_for_a_million() -> None:
+    assert GPU.of(1_000_000, 0, 3) < 1_000_000_000
