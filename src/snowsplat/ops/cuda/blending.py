@@ -8,7 +8,12 @@ import torch
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
 
-KERNELS: dict[str, Kernel] = {}
+KERNELS: dict[str, Kernel] = {
+    "blend_fwd": Kernel("blend", threads=256, items=1),
+    "blend_count": Kernel("blend", threads=256, items=1),
+    "blend_bwd": Kernel("blend", threads=256, items=1),
+    "background_bwd": Kernel("blend", threads=128, items=1),
+}
 
 
 def _sums_in_order(run: Run, suffix: str, n: int) -> int:
@@ -16,6 +21,12 @@ def _sums_in_order(run: Run, suffix: str, n: int) -> int:
     return int(torch.are_deterministic_algorithms_enabled())
 
 
+def _block_bytes(run: Run, suffix: str, n: int) -> int:
+    """A bit for each of the eight warps of a tile."""
+    return 1
+
+
 SEQUENCES: dict[str, Callable[..., int]] = {
+    "blend_block_bytes": _block_bytes,
     "blend_sums_in_order": _sums_in_order,
 }
