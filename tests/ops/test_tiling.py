@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from dataclasses import dataclass
 
 import pytest
 import torch
 from torch import Tensor
 
+from snowsplat.ops import native as natives
 from snowsplat.ops.cuda import sorting
 from snowsplat.ops.cuda.kernels import Argument, Run
 from snowsplat.ops.cuda.launches import KERNELS
@@ -14,9 +18,19 @@ from snowsplat.ops.cuda.launches import KERNELS
 from . import emulation
 from .conftest import variants
 from .engines import execute_there
-from .scenes import CUDA_FLOAT32, EMULATED_FLOAT32, Variant, generator
+from .scenes import (
+    CUDA_FLOAT32,
+    EMULATED_FLOAT32,
+    Variant,
+    assert_close,
+    generator,
+    normal,
+    random_splats,
+    uniform,
+)
 
 BLOCK = 4096  # keys of a block of the sort
+TILE = 16
 
 
 @pytest.fixture(params=variants(EMULATED_FLOAT32, CUDA_FLOAT32))
@@ -50,12 +64,12 @@ def sort(
 ) -> tuple[Tensor, Tensor]:
     """The sorted keys and the numbers they had, from memory with a margin that nobody may touch."""
     n = len(keys)
-    pairs = [torch.full((n + 8,), 99, dtype=dtype) for dtype in 2 * [keys.dtype, torch.int32]]
-    pairs[0][:n] = keys
+    dtypes = (keys.dtype, keys.dtype, torch.int32, torch.int32)
+    a, b, c, d = (torch.full((n + 8,), 99, dtype=dtype) for dtype in dtypes)
+    a[:n] = keys
     there = None if count is None else torch.tensor([count])
-    in_order = [pairs[0], pairs[2], pairs[1], pairs[3]]
-    got, values = sorting.sort_pairs(run, n, *in_order, bits, count=there, rows=True)
-    for tensor in pairs:
+    got, values = sorting.sort_pairs(run, n, a, b, c, d, bits, count=there, rows=True)
+    for tensor in (a, b, c, d):
         assert (tensor[n:] == 99).all()
     return got[:n], values[:n]
 
@@ -134,3 +148,289 @@ def test_exclusive_scan_beyond_32_bits(run: Run) -> None:
     sorting.exclusive_scan(run, 2000, values, out, total)
     assert unsigned(out) == [min(i * most, 2**32 - 1) for i in range(2000)]
     assert total.item() == 2000 * most
+
+
+# ---- Splats into tiles ---------------------------------------------------------------------------
+
+
+@dataclass
+class Binned:
+    """What blending gets, and how many instances it takes in all."""
+
+    rows: list[list[int]]  # of the splats of each tile, in order
+    slots: list[list[int]]  # the numbers of these instances
+    ranges: list[list[int]]  # of the slots of each row
+    needed: int
+
+
+def bin_splats(
+    native: Variant,
+    packed: Tensor,
+    width: int,
+    height: int,
+    *,
+    capacity: int = -1,
+    with_slots: bool = True,
+) -> Binned:
+    """As `rasterize` does, in memory with a margin that nobody may touch."""
+    suffix = "" if native.dtype == torch.float32 else "_f64"
+    packed = packed.to(native.dtype).contiguous()
+    m, stride = packed.shape
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    tiles = tiles_x * tiles_y
+    guarded: list[tuple[Tensor, int]] = []
+
+    def empty(size: int, dtype: torch.dtype = torch.int32) -> Tensor:
+        tensor = torch.full((size + 8,), 99, dtype=dtype)
+        guarded.append((tensor, size))
+        return tensor
+
+    def launch(name: str, n: int, *args: Tensor | int | float | None) -> int:
+        return natives.launch(name + suffix, n, *args)
+
+    columns = torch.tensor([8, 9, 10, -1])
+    key = torch.int32 if native.dtype == torch.float32 else torch.int64
+    keys, keys2, order, order2 = empty(m, key), empty(m, key), empty(m), empty(m)
+    records = empty(m * launch("splat_record_bytes", 0), torch.uint8)
+    launch(
+        *("splats_prepare", m, packed, stride, float(width), float(height)),
+        *(columns, records, keys),
+    )
+    launch("splats_sort", m, keys, keys2, order, order2)
+    assert sorted(order[:m].tolist()) == list(range(m))
+    parts = natives.launch("tiles_parts", m)
+    size = natives.launch("tiles_workspace_bytes", m, tiles, parts)
+    workspace, tile_start = torch.empty(size, dtype=torch.uint8), empty(tiles + 1)
+    needed = torch.full((1,), -5)
+    binning = (m, order, packed, stride, records, tiles_x, tiles_y, parts, workspace, tile_start)
+    count = launch("tiles_count", *binning, capacity, needed)
+    if native.engine != "native" and capacity >= 0:
+        assert count == capacity
+    instance_splat, instance_slot, slot_range = empty(count), empty(count), empty(2 * m)
+    slots = (instance_slot, slot_range) if with_slots else (None, None)
+    launch("tiles_fill", *binning, count, instance_splat, *slots)
+    for tensor, length in guarded:
+        assert (tensor[length:] == 99).all()
+    start = tile_start[: tiles + 1].tolist()
+    assert start[0] == 0
+    if capacity < 0:
+        assert start[tiles] == needed.item() == count
+    spans = list(itertools.pairwise(start))
+    return Binned(
+        [instance_splat[begin:end].tolist() for begin, end in spans],
+        [instance_slot[begin:end].tolist() for begin, end in spans],
+        slot_range[: 2 * m].view(m, 2).tolist(),
+        int(needed.item()),
+    )
+
+
+def least_on_edge(a: float, b: float, c: float, fixed: float, low: float, high: float) -> float:
+    """The least a f² + 2 b f t + c t² for t in [low, high]."""
+    t = min(max(-b * fixed / c, low), high)
+    return a * fixed * fixed + 2 * b * fixed * t + c * t * t
+
+
+def touched_tiles(row: list[float], width: int, height: int, margin: float) -> set[int]:
+    """The definition: tiles whose pixel centres span a rectangle in which α comes near 1/255.
+
+    And near those that the ellipse α ≥ 1/255 spans; if that is one alone, it counts as touched.
+    With a margin > 0, also what is that near to being touched; < 0: not what nearly is not.
+    """
+    x, y, a, b, c, opacity = row[:6]
+    tiles_x = -(-width // TILE)
+    det = a * c - b * b
+    if not (opacity >= 1 / 255 and det > 0 and math.isfinite(x + y)):
+        return set()
+    reach = 2 * math.log(255 * opacity)
+    ex, ey = math.sqrt(reach * c / det) + margin, math.sqrt(reach * a / det) + margin
+    x0, x1 = max(x - ex - 0.5, 0), min(x + ex - 0.5, width - 1)
+    y0, y1 = max(y - ey - 0.5, 0), min(y + ey - 0.5, height - 1)
+    if x1 < x0 or y1 < y0:
+        return set()
+    columns = range(int(x0) // TILE, int(x1) // TILE + 1)
+    rows = range(int(y0) // TILE, int(y1) // TILE + 1)
+    slack = 2 * math.log(2) * 1e-3
+    touched = set()
+    for j in rows:
+        for i in columns:
+            left, top = i * TILE + 0.5 - x, j * TILE + 0.5 - y
+            right, bottom = left + TILE - 1, top + TILE - 1
+            inside = left <= 0 <= right and top <= 0 <= bottom
+            edges = [least_on_edge(a, b, c, u, top, bottom) for u in (left, right)]
+            edges += [least_on_edge(c, b, a, v, left, right) for v in (top, bottom)]
+            least = 0.0 if inside else min(edges)
+            if least <= reach + slack + margin or len(columns) * len(rows) == 1:
+                touched.add(j * tiles_x + i)
+    return touched
+
+
+def check_binning(native: Variant, packed: Tensor, width: int, height: int) -> Binned:
+    """Each tile has the splats that touch it, in order of depth; slots number them by splat."""
+    got = bin_splats(native, packed, width, height)
+    rows = packed.to(native.dtype).double().tolist()
+    margin = 1e-3 if native.dtype == torch.float32 else 1e-9
+    whole = [-(-size // TILE) * TILE for size in (width, height)]
+    of_row: dict[int, dict[int, int]] = {row: {} for row in range(len(rows))}
+    for tile, (splats, slots) in enumerate(zip(got.rows, got.slots, strict=True)):
+        assert splats == sorted(splats, key=lambda row: (rows[row][6], row)), f"tile {tile}"
+        for row, slot in zip(splats, slots, strict=True):
+            assert tile not in of_row[row]
+            of_row[row][tile] = slot
+    for row, tiles in of_row.items():
+        values = rows[row]
+        assert tiles.keys() >= touched_tiles(values, width, height, -margin), f"row {row}"
+        assert tiles.keys() <= touched_tiles(values, whole[0], whole[1], margin), f"row {row}"
+        begin, end = got.ranges[row]
+        assert list(tiles.values()) == list(range(begin, end)), f"row {row}"
+    assert sum(len(tiles) for tiles in of_row.values()) == got.needed
+    ranges = sorted(span for span in got.ranges if span[0] < span[1])
+    assert [begin for begin, _ in ranges] == [0, *(end for _, end in ranges)][: len(ranges)]
+    return got
+
+
+@pytest.mark.parametrize("count", [0, 1, 31, 33, 255, 256, 257, 600])
+def test_tiles_have_the_splats_that_touch_them(native: Variant, count: int) -> None:
+    check_binning(native, random_splats(count, count, 96, 80).packed, 96, 80)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (640, 3), (5, 333)])
+def test_tiles_of_images_of_any_size(native: Variant, width: int, height: int) -> None:
+    check_binning(native, random_splats(width, 90, width, height).packed, width, height)
+
+
+@pytest.mark.parametrize("pixels", [15.0, 60.0, 400.0])
+def test_tiles_of_large_splats(native: Variant, pixels: float) -> None:
+    """Ellipses of many tiles at every angle, between small ones; and more of them than warps."""
+    splats = random_splats(6, 40, 320, 240, pixels=pixels).packed
+    small = random_splats(7, 40, 320, 240).packed
+    mixed = torch.stack([splats, small], dim=1).flatten(0, 1)
+    largest = max(end - begin for begin, end in check_binning(native, mixed, 320, 240).ranges)
+    assert largest > 32
+
+
+@pytest.mark.parametrize("across", [1, 2, 31, 32, 33, 70])
+def test_tiles_of_a_splat_as_wide(native: Variant, across: int) -> None:
+    """Rectangles of a row and a column of tiles, around what a thread looks at alone."""
+    wide = 1e-9
+    packed = torch.zeros(2, 16, dtype=torch.float64)
+    packed[:, :7] = torch.tensor([2.0, 3.0, wide, 0, wide, 0.5, 1.0])
+    for size in ((across * TILE, TILE), (TILE, across * TILE), (across * TILE, 2 * TILE)):
+        got = check_binning(native, packed, *size)
+        assert got.needed == 2 * len(got.rows)
+
+
+def test_tiles_beyond_16_bits(native: Variant) -> None:
+    size = 16 * 260
+    packed = random_splats(8, 60, size, size, pixels=20.0).packed
+    packed[:2, 2:5] = torch.tensor([2e-5, 1e-5, 3e-5])
+    got = check_binning(native, packed, size, size)
+    assert len(got.rows) > 2**16
+    assert max(tile for tile, rows in enumerate(got.rows) if rows) > 2**16
+
+
+def test_tiles_order_of_depths(native: Variant) -> None:
+    """Ties by row, depths below 0 and infinite ones."""
+    splats = random_splats(9, 300, 48, 32, pixels=6.0).packed
+    depths = torch.tensor([2.0, 1.0, -3.0, math.inf, -math.inf, 1e-30, 1e30], dtype=torch.float64)
+    splats[:, 6] = depths[torch.randint(0, len(depths), (300,), generator=generator(0))]
+    check_binning(native, splats, 48, 32)
+
+
+def test_tiles_of_what_is_nowhere(native: Variant) -> None:
+    splats = random_splats(10, 60, 64, 48, opacity=(0.5, 1.0)).packed
+    splats[0] = 0  # an empty row
+    splats[1, 5] = 0.0039  # below 1/255
+    splats[2, :2] = torch.tensor([-500.0, 20.0])
+    splats[3, :2] = torch.tensor([20.0, 900.0])
+    splats[4, 2:5] = torch.tensor([1.0, 2.0, 1.0])  # no ellipse
+    odd = [(c, v) for c in range(5) for v in (math.nan, math.inf, -math.inf)] + [(5, math.nan)]
+    for row, (column, value) in enumerate(odd, start=5):
+        if native.engine == "native":  # which is never given any
+            splats[row] = 0
+        else:
+            splats[row, column] = value
+    got = bin_splats(native, splats, 64, 48)
+    assert all(begin == end for begin, end in got.ranges[:21])
+    seen = {row for rows in got.rows for row in rows}
+    assert seen == {row for row, (begin, end) in enumerate(got.ranges) if begin < end}
+    assert len(seen) > 20
+
+
+def test_tiles_all_nowhere(native: Variant) -> None:
+    got = bin_splats(native, torch.zeros(5, 16), 40, 40)
+    assert got.needed == 0
+    assert all(begin == end for begin, end in got.ranges)
+
+
+@pytest.mark.parametrize("room", [0, 1, 100, 137, 10_000])
+def test_tiles_with_room_for_some(native: Variant, room: int) -> None:
+    """The instances whose slots there is room for, and no others."""
+    splats = random_splats(11, 70, 64, 80, pixels=8.0).packed
+    splats[:3, 2:5] = 1e-9 * torch.tensor([1.0, 0.0, 1.0])
+    splats[0, 6] = 0.1
+    whole = bin_splats(native, splats, 64, 80)
+    got = bin_splats(native, splats, 64, 80, capacity=room)
+    assert got.needed == whole.needed > 140
+    if native.engine == "native":
+        room = whole.needed  # on the CPU there is always enough
+    pairs = [list(zip(*both, strict=True)) for both in zip(whole.rows, whole.slots, strict=True)]
+    kept = [[(row, slot) for row, slot in pair if slot < room] for pair in pairs]
+    assert got.rows == [[row for row, _ in pair] for pair in kept]
+    assert got.slots == [[slot for _, slot in pair] for pair in kept]
+    assert got.ranges == [[min(end, room) for end in span] for span in whole.ranges]
+
+
+@pytest.mark.parametrize("size", [64, 300])
+def test_tiles_without_slots(native: Variant, size: int) -> None:
+    """Where gradients are summed in no order, slots are left out; the order is the same."""
+    if native.engine == "native":
+        pytest.skip("the CPU always has slots")
+    splats = random_splats(12, 200, size, size, pixels=5.0).packed
+    whole = bin_splats(native, splats, size, size)
+    got = bin_splats(native, splats, size, size, with_slots=False)
+    assert got.rows == whole.rows
+
+
+# ---- Gradients of splats from those of their tiles -----------------------------------------------
+
+
+@pytest.mark.parametrize("add", [False, True])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 100])
+def test_reduce(native: Variant, count: int, channels: int, add: bool) -> None:
+    g = generator(count)
+    dtype, suffix = native.dtype, "" if native.dtype == torch.float32 else "_f64"
+    packed = random_splats(13, count, 50, 50, channels=20).packed.to(dtype)
+    stride = packed.shape[1]
+    lengths = torch.randint(0, 9, (count,), generator=g)
+    lengths[::7], lengths[3::7] = 0, 70
+    ends = lengths.cumsum(0)
+    starts = ends - lengths
+    slots = normal(g, int(lengths.sum()), 16)
+    before = uniform(g, -1, 1, count, stride)
+    columns = torch.tensor([12, 9, 6, 27])
+    grad = torch.full((count + 1, stride), 99.0, dtype=dtype)
+    grad[:count] = before if add else math.nan
+    natives.launch(
+        f"splats_reduce{suffix}",
+        count,
+        slots.to(dtype),
+        torch.stack([starts, ends], dim=1).int(),
+        packed,
+        stride,
+        channels,
+        columns,
+        add,
+        grad,
+    )
+    assert (grad[count:] == 99).all()
+    wanted = before if add else torch.zeros(count, stride, dtype=torch.float64)
+    first = 3 if channels <= 3 else 4
+    for i in range(count):
+        total = slots[int(starts[i]) : int(ends[i])].sum(dim=0)
+        a, b, c, opacity = packed[i, 2:6].double()
+        q, qx, qy, qxx, qxy, qyy = total[first : first + 6]
+        wanted[i, :2] += torch.stack([a * qx + b * qy, b * qx + c * qy])
+        wanted[i, 2:6] += torch.stack([-0.5 * qxx, -qxy, -0.5 * qyy, q / opacity])
+        wanted[i, columns[:channels]] += total[:channels]
+    assert_close(grad[:count], wanted, 10 * native.forward if count else 0)
