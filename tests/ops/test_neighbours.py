@@ -46,6 +46,22 @@ def test_points_at_the_same_place(variant: Variant) -> None:
     assert (distances[9] == 5).all()
 
 
+@pytest.mark.parametrize("k", [1, 2, 3, 4, 8, 9, 64])
+def test_all_at_the_same_place(variant: Variant, k: int) -> None:
+    points = torch.tensor([[-7.0, 0.1, 1e3]]).repeat(70, 1).to(variant.dtype)
+    assert (variant.ops.neighbours(points, k) == 0).all()
+
+
+def test_far_apart(variant: Variant) -> None:
+    """As far as squares of float32 reach, and the box of the points farther than that."""
+    points = torch.tensor([[-3e18, 0, 0], [0, 4e18, 0], [0, 0, 0]]).to(variant.dtype)
+    expected = torch.tensor([[3e18, 5e18], [4e18, 5e18], [3e18, 4e18]])
+    assert_close(variant.ops.neighbours(points, k=2) / 1e18, expected / 1e18, 1e-6)
+    corner = torch.full((1, 3), 3e38).to(variant.dtype)
+    distances = variant.ops.neighbours(torch.cat([points, -corner, corner]), k=2)
+    assert_close(distances[:3] / 1e18, expected / 1e18, 1e-6)
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_fewer_points_than_neighbours(variant: Variant, count: int) -> None:
     """What does not exist is infinitely far away."""
@@ -67,6 +83,7 @@ CLOUDS = {
     "duplicates": lambda g: normal(g, 60, 3).repeat(10, 1),
     "far from the origin": lambda g: 64 + uniform(g, 0, 1, 700, 3),
     "one outlier": lambda g: torch.cat([uniform(g, 0, 1, 700, 3), torch.tensor([[1e6, 0, 0]])]),
+    "one far outlier": lambda g: torch.cat([normal(g, 300, 3), torch.tensor([[0, -1e14, 0.0]])]),
 }
 
 
@@ -79,6 +96,37 @@ def test_native_is_the_twin(native: Variant, cloud, k: int) -> None:
     actual = native.ops.neighbours(points.to(native.dtype), k)
     # Every distance by itself: the L2 over all would let the outlier hide the rest.
     torch.testing.assert_close(actual.double(), expected, rtol=native.forward * 1e-1, atol=1e-12)
+
+
+@pytest.mark.parametrize("k", [2, 4, 8, 9, 64])
+def test_native_is_the_twin_for_any_number(native: Variant, k: int) -> None:
+    points = normal(generator(1), 200, 3)
+    expected = reference.neighbours(points, k)
+    actual = native.ops.neighbours(points.to(native.dtype), k)
+    torch.testing.assert_close(actual.double(), expected, rtol=native.forward * 1e-1, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [31, 32, 33, 127, 129, 1023, 1024, 1025])
+def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
+    points = uniform(generator(count), -1, 1, count, 3)
+    expected = reference.neighbours(points)
+    actual = native.ops.neighbours(points.to(native.dtype))
+    torch.testing.assert_close(actual.double(), expected, rtol=native.forward * 1e-1, atol=1e-12)
+
+
+def test_order_does_not_matter(native: Variant) -> None:
+    points = normal(generator(2), 500, 3).to(native.dtype)
+    order = torch.randperm(len(points), generator=generator(3))
+    distances = native.ops.neighbours(points)
+    assert torch.equal(native.ops.neighbours(points[order]), distances[order])
+
+
+def test_many_points(native: Variant) -> None:
+    """More than 32 groups of 32 chunks of 32 points."""
+    points = grid(33, 33, 33)
+    shuffled = points[torch.randperm(len(points), generator=generator(4))]
+    distances = native.ops.neighbours(shuffled.to(native.dtype))
+    assert (distances == 1).all()
 
 
 WRONG = {

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
+from snowsplat.ops import cuda
 
 from .scenes import (
     TWIN,
@@ -23,6 +24,8 @@ from .scenes import (
 pytestmark = pytest.mark.isa
 
 SIZES = [(1, 1), (5, 3), (3, 5), (11, 11), (17, 23), (16, 16), (33, 64), (70, 41)]
+# About the tiles of a GPU: 32 columns, 24 rows of float or 12 of double.
+TILES = [(11, 31), (12, 32), (13, 33), (23, 63), (24, 64), (25, 65), (1, 300), (300, 1)]
 C1, C2 = 0.01**2, 0.03**2
 
 
@@ -168,7 +171,83 @@ def test_finite_differences_of_ssim(double: Variant) -> None:
     )
 
 
-@pytest.mark.parametrize(("height", "width"), [*SIZES, (3, 2000), (1100, 2), (560, 140)])
+def test_finite_differences_of_a_target_of_bytes(double: Variant) -> None:
+    a, b = images(7, 6, 13)
+    levels = (b * 255).round().to(torch.uint8)
+    assert (a - levels / 255).abs().min() > 1e-5
+
+    def loss(image: Tensor) -> Tensor:
+        return double.ops.photometric_loss(image, levels)
+
+    assert torch.autograd.gradcheck(loss, (a.requires_grad_(),), eps=1e-6, atol=1e-8, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [(slice(None), slice(None)), (slice(10, 14), slice(None)), (slice(None), slice(30, 34))],
+    ids=["everywhere", "rows", "columns"],
+)
+def test_finite_differences_across_tiles(double: Variant, changed: tuple[slice, slice]) -> None:
+    a, b = images(8, 37, 70)
+    assert (a - b).abs().min() > 1e-5
+    direction = torch.zeros_like(a)
+    direction[changed] = uniform(generator(9), -1, 1, *direction[changed].shape)
+
+    def loss(image: Tensor) -> Tensor:
+        return double.ops.photometric_loss(image, b)
+
+    eps = 1e-6
+    numeric = (loss(a + eps * direction) - loss(a - eps * direction)) / (2 * eps)
+    a.requires_grad_()
+    (analytic,) = torch.autograd.grad(loss(a), a)
+    assert_close((analytic * direction).sum(), numeric, 1e-6)
+
+
+def test_without_a_gradient(native: Variant) -> None:
+    """The value is the same whether or not somebody wants its gradient, and every time."""
+    a, b = (i.to(native.dtype) for i in images(10, 40, 37))
+    values = [native.ops.photometric_loss(image, b) for image in (a, a, a.clone().requires_grad_())]
+    assert torch.equal(values[0], values[1])
+    assert torch.equal(values[0], values[2].detach())
+
+
+def test_channels_one_after_the_other(native: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where images are large a GPU takes few channels at a time: the same to the bit."""
+    a, b = (i.to(native.dtype) for i in images(11, 27, 35))
+    results = []
+    for room in (cuda.photometric._MAPS_BYTES, 6 * 27 * 35 * a.element_size(), 0):
+        monkeypatch.setattr(cuda.photometric, "_MAPS_BYTES", room)
+        image = a.clone().requires_grad_()
+        value = native.ops.photometric_loss(image, b)
+        value.backward()
+        assert image.grad is not None
+        results.append((value.detach(), image.grad))
+    for value, grad in results[1:]:
+        assert torch.equal(value, results[0][0])
+        assert torch.equal(grad, results[0][1])
+
+
+def test_not_a_number_stays_where_it_is(native: Variant) -> None:
+    """The gradient of a pixel depends on those at most 10 away."""
+    a, b = images(12, 40, 50)
+    a[20, 25, 1] = math.nan
+    image = a.to(native.dtype).requires_grad_()
+    value = native.ops.photometric_loss(image, b.to(native.dtype))
+    value.backward()
+    assert image.grad is not None
+    assert value.isnan()
+    finite = image.grad.isfinite()
+    assert not finite[15:26, 20:31, 1].any()
+    assert finite[:, :, 0].all()
+    assert finite[:, :, 2].all()
+    far = torch.ones(40, 50, dtype=torch.bool)
+    far[10:31, 15:36] = False
+    assert finite[:, :, 1][far].all()
+
+
+@pytest.mark.parametrize(
+    ("height", "width"), [*SIZES, *TILES, (3, 2000), (3, 16384), (1100, 2), (560, 140)]
+)
 @pytest.mark.parametrize("name", ["ssim", "photometric_loss"])
 def test_native_is_the_twin(native: Variant, name: str, height: int, width: int) -> None:
     a, b = images(height + width, height, width)
