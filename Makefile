@@ -24,7 +24,7 @@ export PYTHONPATH := $(CURDIR)/src
 BUILD := build/native
 # Two builds in one checkout wait for each other.
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
-CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' | sort)
+CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
 .PHONY: demo test dev check format native compiler lint types layers pytest clean
 

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import torch
 
+from snowsplat.ops.cuda import nvrtc
 from snowsplat.ops.cuda.kernels import Argument, Kernel
 
 _HERE = Path(__file__).parent
@@ -30,15 +31,17 @@ _FLAGS = {
 
 @functools.cache
 def library(file: str) -> ctypes.CDLL:
-    """`native/cuda/<file>.cu` compiled for the CPU, anew where a source has changed."""
+    """`native/cuda/<file>.cu`, or one beside this file, compiled for the CPU where it changed."""
     kind = os.environ.get("SNOWSPLAT_EMULATION", "")
     folder = _ROOT / "build" / "emulation" / (kind or "plain")
     folder.mkdir(parents=True, exist_ok=True)
-    target, source = folder / f"{file}.so", _NATIVE / "cuda" / f"{file}.cu"
-    headers = [*_NATIVE.glob("*.h"), *_NATIVE.glob("cuda/*.h"), *_HERE.glob("*.[hc]*")]
+    target, source = folder / f"{file}.so", nvrtc.path_of(file)
+    if not source.exists():
+        source = _HERE / f"{file}.cu"
+    made_of = [*nvrtc.sources(source), *_HERE.glob("*.h"), *_HERE.glob("*.cpp")]
     with (folder / f"{file}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        newest = max(path.stat().st_mtime for path in [source, *headers])
+        newest = max(path.stat().st_mtime for path in made_of)
         if not target.exists() or target.stat().st_mtime < newest:
             command = [os.environ.get("CXX", "c++"), "-std=c++17", *_FLAGS[kind]]
             command += ["-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas"]  # of unrolling

@@ -238,7 +238,7 @@ void report_divergence() {
 }
 
 void set_order(int threads) {
-  static const char* const asked = std::getenv("SNOWSPLAT_ORDER");
+  const char* const asked = std::getenv("SNOWSPLAT_ORDER");
   const std::string kind = asked ? asked : "forward";
   order.resize(size_t(threads));
   for (int i = 0; i < threads; i++) order[size_t(i)] = kind == "backward" ? threads - 1 - i : i;

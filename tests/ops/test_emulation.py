@@ -1,0 +1,211 @@
+"""The emulation of CUDA blocks itself: it finds the faults it is there for, and counts right."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.ops.cuda.kernels import Kernel
+
+from . import emulation
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+LANES = torch.arange(32, dtype=torch.int32)
+
+pytestmark = pytest.mark.emulated
+
+
+@pytest.fixture(autouse=True)
+def _forward(monkeypatch):
+    monkeypatch.delenv("SNOWSPLAT_ORDER", raising=False)
+
+
+def run(name: str, threads: int, n: int, *args: torch.Tensor, blocks: int = 1) -> None:
+    emulation.execute(Kernel("faults", threads, threads), name, blocks, (n, *args))
+
+
+def zeros(count: int) -> torch.Tensor:
+    return torch.zeros(count, dtype=torch.int32)
+
+
+@pytest.mark.parametrize("order", ["forward", "backward", "5"])
+@pytest.mark.parametrize(
+    ("name", "threads", "n", "message"),
+    [
+        ("two_barriers", 64, 40, r"divergent barrier: thread 0 waits at __syncthreads \(faults.cu"),
+        ("barrier_or_vote", 64, 40, "thread 0 waits at __syncthreads .*, thread 40 at a warp's"),
+        ("absent_lane", 64, 5, "thread 0 waits at a warp's .* for lanes that do not come"),
+        ("absent_lane", 64, 0, "thread 1 waits at a warp's .* for lanes that do not come"),
+        ("short_warp", 48, 48, "thread 32 waits at a warp's .* for lanes that do not come"),
+        ("two_masks", 32, 16, "for lanes that do not come"),
+        ("not_in_its_mask", 32, 3, r"lane 3 is not in the mask that it gives \(faults.cu:"),
+    ],
+)
+def test_what_waits_for_ever_is_reported(name, threads, n, message, order, monkeypatch):
+    monkeypatch.setenv("SNOWSPLAT_ORDER", order)
+    with pytest.raises(RuntimeError, match=f"{name}: block 0: .*{message}"):
+        run(name, threads, n, zeros(threads))
+    out = zeros(64)
+    run("double_all", 64, 64, out + 3)  # and the next kernel starts afresh
+
+
+def test_all_threads_at_one_barrier_are_fine():
+    for name, n in (("two_barriers", 64), ("two_barriers", 0), ("barrier_or_vote", 64)):
+        out = zeros(64)
+        run(name, 64, n, out)
+        assert out.tolist() == [1] * 64
+    run("short_warp", 48, 32, zeros(48))
+    # A barrier within warps alone: those of the other warp wait for the block.
+    with pytest.raises(RuntimeError, match="divergent barrier"):
+        run("barrier_or_vote", 64, 32, zeros(64))
+
+
+@pytest.mark.parametrize("order", ["backward", "1", "2"])
+def test_a_missing_barrier_shows_in_another_order(order, monkeypatch):
+    given, right, out = torch.arange(64, dtype=torch.int32), zeros(64), zeros(64)
+    run("missing_barrier", 64, 1, given, right)
+    assert right.tolist() == [0, *range(63)]
+    monkeypatch.setenv("SNOWSPLAT_ORDER", order)
+    run("missing_barrier", 64, 1, given, out)
+    assert not torch.equal(out, right)
+
+
+@pytest.mark.parametrize("order", ["forward", "backward", "7"])
+def test_warps_too_need_their_barriers(order, monkeypatch):
+    monkeypatch.setenv("SNOWSPLAT_ORDER", order)
+    out = zeros(32)
+    run("missing_warp_barrier", 32, 1, LANES, out)
+    assert torch.equal(out, LANES.flip(0))
+    run("missing_warp_barrier", 32, 0, LANES, out)
+    assert not torch.equal(out, LANES.flip(0))
+
+
+def test_shared_memory_begins_as_nan_in_every_block():
+    out = torch.zeros(32)
+    run("never_written", 32, 20, out, blocks=3)
+    assert (out[:20] == 1).all()
+    assert out[20:].isnan().all()
+
+
+@pytest.mark.parametrize(
+    ("call", "found"),
+    [
+        ("beyond_shared, 32, 1, zeros(32)", "heap-buffer-overflow"),
+        ("beyond_the_tensor, 32, 1, zeros(32)", "heap-buffer-overflow"),
+        ("shifted_too_far, 32, 40, zeros(32)", "shift exponent 40 is too large"),
+    ],
+)
+def test_the_sanitizers_find_what_reaches_too_far(call, found):
+    compiler = os.environ.get("CXX", "c++")
+    libraries = []
+    for name in ("libasan.so", "libubsan.so"):
+        asked = [compiler, f"-print-file-name={name}"]
+        path = subprocess.run(asked, capture_output=True, text=True).stdout.strip()
+        if not os.path.isabs(path):
+            pytest.skip(f"needs {name}, which comes with GCC")
+        libraries.append(path)
+    name, rest = call.split(", ", 1)
+    code = f"from tests.ops.test_emulation import run, zeros; run('{name}', {rest}); print('ran')"
+    environment = os.environ | {
+        "LD_PRELOAD": " ".join(libraries),
+        "ASAN_OPTIONS": "detect_leaks=0",
+        "SNOWSPLAT_EMULATION": "sanitized",
+        "PYTHONPATH": os.pathsep.join((str(REPOSITORY), str(REPOSITORY / "src"))),
+    }
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment,
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode != 0
+    assert found in result.stderr
+    assert "ran" not in result.stdout
+
+
+def test_threads_that_have_ended_do_not_count():
+    given, out = torch.arange(64, dtype=torch.int32), zeros(1)
+    for n in (64, 40, 1):
+        run("early_return", 64, n, given, out)
+        assert out.item() == n * (n - 1) // 2
+
+
+def test_values_of_exchanges():
+    given = (LANES * 7 + 3) % 32
+    rows = zeros(320)
+    run("exchanges", 32, 4, given, rows)
+    value, lanes = given.tolist(), range(32)
+    sames = [sum(1 << k for k in lanes if value[k] % 3 == value[i] % 3) for i in lanes]
+    expected = [
+        [value[4]] * 32,
+        [value[i - 4] if i >= 4 else value[i] for i in lanes],
+        [value[i + 4] if i + 4 < 32 else value[i] for i in lanes],
+        [value[i ^ 4] for i in lanes],
+        [value[i // 8 * 8 + (i + 1) % 8] for i in lanes],
+        [value[i + 4] if i % 8 < 4 else value[i] for i in lanes],
+        [sum(1 << k for k in lanes if value[k] % 2)] * 32,
+        [1] * 32,
+        [1] * 32,
+        sames,
+    ]
+    unsigned = [[v & 0xFFFFFFFF for v in row] for row in rows.view(10, 32).tolist()]
+    assert unsigned == expected
+
+
+def test_a_double_travels_whole():
+    given, out = torch.rand(32, dtype=torch.float64), torch.zeros(32, dtype=torch.float64)
+    run("wide_values", 32, 5, given, out)
+    assert torch.equal(out, given[LANES.long() ^ 5])
+
+
+def test_partial_masks():
+    out = zeros(128)
+    run("partial_masks", 32, 7, LANES, out)
+    rows = out.view(4, 32)
+    assert (rows[:, ::2] == 0).all()
+    odd = 0xAAAAAAAA
+    above = sum(1 << k for k in range(11, 32, 2))
+    found = [(row[1::2].unique() & 0xFFFFFFFF).tolist() for row in rows.long()]
+    assert found == [[7], [above], [odd], [1]]
+
+
+def test_warps_run_on_their_own():
+    out = zeros(96)
+    run("warps_apart", 96, 3, out)
+    # Of lane i comes i + i.
+    assert out.view(3, 32).tolist() == [
+        [sum(2 * i for i in range(3 * w + 1))] * 32 for w in range(3)
+    ]
+
+
+def test_votes_of_a_block():
+    for n, expected in ((40, [40, 1, 0]), (64, [64, 0, 1]), (0, [0, 1, 0])):
+        out = zeros(192)
+        run("block_votes", 64, n, out)
+        assert out.view(3, 64).tolist() == [[e] * 64 for e in expected]
+
+
+@pytest.mark.parametrize("order", ["forward", "backward"])
+def test_atomics_over_several_blocks(order, monkeypatch):
+    monkeypatch.setenv("SNOWSPLAT_ORDER", order)
+    out, total = torch.tensor([0, -5, 500, 0, 0, -1, 4], dtype=torch.int32), torch.zeros(1)
+    run("atomics", 64, 150, out, total, blocks=3)
+    assert out.tolist() == [150, 149, 0, 255, 1, 4, 9]
+    assert total.item() == 75
+
+
+def test_two_kernels_one_after_the_other():
+    values = torch.arange(100, dtype=torch.int32)
+    run("double_all", 64, 100, values, blocks=2)
+    run("double_all", 64, 70, values, blocks=2)
+    expected = [4 * i if i < 70 else 2 * i for i in range(100)]
+    assert values.tolist() == expected
+
+
+def test_the_number_of_threads_is_checked():
+    with pytest.raises(AssertionError, match="double_all has 64 threads, its Kernel says 32"):
+        run("double_all", 32, 1, zeros(1))
