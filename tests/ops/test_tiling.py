@@ -31,6 +31,7 @@ from .scenes import (
 
 BLOCK = 4096  # keys of a block of the sort
 TILE = 16
+CPU = natives.LAUNCHERS["cpu"]
 
 
 @pytest.fixture(params=variants(EMULATED_FLOAT32, CUDA_FLOAT32))
@@ -306,6 +307,19 @@ def test_tiles_of_large_splats(native: Variant, pixels: float) -> None:
     mixed = torch.stack([splats, small], dim=1).flatten(0, 1)
     largest = max(end - begin for begin, end in check_binning(native, mixed, 320, 240).ranges)
     assert largest > 32
+
+
+def test_tiles_are_those_of_the_cpu(native: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for a rounding where a splat touches a tile just so, and in order of depth."""
+    splats = random_splats(15, 6000, 640, 368, pixels=8.0).packed
+    got = bin_splats(native, splats, 640, 368)
+    monkeypatch.setitem(natives.LAUNCHERS, "cpu", CPU)
+    wanted = bin_splats(native, splats, 640, 368)
+    pairs = zip(got.rows, wanted.rows, strict=True)
+    different = sum(len(set(a) ^ set(b)) for a, b in pairs)
+    assert different <= (1e-4 * wanted.needed if native.dtype == torch.float32 else 0)
+    if different == 0:
+        assert got.rows == wanted.rows
 
 
 @pytest.mark.parametrize("across", [1, 2, 31, 32, 33, 70])
