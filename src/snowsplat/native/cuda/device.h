@@ -2,6 +2,8 @@
 // and, for tests, the C++ compiler, which runs the kernels on a CPU (tests/ops/emulation).
 //
 //   SNOW_KERNEL(name, threads, (parameters)) { body }    a kernel, of blocks of so many threads
+//   SNOW_KERNEL_OF(name, threads, blocks, (parameters))  the same, with registers for so many blocks
+//                                                        at least on a multiprocessor
 //   SNOW_SHARED(type, name, count);                      an array that a block shares
 //
 // A kernel has the name, and the parameters in the same order, of the CPU's function; launches.py
@@ -24,6 +26,8 @@ using uint64_t = unsigned long long;
 
 #define SNOW_KERNEL(NAME, THREADS, PARAMETERS) \
   extern "C" __global__ void __launch_bounds__(THREADS) NAME PARAMETERS
+#define SNOW_KERNEL_OF(NAME, THREADS, BLOCKS, PARAMETERS) \
+  extern "C" __global__ void __launch_bounds__(THREADS, BLOCKS) NAME PARAMETERS
 #define SNOW_SHARED(TYPE, NAME, COUNT) \
   using NAME##_element = TYPE;         \
   __shared__ NAME##_element NAME[COUNT]
