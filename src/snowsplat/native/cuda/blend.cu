@@ -23,6 +23,7 @@
 // a splat, pixel states passing from lane to lane: that would cost an exponential and some 40
 // instructions a pair, and for every pixel of the tile, where here it is about 17, and for the pixels
 // of rectangles that the splat touches.
+#include "blend.h"
 #include "cuda/device.h"
 
 namespace snow {
@@ -104,27 +105,44 @@ SNOW_INLINE SplatTerms<T> load(const Frame<T>& f, uint32_t instance, Batch<T, kS
   return s;
 }
 
+// The places in the batch of the instances that touch a warp's rectangle, in order.
+using Touching = uint8_t[kWarp];
+
+// Lists the places of the lanes that touch, and gives their number. Before it is called again, the
+// warp has to meet.
+SNOW_INLINE int list_touching(Touching& list, unsigned lanes, int place) {
+  const int lane = lane_id();
+  if (lanes >> lane & 1) list[__popc(lanes & ((1u << lane) - 1))] = uint8_t(place);
+  __syncwarp();
+  return __popc(lanes);
+}
+
 template <class T>
 struct Pixel {
-  T x, y, transmittance = T(1);
-  bool unfinished;
+  T x, y;
+  T rest;  // the transmittance; its negative where the pixel is finished or none of the image
 
   SNOW_INLINE explicit Pixel(const Seat& seat)
-      : x(centre<T>(seat.x)), y(centre<T>(seat.y)), unfinished(seat.inside) {}
+      : x(centre<T>(seat.x)), y(centre<T>(seat.y)), rest(seat.inside ? T(1) : T(-1)) {}
 
-  // Whether a splat is blended: α then, before and after it is capped, and what it leaves. Both passes
-  // decide by this what is too faint and where a pixel is finished, so no rounding is left to the
-  // compiler.
-  SNOW_INLINE bool meets(const Four<T>& shape, const Four<T>& look, T& uncapped, T& alpha,
-                         T& next) {
+  SNOW_INLINE bool unfinished() const { return rest > T(0); }
+  SNOW_INLINE T transmittance() const { return max(rest, -rest); }
+
+  // Puts a splat in front of what is left and gives its weight, 0 if it is not blended; and α, before
+  // and after it is capped. Both passes decide by this what is too faint and where a pixel is finished,
+  // so no rounding is left to the compiler. A finished pixel has nothing that could be enough.
+  SNOW_INLINE bool blend(const Four<T>& shape, const Four<T>& look, T& uncapped, T& alpha,
+                         T& weight) {
     const T dx = x - shape.x, dy = y - shape.y;
     const T power = fma(fma(shape.z, dx, shape.w * dy), dx, fma(look.x * dy, dy, look.y));
     uncapped = exp2_blend(power), alpha = min(uncapped, T(kMaxAlpha));
-    next = fma(-alpha, transmittance, transmittance);
-    const bool seen = unfinished && power >= T(kLog2MinAlpha);
-    const bool fits = next >= T(kMinTransmittance);
-    unfinished = unfinished && !(seen && !fits);
-    return seen && fits;
+    const T next = fma(-alpha, rest, rest);
+    const bool visible = power >= T(kLog2MinAlpha), enough = next >= T(kMinTransmittance);
+    const bool blended = visible && enough;
+    weight = blended ? alpha * rest : T(0);
+    if (blended) rest = next;
+    if (visible && !enough) rest = min(rest, -rest);
+    return blended;
   }
 };
 
@@ -132,8 +150,8 @@ template <class T>
 struct ForwardMemory {
   Batch<T, kForwardBatch> batch;
   Two<T> slopes[kForwardBatch];
-  uint32_t touching[kForwardBatch / kWarp]
-                   [kWarps];  // of 32 instances, those that touch the rectangle
+  Touching list[kWarps];
+  uint32_t touched[kForwardBatch / kWarp][kWarps];  // by rectangle, of 32 instances a bit each
   uint32_t ends[kWarps];
 };
 
@@ -147,10 +165,10 @@ SNOW_INLINE void forward(const Frame<T>& f, int channels, const T* background, T
   T color[C] = {};
   const uint32_t end = f.tile_start[blockIdx.x + 1];
   uint32_t base = f.tile_start[blockIdx.x], looked_at = base;
-  bool warp_unfinished = __any_sync(kAllLanes, pixel.unfinished);
+  bool warp_unfinished = __any_sync(kAllLanes, pixel.unfinished());
   for (; base < end; base += kForwardBatch) {
     // Waits, too, until nobody needs the last batch any more.
-    if (!__syncthreads_or(pixel.unfinished)) break;
+    if (!__syncthreads_or(pixel.unfinished())) break;
     const int count = end - base < kForwardBatch ? int(end - base) : kForwardBatch;
     if (thread < count) {
       const SplatTerms<T> s = load<C>(f, base + uint32_t(thread), memory.batch, thread);
@@ -169,33 +187,33 @@ SNOW_INLINE void forward(const Frame<T>& f, int channels, const T* background, T
         const T peak = peak_over_rectangle(s, x, y, x + T(kRectWidth - 1), y + T(kRectHeight - 1));
         touches = peak + s.log2_opacity >= T(kLog2MinAlpha - kCullSlack);
       }
-      unsigned list = __ballot_sync(kAllLanes, touches);
-      if (lane == 0) memory.touching[first / kWarp][warp] = list;
+      const unsigned lanes = __ballot_sync(kAllLanes, touches);
+      if (lane == 0) memory.touched[first / kWarp][warp] = lanes;
       if (warp_unfinished)
         looked_at = base + uint32_t(first + kWarp < count ? first + kWarp : count);
-      for (; list; list &= list - 1) {
-        const int i = first + __ffs(int(list)) - 1;
+      const int listed = list_touching(memory.list[warp], lanes, own);
+      for (int j = 0; j < listed; j++) {
+        const int i = memory.list[warp][j];
         const Four<T> look = memory.batch.look[i];
-        const Two<T> look_on = memory.batch.look_on[i];
-        T uncapped, a, next;
-        if (!pixel.meets(memory.batch.shape[i], look, uncapped, a, next)) continue;
+        T uncapped, a, weight;
+        const bool blended = pixel.blend(memory.batch.shape[i], look, uncapped, a, weight);
         if constexpr (kCount) {
-          color[0] += T(1);
+          color[0] += blended ? T(1) : T(0);
         } else {
+          const Two<T> look_on = memory.batch.look_on[i];
           const T splat[kGroupChannels] = {look.z, look.w, look_on.x, look_on.y};
-          const T weight = a * pixel.transmittance;
 #pragma unroll
           for (int k = 0; k < C; k++) color[k] += weight * splat[k];
         }
-        pixel.transmittance = next;
       }
-      warp_unfinished = __any_sync(kAllLanes, pixel.unfinished);
+      warp_unfinished = __any_sync(kAllLanes, pixel.unfinished());
+      __syncwarp();
     }
     __syncthreads();
     if (thread < count) {
       unsigned bits = 0;
 #pragma unroll
-      for (int w = 0; w < kWarps; w++) bits |= (memory.touching[warp][w] >> lane & 1) << w;
+      for (int w = 0; w < kWarps; w++) bits |= (memory.touched[warp][w] >> lane & 1) << w;
       f.instance_blocks[base + uint32_t(thread)] = uint8_t(bits);
     }
   }
@@ -207,12 +225,12 @@ SNOW_INLINE void forward(const Frame<T>& f, int channels, const T* background, T
     f.tile_end[blockIdx.x] = looked_at;
   }
   if (!seat.inside) return;
+  const T rest = pixel.transmittance();
 #pragma unroll
   for (int k = 0; k < C; k++)
     if (k < channels)
-      image[k * seat.plane + seat.at] =
-          kCount ? color[k] : color[k] + pixel.transmittance * background[k];
-  if (alpha) alpha[seat.at] = T(1) - pixel.transmittance;
+      image[k * seat.plane + seat.at] = kCount ? color[k] : color[k] + rest * background[k];
+  if (alpha) alpha[seat.at] = T(1) - rest;
 }
 
 constexpr int kGroup = kWarp / kRectHeight;  // splats that a warp takes at a time
@@ -227,7 +245,8 @@ struct BackwardMemory {
   Four<T> grads[kGroupChannels][kBlock / 4];  // ∂L/∂C of each pixel, in the order of threads
   // w and q of each splat of a group and pixel; after 32 instances, the sums of each.
   Four<T> pairs[kWarps][kGroup * kPairStride / 2];
-  uint8_t touched[kBackwardBatch];
+  Touching list[kWarps];
+  uint8_t touched[kBackwardBatch];  // what the forward pass kept of each instance
 };
 
 // Sums of a splat over pixels: of C colours, then the moments.
@@ -279,6 +298,43 @@ struct Sums {
   }
 };
 
+// Where the sums of an instance go: half a warp an instance, a thread a sum of it.
+template <int C, class T>
+struct Destination {
+  T *at = nullptr, scale = T(1), across = T(0);
+
+  SNOW_INLINE void find(const Frame<T>& f, uint32_t instance, const uint32_t* instance_slot,
+                        T* slots, T* grad_packed) {
+    const int column = int(threadIdx.x) % kSlotWidth, moment = column - C;
+    if (slots) {
+      at = slots + int64_t(instance_slot[instance]) * kSlotWidth + column;
+      return;
+    }
+    // splat_terms_vjp, each thread a number of its.
+    const int64_t row = f.instance_splat[instance] * f.stride;
+    const T* splat = f.packed + row;
+    int to = -1;
+    if (moment < 0) to = int(f.columns[column]);
+    if (moment == 0) to = 5, scale = T(1) / splat[5];
+    if (moment == 1) to = 0, scale = splat[2], across = splat[3];
+    if (moment == 2) to = 1, scale = splat[4], across = splat[3];
+    if (moment == 3 || moment == 5) to = moment - 1, scale = T(-0.5);
+    if (moment == 4) to = 3, scale = T(-1);
+    if (to >= 0) at = grad_packed + row + to;
+  }
+  SNOW_INLINE void put(T sum) const {
+    if (at) *at = sum;
+  }
+  // Every lane has to call it: the gradients of the mean are made of both of its moments.
+  SNOW_INLINE void add(T sum) const {
+    const int moment = int(threadIdx.x) % kSlotWidth - C;
+    const T other = __shfl_sync(kAllLanes, sum, moment == 1 ? C + 2 : C + 1, kSlotWidth);
+    sum *= scale;
+    if (moment == 1 || moment == 2) sum += across * other;
+    if (at && sum != T(0)) atomicAdd(at, sum);
+  }
+};
+
 // grad_alpha may be null; slots too, and then instance_slot. image and grad_image are the group's planes.
 template <int C, class T>
 SNOW_INLINE void backward(const Frame<T>& f, int channels, const uint32_t* instance_slot,
@@ -319,41 +375,37 @@ SNOW_INLINE void backward(const Frame<T>& f, int channels, const uint32_t* insta
     __syncthreads();
     for (int first = 0; first < count; first += kWarp) {
       const bool touches = first + lane < count && memory.touched[first + lane] >> warp & 1;
-      unsigned list = __ballot_sync(kAllLanes, touches);
+      const unsigned lanes = __ballot_sync(kAllLanes, touches);
+      const Touching& list = memory.list[warp];
+      const int listed = list_touching(memory.list[warp], lanes, first + lane);
+      const int rank = __popc(lanes & ((1u << lane) - 1));
       Sums<C, T> sums;
-      while (list && __any_sync(kAllLanes, pixel.unfinished)) {
-        const unsigned todo = list;
-        int in_group = 0, mine = 0;
-        for (; list && in_group < kGroup; list &= list - 1, in_group++) {
-          const int i = first + __ffs(int(list)) - 1;
-          if (slot == in_group) mine = i;
+      for (int done = 0; done < listed; done += kGroup) {
+        if (!__any_sync(kAllLanes, pixel.unfinished())) break;
+        const int group = listed - done < kGroup ? listed - done : kGroup;
+        Two<T>* pair = reinterpret_cast<Two<T>*>(pairs) + lane;
+        for (int j = 0; j < group; j++, pair += kPairStride) {
+          const int i = list[done + j];
           const Four<T> look = memory.batch.look[i];
           const Two<T> look_on = memory.batch.look_on[i];
-          T uncapped, a, next;
-          Two<T> pair = {T(0), T(0)};
-          if (pixel.meets(memory.batch.shape[i], look, uncapped, a, next)) {
-            const T splat[kGroupChannels] = {look.z, look.w, look_on.x, look_on.y};
-            T seen = grad_opaque;
+          T uncapped, a, weight, seen = grad_opaque;
+          const bool blended = pixel.blend(memory.batch.shape[i], look, uncapped, a, weight);
+          const T splat[kGroupChannels] = {look.z, look.w, look_on.x, look_on.y};
 #pragma unroll
-            for (int k = 0; k < C; k++) seen += splat[k] * grad[k];
-            pair.x = a * pixel.transmittance;
-            const T ahead = pair.x * seen;
-            behind -= ahead;
-            if (uncapped < T(kMaxAlpha))
-              pair.y = ahead - a * behind * reciprocal_estimate(T(1) - a);
-            pixel.transmittance = next;
-          }
-          reinterpret_cast<Two<T>*>(pairs)[in_group * kPairStride + lane] = pair;
+          for (int k = 0; k < C; k++) seen += splat[k] * grad[k];
+          const T ahead = weight * seen;
+          behind -= ahead;
+          const T q = ahead - a * behind * reciprocal_estimate(T(1) - a);
+          *pair = {weight, blended && uncapped < T(kMaxAlpha) ? q : T(0)};
         }
         __syncwarp();
         Sums<C, T> rows;
-        if (slot < in_group) {
-          const Four<T> shape = memory.batch.shape[mine];
+        if (slot < group) {
+          const Four<T> shape = memory.batch.shape[list[done + slot]];
           rows.add_row(row_pairs, row_grads, centre<T>(seat.left) - shape.x,
                        centre<T>(seat.top + row) - shape.y);
         }
-        const unsigned group = todo & ~list;
-        sums.take_rows(rows, __popc(group & ((1u << lane) - 1)), group >> lane & 1);
+        sums.take_rows(rows, rank % kGroup, touches && rank / kGroup == done / kGroup);
         __syncwarp();
       }
       T* const partial = reinterpret_cast<T*>(pairs);
@@ -361,49 +413,29 @@ SNOW_INLINE void backward(const Frame<T>& f, int channels, const uint32_t* insta
 #pragma unroll
         for (int k = 0; k < C + 6; k++) partial[lane * kSumStride + k] = sums.value[k];
       }
-      // Half a warp an instance, a thread a sum of it; sixteen instances, then the other sixteen. Where
-      // it goes is fetched before all are here.
+      // What a thread needs of the splats then is fetched before all are here.
       constexpr int kPlaces = kBlock / kSlotWidth;
       const int place = thread / kSlotWidth, column = thread % kSlotWidth;
-      uint32_t target[2] = {};
-      T conic[2][3] = {}, opacity[2] = {T(1), T(1)};
+      Destination<C, T> to[kWarp / kPlaces];
 #pragma unroll
-      for (int h = 0; h < 2; h++) {
+      for (int h = 0; h < kWarp / kPlaces; h++) {
         const int i = first + place + h * kPlaces;
-        if (i >= count) continue;
-        target[h] = (slots ? instance_slot : f.instance_splat)[base + uint32_t(i)];
-        if (slots) continue;
-        const T* splat = f.packed + target[h] * f.stride;
-#pragma unroll
-        for (int k = 0; k < 3; k++) conic[h][k] = splat[2 + k];
-        opacity[h] = splat[5];
+        if (i < count) to[h].find(f, base + uint32_t(i), instance_slot, slots, grad_packed);
       }
       __syncthreads();
 #pragma unroll
-      for (int h = 0; h < 2; h++) {
+      for (int h = 0; h < kWarp / kPlaces; h++) {
         const int from = place + h * kPlaces, i = first + from;
-        const unsigned bits = i < count ? memory.touched[i] : 0;
+        const unsigned bits = i < count && column < C + 6 ? memory.touched[i] : 0;
         T sum(0);
 #pragma unroll
         for (int w = 0; w < kWarps; w++)
-          if (column < C + 6 && bits >> w & 1)
+          if (bits >> w & 1)
             sum += reinterpret_cast<const T*>(memory.pairs[w])[from * kSumStride + column];
-        if (slots) {
-          if (i < count) slots[int64_t(target[h]) * kSlotWidth + column] = sum;
-          continue;
-        }
-        T value[6];
-#pragma unroll
-        for (int k = 0; k < 6; k++) value[k] = __shfl_sync(kAllLanes, sum, C + k, kSlotWidth);
-        const BlendMoments<T> m = {value[0], value[1], value[2], value[3], value[4], value[5]};
-        splat_terms_vjp(conic[h], opacity[h], m, value, value + 2, value[5]);
-        int to = column - C;
-        if (column < C) to = int(f.columns[column]);
-#pragma unroll
-        for (int k = 0; k < 6; k++)
-          if (to == k && column >= C) sum = value[k];
-        if (bits && column < C + 6 && to >= 0 && sum != T(0))
-          atomicAdd(grad_packed + target[h] * f.stride + to, sum);
+        if (slots)
+          to[h].put(sum);
+        else
+          to[h].add(sum);
       }
       __syncthreads();
     }
@@ -436,7 +468,8 @@ SNOW_INLINE void background_row(int height, int width, int channels, const T* gr
 }  // namespace snow
 
 // On a GPU the splats are read from `packed`, and records are empty.
-#define SNOW_BLEND_KERNELS(SUFFIX, T)                                                              \
+// RESIDENT: how many blocks of the backward pass the shared memory of a multiprocessor holds.
+#define SNOW_BLEND_KERNELS(SUFFIX, T, RESIDENT)                                                    \
   SNOW_KERNEL(blend_fwd##SUFFIX, 256,                                                              \
               (int64_t, int64_t width, int64_t height, const T* packed, int64_t stride,            \
                const int64_t* columns, const void*, const uint32_t* tile_start,                    \
@@ -461,8 +494,8 @@ SNOW_INLINE void background_row(int height, int width, int channels, const T* gr
     snow::forward<1, true>(f, 1, static_cast<const T*>(nullptr), counts, static_cast<T*>(nullptr), \
                            *memory);                                                               \
   }                                                                                                \
-  SNOW_KERNEL(                                                                                     \
-      blend_bwd##SUFFIX, 256,                                                                      \
+  SNOW_KERNEL_OF(                                                                                  \
+      blend_bwd##SUFFIX, 256, RESIDENT,                                                            \
       (int64_t, int64_t width, int64_t height, const T* packed, int64_t stride,                    \
        const int64_t* columns, const void*, const uint32_t* tile_start, uint32_t* tile_end,        \
        const uint32_t* instance_splat, uint8_t* instance_blocks, int64_t channels,                 \
@@ -484,5 +517,5 @@ SNOW_INLINE void background_row(int height, int width, int channels, const T* gr
     snow::background_row(int(height), int(width), int(channels), grad_image, alpha, rows);         \
   }
 
-SNOW_BLEND_KERNELS(, float)
-SNOW_BLEND_KERNELS(_f64, double)
+SNOW_BLEND_KERNELS(, float, 4)
+SNOW_BLEND_KERNELS(_f64, double, 1)
