@@ -163,6 +163,8 @@ SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals)
 // the block's keys in the order of their digits. In this order they go to shared memory and from
 // there out, so that neighbouring threads write to neighbouring addresses; the values follow. What
 // is not valid is at the end and has the last digit, so that it stays at the end.
+// One block alone has no others to add, so that sort_offsets may be left out: its counts are the
+// totals.
 template <class Key>
 SNOW_INLINE void scatter(int64_t n, const Key* keys, const uint32_t* values, Key* keys_out,
                          uint32_t* values_out, Digit digit_of, int64_t blocks,
@@ -222,7 +224,8 @@ SNOW_INLINE void scatter(int64_t n, const Key* keys, const uint32_t* values, Key
 #pragma unroll
     for (int w = 0; w < kWarps; w++)
       tally[w * kDigits + thread] = uint16_t(tally[w * kDigits + thread] + here);
-    const uint32_t other_blocks = is_digit ? counts[int64_t(thread) * blocks + blockIdx.x] : 0;
+    uint32_t other_blocks = 0;
+    if (is_digit && blocks > 1) other_blocks = counts[int64_t(thread) * blocks + blockIdx.x];
     run_start[thread] = uint32_t(before >> 32) + other_blocks - here;
   }
   __syncthreads();

@@ -73,15 +73,17 @@ def sort_pairs(
     name, device = _KEYS[keys.dtype], keys.device
     blocks = KERNELS[f"sort_count_{name}"].blocks(n)
     counts = torch.empty(blocks << _DIGIT_BITS, dtype=torch.int32, device=device)
-    totals = torch.empty(1 << _DIGIT_BITS, dtype=torch.int32, device=device)
+    totals = counts  # those of a single block are
+    if blocks > 1:
+        totals = torch.empty(1 << _DIGIT_BITS, dtype=torch.int32, device=device)
     begin, end = bits
     passes = sort_passes(end - begin)
     for i in range(passes):
         shift = begin + (end - begin) * i // passes
         width = begin + (end - begin) * (i + 1) // passes - shift
-        digits = 1 << width if n > 0 else 0
         run(f"sort_count_{name}", blocks, n, keys, shift, width, blocks, counts, count)
-        run("sort_offsets", digits, blocks, counts, totals)
+        if blocks > 1:
+            run("sort_offsets", 1 << width, blocks, counts, totals)
         given = None if rows and i == 0 else values
         pairs = (keys, given, keys2, values2)
         run(f"sort_scatter_{name}", blocks, n, *pairs, shift, width, blocks, counts, totals, count)
