@@ -206,6 +206,15 @@ def test_two_kernels_one_after_the_other():
     assert values.tolist() == expected
 
 
-def test_the_number_of_threads_is_checked():
+def test_threads_and_arguments_are_checked():
     with pytest.raises(AssertionError, match="double_all has 64 threads, its Kernel says 32"):
         run("double_all", 32, 1, zeros(1))
+    kernel = Kernel("faults", 64, 64)
+    for given, letters in (
+        ((1,), "i"),
+        ((1, 2.0), "id"),
+        ((1.0, None), "dp"),
+        ((1, None, 1), "ipi"),
+    ):
+        with pytest.raises(AssertionError, match=f"double_all takes ip, not {letters}$"):
+            emulation.execute(kernel, "double_all", 1, given)

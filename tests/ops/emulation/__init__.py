@@ -55,15 +55,26 @@ def library(file: str) -> ctypes.CDLL:
     return loaded
 
 
+def _letter(arg: Argument) -> str:
+    if arg is None or isinstance(arg, torch.Tensor):
+        return "p"
+    return "i" if isinstance(arg, int) else "d"
+
+
 def execute(kernel: Kernel, name: str, blocks: int, args: Sequence[Argument]) -> None:
     """Runs a kernel on CPU tensors, to its end.
 
     Raises:
         RuntimeError: a divergent barrier, and what else the emulation finds.
+        AssertionError: threads or arguments are not those of the kernel.
     """
     loaded = library(kernel.file)
     built = getattr(loaded, f"{name}_threads")()
     assert built == kernel.threads, f"{name} has {built} threads, its Kernel says {kernel.threads}"
+    parameters = getattr(loaded, f"{name}_parameters")
+    parameters.restype = ctypes.c_char_p
+    taken, given = parameters().decode(), "".join(map(_letter, args))
+    assert given == taken, f"{name} takes {taken}, not {given}"
     values: list[ctypes.c_void_p | ctypes.c_int64 | ctypes.c_double] = []
     for arg in args:
         if isinstance(arg, torch.Tensor):
