@@ -24,8 +24,8 @@ from snowsplat.gaussians import Gaussians
 from snowsplat.lpips import Lpips
 from snowsplat.render import render
 
-# Each photo is used once, so memory for some that are decoded ahead is enough.
-_PHOTOS_AHEAD = 128 << 20
+# Each photo is used once: memory for so many is enough to decode ahead.
+_PHOTOS_AHEAD = 6
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,9 @@ def evaluate_views(
     device = gaussians.means.device
     color = torch.tensor(background, dtype=torch.float32, device=device)
     results = []
-    with ImageLoader(views, budget_bytes=_PHOTOS_AHEAD, device=device) as loader:
+    largest = max((view.camera.width * view.camera.height for view in views), default=0)
+    ahead = _PHOTOS_AHEAD * 3 * largest
+    with ImageLoader(views, budget_bytes=ahead, device=device) as loader:
         loader.prefetch(views)
         for view in views:
             photo = loader.get(view)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from snowsplat.capture.capture import Capture
+from snowsplat.capture.images import DECODERS
 from snowsplat.config import TrainConfig, changed
 from snowsplat.errors import UserError
 from snowsplat.gaussians import SH_REST_COUNTS
@@ -23,7 +24,7 @@ class Cost:
 
     Attributes:
         fixed: bytes, whatever is trained.
-        pixel: bytes a pixel of the largest photo: renders, their gradients, photos being decoded.
+        pixel: bytes a pixel of the largest photo: renders and their gradients.
         gaussian: bytes a Gaussian, beside its parameters and their two moments: its splat, the
             gradient of that, the tiles that it touches, statistics.
     """
@@ -42,10 +43,12 @@ class Cost:
         return 3 * 4 * numbers + self.gaussian
 
 
-# Measured on the CPU (see docs/performance.md): 1.0 to 1.1 kB a Gaussian beside parameters and
-# moments where each touches some seven tiles. On a GPU reckoned from what is allocated.
-CPU = Cost(fixed=40 << 20, pixel=130, gaussian=1150)
-GPU = Cost(fixed=40 << 20, pixel=70, gaussian=240)
+# Measured on the CPU: 1.0 to 1.1 kB a Gaussian beside parameters and moments, where each touches
+# some seven tiles. On a GPU reckoned from what is allocated.
+CPU = Cost(fixed=50_000_000, pixel=170, gaussian=1150)
+GPU = Cost(fixed=50_000_000, pixel=70, gaussian=240)
+# A photo that is being decoded, bytes a pixel; on the CPU, and so many at a time.
+_DECODING = 18
 
 # Photos at hand at least: the one in use, and those that are decoded ahead.
 _FEWEST_PHOTOS = 6
@@ -109,6 +112,8 @@ def plan_memory(
     masked = (size for view, size in zip(capture.train, sizes, strict=True) if view.mask)
     all_photos = 3 * sum(sizes) + sum(masked)
     images = cost.of(0, largest, config.sh_degree)
+    if cost is CPU:
+        images += DECODERS * _DECODING * largest
     each = cost.of(1, 0, config.sh_degree) - cost.fixed
     config = config.capped(sorted(sizes)[len(sizes) // 2])
     cap = config.density.max_gaussians or None

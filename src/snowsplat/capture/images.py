@@ -19,6 +19,9 @@ import torch
 from snowsplat.capture.capture import View
 from snowsplat.capture.decode import ImageSource, LoadedImage, box_downscale, load_image, load_mask
 
+#: Threads that decode ahead.
+DECODERS = min(4, os.cpu_count() or 1)
+
 _Key = tuple[ImageSource, ImageSource | None, int]
 
 
@@ -36,7 +39,7 @@ class ImageLoader:
         background: colour in 0..1 to compose transparent images over; None keeps their alpha.
         budget_bytes: memory for decoded images; None takes half of what is available now.
         device: where they are kept, and what `get` gives them on.
-        threads: that decode ahead; None takes up to four.
+        threads: that decode ahead; None takes `DECODERS`.
     """
 
     def __init__(
@@ -56,7 +59,7 @@ class ImageLoader:
             budget_bytes = available_memory(self._device) // 2
         self.budget_bytes = budget_bytes
         self._background = None if background is None else tuple(float(c) for c in background)
-        self._threads = threads or min(4, os.cpu_count() or 1)
+        self._threads = threads or DECODERS
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="snowsplat-images")
         self._lock = threading.RLock()
         self._cache: OrderedDict[_Key, LoadedImage] = OrderedDict()  # oldest use first

@@ -1,0 +1,72 @@
+"""`--memory`: a capture ten times as large as the memory that it may take."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import snowsplat
+
+SOURCES = Path(snowsplat.__file__).parents[1]
+WIDTH, HEIGHT, BUDGET = 640, 480, 140_000_000
+COUNT = 10 * BUDGET // (3 * WIDTH * HEIGHT)
+
+
+def snowsplat_cli(*words: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(SOURCES), "SNOWSPLAT_DEVICE": "cpu"}
+    command = [sys.executable, "-m", "snowsplat", *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Few photos under very many names."""
+    folder: Path = tmp_path_factory.mktemp("large")
+    random = np.random.default_rng(0)
+    frames = []
+    for i in range(COUNT):
+        name = f"{i:05d}.jpg"
+        if i < 4:
+            coarse = random.integers(0, 255, (HEIGHT // 20, WIDTH // 20, 3), dtype=np.uint8)
+            Image.fromarray(coarse).resize((WIDTH, HEIGHT)).save(folder / name)
+        else:
+            os.link(folder / f"{i % 4:05d}.jpg", folder / name)
+        c, s = math.cos(2 * math.pi * i / COUNT), math.sin(2 * math.pi * i / COUNT)
+        pose = [[c, 0, s, 4 * s], [0, 1, 0, 0], [-s, 0, c, 4 * c], [0, 0, 0, 1]]
+        frames.append({"file_path": name, "transform_matrix": pose})
+    about = {"w": WIDTH, "h": HEIGHT, "fl_x": 600, "fl_y": 600, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(about))
+    return folder
+
+
+def test_a_capture_of_ten_times_the_memory_trains(capture: Path, tmp_path: Path) -> None:
+    words = ("-o", str(tmp_path / "out"), "--memory", f"{BUDGET // 10**6}MB", "--iterations", "100")
+    run = snowsplat_cli("train", str(capture), *words, "--densify-from-iter", "20")
+    assert run.returncode == 0, run.stderr
+    assert re.search(r"^memory: \d+ MB at most \(.*photos \d+ MB\)$", run.stdout, re.MULTILINE)
+    assert re.search(r"^for lack of memory: at most [\d,]+ Gaussians", run.stdout, re.MULTILINE)
+    assert "of the photos stay decoded" in run.stdout
+    taken = re.search(r"at most (\d+) MB, (\d+) of them Python", run.stdout)
+    assert taken is not None
+    assert int(taken[1]) - int(taken[2]) <= BUDGET / 1e6
+
+
+def test_too_little_is_said_before_anything_is_made(capture: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for words, line in (
+        (("--memory", "40MB"), r"snowsplat: --memory 40 MB is too little for photos .* -r\n"),
+        (("--memory", "lots"), r"snowsplat: --memory is 'lots'; it must be like 4GB or 800MB\n"),
+    ):
+        run = snowsplat_cli("train", str(capture), "-o", str(out), *words)
+        assert run.returncode == 2
+        assert re.fullmatch(line, run.stderr), run.stderr
+        assert not out.exists()
