@@ -1,0 +1,157 @@
+"""Every op once, forward and backward: the program that compute-sanitizer looks at.
+
+Scenes are small and of odd sizes, so that blocks, warps and tiles are cut off everywhere. In both
+dtypes, with sums of gradients by atomics and in order, and last the training step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from gpu_step import Step, sums_in_order
+from torch import Tensor
+from workloads import Workload
+
+from snowsplat import ops
+from snowsplat.camera import Camera
+from snowsplat.gaussians import Gaussians
+
+#: Gaussians, width, height. From one of each to a few thousand, none a multiple of anything.
+SIZES = ((0, 1, 1), (1, 5, 3), (33, 17, 31), (999, 95, 53), (4099, 161, 99))
+SMALL = ((0, 1, 1), (1, 5, 3), (41, 19, 33))
+WIDE = 16 * (1 << 16) + 5
+
+
+def every_op(
+    device: torch.device,
+    sizes: tuple[tuple[int, int, int], ...] = SIZES,
+    wide: bool = True,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Runs them all; says what comes next. ``wide``: an image of many tiles, too.
+
+    Raises:
+        AssertionError: a result is not finite.
+    """
+    for count, width, height in sizes:
+        scene = random_scene(count, width, height)
+        for dtype in (torch.float32, torch.float64):
+            for in_order in (False, True):
+                name = f"{count} Gaussians, {width}x{height}, {dtype}, in order: {in_order}"
+                say(f"ops: {name}")
+                with sums_in_order(in_order):
+                    _ops_of(scene, device, dtype)
+        _neighbours(scene.gaussians.means, device)
+        if count > 0:
+            for in_order in (False, True):
+                say(f"training: {count} Gaussians, {width}x{height}, in order: {in_order}")
+                with sums_in_order(in_order):
+                    # Too little room at first: lists that are cut off.
+                    step = Step(scene, device, room=max(1, count // 2))
+                    assert math.isfinite(step.run())
+                    assert math.isfinite(step.run())
+    say("ops: a sort of several blocks")
+    ops.neighbours(torch.rand(2100, 3).to(device), 1)
+    if wide:
+        say(f"ops: {WIDE} pixels in a row, more tiles than 16 bits count")
+        _ops_of(random_scene(100, WIDE, 1), device, torch.float32)
+
+
+def random_scene(count: int, width: int, height: int) -> Workload:
+    """Gaussians all over the view and beyond it, some behind the camera, a few large ones."""
+    g = torch.Generator().manual_seed(count)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(count, *shape, generator=g)
+
+    focal = 0.9 * max(width, height)
+    depth = uniform(1, 6)
+    depth[6::11] *= -1
+    x = (uniform(-0.2, 1.2) - 0.5) * width / focal * depth
+    y = (uniform(-0.2, 1.2) - 0.5) * height / focal * depth
+    size = (3 / focal * depth.abs()).log()
+    size[::17] += 2
+    gaussians = Gaussians(
+        means=torch.stack([x, y, depth], dim=1),
+        log_scales=size[:, None] + uniform(-1, 1, 3),
+        quats=uniform(-1, 1, 4),
+        opacity_logits=uniform(-4, 4),
+        sh_dc=uniform(-1, 1, 1, 3),
+        sh_rest=uniform(-0.3, 0.3, 15, 3),
+    )
+    pose = torch.eye(4, dtype=torch.float64)[:3]
+    camera = Camera(width, height, focal, 1.1 * focal, width / 2 + 0.3, height / 2 - 0.4, pose)
+    return Workload("random", "random Gaussians", gaussians, camera)
+
+
+def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
+    camera = scene.camera
+    size = camera.width, camera.height
+    view = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    params = {
+        name: p.to(device, dtype, copy=True).requires_grad_()
+        for name, p in scene.gaussians.parameters().items()
+    }
+    pose = camera.cam_from_world.to(device, dtype, copy=True).requires_grad_()
+    background = torch.rand(3, device=device, dtype=dtype).requires_grad_()
+
+    # The gradient all the way to the parameters and the pose; depth is a second group of channels.
+    splats = ops.project(**params, cam_from_world=pose, **view, sh_degree=3)
+    image, alpha, depth = ops.rasterize(splats, *size, background, with_depth=True)
+    assert depth is not None
+    photo = torch.rand(3, camera.height, camera.width, device=device, dtype=dtype).permute(1, 2, 0)
+    loss = ops.photometric_loss(image, photo) + (1 - ops.ssim(image, photo))
+    (loss + alpha.mean() + depth.mean()).backward()
+    _finite(loss, background.grad, pose.grad, *(p.grad for p in params.values()))
+
+    # The course of a training step: the gradient of the splats, at a lower degree.
+    with torch.no_grad():
+        splats = ops.project(**params, cam_from_world=pose.detach(), **view, sh_degree=1)
+        splats.packed.requires_grad_()
+        with torch.enable_grad():
+            image, _, _ = ops.rasterize(splats, *size, background.detach())
+            ops.photometric_loss(image, (255 * photo).to(torch.uint8)).backward()
+        many = [torch.zeros(len(scene.gaussians), device=device, dtype=dtype) for _ in range(3)]
+        ops.accumulate_screen_statistics(splats, *size, *many)
+        moments: Any = [{name: torch.zeros_like(p) for name, p in params.items()} for _ in range(2)]
+        gradient = splats.packed.grad
+        assert gradient is not None
+        assert splats.ids is not None
+        rows = torch.arange(len(splats), device=device)[splats.ids >= 0]
+        for visible_only, valid, ids, grad in (
+            (False, None, splats.ids, gradient),
+            (True, torch.ones(1, dtype=torch.bool, device=device), splats.ids, gradient),
+            (True, None, splats.ids[rows], gradient[rows]),
+        ):
+            ops.adam_step(
+                params,
+                *moments,
+                ids,
+                grad,
+                pose.detach(),
+                **view,
+                sh_degree=1,
+                lr=dict.fromkeys(params, 1e-3),
+                step=1,
+                visible_only=visible_only,
+                valid=valid,
+            )
+            for p in params.values():
+                p.grad = None
+        counts = ops.count_blended(splats, *size)
+    _finite(counts, *many, *params.values())
+
+
+def _neighbours(means: Tensor, device: torch.device) -> None:
+    for dtype in (torch.float32, torch.float64):
+        for k in (1, 3, 8, 64):
+            ops.neighbours(means.to(device, dtype), k)
+
+
+def _finite(*tensors: Tensor | None) -> None:
+    for tensor in tensors:
+        assert tensor is not None
+        assert bool(tensor.isfinite().all()), "a result is not finite"

@@ -1,0 +1,550 @@
+"""The parts of `gpu.py`, each a process of its own: `python gpu_parts.py PART …` prints findings.
+
+Nothing of the package that needs more than PyTorch, numpy, Pillow and cuda-bindings is imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gpu_jobs import MARK, finding
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Captures whose pictures are transparent.
+BACKGROUNDS = {"lego400": "white"}
+
+
+# ------------------------------------------------------------------------------------ the machine
+
+
+def probe() -> None:
+    """Whether there is a GPU that the package can use, and which."""
+    from snowsplat.ops.cuda.availability import why_unusable
+
+    why = why_unusable()
+    if why is not None:
+        finding("no gpu", why=why)
+        return
+    import torch
+
+    finding("gpu", name=torch.cuda.get_device_name(0))
+
+
+def device() -> None:
+    import torch
+
+    card = torch.cuda.get_device_properties(0)
+    finding(
+        "device",
+        name=card.name,
+        capability=f"{card.major}.{card.minor}",
+        multiprocessors=card.multi_processor_count,
+        memory_gb=card.total_memory / 1e9,
+        l2_mb=getattr(card, "L2_cache_size", 0) / 1e6,
+        torch=torch.__version__,
+        python=sys.version.split()[0],
+        cores=len(os.sched_getaffinity(0)),
+        kernels=_built_kernels(card.major, card.minor),
+        clocks=_clocks(),
+    )
+    finding("bandwidth", bytes_a_second=_copy_bandwidth())
+    try:
+        rate = _multiply_add_rate()
+        finding("rate", operations_a_second=rate, clocks=_clocks())
+    except Exception as error:  # a figure less, and floors are of bytes alone
+        print(f"multiply-adds were not measured: {error!r}")
+    finding("mark", milliseconds=_mark_time())
+
+
+def _built_kernels(major: int, minor: int) -> str:
+    built = ROOT / "src" / "snowsplat" / "_lib" / "cuda"
+    for lower in range(minor, -1, -1):
+        if (built / f"sm_{10 * major + lower}").is_dir():
+            return f"built for sm_{10 * major + lower}"
+    return "compiled on the spot"
+
+
+def _clocks() -> str:
+    """As nvidia-smi tells; read, never set."""
+    wanted = "driver_version,clocks.sm,clocks.max.sm,clocks.mem,power.draw,temperature.gpu"
+    try:
+        run = subprocess.run(
+            ["nvidia-smi", f"--query-gpu={wanted}", "--format=csv,noheader", "--id=0"],
+            capture_output=True,
+            text=True,
+            timeout=20,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return "nvidia-smi does not answer"
+    values = [value.strip() for value in run.stdout.split(",")]
+    if run.returncode != 0 or len(values) != 6:
+        return "nvidia-smi does not answer"
+    driver, sm, most, memory, power, temperature = values
+    return f"driver {driver}, SM {sm} of {most}, memory {memory}, {power}, {temperature} °C"
+
+
+def _copy_bandwidth() -> float:
+    """Bytes read and written a second, by copies many times the size of the caches."""
+    import torch
+    from gpu_step import gpu_times
+
+    free, _ = torch.cuda.mem_get_info()
+    count = min(2 << 30, free // 4)
+    source = torch.empty(count, dtype=torch.uint8, device="cuda").random_()
+    target = torch.empty_like(source)
+    for _ in range(3):
+        target.copy_(source)
+    times = gpu_times(lambda: target.copy_(source), 15)
+    return 2 * count / (1e-3 * statistics.median(times))
+
+
+def _multiply_add_rate() -> float:
+    """Multiply-adds a second, of gpu_rate.cu."""
+    import torch
+    from gpu_step import gpu_times
+
+    from snowsplat.ops.cuda import driver, nvrtc
+    from snowsplat.ops.cuda.kernels import Kernel
+
+    name, threads, a_loop = "multiply_adds", 256, 8 * 32
+    card = torch.cuda.get_device_properties(0)
+    code, _ = nvrtc.Nvrtc(nvrtc.find()).compile(
+        Path(__file__).with_name("gpu_rate.cu"), f"sm_{card.major}{card.minor}"
+    )
+    gpu = driver._gpu(0)
+    with gpu.current():
+        library = gpu._check(gpu.cuda.cuLibraryLoadData(code, None, None, 0, None, None, 0))
+        error, gpu.functions[name] = gpu._function(library, name)
+    if error != 0:
+        raise RuntimeError(f"the driver answers {error}")
+    blocks, loops = 64 * card.multi_processor_count, 400
+    numbers = torch.tensor([0.999, 0.001], device="cuda")
+    out = torch.empty(blocks * threads, device="cuda")
+    kernel = Kernel("gpu_rate", threads=threads, items=1)
+
+    def work() -> None:
+        driver.run(kernel, name, blocks, (loops, numbers, out))
+
+    for _ in range(3):
+        work()
+    milliseconds = statistics.median(gpu_times(work, 9))
+    return blocks * threads * loops * a_loop / (1e-3 * milliseconds)
+
+
+def _mark_time() -> float:
+    """Milliseconds between two marks with nothing in between: in the time of every kernel."""
+    from gpu_step import gpu_times
+
+    return statistics.median(gpu_times(lambda: None, 21))
+
+
+# ------------------------------------------------------------------------------------------ tests
+
+
+@dataclass
+class Reporter:
+    """A plugin of pytest: tells each failure at once, and counts what has been done.
+
+    ``done`` is a file of the tests that are over. Where a test leaves the GPU unusable for this
+    process, the tests after it need another one: `lost` is True then.
+    """
+
+    done: Path
+    outcomes: dict[str, str] = field(default_factory=dict)
+    lost: bool = False
+    total: int = 0
+    session: Any = None
+
+    def __post_init__(self) -> None:
+        if self.done.exists():
+            lines = self.done.read_text(encoding="utf-8").splitlines()
+            self.outcomes = dict(reversed(line.split(" ", 1)) for line in lines)
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        self.total = len(items)
+        items[:] = [item for item in items if item.nodeid not in self.outcomes]
+
+    def pytest_sessionstart(self, session: Any) -> None:
+        self.session = session
+
+    def pytest_collectreport(self, report: Any) -> None:
+        if report.failed:
+            self._failure(report)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        if report.failed:
+            self._failure(report)
+            self._note(report.nodeid, "failed")
+            self.lost = gpu_is_lost()
+            if self.lost:
+                self.session.shouldstop = "the GPU is lost to this process"
+        elif report.when == "call" or report.skipped:
+            self._note(report.nodeid, report.outcome)
+
+    def counts(self) -> dict[str, int]:
+        outcomes = list(self.outcomes.values())
+        return {name: outcomes.count(name) for name in ("passed", "failed", "skipped")}
+
+    def _failure(self, report: Any) -> None:
+        crash = getattr(report.longrepr, "reprcrash", None)
+        text = crash.message if crash is not None else str(report.longrepr)
+        lines = [line.strip() for line in text.splitlines() if line.strip()] or ["no message"]
+        finding("failure", test=report.nodeid, line=lines[0][:200])
+        print(report.longreprtext)
+
+    def _note(self, test: str, outcome: str) -> None:
+        if self.outcomes.get(test) == "failed":
+            return
+        self.outcomes[test] = outcome
+        with self.done.open("a", encoding="utf-8") as file:
+            file.write(f"{outcome} {test}\n")
+        finding("tests", **self.counts(), total=self.total)
+
+
+def gpu_is_lost() -> bool:
+    """Whether an error of a kernel has made the GPU unusable for this process."""
+    import torch
+
+    try:
+        if torch.cuda.is_initialized():
+            torch.cuda.synchronize()
+    except RuntimeError:
+        return True
+    return False
+
+
+_MOST_PROCESSES = 5
+
+
+def tests(path: str, marker: str, done: Path, attempt: int) -> None:
+    """The tests of a file that carry a marker, in new processes where one loses the GPU."""
+    import pytest
+
+    os.chdir(ROOT)
+    reporter = Reporter(done)
+    code = pytest.main(
+        ["-o", "addopts=--import-mode=importlib", "-q", "-p", "no:cacheprovider", "-m", marker, path],
+        plugins=[reporter],
+    )
+    finding("tests", **reporter.counts(), total=reporter.total)
+    if reporter.lost and attempt < _MOST_PROCESSES:
+        sys.stdout.flush()
+        again = [path, "--marker", marker, "--done", str(done), "--attempt", str(attempt + 1)]
+        os.execv(sys.executable, [sys.executable, __file__, "tests", *again])
+    # Failures are findings; that no test has the marker is none.
+    if code not in (0, 1, 2, 5) or (code == 2 and not reporter.lost):
+        raise SystemExit(f"pytest ends with {int(code)}")
+
+
+# ---------------------------------------------------------------------------------- the sanitizer
+
+
+def ops() -> None:
+    """The program that the sanitizer looks at."""
+    import torch
+    from gpu_ops import every_op
+
+    every_op(torch.device("cuda"), say=lambda line: print(line, flush=True))
+    torch.cuda.synchronize()
+    print(OPS_DONE, flush=True)
+
+
+OPS_DONE = "all ops ran"
+_SANITIZER_LINE = re.compile(r"=========\s?(.*)")
+_ERRORS = re.compile(r"(?:ERROR|RACECHECK) SUMMARY: (\d+)")
+_NO_ERROR = ("COMPUTE-SANITIZER", "Target application", "LEAK SUMMARY")
+
+
+class SanitizerLog:
+    """What compute-sanitizer says, line by line.
+
+    Attributes:
+        errors: its own count; until it gives that, the number of errors seen.
+        first: first lines of the first few errors.
+        last: what the program was doing.
+        finished: whether the program came to its end.
+    """
+
+    def __init__(self, most: int = 4) -> None:
+        self.errors, self.finished = 0, False
+        self.first: list[str] = []
+        self.last = ""
+        self.counted = False
+        self._most = most
+        self._begins = True  # the next line begins an error
+        self._second = False
+
+    def read(self, line: str) -> bool:
+        """Gives whether something changed that is worth telling."""
+        match = _SANITIZER_LINE.match(line)
+        if match is None:
+            self.finished = self.finished or line.strip() == OPS_DONE
+            if line.startswith(("ops:", "training:")):
+                self.last = line.strip()
+            return False
+        text = match[1].strip()
+        summary = _ERRORS.match(text)
+        if summary is not None:
+            self.errors, self.counted = int(summary[1]), True
+            return True
+        if not text:
+            self._begins = True
+            return False
+        if text.startswith(_NO_ERROR):
+            return False
+        begins, self._begins = self._begins, False
+        if begins:
+            self.errors += 1
+            if len(self.first) < self._most:
+                self.first.append(text[:160])
+                self._second = True
+            return True
+        if self._second:  # where it is
+            self.first[-1] += f", {text[:80]}"
+            self._second = False
+        return False
+
+    def tell(self, tool: str) -> None:
+        finding(
+            "sanitizer",
+            tool=tool,
+            errors=self.errors,
+            counted=self.counted,
+            lines=self.first,
+            last=self.last,
+            finished=self.finished,
+        )
+
+
+def sanitize(tool: str) -> None:
+    program = find_tool("compute-sanitizer")
+    if program is None:
+        raise SystemExit("compute-sanitizer is not here")
+    environment = dict(os.environ)
+    if tool in ("memcheck", "initcheck"):
+        # Each tensor in memory of its own, so that its end is known.
+        environment["PYTORCH_NO_CUDA_MEMORY_CACHING"] = "1"
+    command = [program, "--tool", tool, "--print-limit", "20"]
+    if tool == "memcheck":
+        command += ["--report-api-errors", "no"]  # torch asks for what is not there, and copes
+    log = SanitizerLog()
+    with subprocess.Popen(
+        [*command, sys.executable, __file__, "ops"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        env=environment,
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            print(line, end="", flush=True)
+            if log.read(line):
+                log.tell(tool)
+    log.tell(tool)
+    if not log.finished:
+        raise SystemExit(f"the program ended ({process.returncode}) at: {log.last or 'its begin'}")
+
+
+def find_tool(name: str) -> str | None:
+    """A program of the CUDA toolkit."""
+    homes = [os.environ.get("CUDA_HOME", ""), "/usr/local/cuda"]
+    folders = [f"{home}/bin" for home in homes if home]
+    return shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), *folders]))
+
+
+# ------------------------------------------------------------------------------------------ times
+
+
+def scenes(sizes: Iterable[str], folder: Path) -> None:
+    """Makes workloads ready, since that takes the CPU its time."""
+    import torch
+    from workloads import workload
+
+    for size in sizes:
+        path = _scene_path(folder, size)
+        torch.save(workload(size), path.with_suffix(".part"))
+        path.with_suffix(".part").rename(path)
+        print(f"{size} is ready", flush=True)
+
+
+def _scene_path(folder: Path, size: str) -> Path:
+    return folder / f"{size}.scene"
+
+
+def _scene(folder: Path, size: str) -> Any:
+    import torch
+    from workloads import workload
+
+    path = _scene_path(folder, size)
+    return torch.load(path, weights_only=False) if path.exists() else workload(size)
+
+
+def stages(size: str, folder: Path, repeats: int) -> None:
+    import torch
+    from gpu_step import Step, stage_times, step_times, sums_in_order
+
+    from snowsplat.ops.cuda import driver
+
+    scene = _scene(folder, size)
+    finding("scene", size=size, source=scene.source)
+    torch.cuda.reset_peak_memory_stats()
+    step = Step(scene, torch.device("cuda"))
+    for _ in range(4):  # room for the instances, kernels, torch's memory
+        step.run()
+    torch.cuda.synchronize()
+    held = torch.cuda.memory_allocated()
+    counts = step.counts()
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    for _ in range(3):
+        step.run()
+    finding("frame", size=size, **counts)
+    finding("memory", size=size, held=held, peak=torch.cuda.max_memory_allocated())
+    for in_order in (False, True):
+        with sums_in_order(in_order):
+            for _ in range(3):
+                step.run()
+            torch.cuda.reset_peak_memory_stats()
+            times = step_times(step, repeats)
+            peak = torch.cuda.max_memory_allocated()
+            finding("step", size=size, in_order=in_order, repeats=repeats, peak=peak, **times)
+            kernels = stage_times(step, driver.run, repeats)
+            finding("stages", size=size, in_order=in_order, kernels=kernels)
+
+
+# --------------------------------------------------------------------------------------- training
+
+
+def train(captures: Iterable[Path], seeds: Iterable[int], device: str, iterations: int | None) -> None:
+    """Held-out PSNR, time and memory of the default recipe; one seed of all captures, then the next."""
+    for seed in seeds:
+        for path in captures:
+            if path.is_dir():
+                _train(path, seed, device, iterations)
+            elif seed == 0:
+                finding("absent", capture=path.name)
+
+
+def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
+    import torch
+
+    from snowsplat import Trainer, evaluate_views, load_capture, recipe
+
+    device = torch.device(name)
+    on_gpu = device.type == "cuda"
+    capture = load_capture(path)
+    background: Any = BACKGROUNDS.get(path.name, "black")
+    config = recipe(
+        "default",
+        seed=seed,
+        test_iterations=(),
+        background=background,
+        **({} if iterations is None else {"iterations": iterations}),
+    )
+    if on_gpu:
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+    begin = time.perf_counter()
+    trainer = Trainer(capture, config, device=device)
+    trainer.run()
+    if on_gpu:
+        torch.cuda.synchronize()
+    seconds = time.perf_counter() - begin
+    if on_gpu:
+        peak = torch.cuda.max_memory_allocated()
+    else:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    found = trainer.evaluate()
+    same = None
+    if on_gpu:  # the scene as the CPU sees it
+        white = (1.0 if background == "white" else 0.0,) * 3
+        same = evaluate_views(trainer.gaussians.to("cpu"), capture.test, background=white).psnr
+    finding(
+        "training",
+        capture=path.name,
+        device=device.type,
+        seed=seed,
+        iterations=config.iterations,
+        psnr=found.psnr,
+        ssim=found.ssim,
+        psnr_on_cpu=same,
+        seconds=seconds,
+        gaussians=len(trainer.gaussians),
+        peak=peak,
+    )
+
+
+# ------------------------------------------------------------------------------------------- main
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parts = parser.add_subparsers(dest="part", required=True)
+    for name in ("probe", "device", "ops", "peer-build"):
+        parts.add_parser(name)
+    part = parts.add_parser("tests")
+    part.add_argument("path")
+    part.add_argument("--marker", default="gpu")
+    part.add_argument("--done", type=Path, required=True)
+    part.add_argument("--attempt", type=int, default=1)
+    part = parts.add_parser("sanitize")
+    part.add_argument("tool")
+    part = parts.add_parser("scenes")
+    part.add_argument("sizes", nargs="+")
+    part.add_argument("--folder", type=Path, required=True)
+    part = parts.add_parser("stages")
+    part.add_argument("size")
+    part.add_argument("--folder", type=Path, required=True)
+    part.add_argument("--repeats", type=int, default=30)
+    part = parts.add_parser("peer")
+    part.add_argument("size")
+    part.add_argument("--folder", type=Path, required=True)
+    part.add_argument("--repeats", type=int, default=20)
+    part = parts.add_parser("train")
+    part.add_argument("captures", nargs="+", type=Path)
+    part.add_argument("--seeds", nargs="+", type=int, default=[0])
+    part.add_argument("--device", default="cuda")
+    part.add_argument("--iterations", type=int)
+    flags = parser.parse_args()
+    match flags.part:
+        case "probe":
+            probe()
+        case "device":
+            device()
+        case "ops":
+            ops()
+        case "tests":
+            tests(flags.path, flags.marker, flags.done, flags.attempt)
+        case "sanitize":
+            sanitize(flags.tool)
+        case "scenes":
+            scenes(flags.sizes, flags.folder)
+        case "stages":
+            stages(flags.size, flags.folder, flags.repeats)
+        case "train":
+            train(flags.captures, flags.seeds, flags.device, flags.iterations)
+        case "peer-build":
+            import gpu_peer
+
+            gpu_peer.build()
+        case "peer":
+            import gpu_peer
+
+            gpu_peer.compare(_scene(flags.folder, flags.size), flags.size, flags.repeats)
+
+
+if __name__ == "__main__":
+    main()

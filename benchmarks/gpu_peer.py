@@ -1,0 +1,165 @@
+"""Our step beside that of gsplat (Apache 2.0), where it is installed, on the same tensors.
+
+Three pairs of times: an image; an image and its gradient, up to the parameters, by autograd on both
+sides; and a whole training step, where ours is the trainer's and theirs has our loss, which is
+fused, and PyTorch's fused Adam. Of their two layouts the faster one counts.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from gpu_jobs import finding
+from gpu_step import Step, gpu_times, step_times
+from torch import Tensor
+from workloads import Workload
+
+from snowsplat import ops
+from snowsplat.evaluate import psnr
+
+
+def build() -> None:
+    """Has gsplat compile what it needs, by a first image."""
+    try:
+        import gsplat
+    except ImportError as error:
+        finding("no peer", why=str(error))
+        return
+    from gpu_ops import random_scene
+
+    peer = Peer(random_scene(100, 64, 48))
+    peer.image()
+    torch.cuda.synchronize()
+    finding("peer", version=getattr(gsplat, "__version__", "of unknown version"))
+
+
+class Peer:
+    """A scene as gsplat's own trainer holds it."""
+
+    def __init__(self, scene: Workload) -> None:
+        gaussians, camera = scene.gaussians.to("cuda"), scene.camera
+        self.parameters = {
+            name: p.clone().requires_grad_() for name, p in gaussians.parameters().items()
+        }
+        pose = torch.eye(4)
+        pose[:3] = camera.cam_from_world.float()
+        self._pose = pose[None].cuda()
+        matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+        self._matrix = torch.tensor(matrix)[None].cuda()
+        self._size = camera.width, camera.height
+        self.packed = False
+
+    def image(self) -> Tensor:
+        """(H, W, 3), without gradient."""
+        with torch.no_grad():
+            return self._render()
+
+    def _render(self) -> Tensor:
+        from gsplat import rasterization
+
+        p = self.parameters
+        image, _, _ = rasterization(
+            p["means"],
+            p["quats"],
+            p["log_scales"].exp(),
+            p["opacity_logits"].sigmoid(),
+            torch.cat([p["sh_dc"], p["sh_rest"]], dim=1),
+            self._pose,
+            self._matrix,
+            *self._size,
+            near_plane=0.2,
+            sh_degree=3,
+            packed=self.packed,
+        )
+        return image[0]
+
+    def gradient(self, photo: Tensor) -> None:
+        for p in self.parameters.values():
+            p.grad = None
+        # As our op has it best: by planes.
+        image = self._render().permute(2, 0, 1).contiguous().permute(1, 2, 0)
+        ops.photometric_loss(image, photo).backward()
+
+    def optimizer(self) -> torch.optim.Adam:
+        return torch.optim.Adam(self.parameters.values(), lr=0.0, eps=1e-15, fused=True)
+
+
+def compare(scene: Workload, size: str, repeats: int) -> None:
+    peer, step = Peer(scene), Step(scene, torch.device("cuda"))
+    for _ in range(3):
+        step.run()
+    photo = step.photo.rgb
+    camera = step.camera
+    theirs = peer.image()
+    ours = _our_image(step)
+    finding("peer image", size=size, psnr=psnr(ours.clamp(0, 1), theirs.clamp(0, 1)))
+    optimizer = peer.optimizer()
+
+    def their_step() -> None:
+        peer.gradient(photo)
+        optimizer.step()
+
+    room = step.trainer._room
+    parameters = {
+        name: p.clone().requires_grad_()
+        for name, p in step.trainer.gaussians.parameters().items()
+    }
+
+    def our_gradient() -> None:
+        for p in parameters.values():
+            p.grad = None
+        view = {k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy")}
+        splats = ops.project(
+            **parameters, cam_from_world=camera.cam_from_world, **view, sh_degree=3
+        )
+        image, _, _ = ops.rasterize(splats, camera.width, camera.height, room=room)
+        ops.photometric_loss(image, photo).backward()
+
+    pairs: dict[str, tuple[Callable[[], Any], Callable[[], Any]]] = {
+        "image": (partial(_our_image, step), peer.image),
+        "image and gradient": (our_gradient, partial(peer.gradient, photo)),
+        "training step": (step.queue, their_step),
+    }
+    for what, (our_work, their_work) in pairs.items():
+        ours_ms = _wall(our_work, repeats)
+        times = {}
+        for packed in (False, True):
+            peer.packed = packed
+            times[packed] = _wall(their_work, repeats)
+        best = min(times, key=times.__getitem__)
+        finding(
+            "peer times", size=size, what=what, ours=ours_ms, theirs=times[best], packed=best
+        )
+    finding("peer step", size=size, **step_times(step, repeats))
+
+
+@torch.no_grad()
+def _our_image(step: Step) -> Tensor:
+    from snowsplat.render import project
+
+    camera = step.camera
+    splats = project(step.trainer.gaussians, camera)
+    return ops.rasterize(splats, camera.width, camera.height, room=step.trainer._room)[0]
+
+
+def _wall(work: Callable[[], object], repeats: int) -> float:
+    """Milliseconds by events, one repeat behind the other: theirs waits for the GPU in between."""
+    for _ in range(3):
+        work()
+    times = []
+    for _ in range(repeats):
+        torch.cuda.synchronize()
+        before, after = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        before.record()
+        work()
+        after.record()
+        torch.cuda.synchronize()
+        times.append(before.elapsed_time(after))
+    return statistics.median(times)
+
+
+__all__ = ["Peer", "build", "compare", "gpu_times"]

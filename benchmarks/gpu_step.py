@@ -1,0 +1,270 @@
+"""A training step on a GPU under the stopwatch: the trainer's own, on a scene that stays as it is.
+
+Three times are told apart. `host`: how long the CPU takes to queue a step. `gpu`: how long the GPU
+takes for it when all of it is queued already. `wall`: how long a step takes in a training, where
+the CPU waits for each loss. The longer of the first two is what limits the last.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from workloads import Workload
+
+from snowsplat import ops
+from snowsplat.capture import Capture, Points, View
+from snowsplat.capture.decode import ImageSource, LoadedImage
+from snowsplat.config import TrainConfig
+from snowsplat.density import AdaptiveDensity
+from snowsplat.ops.cuda.kernels import Argument, Kernel
+from snowsplat.ops.cuda.launches import launch_by
+from snowsplat.ops.native import LAUNCHERS
+from snowsplat.optim import Adam, LearningRates
+from snowsplat.render import project, render
+from snowsplat.trainer import Trainer
+
+EXTENT = 4.0
+
+#: The paper's, with rates so small that every repeat does the same on the same numbers.
+CONFIG = TrainConfig(
+    sh_interval=0,
+    learning_rates=replace(
+        LearningRates().scaled(1e-30), means_final=1e-36, means_steps=1.0
+    ),
+    density=AdaptiveDensity(densify_until=0.5, prune_screen_size=0.0),
+    test_iterations=(),
+)
+STEP = 1000  # of CONFIG's: the statistics of density control are taken
+
+
+@contextmanager
+def sums_in_order(wanted: bool) -> Iterator[None]:
+    """What `snowsplat train --deterministic` asks for."""
+    before = torch.utils.deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(wanted, warn_only=True)
+    torch.utils.deterministic.fill_uninitialized_memory = False
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
+        torch.utils.deterministic.fill_uninitialized_memory = before
+
+
+class Step:
+    """The step of one workload, on a device."""
+
+    def __init__(self, scene: Workload, device: torch.device, room: int | None = None) -> None:
+        """``room``: for instances, to begin with; None: the trainer's guess."""
+        camera = scene.camera
+        source = ImageSource(Path("not read"), camera.width, camera.height)
+        points = Points(torch.rand(8, 3), torch.zeros(8, 3, dtype=torch.uint8))
+        view = View("not read", camera, source)
+        self.trainer = trainer = Trainer(
+            Capture([view], [], points, extent=EXTENT), CONFIG, device=device
+        )
+        gaussians = scene.gaussians.to(device)
+        trainer.gaussians = gaussians
+        trainer._optimizer = Adam(
+            gaussians, CONFIG.learning_rates, schedule=trainer.schedule, extent=EXTENT
+        )
+        trainer._density = CONFIG.density.control(
+            len(gaussians),
+            schedule=trainer.schedule,
+            extent=EXTENT,
+            random_start=False,
+            generator=torch.Generator(),
+            device=device,
+        )
+        instances = 4 * len(gaussians) if room is None else room
+        trainer._room = ops.Room(instances, torch.zeros(1, dtype=torch.int64, device=device))
+        self.camera = camera.to(device)
+        self.background = torch.zeros(3, device=device)
+        self.photo = LoadedImage(self._planes())
+
+    @torch.no_grad()
+    def _planes(self) -> Tensor:
+        """(3, H, W) uint8: what the camera sees, with noise, so that every pixel has a gradient."""
+        image = render(self.trainer.gaussians, self.camera, self.background).image.permute(2, 0, 1)
+        noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+        return (255 * image + 10 * noise.to(image.device)).clamp(0, 255).to(torch.uint8)
+
+    @torch.no_grad()
+    def queue(self) -> None:
+        self.trainer._queue_step(STEP, self.camera, self.photo, self.background)
+
+    def run(self) -> float:
+        """A whole step, with room enough; its loss."""
+        trainer = self.trainer
+        while True:
+            self.queue()
+            loss, needed = trainer._readback.wait()
+            if needed <= trainer._room.instances:
+                return loss
+            trainer._room = replace(trainer._room, instances=int(1.3 * needed))
+
+    @torch.no_grad()
+    def counts(self) -> dict[str, int]:
+        """What a step has to do: see `gpu_floor.Frame`."""
+        camera, gaussians = self.camera, self.trainer.gaussians
+        splats = project(gaussians, camera)
+        assert splats.ids is not None
+        return {
+            "gaussians": len(gaussians),
+            "seen": int((splats.ids >= 0).sum()),
+            "instances": int(self.trainer._room.needed),
+            "pairs": int(ops.count_blended(splats, camera.width, camera.height).double().sum()),
+            "width": camera.width,
+            "height": camera.height,
+        }
+
+
+Execute = Callable[[Kernel, str, int, Sequence[Argument]], None]
+
+
+class KernelClock:
+    """Marks the times before and after every kernel that the ops launch.
+
+    ``mark()`` makes a mark in the stream. ``laps`` are (native function, kernel, before, after).
+    """
+
+    def __init__(self, execute: Execute, mark: Callable[[], Any]) -> None:
+        self.laps: list[tuple[str, str, Any, Any]] = []
+        self._execute, self._mark = execute, mark
+
+    @contextmanager
+    def on(self, device: str) -> Iterator[None]:
+        """In the block, what is launched for tensors on this device is marked."""
+        before = LAUNCHERS[device]
+        LAUNCHERS[device] = self._launch
+        try:
+            yield
+        finally:
+            LAUNCHERS[device] = before
+
+    def _launch(self, function: str, n: int, args: Sequence[Argument]) -> int:
+        def marked(kernel: Kernel, name: str, blocks: int, arguments: Sequence[Argument]) -> None:
+            before = self._mark()
+            self._execute(kernel, name, blocks, arguments)
+            self.laps.append((function, name, before, self._mark()))
+
+        return launch_by(marked, function, n, args)
+
+
+def kernel_times(
+    laps: Sequence[tuple[str, str, Any, Any]], between: Callable[[Any, Any], float]
+) -> dict[str, dict[str, float]]:
+    """{native function: {kernel: its time, all its launches together}}."""
+    found: dict[str, dict[str, float]] = {}
+    for function, kernel, before, after in laps:
+        kernels = found.setdefault(function, {})
+        kernels[kernel] = kernels.get(kernel, 0.0) + between(before, after)
+    return found
+
+
+def medians(repeats: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Of the times of each kernel."""
+    return {
+        function: {
+            kernel: statistics.median(times[function][kernel] for times in repeats)
+            for kernel in kernels
+        }
+        for function, kernels in repeats[0].items()
+    }
+
+
+# ----------------------------------------------------------------------------------------- on a GPU
+
+
+def event() -> torch.cuda.Event:
+    found = torch.cuda.Event(enable_timing=True)
+    found.record()
+    return found
+
+
+def milliseconds(before: torch.cuda.Event, after: torch.cuda.Event) -> float:
+    return float(before.elapsed_time(after))
+
+
+class Behind:
+    """Keeps the GPU busy until all that is to be timed is queued: else it would be waited for.
+
+        with behind:
+            before = event(); work(); after = event()
+
+    Where the pause was too short for that, `late` is True and the next one is longer.
+    """
+
+    def __init__(self, seconds: float = 0.02) -> None:
+        self.late = False
+        self._cycles = int(2e9 * seconds)  # clocks are lower than 2 GHz
+
+    def __enter__(self) -> Behind:
+        torch.cuda.synchronize()
+        torch.cuda._sleep(self._cycles)
+        self._over = event()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.late = bool(self._over.query())
+        if self.late:
+            self._cycles *= 2
+        torch.cuda.synchronize()
+
+
+def gpu_times(work: Callable[[], object], repeats: int) -> list[float]:
+    """Milliseconds of the GPU for what ``work`` queues, without waiting in between."""
+    times: list[float] = []
+    behind = Behind()
+    for _ in range(repeats + 6):
+        with behind:
+            before = event()
+            work()
+            after = event()
+        if not behind.late:
+            times.append(milliseconds(before, after))
+        if len(times) == repeats:
+            break
+    if not times:
+        raise RuntimeError("the CPU never came to queue a step before the GPU was done")
+    return times
+
+
+def step_times(step: Step, repeats: int) -> dict[str, float]:
+    """Milliseconds {"host", "gpu", "wall"}, medians; the rest is a mean."""
+    gpu = statistics.median(gpu_times(step.queue, repeats))
+    host = []
+    torch.cuda.synchronize()
+    begin = time.perf_counter()
+    for _ in range(repeats):
+        before = time.perf_counter()
+        step.queue()
+        host.append(1e3 * (time.perf_counter() - before))
+        step.trainer._readback.wait()
+    torch.cuda.synchronize()
+    wall = 1e3 * (time.perf_counter() - begin) / repeats
+    return {"host": statistics.median(host), "gpu": gpu, "wall": wall}
+
+
+def stage_times(step: Step, execute: Execute, repeats: int) -> dict[str, dict[str, float]]:
+    """Milliseconds of each kernel of a step: medians of {native function: {kernel: …}}."""
+    found = []
+    behind = Behind()
+    for _ in range(repeats + 6):
+        clock = KernelClock(execute, event)
+        with clock.on("cuda"), behind:
+            step.queue()
+        if not behind.late:
+            found.append(kernel_times(clock.laps, milliseconds))
+        if len(found) == repeats:
+            break
+    if not found:
+        raise RuntimeError("the CPU never came to queue a step before the GPU was done")
+    return medians(found)
