@@ -166,9 +166,9 @@ SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals)
 // One block alone has no others to add, so that sort_offsets may be left out: its counts are the
 // totals.
 template <class Key>
-SNOW_INLINE void scatter(int64_t n, const Key* keys, const uint32_t* values, Key* keys_out,
-                         uint32_t* values_out, Digit digit_of, int64_t blocks,
-                         const uint32_t* counts, const uint32_t* totals, const int64_t* count) {
+SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const uint32_t* values,
+                               Key* keys_out, uint32_t* values_out, Digit digit_of, int64_t blocks,
+                               const uint32_t* counts, const uint32_t* totals) {
   constexpr int kItems = kSortItems<Key>, kWarps = kThreads / kWarp, kAll = kThreads * kItems;
   constexpr int kWords = kAll * int(sizeof(Key) == 8 ? 2 : 1) / 2;
   SNOW_SHARED(uint16_t, tally, kWarps* kDigits);
@@ -177,10 +177,6 @@ SNOW_INLINE void scatter(int64_t n, const Key* keys, const uint32_t* values, Key
   Key* const staged_keys = reinterpret_cast<Key*>(staged);
   uint32_t* const staged_values = reinterpret_cast<uint32_t*>(staged);
 
-  const int64_t first = int64_t(blockIdx.x) * kAll;
-  const int64_t left = valid_items(n, count) - first;
-  if (left <= 0) return;  // the whole block
-  const int valid = left < kAll ? int(left) : kAll;
   const int thread = int(threadIdx.x), lane = lane_id();
   const int mine = warp_id() * (kItems * kWarp) + lane;
   uint16_t* const own = tally + warp_id() * kDigits;
@@ -258,6 +254,17 @@ SNOW_INLINE void scatter(int64_t n, const Key* keys, const uint32_t* values, Key
     const int at = k * kThreads + thread;
     if (at < valid) values_out[target[k]] = staged_values[at];
   }
+}
+
+template <class Key>
+SNOW_INLINE void scatter(int64_t n, const Key* keys, const uint32_t* values, Key* keys_out,
+                         uint32_t* values_out, Digit digit_of, int64_t blocks,
+                         const uint32_t* counts, const uint32_t* totals, const int64_t* count) {
+  constexpr int kAll = kThreads * kSortItems<Key>;
+  const int64_t first = int64_t(blockIdx.x) * kAll, left = valid_items(n, count) - first;
+  if (left > 0)
+    scatter_block(first, left < kAll ? int(left) : kAll, keys, values, keys_out, values_out,
+                  digit_of, blocks, counts, totals);
 }
 
 }  // namespace
