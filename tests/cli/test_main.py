@@ -82,6 +82,30 @@ def test_errors_of_the_system_and_warnings_are_one_line(monkeypatch, refused, ru
         run("info", "x")
 
 
+def test_no_memory_is_one_line_that_says_what_helps(monkeypatch, refused):
+    import torch
+
+    def torch_allocates(self):
+        torch.empty(2**60, dtype=torch.uint8)
+
+    def a_gpu_is_full(self):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+
+    def python_allocates(self):
+        raise MemoryError
+
+    for fails in (torch_allocates, a_gpu_is_full, python_allocates):
+        monkeypatch.setattr(module.VERBS["info"], "run", fails)
+        assert "out of memory; train with --memory" in refused("info", "x")
+
+    def another(self):
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(module.VERBS["info"], "run", another)
+    with pytest.raises(RuntimeError, match="a defect"):
+        module.main(["info", "x"])
+
+
 def test_python_m(start):
     process = start("info", "/nonexistent")
     _, err = process.communicate(timeout=60)

@@ -29,6 +29,10 @@ def compute_with(threads: int | None, device: str | None) -> torch.device:
     """
     from snowsplat import ops
 
+    # Tensors of a scene that grows are each a little larger than the one before: without this the
+    # memory of a GPU fills with holes. Read when it is used first.
+    if sys.platform == "linux":
+        os.environ.setdefault("PYTORCH_CUDA_ALLOC_CONF", "expandable_segments:True")
     check_threads(threads)
     if threads is not None:
         ops.set_num_threads(threads)

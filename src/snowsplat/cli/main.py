@@ -56,6 +56,11 @@ For completion in the shell, put this into a file that it reads:
   eval "$(snowsplat --tyro-print-completion bash)"    (or zsh)"""
 
 
+_OUT_OF_MEMORY = (
+    "out of memory; train with --memory and a smaller number, or make photos smaller, -r 2"
+)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with ``argv`` (those of the process by default); gives its exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -70,7 +75,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except MemoryError:
-        return _fail("out of memory; try --max-gaussians with a smaller number, or -r 2", 2)
+        return _fail(_OUT_OF_MEMORY, 2)
+    except RuntimeError as error:
+        if not _is_out_of_memory(error):
+            raise
+        return _fail(_OUT_OF_MEMORY, 2)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{error.strerror or error}", 2)
@@ -92,6 +101,12 @@ def _parse(arguments: list[str]) -> Any:
         args=arguments,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
+
+
+def _is_out_of_memory(error: RuntimeError) -> bool:
+    """Whether torch says so, of a GPU or of the computer; it has a class for the first alone."""
+    words = str(error)
+    return any(said in words for said in ("out of memory", "not enough memory", "allocate memory"))
 
 
 def _fail(message: str, code: int) -> int:

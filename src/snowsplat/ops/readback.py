@@ -18,13 +18,14 @@ class Readback:
         on_gpu = device.type == "cuda"
         self._numbers = torch.zeros(count, dtype=torch.float64, pin_memory=on_gpu)
         self._arrived = torch.cuda.Event() if on_gpu else None
+        self._device = device
 
     def post(self, *numbers: Tensor) -> None:
         """``numbers``: tensors of one element each, on the device."""
         gathered = torch.cat([number.detach().double().reshape(1) for number in numbers])
         self._numbers.copy_(gathered, non_blocking=True)
         if self._arrived is not None:
-            self._arrived.record()
+            self._arrived.record(torch.cuda.current_stream(self._device))
 
     def wait(self) -> list[float]:
         """What was posted last."""
