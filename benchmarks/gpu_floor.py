@@ -1,16 +1,15 @@
 """Floors for the stages of a training step on a GPU: the bytes that have to move, the operations.
 
 Bytes are those that device memory moves at least, each number read once and written once, float32;
-where single columns of a splat's row (16 numbers) are read from all over the place, 32 bytes, the
-least that memory gives. What a stage leaves for the next one is counted, since it does not fit in
-the caches at the sizes where it matters. Operations are those of one lane of a vector, without loads,
-index arithmetic, and lanes that lie idle; a multiply-add is one. Where they are few beside the bytes,
-they are left out.
+where some columns of a splat's row (16 numbers) are read, 32 bytes, the least that memory gives.
+What a stage leaves for the next one is counted, though caches may hold some of it. Operations are
+those of one lane, without loads, index arithmetic, and lanes that lie idle; a multiply-add is one.
+Where they are few beside the bytes, they are left out.
 
     floor of a stage = max(bytes / copy bandwidth, operations / rate of multiply-adds)
 
-with both rates measured on the card (`gpu_parts.py device`). The floor is one of the work, not of the
-kernel: what a kernel moves twice, or could do without, shows in its share of the floor.
+with both rates measured on the card (`gpu_parts.py device`). The floor is that of the work, not of
+the kernels: what these move twice shows in their share of it.
 """
 
 from __future__ import annotations
@@ -103,7 +102,7 @@ def works(frame: Frame) -> dict[str, Work]:
         # The order and columns of a row; four numbers for tiles_fill, one of them summed up.
         "tiles_count": Work(n * (4 + SECTOR + 16 + 8)),
         "tiles_fill": Work(_fill_bytes(frame)),
-        # An instance's splat, and which parts of the tile it touches; tiles; rows once; four planes.
+        # An instance's splat, and what of the tile it touches; tiles; rows once; four planes.
         "blend_fwd": Work(
             instances * (4 + 1) + frame.tiles * 8 + seen * ROW + pixels * 16,
             frame.pairs * sum(FORWARD.values()),

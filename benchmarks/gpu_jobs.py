@@ -118,7 +118,9 @@ class Runner:
         if outcome.state == "failed" and not outcome.reason:
             outcome.reason = child.last_line or "it said nothing"
         with self._log.open("ab") as log:
-            log.write(f"\n===== {child.job.name}: {outcome.state}, {outcome.seconds:.1f} s\n".encode())
+            log.write(
+                f"\n===== {child.job.name}: {outcome.state}, {outcome.seconds:.1f} s\n".encode()
+            )
             log.write(child.output(_LOG_BYTES))
         child.close()
         self._add(outcome)
@@ -177,15 +179,18 @@ class _Child:
         *lines, self._partial = (self._partial + self._read.read()).split(b"\n")
         for line in lines:
             text = line.decode(errors="replace").strip()
-            if text.startswith(MARK):
+            # Others may have begun the line, such as pytest with its dots.
+            _, marked, rest = text.partition(MARK)
+            if marked:
                 with contextlib.suppress(ValueError):
-                    on_finding(self.job.name, json.loads(text[len(MARK) :]))
+                    on_finding(self.job.name, json.loads(rest))
             elif text:
                 self.last_line = text
 
     def output(self, most: int) -> bytes:
-        """What it printed, without the middle where that is long."""
-        content = self._path.read_bytes()
+        """What it printed beside its findings, without the middle where that is long."""
+        lines = self._path.read_bytes().splitlines(keepends=True)
+        content = b"".join(line for line in lines if MARK.encode() not in line)
         if len(content) <= most:
             return content
         return content[: most // 2] + b"\n ...\n" + content[-most // 2 :]

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gpu_jobs import MARK, finding
+from gpu_jobs import finding
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Captures whose pictures are transparent.
@@ -201,7 +201,9 @@ class Reporter:
         crash = getattr(report.longrepr, "reprcrash", None)
         text = crash.message if crash is not None else str(report.longrepr)
         lines = [line.strip() for line in text.splitlines() if line.strip()] or ["no message"]
-        finding("failure", test=report.nodeid, line=lines[0][:200])
+        # A file that cannot be collected has its error last.
+        line = lines[0] if crash is not None else lines[-1].removeprefix("E").strip()
+        finding("failure", test=report.nodeid, line=line[:200])
         print(report.longreprtext)
 
     def _note(self, test: str, outcome: str) -> None:
@@ -235,7 +237,17 @@ def tests(path: str, marker: str, done: Path, attempt: int) -> None:
     os.chdir(ROOT)
     reporter = Reporter(done)
     code = pytest.main(
-        ["-o", "addopts=--import-mode=importlib", "-q", "-p", "no:cacheprovider", "-m", marker, path],
+        [
+            "-o",
+            "addopts=--import-mode=importlib",
+            "-q",
+            "-s",  # findings are printed while tests run
+            "-p",
+            "no:cacheprovider",
+            "-m",
+            marker,
+            path,
+        ],
         plugins=[reporter],
     )
     finding("tests", **reporter.counts(), total=reporter.total)
@@ -297,7 +309,9 @@ class SanitizerLog:
         text = match[1].strip()
         summary = _ERRORS.match(text)
         if summary is not None:
-            self.errors, self.counted = int(summary[1]), True
+            # A second one says how many of them were not printed.
+            count = int(summary[1])
+            self.errors, self.counted = max(count, self.errors if self.counted else 0), True
             return True
         if not text:
             self._begins = True
@@ -428,8 +442,10 @@ def stages(size: str, folder: Path, repeats: int) -> None:
 # --------------------------------------------------------------------------------------- training
 
 
-def train(captures: Iterable[Path], seeds: Iterable[int], device: str, iterations: int | None) -> None:
-    """Held-out PSNR, time and memory of the default recipe; one seed of all captures, then the next."""
+def train(
+    captures: Iterable[Path], seeds: Iterable[int], device: str, iterations: int | None
+) -> None:
+    """Held-out PSNR, time, memory of the default recipe; a seed of all captures, then the next."""
     for seed in seeds:
         for path in captures:
             if path.is_dir():
@@ -490,7 +506,7 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
 # ------------------------------------------------------------------------------------------- main
 
 
-def main() -> None:
+def parse(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parts = parser.add_subparsers(dest="part", required=True)
     for name in ("probe", "device", "ops", "peer-build"):
@@ -518,7 +534,11 @@ def main() -> None:
     part.add_argument("--seeds", nargs="+", type=int, default=[0])
     part.add_argument("--device", default="cuda")
     part.add_argument("--iterations", type=int)
-    flags = parser.parse_args()
+    return parser.parse_args(arguments)
+
+
+def main() -> None:
+    flags = parse(sys.argv[1:])
     match flags.part:
         case "probe":
             probe()

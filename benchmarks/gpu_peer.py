@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 from gpu_jobs import finding
-from gpu_step import Step, gpu_times, step_times
+from gpu_step import Step, event, milliseconds
 from torch import Tensor
 from workloads import Workload
 
@@ -89,6 +89,10 @@ class Peer:
 
 
 def compare(scene: Workload, size: str, repeats: int) -> None:
+    try:
+        import gsplat  # noqa: F401
+    except ImportError:
+        return  # `build` has said so
     peer, step = Peer(scene), Step(scene, torch.device("cuda"))
     for _ in range(3):
         step.run()
@@ -105,8 +109,7 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
 
     room = step.trainer._room
     parameters = {
-        name: p.clone().requires_grad_()
-        for name, p in step.trainer.gaussians.parameters().items()
+        name: p.clone().requires_grad_() for name, p in step.trainer.gaussians.parameters().items()
     }
 
     def our_gradient() -> None:
@@ -125,16 +128,13 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
         "training step": (step.queue, their_step),
     }
     for what, (our_work, their_work) in pairs.items():
-        ours_ms = _wall(our_work, repeats)
+        ours_ms = _each(our_work, repeats)
         times = {}
         for packed in (False, True):
             peer.packed = packed
-            times[packed] = _wall(their_work, repeats)
+            times[packed] = _each(their_work, repeats)
         best = min(times, key=times.__getitem__)
-        finding(
-            "peer times", size=size, what=what, ours=ours_ms, theirs=times[best], packed=best
-        )
-    finding("peer step", size=size, **step_times(step, repeats))
+        finding("peer times", size=size, what=what, ours=ours_ms, theirs=times[best], packed=best)
 
 
 @torch.no_grad()
@@ -146,20 +146,17 @@ def _our_image(step: Step) -> Tensor:
     return ops.rasterize(splats, camera.width, camera.height, room=step.trainer._room)[0]
 
 
-def _wall(work: Callable[[], object], repeats: int) -> float:
-    """Milliseconds by events, one repeat behind the other: theirs waits for the GPU in between."""
+def _each(work: Callable[[], object], repeats: int) -> float:
+    """Milliseconds of one among many that follow each other, as in a training."""
     for _ in range(3):
         work()
     times = []
-    for _ in range(repeats):
+    for _ in range(3):
         torch.cuda.synchronize()
-        before, after = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        before.record()
-        work()
-        after.record()
+        before = event()
+        for _ in range(repeats):
+            work()
+        after = event()
         torch.cuda.synchronize()
-        times.append(before.elapsed_time(after))
+        times.append(milliseconds(before, after) / repeats)
     return statistics.median(times)
-
-
-__all__ = ["Peer", "build", "compare", "gpu_times"]

@@ -36,9 +36,7 @@ EXTENT = 4.0
 #: The paper's, with rates so small that every repeat does the same on the same numbers.
 CONFIG = TrainConfig(
     sh_interval=0,
-    learning_rates=replace(
-        LearningRates().scaled(1e-30), means_final=1e-36, means_steps=1.0
-    ),
+    learning_rates=replace(LearningRates().scaled(1e-30), means_final=1e-36, means_steps=1.0),
     density=AdaptiveDensity(densify_until=0.5, prune_screen_size=0.0),
     test_iterations=(),
 )

@@ -1,9 +1,11 @@
 """The benchmarks run, on workloads small enough for a test, and count what they say they count."""
 
+import argparse
 import json
 import os
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -13,6 +15,8 @@ import torch
 from snowsplat import Gaussians, load_capture, ops, write_gaussians
 from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.ops import native, reference
+from snowsplat.ops.cuda.launches import KERNELS, launch_by
+from snowsplat.ops.native import LAUNCHERS
 
 ROOT = Path(__file__).resolve().parents[1]
 BENCHMARKS = ROOT / "benchmarks"
@@ -163,3 +167,432 @@ def test_formats(tmp_path):
         size, similar = row(text, f"{name:<14}")[2:4]
         assert 0 < size < 200
         assert similar > 30
+
+
+# ------------------------------------------------------------------------------------------ gpu.py
+
+
+@pytest.fixture
+def gpu_modules(monkeypatch):
+    """The modules beside gpu.py, to be imported by their names."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.setenv("SNOWSPLAT_GARDEN", "none")
+
+
+def run_jobs(folder, *jobs, seconds=60.0, width=4):
+    import gpu_jobs
+
+    found, log = [], folder / "log"
+    log.write_bytes(b"")
+    runner = gpu_jobs.Runner(
+        folder,
+        log,
+        time.monotonic() + seconds,
+        width,
+        lambda job, one: found.append((job, one)),
+        say=lambda line: None,
+    )
+    runner.run(jobs)
+    return {outcome.job: outcome for outcome in runner.outcomes}, found, log.read_text()
+
+
+def job(name, code, limit=30.0, **more):
+    import gpu_jobs
+
+    return gpu_jobs.Job(name, [sys.executable, "-c", code], limit, **more)
+
+
+def test_without_a_gpu_one_line_says_so(tmp_path):
+    run = subprocess.run(
+        [sys.executable, str(BENCHMARKS / "gpu.py"), "--out", str(tmp_path / "out")],
+        env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 2
+    assert len(run.stdout.splitlines()) == 1
+    assert run.stdout.startswith("gpu: nothing was measured: ")
+    assert run.stderr == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_job_that_crashes_or_is_late_stops_no_other(gpu_modules, tmp_path):
+    tell = 'print(\'@@ {"kind": "x", "value": 1}\', flush=True); '
+    outcomes, found, log = run_jobs(
+        tmp_path,
+        job("a child of its own", "import subprocess; subprocess.run(['sleep', '77.25'])", 1.0),
+        job("late", tell + "import time; time.sleep(60)", limit=1.5),
+        job("crash", tell + "import os; print('last words', flush=True); os.abort()"),
+        job("error", tell + "raise ValueError('what was wrong')"),
+        job("no program", ""),
+        job("well", tell + "print('@@ not json'); print('@@ {\"half', end='')"),
+    )
+    states = {name: outcome.state for name, outcome in outcomes.items()}
+    assert states == {
+        "a child of its own": "late",
+        "late": "late",
+        "crash": "failed",
+        "error": "failed",
+        "no program": "done",
+        "well": "done",
+    }
+    assert outcomes["crash"].reason == "SIGABRT; last words"
+    assert outcomes["error"].reason == "ValueError: what was wrong"
+    assert outcomes["late"].reason == "ended after 2 s"
+    assert 1.5 <= outcomes["late"].seconds < 10
+    # What they found before is there.
+    assert sorted(name for name, _ in found) == ["crash", "error", "late", "well"]
+    assert "===== crash: failed" in log
+    assert "last words" in log
+    assert "kind" not in log
+    running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
+    assert "sleep 77.25" not in running
+
+
+def test_what_is_timed_runs_alone_and_nothing_begins_too_late(gpu_modules, tmp_path):
+    note = (
+        "import time, pathlib; p = pathlib.Path(r'{}'); a = time.time(); time.sleep(0.4); "
+        "f = p.open('a'); f.write(f'{} {{a}} {{time.time()}}\\n')"
+    )
+    path = tmp_path / "times"
+    together = [job(f"together {i}", note.format(path, f"t{i}")) for i in range(3)]
+    alone = [job(f"alone {i}", note.format(path, f"a{i}"), alone=True) for i in range(2)]
+    outcomes, _, _ = run_jobs(
+        tmp_path, *together, *alone, job("never", "", least=1000.0), job("missing", "", 5.0)
+    )
+    lines = map(str.split, path.read_text().splitlines())
+    spans = {name: (float(a), float(b)) for name, a, b in lines}
+    assert len(spans) == 5
+    for name in ("a0", "a1"):
+        begin, end = spans[name]
+        others = [span for other, span in spans.items() if other != name]
+        assert all(b <= begin or a >= end for a, b in others)
+    assert max(spans[f"t{i}"][0] for i in range(3)) < min(spans[f"t{i}"][1] for i in range(3))
+    assert outcomes["never"].state == "not run"
+    outcomes, _, _ = run_jobs(
+        tmp_path, job("cut", "import time; time.sleep(60)", least=0.0), seconds=1
+    )
+    assert outcomes["cut"].state == "late"
+    import gpu_jobs
+
+    outcomes, _, _ = run_jobs(tmp_path, gpu_jobs.Job("absent", ["/no/such/program"], 5.0))
+    assert outcomes["absent"].state == "failed"
+
+
+def test_floors_by_hand(gpu_modules):
+    import gpu_floor
+
+    frame = gpu_floor.Frame(1000, 600, 5000, 100_000, 320, 160)
+    works = gpu_floor.works(frame)
+    pixels, tiles = 320 * 160, 20 * 10
+    assert (frame.pixels, frame.tiles) == (pixels, tiles)
+    assert works["project_cull"].bytes == 1000 * (11 * 4 + 4)
+    assert works["project_fwd"].bytes == 1000 * (4 + 64) + 600 * 59 * 4
+    assert works["splats_prepare"].bytes == 1000 * 36
+    # 4 passes of 8 bytes in and out, 4 for the histogram, no values read in the first one.
+    assert works["splats_sort"].bytes == 1000 * 64
+    # Tiles in 8 bits: one pass over keys of 2 bytes, values of 4.
+    fill = 1000 * 20 + 600 * 32 + 5000 * 6
+    assert works["tiles_fill"].bytes == fill + 5000 * (2 + 12) + 5000 * 2 + 200 * 4
+    assert works["blend_fwd"].bytes == 5000 * 5 + 200 * 8 + 600 * 64 + pixels * 16
+    assert works["blend_fwd"].operations == 100_000 * 19
+    assert works["blend_bwd"].bytes == 5000 * 5 + 200 * 8 + 600 * 128 + pixels * 28
+    assert works["blend_bwd"].operations == 100_000 * 34
+    assert works["photometric_u8"] == gpu_floor.Work(pixels * 27, pixels * 3 * 154)
+    assert works["adam_step"].bytes == 1000 * (59 * 4 * 6 + 4) + 600 * 64
+    assert "splats_reduce" not in works
+    # Of bytes: 1.42 MB at 1 TB/s; of operations where these take longer.
+    adam = works["adam_step"]
+    assert adam.seconds(1e12, 1e12) == pytest.approx(adam.bytes * 1e-12)
+    assert works["blend_fwd"].seconds(1e12, 1e11) == pytest.approx(100_000 * 19e-11)
+    assert works["blend_fwd"].seconds(1e12, None) == pytest.approx(works["blend_fwd"].bytes * 1e-12)
+
+    in_order = gpu_floor.works(gpu_floor.Frame(1000, 600, 5000, 100_000, 320, 160, in_order=True))
+    names = list(in_order)
+    assert names.index("splats_reduce") == names.index("blend_bwd") + 1
+    assert in_order["splats_reduce"].bytes == 5000 * 64 + 1000 * 72 + 600 * 32
+    more = in_order["blend_bwd"].bytes - works["blend_bwd"].bytes
+    assert more == 5000 * 68 - 600 * 64
+    # 1920×1080 are 8160 tiles, 13 bits: two passes. 2²⁰ tiles: keys of 4 bytes, three passes.
+    full = gpu_floor.works(gpu_floor.Frame(0, 0, 1, 0, 1920, 1080))["tiles_fill"].bytes
+    assert full == 6 + 2 + 2 * 12 + 2 + 8160 * 4
+    wide = gpu_floor.works(gpu_floor.Frame(0, 0, 1, 0, 1 << 24, 1))["tiles_fill"].bytes
+    assert wide == 8 + 4 + 3 * 16 + 4 + 4 * (1 << 20)
+
+
+@pytest.mark.emulated
+def test_every_op_and_kernel_is_in_the_program_of_the_sanitizer(gpu_modules, monkeypatch):
+    """And a step's stages are those that have floors and names."""
+    import gpu_floor
+    import gpu_ops
+    import gpu_step
+    import gpu_table
+
+    from .ops import emulation
+
+    launched = set()
+
+    def execute(kernel, name, blocks, args):
+        launched.add(name)
+        emulation.execute(kernel, name, blocks, args)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    monkeypatch.setitem(LAUNCHERS, "cpu", lambda *args: launch_by(execute, *args))
+    gpu_ops.every_op(torch.device("cpu"), gpu_ops.SMALL, wide=False, say=lambda line: None)
+    # This one is for more tiles than the emulation does in a moment.
+    assert set(KERNELS) - {name.removesuffix("_f64") for name in launched} == {"tiles_start_u32"}
+
+    step = gpu_step.Step(gpu_ops.random_scene(60, 40, 30), torch.device("cpu"), room=7)
+    photo, gaussians = step.photo.planes.clone(), step.trainer.gaussians.clone()
+    losses = [step.run(), step.run()]
+    assert losses[0] == losses[1] > 0  # it stays as it is
+    assert step.trainer._room.instances > 7
+    assert torch.equal(photo, step.photo.planes)
+    for name, parameter in gaussians.parameters().items():
+        torch.testing.assert_close(parameter, step.trainer.gaussians.parameters()[name])
+    counts = step.counts()
+    assert 0 < counts["seen"] < counts["gaussians"] == 60
+    assert 0 < counts["instances"] <= counts["seen"] * 6
+    assert 0 < counts["pairs"] <= counts["instances"] * 256
+    for in_order in (False, True):
+        clock = gpu_step.KernelClock(emulation.execute, time.perf_counter)
+        with gpu_step.sums_in_order(in_order), clock.on("cpu"):
+            step.queue()
+        times = gpu_step.kernel_times(clock.laps, lambda a, b: 1e3 * (b - a))
+        assert gpu_step.medians([times, times, times]) == times
+        works = gpu_floor.works(gpu_floor.Frame(**counts, in_order=in_order))
+        assert list(times) == list(works)
+        assert times.keys() <= gpu_table.NAMES.keys()
+        assert times["blend_fwd"].keys() == {"blend_fwd"}
+        assert min(t for kernels in times.values() for t in kernels.values()) > 0
+    assert not torch.are_deterministic_algorithms_enabled()
+    torch.set_num_threads(before)
+
+
+def test_tests_are_counted_and_go_on_after_one_that_loses_the_gpu(gpu_modules, tmp_path):
+    """The GPU is lost when a test leaves a file; each process afterwards has it again."""
+    test = tmp_path / "test_them.py"
+    test.write_text(
+        "import pytest\n"
+        "pytestmark = pytest.mark.gpu\n"
+        "def test_a(): pass\n"
+        "def test_b():\n"
+        "    import sys; sys.modules['__main__'].gpu_is_lost = lambda: True\n"
+        "    assert 1 == 2, 'one is not two'\n"
+        "def test_c(): pytest.skip('not now')\n"
+        "@pytest.fixture\n"
+        "def broken(): raise RuntimeError('no\\nluck')\n"
+        "def test_d(broken): pass\n"
+        "def test_e(): pass\n"
+    )
+    arguments = ["tests", str(test), "--done", str(tmp_path / "done")]
+    outcomes, found, log = run_jobs(tmp_path, part("t", *arguments))
+    assert outcomes["t"].state == "done", log
+    last = [one for _, one in found if one["kind"] == "tests"][-1]
+    assert last == {"kind": "tests", "passed": 2, "failed": 2, "skipped": 1, "total": 5}
+    failures = [(f["test"].split("::")[1], f["line"]) for _, f in found if f["kind"] == "failure"]
+    assert [name for name, _ in failures] == ["test_b", "test_d"]
+    assert "one is not two" in failures[0][1]
+    assert "luck" in log
+
+    (tmp_path / "test_broken.py").write_text("import no_such_module\n")
+    arguments = ["tests", str(tmp_path / "test_broken.py"), "--done", str(tmp_path / "done2")]
+    outcomes, found, log = run_jobs(tmp_path, part("t", *arguments))
+    assert outcomes["t"].state == "failed"
+    assert any(f["kind"] == "failure" and "no_such_module" in f["line"] for _, f in found), found
+
+
+def part(name, *arguments, limit=100.0, **environment):
+    import gpu_jobs
+
+    paths = os.pathsep.join([str(ROOT / "src"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return gpu_jobs.Job(
+        name,
+        [sys.executable, str(BENCHMARKS / "gpu_parts.py"), *map(str, arguments)],
+        limit,
+        environment={"PYTHONPATH": paths, **environment},
+    )
+
+
+def test_what_the_sanitizer_says(gpu_modules, monkeypatch, tmp_path):
+    import gpu_parts
+
+    log = gpu_parts.SanitizerLog()
+    text = """========= COMPUTE-SANITIZER
+ops: 33 Gaussians
+========= Invalid __global__ write of size 4 bytes
+=========     at blend_bwd+0x1230
+=========     by thread (1,0,0) in block (0,0,0)
+=========     Address 0x7f is out of bounds
+=========
+========= Error: Race reported between Write access at blend_fwd+0x10 and Read access at x
+=========
+all ops ran
+========= ERROR SUMMARY: 30 errors
+========= ERROR SUMMARY: 28 errors were not printed. Use --print-limit option to adjust
+"""
+    for line in text.splitlines(keepends=True):
+        log.read(line)
+    assert (log.errors, log.finished, log.last) == (30, True, "ops: 33 Gaussians")
+    assert log.first[0] == "Invalid __global__ write of size 4 bytes, at blend_bwd+0x1230"
+    assert log.first[1].startswith("Error: Race reported between Write access at blend_fwd")
+    for summary in ("ERROR SUMMARY: 0 errors", "RACECHECK SUMMARY: 0 hazards displayed (0 errors)"):
+        log = gpu_parts.SanitizerLog()
+        for line in ("========= COMPUTE-SANITIZER\n", f"========= {summary}\n"):
+            log.read(line)
+        assert (log.errors, log.first, log.finished) == (0, [], False)
+
+    # With a program in the sanitizer's place, which never runs ours to its end.
+    fake = tmp_path / "compute-sanitizer"
+    fake.write_text("#!/bin/sh\nprintf '%s\\n' \"$*\" '========= COMPUTE-SANITIZER' 'ops: first'\n")
+    fake.chmod(0o755)
+    path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
+    outcomes, found, text = run_jobs(tmp_path, part("memcheck", "sanitize", "memcheck", PATH=path))
+    assert outcomes["memcheck"].state == "failed"
+    assert outcomes["memcheck"].reason == "the program ended (0) at: ops: first"
+    assert "--tool memcheck" in text
+    assert [f["errors"] for _, f in found] == [0]
+    assert gpu_parts.find_tool("no such tool") is None
+
+
+def test_training_as_on_a_machine_with_little_installed(gpu_modules, tmp_path):
+    """The child that trains on the CPU, where nothing can be imported that is not there."""
+    with torch.random.fork_rng():
+        write_synthetic_capture(tmp_path / "lego400", n_views=9, width=48, height=36, n_points=200)
+    blocked = tmp_path / "site"
+    blocked.mkdir()
+    (blocked / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Blocked:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in {'tyro', 'pycolmap', 'viser', 'av', 'pillow_heif',\n"
+        "                                  'zstandard'}:\n"
+        "            raise ImportError(f'{name} is not here')\n"
+        "sys.meta_path.insert(0, Blocked())\n"
+    )
+    paths = os.pathsep.join([str(blocked), str(ROOT / "src")])
+    training = part(
+        *("train", "train", tmp_path / "none", tmp_path / "lego400"),
+        *("--device", "cpu", "--iterations", 30, "--seeds", 0, 3),
+        PYTHONPATH=paths,
+        SNOWSPLAT_THREADS="1",
+    )
+    scenes = part("scenes", "scenes", "tiny", "--folder", tmp_path, PYTHONPATH=paths)
+    imports = "import gpu_ops, gpu_parts, gpu_peer, gpu_step, gpu; print('imported')"
+    beside = os.pathsep.join([paths, str(BENCHMARKS)])
+    outcomes, found, log = run_jobs(
+        tmp_path, training, scenes, job("imports", imports, environment={"PYTHONPATH": beside})
+    )
+    assert {outcome.state for outcome in outcomes.values()} == {"done"}, log
+    absent, *runs = [one for name, one in found if name == "train"]
+    assert absent == {"kind": "absent", "capture": "none"}
+    assert [(f["capture"], f["seed"]) for f in runs] == [("lego400", 0), ("lego400", 3)]
+    for run in runs:
+        assert (run["device"], run["iterations"]) == ("cpu", 30)
+        assert 5 < run["psnr"] < 60
+        assert run["seconds"] > 0
+        assert run["peak"] > 1e8
+        assert run["psnr_on_cpu"] is None
+    assert (tmp_path / "tiny.scene").exists()
+
+
+def test_the_page_of_a_gpu(gpu_modules):
+    """Figures in, and beside them what follows from them; every heading has the card's name."""
+    import gpu_table
+    from gpu_jobs import Outcome
+
+    findings = gpu_table.Findings()
+
+    def add(job, kind, **values):
+        findings.add(job, {"kind": kind, **values})
+
+    add("probe", "gpu", name="Card X")
+    empty = gpu_table.page(findings, [], "2030-01-01", running=True)
+    assert empty.startswith("# Card X, 2030-01-01 (not finished)\n")
+    card = {"name": "Card X", "capability": "9.0", "multiprocessors": 100, "memory_gb": 80.0}
+    software = {"torch": "2.9", "python": "3.12", "kernels": "built for sm_90"}
+    card |= {"l2_mb": 50.0, "cores": 16, "clocks": "as they are"}
+    add("device", "device", **card, **software)
+    add("device", "bandwidth", bytes_a_second=2e12)
+    add("device", "rate", operations_a_second=1e13, clocks="high")
+    for passed in range(90):
+        add("a", "tests", passed=passed, failed=1, skipped=2, total=93)
+    for i in range(30):
+        add("a", "failure", test=f"tests/a.py::t{i}", line="went wrong " + 300 * "x")
+    add("memcheck", "sanitizer", tool="memcheck", errors=2, counted=True, lines=["Invalid write"],
+        last="ops: 33", finished=False)  # fmt: skip
+    key = {"capture": "fox", "iterations": 3000, "seed": 0, "ssim": 0.9, "gaussians": 65_000}
+    add("c", "training", device="cpu", psnr=32.0, seconds=30.0, peak=9e8, psnr_on_cpu=None, **key)
+    add(
+        "g", "training", device="cuda", psnr=32.25, seconds=6.0, peak=2e8, psnr_on_cpu=32.251, **key
+    )
+    add("g", "absent", capture="lego400")
+    for size, count, peak in (("3m", 3_000_000, 2.5e9), ("1m", 1_000_000, 1e9)):
+        counts = {"gaussians": count, "seen": count // 2, "instances": 4 * count}
+        add(size, "frame", size=size, pairs=10**8, width=1920, height=1080, **counts)
+        add(size, "scene", size=size, source="a garden")
+        add(size, "memory", size=size, peak=peak, held=peak / 2)
+        for in_order in (False, True):
+            kernels = {"adam_step": {"adam_update": 2.0, "adam_splat_of": 0.832}, "new": {"k": 1.0}}
+            if in_order:
+                kernels["splats_reduce"] = {"splats_reduce": 0.5}
+            add(size, "stages", size=size, in_order=in_order, kernels=kernels)
+            gpu = 5.0 + in_order
+            add(size, "step", size=size, in_order=in_order, gpu=gpu, host=2.0, wall=5.5, peak=peak)
+    add("peer", "peer", version="1.5")
+    add("p", "peer image", size="1m", psnr=48.0)
+    add("p", "peer times", size="1m", what="training step", ours=5.0, theirs=15.0, packed=False)
+    outcomes = [Outcome("a", "done", 10.0), Outcome("b", "late", 60.0, "ended after 60 s")]
+    text = gpu_table.page(findings, outcomes, "2030-01-01", running=False)
+
+    assert len(text) < 11_500
+    headings = [line for line in text.splitlines() if line.startswith("#")]
+    assert all("Card X" in line for line in headings if line != "## What was run")
+    assert "89 passed, 1 failed, 2 skipped, 1 not reached, of 93 in 1 files" in text
+    assert "- and 18 more" in text
+    assert "memcheck: 2 errors; not finished, at: ops: 33" in text
+    assert (
+        "| fox | 3000 | 0 | 32.00 | 32.25 | +0.25 | 30.0 | 6.0 | 500 | 65,000 | 200 | +0.001 |"
+        in text
+    )
+    assert "fox: mean difference +0.250 dB, NOT within 0.1 dB" in text
+    assert "Not here, so not trained: lego400" in text
+    # 1m: 1000000 × (59 × 24 + 4) + 500000 × 64 bytes at 2 TB/s are 0.726 ms, of 2.832.
+    assert "| Adam | 2.832 | 0.726 | 26% |" in text
+    assert "| new | 1.000 |  |  |" in text
+    assert "| rest (PyTorch) | 1.168 |" in text
+    assert "| 1m | 5.000 | 2.000 | 5.500 | GPU | 182 | 1.20 | 1000 | 500 | 1000 |" in text
+    assert "1m to 3m: 750 bytes more for each Gaussian, within the goal" in text
+    assert "| 1m | training step | 5.000 | 15.000 | 3.00 | goal 2: reached |" in text
+    assert "Done: a 10 s." in text
+    assert "- b: late after 60 s; ended after 60 s" in text
+    assert findings.wrong() == 32
+    kinds = [f["kind"] for f in findings.as_json()]
+    assert kinds.count("tests") == 1
+
+
+def test_the_plan_of_a_run(gpu_modules, tmp_path):
+    """Every part is there, what is timed runs alone, and `gpu_parts.py` knows all the flags."""
+    import gpu
+    import gpu_parts
+
+    (tmp_path / "garden_points.npz").touch()
+    flags = argparse.Namespace(
+        captures=tmp_path, only=list(gpu.GROUPS), seeds=[0, 1], peer=None, arch="9.0"
+    )
+    planned = gpu.jobs(flags, tmp_path)
+    names = [job.name for job in planned]
+    assert len(set(names)) == len(names)
+    assert names[0] == "device"
+    assert {"stages 200k", "stages 1m", "stages 3m", "memcheck", "racecheck"} <= set(names)
+    assert "tests/ops/test_rasterize.py" in names
+    assert "tests/test_trainer_gpu.py" in names
+    first_alone = next(i for i, job in enumerate(planned) if job.alone and i > 0)
+    assert all(job.alone for job in planned[first_alone:])
+    for job in planned:
+        assert job.environment["SNOWSPLAT_GARDEN"] == str(tmp_path / "garden_points.npz")
+        gpu_parts.parse(list(job.command[2:]))
+    flags.only = ["stages"]
+    names = [job.name for job in gpu.jobs(flags, tmp_path)]
+    assert names == ["make scenes", "stages 1m", "stages 200k", "stages 3m"]

@@ -1,0 +1,200 @@
+"""All that only a GPU can show, in one run of less than nine minutes.
+
+    python benchmarks/gpu.py --out OUT --captures CAPTURES
+    python benchmarks/gpu.py --out OUT --only device stages        some of the parts
+
+The tests that need a GPU; compute-sanitizer over every op; a training step by stages beside their
+floors, its memory, and what sums in a fixed order cost; trainings beside those of the CPU; and the
+same step beside gsplat's. What is measured how: benchmarks/README.md.
+
+Each part is a process with a time limit, so that one that crashes or hangs stops no other. The page
+OUT/gpu.md is written anew whenever something is found, and printed at the end; OUT/gpu.json has
+every figure, OUT/gpu.log what the parts printed. Exit code: 0 if all is well, 1 if something failed
+or was late, 2 without a GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from gpu_jobs import MARK, Finding, Job, Runner
+from gpu_table import Findings, page
+
+ROOT = Path(__file__).resolve().parents[1]
+PARTS = Path(__file__).with_name("gpu_parts.py")
+GROUPS = ("device", "tests", "sanitizer", "stages", "train", "peer")
+SIZES = ("200k", "1m", "3m")
+CAPTURES = ("fox", "lego400")
+
+
+def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
+    """In their order; those that are not timed run side by side before the others."""
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    environment = {
+        "PYTHONPATH": os.pathsep.join(
+            [
+                str(ROOT / "src"),
+                *filter(None, [str(flags.peer or ""), os.environ.get("PYTHONPATH")]),
+            ]
+        ),
+        "PYTHONUNBUFFERED": "1",
+        "TORCH_CUDA_ARCH_LIST": flags.arch,
+        "SNOWSPLAT_DEVICE": "",
+    }
+    garden = flags.captures / "garden_points.npz"
+    if garden.is_file():
+        environment["SNOWSPLAT_GARDEN"] = str(garden)
+    captures = [str(flags.captures / name) for name in CAPTURES]
+    folder = ["--folder", str(scratch)]
+
+    def job(
+        name: str,
+        part: list[str],
+        limit: float,
+        alone: bool = False,
+        **more: str,
+    ) -> Job:
+        command = [sys.executable, str(PARTS), *part]
+        return Job(name, command, limit, alone, environment={**environment, **more})
+
+    few = {"SNOWSPLAT_THREADS": "2", "OMP_NUM_THREADS": "2"}
+    most = str(max(1, cores - 6))
+    found = {group: [] for group in (*GROUPS, "beside")}
+    found["device"] = [job("device", ["device"], 45, alone=True)]
+    if "train" in flags.only:
+        part = ["train", *captures, "--device", "cpu", "--seeds", *map(str, flags.seeds)]
+        found["beside"].append(job("train on the CPU", part, 200, SNOWSPLAT_THREADS=most))
+    if "peer" in flags.only:
+        found["beside"].append(job("build the peer", ["peer-build"], 240))
+    if {"stages", "peer"} & set(flags.only):
+        found["beside"].append(job("make scenes", ["scenes", *SIZES, *folder], 120))
+    for path in sorted([*ROOT.glob("tests/ops/test_*.py"), ROOT / "tests" / "test_trainer_gpu.py"]):
+        name = str(path.relative_to(ROOT))
+        part = ["tests", name, "--done", str(scratch / f"{path.stem}.done")]
+        found["tests"].append(job(name, part, 120, **few))
+    found["sanitizer"] = [
+        job(tool, ["sanitize", tool], 170, **few) for tool in ("memcheck", "racecheck", "synccheck")
+    ]
+    for size in ("1m", "200k", "3m"):
+        found["stages"].append(job(f"stages {size}", ["stages", size, *folder], 60, alone=True))
+    if "peer" in flags.only:
+        found["peer"] = [
+            job(f"peer {size}", ["peer", size, *folder], 50, alone=True) for size in ("1m", "200k")
+        ]
+    part = ["train", *captures, "--seeds", *map(str, flags.seeds)]
+    found["train"] = [job("train on the GPU", part, 100, alone=True)]
+    late = []
+    if "sanitizer" in flags.only:
+        late.append(job("initcheck", ["sanitize", "initcheck"], 60, alone=True, **few))
+    if "train" in flags.only:
+        part = ["train", *captures, "--iterations", "7000"]
+        late.append(job("train on the GPU, 7000 steps", part, 90, alone=True))
+    wanted = {group: found[group] if group in flags.only else [] for group in GROUPS}
+    # The sanitizers take longest, the tests are many.
+    side_by_side = [*found["beside"], *wanted["sanitizer"], *wanted["tests"]]
+    timed = [*wanted["train"], *wanted["stages"], *wanted["peer"]]
+    return [*wanted["device"], *side_by_side, *timed, *late]
+
+
+def probe() -> Finding:
+    """Whether there is a GPU: a finding of `gpu_parts.py probe`."""
+    run = subprocess.run(
+        [sys.executable, str(PARTS), "probe"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), *_python_path()])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    for line in run.stdout.splitlines():
+        if line.startswith(MARK):
+            answer: Finding = json.loads(line[len(MARK) :])
+            return answer
+    last = (run.stderr.strip().splitlines() or ["it said nothing"])[-1]
+    return {"kind": "no gpu", "why": f"the package does not load: {last}"}
+
+
+def _python_path() -> list[str]:
+    return [os.environ["PYTHONPATH"]] if os.environ.get("PYTHONPATH") else []
+
+
+def main() -> int:
+    began = time.monotonic()
+    flags = _flags()
+    found = probe()
+    if found["kind"] == "no gpu":
+        print(f"gpu: nothing was measured: {found['why']}")
+        return 2
+    flags.out.mkdir(parents=True, exist_ok=True)
+    findings = Findings()
+    findings.add("probe", found)
+    when = time.strftime("%Y-%m-%d")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # children end with us, too
+
+    def write(running: bool = True) -> str:
+        text = page(findings, runner.outcomes, when, running)
+        for name, content in (
+            ("gpu.md", text),
+            ("gpu.json", json.dumps(findings.as_json(), indent=1) + "\n"),
+        ):
+            part = flags.out / f".{name}.part"
+            part.write_text(content, encoding="utf-8")
+            part.replace(flags.out / name)
+        return text
+
+    def on_finding(job: str, one: Finding) -> None:
+        findings.add(job, one)
+        nonlocal written
+        if time.monotonic() - written > 1:
+            write()
+            written = time.monotonic()
+
+    def say(line: str) -> None:
+        print(f"{time.monotonic() - began:5.0f} s  {line}", flush=True)
+        write()
+
+    written = 0.0
+    log = flags.out / "gpu.log"
+    log.write_bytes(b"")
+    with tempfile.TemporaryDirectory(prefix="snowsplat-gpu-") as scratch:
+        until = began + 60 * flags.minutes - 10
+        runner = Runner(Path(scratch), log, until, flags.width, on_finding, say)
+        try:
+            runner.run(jobs(flags, Path(scratch)))
+        finally:
+            print("\n" + write(running=False), flush=True)
+    well = all(outcome.state == "done" for outcome in runner.outcomes) and not findings.wrong()
+    return 0 if well else 1
+
+
+def _flags() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "gpu", help="for three files")
+    parser.add_argument(
+        "--captures",
+        type=Path,
+        default=ROOT.parent / "shared" / "captures",
+        help=f"a folder with {', '.join(CAPTURES)} and garden_points.npz, or some of them",
+    )
+    parser.add_argument("--only", nargs="+", default=list(GROUPS), choices=GROUPS)
+    parser.add_argument("--minutes", type=float, default=8.8, help="for all of it")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="of the trainings")
+    parser.add_argument("--width", type=int, default=8, help="how many parts run side by side")
+    parser.add_argument("--peer", type=Path, metavar="DIR", help="gsplat's checkout, built here")
+    parser.add_argument("--arch", default="9.0", help="of the card, to build the peer for")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,348 @@
+"""The findings of `gpu.py` as a page of Markdown. Nothing here needs more than Python."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from gpu_floor import Frame, works
+from gpu_jobs import Finding, Outcome
+
+#: Native functions in words; one that is not here appears under its own name.
+NAMES = {
+    "project_cull": "project: cull",
+    "project_fwd": "project: forward",
+    "splats_prepare": "prepare",
+    "splats_sort": "sort by depth",
+    "tiles_count": "tiles: count",
+    "tiles_fill": "tiles: fill, sort",
+    "blend_fwd": "blend forward",
+    "photometric_u8": "photometric",
+    "blend_bwd": "blend backward",
+    "splats_reduce": "reduce",
+    "accumulate_screen_statistics": "density statistics",
+    "adam_step": "Adam",
+}
+REST, TOTAL = "rest (PyTorch)", "whole step"
+PSNR_GOAL, MEMORY_GOAL, PEER_GOAL = 0.1, 1e9, 2.0
+#: Told again and again; the last one of a job counts.
+_COUNTS = ("tests", "sanitizer")
+#: Of failures and errors on the page; gpu.json has all.
+_MOST_LINES = 12
+_MOST_CHARACTERS = 11_000
+
+
+class Findings:
+    """What the children told, job by job."""
+
+    def __init__(self) -> None:
+        self._all: list[tuple[str, Finding]] = []
+
+    def add(self, job: str, found: Finding) -> None:
+        if found["kind"] in _COUNTS:
+            self._all = [(j, f) for j, f in self._all if (j, f["kind"]) != (job, found["kind"])]
+        self._all.append((job, found))
+
+    def of(self, kind: str) -> list[Finding]:
+        return [found for _, found in self._all if found["kind"] == kind]
+
+    def last_by_job(self, kind: str) -> dict[str, Finding]:
+        return {job: found for job, found in self._all if found["kind"] == kind}
+
+    def one(self, kind: str, **where: object) -> Finding | None:
+        """The last one of these values."""
+        for found in reversed(self.of(kind)):
+            if all(found.get(name) == value for name, value in where.items()):
+                return found
+        return None
+
+    def sizes(self, kind: str) -> list[str]:
+        """In the order of the Gaussians."""
+        frames = {found["size"]: found["gaussians"] for found in self.of("frame")}
+        sizes = {found["size"] for found in self.of(kind)}
+        return sorted(sizes, key=lambda size: (frames.get(size, 0), size))
+
+    def as_json(self) -> list[dict[str, object]]:
+        return [{"job": job, **found} for job, found in self._all]
+
+    def wrong(self) -> int:
+        """Failures of tests and errors of the sanitizer."""
+        errors = (found["errors"] for found in self.last_by_job("sanitizer").values())
+        return len(self.of("failure")) + sum(errors)
+
+
+def page(findings: Findings, outcomes: Sequence[Outcome], when: str, running: bool) -> str:
+    """The whole page; it fits into the last 12,000 characters of an output."""
+    card = findings.one("device") or findings.one("gpu") or {}
+    name = str(card.get("name", "a GPU without a name"))
+    sections = [
+        _machine(findings, name, when, running),
+        _tests(findings, name),
+        _sanitizer(findings, name),
+        _training(findings, name),
+        _stages(findings, name, in_order=False),
+        _steps(findings, name),
+        _stages(findings, name, in_order=True),
+        _peer(findings, name),
+        _jobs(outcomes),
+    ]
+    text = "\n\n".join(section for section in sections if section) + "\n"
+    if len(text) > _MOST_CHARACTERS:
+        text = text[:_MOST_CHARACTERS].rpartition("\n")[0] + "\n(cut off; gpu.json has all)\n"
+    return text
+
+
+def _machine(findings: Findings, name: str, when: str, running: bool) -> str:
+    lines = [f"# {name}, {when}{' (not finished)' if running else ''}", ""]
+    card = findings.one("device")
+    if card is not None:
+        lines.append(
+            f"{name}: compute capability {card['capability']}, {card['multiprocessors']} "
+            f"multiprocessors, {card['memory_gb']:.0f} GB, L2 {card['l2_mb']:.0f} MB; as found: "
+            f"{card['clocks']}. PyTorch {card['torch']}, Python {card['python']}, "
+            f"{card['cores']} cores. Kernels {card['kernels']}."
+        )
+    bandwidth, rate, mark = (findings.one(kind) for kind in ("bandwidth", "rate", "mark"))
+    measured = []
+    if bandwidth is not None:
+        measured.append(f"copying {bandwidth['bytes_a_second'] / 1e12:.2f} TB/s, both ways counted")
+    if rate is not None:
+        measured.append(
+            f"{rate['operations_a_second'] / 1e12:.1f}·10¹² float32 multiply-adds a second "
+            f"(then: {rate['clocks']})"
+        )
+    if mark is not None:
+        measured.append(f"{1e3 * mark['milliseconds']:.1f} µs between two marks of time")
+    if measured:
+        lines += ["", f"Measured on {name}: {'; '.join(measured)}."]
+    return "\n".join(lines)
+
+
+def _tests(findings: Findings, name: str) -> str:
+    by_job = findings.last_by_job("tests")
+    if not by_job:
+        return ""
+    sums = {key: sum(f[key] for f in by_job.values()) for key in ("passed", "failed", "skipped")}
+    total = sum(found["total"] for found in by_job.values())
+    left = total - sum(sums.values())
+    counts = ", ".join(f"{count} {key}" for key, count in sums.items())
+    lines = [
+        f"## Tests on {name}",
+        "",
+        f"{counts}{f', {left} not reached' * (left > 0)}, of {total} in {len(by_job)} files.",
+    ]
+    failures = [f"- {found['test']}: {found['line']}"[:200] for found in findings.of("failure")]
+    return "\n".join(lines + _some(failures))
+
+
+def _sanitizer(findings: Findings, name: str) -> str:
+    found = findings.last_by_job("sanitizer").values()
+    if not found:
+        return ""
+    lines = [f"## compute-sanitizer on {name}: every op, a training step", ""]
+    for f in found:
+        reached = "" if f["finished"] else f"; not finished, at: {f['last'] or 'the begin'}"
+        lines.append(f"- {f['tool']}: {f['errors']} errors{reached}")
+        lines += [f"  - {line}" for line in f["lines"]]
+    return "\n".join(lines[: 2 + 2 * _MOST_LINES])
+
+
+def _training(findings: Findings, name: str) -> str:
+    rows = []
+    key = ("capture", "iterations", "seed")
+    runs = {tuple(f[k] for k in key): {} for f in findings.of("training")}
+    for found in findings.of("training"):
+        runs[tuple(found[k] for k in key)][found["device"]] = found
+    differences: dict[str, list[float]] = {}
+    for (capture, iterations, seed), by_device in sorted(runs.items()):
+        cpu, gpu = by_device.get("cpu"), by_device.get("cuda")
+        difference = "—"
+        if cpu and gpu:
+            differences.setdefault(capture, []).append(gpu["psnr"] - cpu["psnr"])
+            difference = f"{differences[capture][-1]:+.2f}"
+        cells = [f"{capture}", f"{iterations}", f"{seed}"]
+        cells += [f"{cpu['psnr']:.2f}" if cpu else "—", f"{gpu['psnr']:.2f}" if gpu else "—"]
+        cells += [difference, f"{cpu['seconds']:.1f}" if cpu else "—"]
+        if gpu:
+            cells += [f"{gpu['seconds']:.1f}", f"{gpu['iterations'] / gpu['seconds']:.0f}"]
+            cells += [f"{gpu['gaussians']:,}", f"{gpu['peak'] / 1e6:.0f}"]
+            cells += [f"{gpu['psnr_on_cpu'] - gpu['psnr']:+.3f}" if gpu["psnr_on_cpu"] else "—"]
+        else:
+            cells += ["—"] * 5
+        rows.append(cells)
+    absent = sorted({found["capture"] for found in findings.of("absent")})
+    if not rows and not absent:
+        return ""
+    lines = [f"## Training on {name}, PSNR of held-out photos in dB", ""]
+    if rows:
+        head = "capture,steps,seed,CPU,GPU,difference,CPU s,GPU s,steps/s,Gaussians,peak MB"
+        lines += _table([*head.split(","), "seen by the CPU"], rows)
+    for capture, found in differences.items():
+        mean = sum(found) / len(found)
+        verdict = "within" if abs(mean) <= PSNR_GOAL else "NOT within"
+        lines += ["", f"{capture}: mean difference {mean:+.3f} dB, {verdict} {PSNR_GOAL} dB."]
+    if absent:
+        lines += ["", f"Not here, so not trained: {', '.join(absent)}."]
+    return "\n".join(lines)
+
+
+def _stages(findings: Findings, name: str, in_order: bool) -> str:
+    sizes = findings.sizes("stages")
+    by_size = {size: findings.one("stages", size=size, in_order=in_order) for size in sizes}
+    sizes = [size for size in sizes if by_size[size] is not None]
+    if not sizes:
+        return ""
+    bandwidth, rate = findings.one("bandwidth"), findings.one("rate")
+    columns = {}
+    for size in sizes:
+        found, frame = by_size[size], findings.one("frame", size=size)
+        assert found is not None
+        floors = _floors(frame, in_order, bandwidth, rate)
+        columns[size] = _column(found, findings.one("step", size=size, in_order=in_order), floors)
+    order = list(NAMES) if any(columns.values()) else []
+    names = [n for n in order if any(n in column for column in columns.values())]
+    names += sorted({n for c in columns.values() for n in c} - {*names, REST, TOTAL})
+    names += [REST, TOTAL]
+    if in_order:  # only what differs
+        names = [n for n in names if n in ("tiles_fill", "blend_bwd", "splats_reduce", TOTAL)]
+    rows = []
+    for n in names:
+        row = [NAMES.get(n, n)]
+        for size in sizes:
+            row += columns[size].get(n, ["—", "—", "—"])
+        rows.append(row)
+    title = "with sums in a fixed order, what differs" if in_order else "ms of the GPU by stage"
+    head = [""] + [cell for size in sizes for cell in (f"{size} ms", "floor", "share")]
+    notes = []
+    if not in_order:
+        notes = [_frame_line(findings, size) for size in sizes]
+    return "\n".join([f"## {name}: {title}", "", *notes, *_table(head, rows)])
+
+
+def _frame_line(findings: Findings, size: str) -> str:
+    frame, scene = findings.one("frame", size=size), findings.one("scene", size=size)
+    if frame is None:
+        return ""
+    source = scene["source"] if scene else "?"
+    return (
+        f"{size}: {frame['gaussians']:,} Gaussians of {source}, {frame['width']}×"
+        f"{frame['height']}, {frame['seen']:,} seen, {frame['instances']:,} instances, "
+        f"{frame['pairs']:,} pairs.\n"
+    )
+
+
+def _floors(
+    frame: Finding | None, in_order: bool, bandwidth: Finding | None, rate: Finding | None
+) -> dict[str, float]:
+    """Milliseconds by native function; of bytes alone where no rate was measured."""
+    if frame is None or bandwidth is None:
+        return {}
+    counts = {key: frame[key] for key in ("gaussians", "seen", "instances", "pairs")}
+    known = Frame(**counts, width=frame["width"], height=frame["height"], in_order=in_order)
+    a_second = rate["operations_a_second"] if rate else None
+    return {
+        name: 1e3 * work.seconds(bandwidth["bytes_a_second"], a_second)
+        for name, work in works(known).items()
+    }
+
+
+def _column(found: Finding, step: Finding | None, floors: dict[str, float]) -> dict[str, list[str]]:
+    """{native function: [time, floor, share]}."""
+    times = {name: sum(kernels.values()) for name, kernels in found["kernels"].items()}
+    cells = {name: _cells(time, floors.get(name)) for name, time in times.items()}
+    if step is not None:
+        cells[REST] = _cells(max(0.0, step["gpu"] - sum(times.values())), None)
+        known = sum(floors.values()) if floors else None
+        cells[TOTAL] = _cells(step["gpu"], known)
+    return cells
+
+
+def _cells(time: float, floor: float | None) -> list[str]:
+    if floor is None or time <= 0:
+        return [f"{time:.3f}", "", ""]
+    return [f"{time:.3f}", f"{floor:.3f}", f"{floor / time:.0%}"]
+
+
+def _steps(findings: Findings, name: str) -> str:
+    rows = []
+    for size in findings.sizes("step"):
+        step = findings.one("step", size=size, in_order=False)
+        ordered = findings.one("step", size=size, in_order=True)
+        if step is None:
+            continue
+        memory, frame = findings.one("memory", size=size), findings.one("frame", size=size)
+        limit = "GPU" if step["gpu"] >= step["host"] else "CPU"
+        cells = [size, *(f"{step[key]:.3f}" for key in ("gpu", "host", "wall")), limit]
+        cells.append(f"{1e3 / step['wall']:.0f}")
+        cells.append(f"{ordered['gpu'] / step['gpu']:.2f}" if ordered else "—")
+        if memory and frame:
+            peak, count = memory["peak"], frame["gaussians"]
+            cells += [f"{peak / 1e6:.0f}", f"{memory['held'] / 1e6:.0f}", f"{peak / count:.0f}"]
+        else:
+            cells += ["—"] * 3
+        rows.append(cells)
+    if not rows:
+        return ""
+    head = "size,GPU ms,queueing ms,step ms,limit,steps/s,in order ×,peak MB,held MB,bytes each"
+    lines = [f"## {name}: a training step", "", *_table(head.split(","), rows)]
+    each = _memory_each(findings)
+    if each is not None:
+        verdict = "within" if each <= MEMORY_GOAL / 1e6 else "NOT within"
+        lines += ["", f"1m to 3m: {each:.0f} bytes more for each Gaussian, {verdict} the goal of "]
+        lines[-1] += f"{MEMORY_GOAL / 1e9:.0f} GB a million on {name}."
+    return "\n".join(lines)
+
+
+def _memory_each(findings: Findings) -> float | None:
+    """Bytes a Gaussian: the difference of two scenes in images of the same size."""
+    found = []
+    for size in ("1m", "3m"):
+        memory, frame = findings.one("memory", size=size), findings.one("frame", size=size)
+        if memory is None or frame is None:
+            return None
+        found.append((memory["peak"], frame["gaussians"]))
+    (less, few), (more, many) = found
+    return (more - less) / (many - few)
+
+
+def _peer(findings: Findings, name: str) -> str:
+    none, peer = findings.one("no peer"), findings.one("peer")
+    if none is not None:
+        return f"## A peer\n\nNone was measured: {none['why']}."
+    if peer is None:
+        return ""
+    rows = []
+    for found in findings.of("peer times"):
+        ratio = found["theirs"] / found["ours"] if found["ours"] > 0 else math.nan
+        goal = ""
+        if found["what"] == "training step":
+            goal = f"goal {PEER_GOAL:.0f}: {'reached' if ratio >= PEER_GOAL else 'NOT reached'}"
+        times = [f"{found['ours']:.3f}", f"{found['theirs']:.3f}", f"{ratio:.2f}"]
+        rows.append([found["size"], found["what"], *times, goal])
+    images = [f"{f['size']}: {f['psnr']:.1f} dB" for f in findings.of("peer image")]
+    lines = [f"## {name}: beside gsplat {peer['version']}", ""]
+    if images:
+        lines += [f"PSNR between the two images: {', '.join(images)}.", ""]
+    return "\n".join(lines + _table(["size", "", "ours ms", "gsplat ms", "ratio", ""], rows))
+
+
+def _jobs(outcomes: Sequence[Outcome]) -> str:
+    lines = ["## What was run", ""]
+    done = [f"{o.job} {o.seconds:.0f} s" for o in outcomes if o.state == "done"]
+    lines.append(f"Done: {', '.join(done) or 'nothing'}.")
+    others = [o for o in outcomes if o.state != "done"]
+    reasons = [f"- {o.job}: {o.state} after {o.seconds:.0f} s; {o.reason}"[:240] for o in others]
+    return "\n".join(lines + _some(reasons))
+
+
+def _some(lines: list[str]) -> list[str]:
+    """Not too many of them, as a list below a paragraph."""
+    if not lines:
+        return []
+    more = len(lines) - _MOST_LINES
+    return ["", *lines[:_MOST_LINES], *([f"- and {more} more"] if more > 0 else [])]
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return lines + ["| " + " | ".join(row) + " |" for row in rows]
