@@ -41,8 +41,8 @@ namespace snow {
 constexpr int kWarp = 32;
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-SNOW_INLINE int lane_id() { return int(threadIdx.x) % kWarp; }
-SNOW_INLINE int warp_id() { return int(threadIdx.x) / kWarp; }
+SNOW_INLINE int lane_id() { return int(threadIdx.x % kWarp); }
+SNOW_INLINE int warp_id() { return int(threadIdx.x / kWarp); }
 // The index of this thread among those of all blocks.
 SNOW_INLINE int64_t thread_index() { return int64_t(blockIdx.x) * blockDim.x + threadIdx.x; }
 
