@@ -29,7 +29,7 @@
 namespace snow {
 namespace {
 
-constexpr int kRectWidth = 8, kRectHeight = 4;
+constexpr int kRectWidth = 8, kRectHeight = 4, kRectsAcross = kTile / kRectWidth;
 constexpr int kWarps = kTile * kTile / kWarp, kBlock = kTile * kTile;
 constexpr int kForwardBatch = kBlock, kBackwardBatch = 64;
 
@@ -64,8 +64,8 @@ struct Seat {
 
   SNOW_INLINE Seat(int width, int height) {
     const int tiles_x = (width + kTile - 1) / kTile, tile = int(blockIdx.x);
-    left = tile % tiles_x * kTile + warp_id() % (kTile / kRectWidth) * kRectWidth;
-    top = tile / tiles_x * kTile + warp_id() / (kTile / kRectWidth) * kRectHeight;
+    left = tile % tiles_x * kTile + warp_id() % kRectsAcross * kRectWidth;
+    top = tile / tiles_x * kTile + warp_id() / kRectsAcross * kRectHeight;
     x = left + lane_id() % kRectWidth, y = top + lane_id() / kRectWidth;
     inside = x < width && y < height;
     plane = int64_t(width) * height, at = int64_t(y) * width + x;
@@ -117,6 +117,9 @@ SNOW_INLINE int list_touching(Touching& list, unsigned lanes, int place) {
   return __popc(lanes);
 }
 
+SNOW_INLINE float negative(float a) { return ::fminf(a, -a); }
+SNOW_INLINE double negative(double a) { return ::fmin(a, -a); }
+
 template <class T>
 struct Pixel {
   T x, y;
@@ -141,7 +144,7 @@ struct Pixel {
     const bool blended = visible && enough;
     weight = blended ? alpha * rest : T(0);
     if (blended) rest = next;
-    if (visible && !enough) rest = min(rest, -rest);
+    if (visible && !enough) rest = negative(rest);
     return blended;
   }
 };
@@ -280,20 +283,40 @@ struct Sums {
     value[C] = q0, value[C + 1] = qx, value[C + 2] = qy;
     value[C + 3] = qxx, value[C + 4] = qx * dy, value[C + 5] = qy * dy;
   }
+};
 
-  // The sums over the four lanes that have the same lane % 8 as `source`, to lanes that `take` them.
-  // Half of the numbers to the upper lanes: what is exchanged first is then exchanged once.
-  SNOW_INLINE void take_rows(const Sums& rows, int source, bool take) {
+// The sums of the splats that a warp has done, of up to 32. A lane has half of the sums of two of them:
+// the upper half warp has the second half.
+template <int C, class T>
+struct KeptSums {
+  static constexpr int kHalf = Sums<C, T>::kHalf, kWays = kWarp / kGroup / 2;
+  T kept[kWays][kHalf] = {};
+
+  // What the lanes of a splat have summed, a row each, becomes one, and two of these lanes keep it.
+  SNOW_INLINE void keep(const Sums<C, T>& rows, int group) {
     const bool upper = lane_id() >= kWarp / 2;
+    const int odd = int(threadIdx.x / kGroup % 2);
 #pragma unroll
     for (int k = 0; k < kHalf; k++) {
       const T low = rows.value[k], high = rows.value[kHalf + k];
       T sum = upper ? high : low;
       sum += __shfl_xor_sync(kAllLanes, upper ? low : high, kWarp / 2);
-      sum += __shfl_xor_sync(kAllLanes, sum, kWarp / 4);
-      const T first = __shfl_sync(kAllLanes, sum, source);
-      const T second = __shfl_sync(kAllLanes, sum, source + kWarp / 2);
-      if (take) value[k] = first, value[kHalf + k] = second;
+      sum += __shfl_xor_sync(kAllLanes, sum, kGroup);
+#pragma unroll
+      for (int way = 0; way < kWays; way++)
+        if (group == 2 * way + odd) kept[way][k] = sum;
+    }
+  }
+  // Writes them to `sums`, kSumStride for each of 32 instances, of which the first has place `first`.
+  SNOW_INLINE void store(const Touching& list, int listed, int first, T* sums) const {
+    const bool upper = lane_id() >= kWarp / 2;
+#pragma unroll
+    for (int way = 0; way < kWays; way++) {
+      const int at = way * 2 * kGroup + int(threadIdx.x % (2 * kGroup));
+      if (at >= listed) continue;
+      T* const to = sums + (list[at] - first) * kSumStride + (upper ? kHalf : 0);
+#pragma unroll
+      for (int k = 0; k < kHalf; k++) to[k] = kept[way][k];
     }
   }
 };
@@ -305,21 +328,22 @@ struct Destination {
 
   SNOW_INLINE void find(const Frame<T>& f, uint32_t instance, const uint32_t* instance_slot,
                         T* slots, T* grad_packed) {
-    const int column = int(threadIdx.x) % kSlotWidth, moment = column - C;
+    const int column = int(threadIdx.x % kSlotWidth), moment = column - C;
     if (slots) {
       at = slots + int64_t(instance_slot[instance]) * kSlotWidth + column;
       return;
     }
+    if (moment >= 6) return;
     // splat_terms_vjp, each thread a number of its.
     const int64_t row = f.instance_splat[instance] * f.stride;
-    const T* splat = f.packed + row;
-    int to = -1;
+    int to = moment == 0 ? 5 : moment - 1;
     if (moment < 0) to = int(f.columns[column]);
-    if (moment == 0) to = 5, scale = T(1) / splat[5];
-    if (moment == 1) to = 0, scale = splat[2], across = splat[3];
-    if (moment == 2) to = 1, scale = splat[4], across = splat[3];
-    if (moment == 3 || moment == 5) to = moment - 1, scale = T(-0.5);
-    if (moment == 4) to = 3, scale = T(-1);
+    if (moment > 2) scale = moment == 4 ? T(-1) : T(-0.5);
+    if (moment >= 0 && moment <= 2) {
+      const T own = f.packed[row + (moment == 0 ? 5 : 2 * moment)];
+      scale = moment == 0 ? reciprocal_estimate(own) : own;
+      across = f.packed[row + 3];
+    }
     if (to >= 0) at = grad_packed + row + to;
   }
   SNOW_INLINE void put(T sum) const {
@@ -327,7 +351,7 @@ struct Destination {
   }
   // Every lane has to call it: the gradients of the mean are made of both of its moments.
   SNOW_INLINE void add(T sum) const {
-    const int moment = int(threadIdx.x) % kSlotWidth - C;
+    const int moment = int(threadIdx.x % kSlotWidth) - C;
     const T other = __shfl_sync(kAllLanes, sum, moment == 1 ? C + 2 : C + 1, kSlotWidth);
     sum *= scale;
     if (moment == 1 || moment == 2) sum += across * other;
@@ -358,7 +382,7 @@ SNOW_INLINE void backward(const Frame<T>& f, int channels, const uint32_t* insta
     behind += grad_opaque * alpha[seat.at];
   }
   // In step 2: which splat of a group and row of the rectangle.
-  const int slot = lane % kGroup, row = lane / kGroup;
+  const int slot = int(threadIdx.x % kGroup), row = int(threadIdx.x % kWarp / kGroup);
   Four<T>* const pairs = memory.pairs[warp];
   const Four<T>* const row_pairs = pairs + (slot * kPairStride + row * kRectWidth) / 2;
   const Four<T>(*const row_grads)[kBlock / 4] = reinterpret_cast<const Four<T>(*)[kBlock / 4]>(
@@ -378,8 +402,7 @@ SNOW_INLINE void backward(const Frame<T>& f, int channels, const uint32_t* insta
       const unsigned lanes = __ballot_sync(kAllLanes, touches);
       const Touching& list = memory.list[warp];
       const int listed = list_touching(memory.list[warp], lanes, first + lane);
-      const int rank = __popc(lanes & ((1u << lane) - 1));
-      Sums<C, T> sums;
+      KeptSums<C, T> sums;
       for (int done = 0; done < listed; done += kGroup) {
         if (!__any_sync(kAllLanes, pixel.unfinished())) break;
         const int group = listed - done < kGroup ? listed - done : kGroup;
@@ -405,17 +428,13 @@ SNOW_INLINE void backward(const Frame<T>& f, int channels, const uint32_t* insta
           rows.add_row(row_pairs, row_grads, centre<T>(seat.left) - shape.x,
                        centre<T>(seat.top + row) - shape.y);
         }
-        sums.take_rows(rows, rank % kGroup, touches && rank / kGroup == done / kGroup);
+        sums.keep(rows, done / kGroup);
         __syncwarp();
       }
-      T* const partial = reinterpret_cast<T*>(pairs);
-      if (__any_sync(kAllLanes, touches)) {
-#pragma unroll
-        for (int k = 0; k < C + 6; k++) partial[lane * kSumStride + k] = sums.value[k];
-      }
+      sums.store(list, listed, first, reinterpret_cast<T*>(pairs));
       // What a thread needs of the splats then is fetched before all are here.
       constexpr int kPlaces = kBlock / kSlotWidth;
-      const int place = thread / kSlotWidth, column = thread % kSlotWidth;
+      const int place = int(threadIdx.x / kSlotWidth), column = int(threadIdx.x % kSlotWidth);
       Destination<C, T> to[kWarp / kPlaces];
 #pragma unroll
       for (int h = 0; h < kWarp / kPlaces; h++) {
