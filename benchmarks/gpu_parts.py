@@ -97,16 +97,16 @@ def _clocks() -> str:
 
 def _copy_bandwidth() -> float:
     """Bytes read and written a second, by copies many times the size of the caches."""
+    import gpu_step
     import torch
-    from gpu_step import gpu_times
 
     free, _ = torch.cuda.mem_get_info()
     count = min(2 << 30, free // 4)
-    source = torch.empty(count, dtype=torch.uint8, device="cuda").random_()
+    source = torch.empty(count, dtype=torch.uint8, device=gpu_step.GPU).random_()
     target = torch.empty_like(source)
     for _ in range(3):
         target.copy_(source)
-    times = gpu_times(lambda: target.copy_(source), 15)
+    times = gpu_step.gpu_times(lambda: target.copy_(source), 15)
     return 2 * count / (1e-3 * statistics.median(times))
 
 
@@ -153,7 +153,7 @@ def _mark_time() -> float:
 # ------------------------------------------------------------------------------------------ tests
 
 
-@dataclass
+@dataclass(eq=False)  # pytest wants to hash it
 class Reporter:
     """A plugin of pytest: tells each failure at once, and counts what has been done.
 
@@ -173,8 +173,10 @@ class Reporter:
             self.outcomes = dict(reversed(line.split(" ", 1)) for line in lines)
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        self.total = len(items)
         items[:] = [item for item in items if item.nodeid not in self.outcomes]
+
+    def pytest_collection_finish(self, session: Any) -> None:
+        self.total = len(self.outcomes) + len(session.items)
 
     def pytest_sessionstart(self, session: Any) -> None:
         self.session = session
@@ -408,14 +410,14 @@ def _scene(folder: Path, size: str) -> Any:
 
 def stages(size: str, folder: Path, repeats: int) -> None:
     import torch
-    from gpu_step import Step, stage_times, step_times, sums_in_order
+    from gpu_step import GPU, Step, stage_times, step_times, sums_in_order
 
     from snowsplat.ops.cuda import driver
 
     scene = _scene(folder, size)
     finding("scene", size=size, source=scene.source)
     torch.cuda.reset_peak_memory_stats()
-    step = Step(scene, torch.device("cuda"))
+    step = Step(scene, GPU)
     for _ in range(4):  # room for the instances, kernels, torch's memory
         step.run()
     torch.cuda.synchronize()

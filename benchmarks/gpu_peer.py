@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 from gpu_jobs import finding
-from gpu_step import Step, event, milliseconds
+from gpu_step import GPU, Step, event, milliseconds
 from torch import Tensor
 from workloads import Workload
 
@@ -41,15 +41,15 @@ class Peer:
     """A scene as gsplat's own trainer holds it."""
 
     def __init__(self, scene: Workload) -> None:
-        gaussians, camera = scene.gaussians.to("cuda"), scene.camera
+        gaussians, camera = scene.gaussians.to(GPU), scene.camera
         self.parameters = {
             name: p.clone().requires_grad_() for name, p in gaussians.parameters().items()
         }
         pose = torch.eye(4)
         pose[:3] = camera.cam_from_world.float()
-        self._pose = pose[None].cuda()
+        self._pose = pose[None].to(GPU)
         matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-        self._matrix = torch.tensor(matrix)[None].cuda()
+        self._matrix = torch.tensor(matrix)[None].to(GPU)
         self._size = camera.width, camera.height
         self.packed = False
 
@@ -93,7 +93,7 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
         import gsplat  # noqa: F401
     except ImportError:
         return  # `build` has said so
-    peer, step = Peer(scene), Step(scene, torch.device("cuda"))
+    peer, step = Peer(scene), Step(scene, GPU)
     for _ in range(3):
         step.run()
     photo = step.photo.rgb

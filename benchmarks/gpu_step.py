@@ -31,6 +31,7 @@ from snowsplat.optim import Adam, LearningRates
 from snowsplat.render import project, render
 from snowsplat.trainer import Trainer
 
+GPU = torch.device("cuda")
 EXTENT = 4.0
 
 #: The paper's, with rates so small that every repeat does the same on the same numbers.
@@ -257,7 +258,7 @@ def stage_times(step: Step, execute: Execute, repeats: int) -> dict[str, dict[st
     behind = Behind()
     for _ in range(repeats + 6):
         clock = KernelClock(execute, event)
-        with clock.on("cuda"), behind:
+        with clock.on(GPU.type), behind:
             step.queue()
         if not behind.late:
             found.append(kernel_times(clock.laps, milliseconds))

@@ -122,6 +122,7 @@ def _tests(findings: Findings, name: str) -> str:
     by_job = findings.last_by_job("tests")
     if not by_job:
         return ""
+    by_job = {job: found for job, found in by_job.items() if found["total"] > 0}
     sums = {key: sum(f[key] for f in by_job.values()) for key in ("passed", "failed", "skipped")}
     total = sum(found["total"] for found in by_job.values())
     left = total - sum(sums.values())

@@ -596,3 +596,202 @@ def test_the_plan_of_a_run(gpu_modules, tmp_path):
     flags.only = ["stages"]
     names = [job.name for job in gpu.jobs(flags, tmp_path)]
     assert names == ["make scenes", "stages 1m", "stages 200k", "stages 3m"]
+
+
+class FakeEvent:
+    """An event of a GPU that is as fast as the CPU."""
+
+    def __init__(self, enable_timing=False):
+        self.time = 0.0
+
+    def record(self):
+        self.time = time.perf_counter()
+
+    def elapsed_time(self, other):
+        return 1e3 * (other.time - self.time)
+
+    def query(self):
+        return False
+
+    def synchronize(self):
+        pass
+
+
+@pytest.fixture
+def fake_gpu(gpu_modules, monkeypatch):
+    """The emulation, under the names by which the parts know a GPU: that they run, not how fast."""
+    import gpu_peer
+    import gpu_step
+
+    from snowsplat.ops.cuda import driver
+
+    from .ops import emulation
+
+    def nothing(*args):
+        return 1 << 20
+
+    monkeypatch.setattr(torch.cuda, "Event", FakeEvent)
+    for name in ("synchronize", "_sleep", "empty_cache", "reset_peak_memory_stats"):
+        monkeypatch.setattr(torch.cuda, name, nothing)
+    for name in ("memory_allocated", "max_memory_allocated"):
+        monkeypatch.setattr(torch.cuda, name, nothing)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 20, 1 << 20))
+    card = argparse.Namespace(name="Card X", major=9, minor=0, multi_processor_count=2)
+    card.total_memory, card.L2_cache_size = 10**9, 10**6
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: card)
+    monkeypatch.setattr(driver, "run", emulation.execute)
+    for module in (gpu_step, gpu_peer):
+        monkeypatch.setattr(module, "GPU", torch.device("cpu"))
+    monkeypatch.setitem(LAUNCHERS, "cpu", lambda *args: launch_by(emulation.execute, *args))
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def found_in(text):
+    import gpu_jobs
+
+    lines = [line.partition(gpu_jobs.MARK) for line in text.splitlines()]
+    return [json.loads(rest) for _, marked, rest in lines if marked]
+
+
+def page_of(found):
+    import gpu_table
+
+    findings = gpu_table.Findings()
+    for one in found:
+        findings.add("job", one)
+    return gpu_table.page(findings, [], "2030-01-01", running=False)
+
+
+@pytest.mark.emulated
+def test_the_parts_that_measure_run(fake_gpu, capsys, tmp_path):
+    """From what they print to the page."""
+    import gpu_floor
+    import gpu_ops
+    import gpu_parts
+
+    torch.save(gpu_ops.random_scene(60, 40, 30), tmp_path / "1m.scene")
+    gpu_parts.device()
+    gpu_parts.stages("1m", tmp_path, repeats=2)
+    text = capsys.readouterr().out
+    found = found_in(text)
+    kinds = [one["kind"] for one in found]
+    assert kinds[:2] == ["device", "bandwidth"]
+    assert "rate" not in kinds  # there is no driver
+    assert "multiply-adds were not measured" in text
+    assert kinds[-6:] == ["frame", "memory", "step", "stages", "step", "stages"]
+    stages = [one for one in found if one["kind"] == "stages"]
+    assert [one["in_order"] for one in stages] == [False, True]
+    assert "splats_reduce" in stages[1]["kernels"].keys() - stages[0]["kernels"].keys()
+    for step in (one for one in found if one["kind"] == "step"):
+        assert min(step["gpu"], step["host"], step["wall"]) > 0
+    page = page_of(found)
+    frame = next(one for one in found if one["kind"] == "frame")
+    assert f"60 Gaussians of random Gaussians, 40×30, {frame['seen']} seen" in page
+    for name in ("project: cull", "blend backward", "Adam", "whole step"):
+        assert f"| {name} | " in page
+    assert "| reduce | " in page
+    assert ops.rasterize.__globals__["TILE"] == gpu_floor.TILE
+
+
+@pytest.mark.emulated
+def test_beside_a_peer(fake_gpu, capsys, monkeypatch):
+    """One that is our own twin: the same images."""
+    import gpu_ops
+    import gpu_peer
+
+    gpu_peer.build()
+    (none,) = found_in(capsys.readouterr().out)
+    assert none["kind"] == "no peer"
+    assert "None was measured" in page_of([none])
+
+    def rasterization(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane,
+        sh_degree, packed,
+    ):  # fmt: skip
+        assert viewmats.shape == (1, 4, 4)
+        splats = reference.project(
+            means,
+            scales.log(),
+            quats,
+            opacities.logit(),
+            colors[:, :1],
+            colors[:, 1:],
+            viewmats[0, :3],
+            width=width,
+            height=height,
+            fx=float(Ks[0, 0, 0]),
+            fy=float(Ks[0, 1, 1]),
+            cx=float(Ks[0, 0, 2]),
+            cy=float(Ks[0, 1, 2]),
+            sh_degree=sh_degree,
+            near=near_plane,
+        )
+        image, alpha, _ = reference.rasterize(splats, width, height)
+        return image[None], alpha[None, :, :, None], {}
+
+    peer = argparse.Namespace(rasterization=rasterization, __version__="9.9")
+    monkeypatch.setitem(sys.modules, "gsplat", peer)
+    gpu_peer.build()
+    gpu_peer.compare(gpu_ops.random_scene(60, 40, 30), "1m", repeats=1)
+    found = found_in(capsys.readouterr().out)
+    assert found[0] == {"kind": "peer", "version": "9.9"}
+    assert found[1]["kind"] == "peer image"
+    assert found[1]["psnr"] > 90
+    whats = [one["what"] for one in found[2:]]
+    assert whats == ["image", "image and gradient", "training step"]
+    assert all(min(one["ours"], one["theirs"]) > 0 for one in found[2:])
+    page = page_of(found)
+    assert "beside gsplat 9.9" in page
+    assert "| 1m | training step | " in page
+
+
+FAKE_RUN = """
+import sys
+import gpu, gpu_jobs
+tell = "print('@@ {}', flush=True); "
+def job(name, code, **more):
+    return gpu_jobs.Job(name, [sys.executable, "-c", code], 30.0, **more)
+gpu.probe = lambda: {"kind": "gpu", "name": "Card X"}
+failure = tell.format('{"kind": "failure", "test": "t", "line": "no"}')
+tests = tell.format('{"kind": "tests", "passed": 1, "failed": 1, "skipped": 0, "total": 2}')
+gpu.jobs = lambda flags, scratch: [
+    job("tests", failure + tests),
+    job("train", "import os; os.abort()"),
+    job("slow", "import time; time.sleep(LONG)", alone=True),
+]
+sys.exit(gpu.main())
+"""
+
+
+@pytest.mark.parametrize("long", [0, 77.5], ids=["to its end", "killed"])
+def test_a_whole_run_leaves_its_page(tmp_path, long):
+    run = subprocess.Popen(
+        [sys.executable, "-c", FAKE_RUN.replace("LONG", str(long)), "--out", str(tmp_path)],
+        env=os.environ | {"PYTHONPATH": str(BENCHMARKS)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    if long:
+        page, until = tmp_path / "gpu.md", time.monotonic() + 20
+        while not (page.exists() and "train: failed" in page.read_text()):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        assert "(not finished)" in page.read_text()
+        run.terminate()
+    text, _ = run.communicate(timeout=60)
+    assert run.returncode == (143 if long else 1)
+    page = (tmp_path / "gpu.md").read_text()
+    assert text.endswith(page + "\n")
+    assert page.startswith("# Card X, ")
+    assert "(not finished)" not in page
+    assert "1 passed, 1 failed, 0 skipped, of 2 in 1 files" in page
+    assert "- train: failed" in page
+    assert ("- slow: failed" in page) == bool(long)
+    kinds = [one["kind"] for one in json.loads((tmp_path / "gpu.json").read_text())]
+    assert kinds == ["gpu", "failure", "tests"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["gpu.json", "gpu.log", "gpu.md"]
+    running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
+    assert "import time; time.sleep(77.5)" not in running
