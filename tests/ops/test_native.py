@@ -93,14 +93,21 @@ def test_tensors_must_be_contiguous_on_one_device_and_on_the_cpu(recording):
         native.launch("record", 1, x, "x")
 
 
-def test_cuda_says_that_it_is_not_there_yet(recording):
-    # Seen without a card: fake tensors carry the device and no memory.
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_cuda_without_a_gpu_says_why():
+    # Fake tensors carry the device and no memory.
     from torch._subclasses.fake_tensor import FakeTensorMode
+
+    class OnGpu(torch.Tensor):
+        device = torch.device("cuda", 0)
 
     with FakeTensorMode():
         x = torch.empty(3, device="cuda")
-        with pytest.raises(UserError, match="CUDA kernels are not built yet; use device cpu"):
-            native.launch("record", 1, x)
+        with pytest.raises(ValueError, match="tensors on cuda:0 and on cpu; move them to one"):
+            native.launch("accumulate_screen_statistics", 1, x, torch.empty(3))
+    x = torch.empty(3).as_subclass(OnGpu)
+    with pytest.raises(UserError, match="^cuda:0: (there is no NVIDIA|this PyTorch|PyTorch|the )"):
+        native.launch("accumulate_screen_statistics", 1, x)
 
 
 def test_unknown_function_names_the_remedy(fresh):

@@ -88,10 +88,12 @@ def _key(version: tuple[int, int], target: str, source: Path) -> str:
 def _cache_path(file: str, target: str, key: str) -> Path | None:
     """By the custom of the system; None where there is no such place."""
     try:
+        base: str | Path
         if sys.platform == "win32":
             base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
         else:
-            base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+            named = os.environ.get("XDG_CACHE_HOME", "")
+            base = named if os.path.isabs(named) else Path.home() / ".cache"
     except RuntimeError:  # nobody's home
         return None
     return Path(base, "snowsplat", "kernels", f"{file}-{target}-{key}")

@@ -1,0 +1,239 @@
+"""The kernels of a GPU as NVRTC compiles them, for each architecture: no GPU is needed to look."""
+
+from __future__ import annotations
+
+import ast
+import re
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import snowsplat
+from snowsplat.ops.cuda import nvrtc
+from snowsplat.ops.cuda.launches import KERNELS, SEQUENCES
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PACKAGE = Path(snowsplat.__file__).parent
+FILES = sorted(path.stem for path in (PACKAGE / "native" / "cuda").glob("*.cu"))
+ARCHITECTURES = re.search(
+    r"set\(gpu_architectures ([\d ]+)\)", (REPOSITORY / "CMakeLists.txt").read_text()
+)[1].split()
+
+# Bytes of local memory (spilled registers, arrays with dynamic indices) that a thread may have.
+# Kernels for float64 are for tests, and may.
+LOCAL_BYTES = 0
+
+
+@pytest.fixture(scope="module")
+def compiler() -> nvrtc.Nvrtc:
+    try:
+        return nvrtc.Nvrtc(nvrtc.find((12,)))
+    except nvrtc.NotFound:
+        pytest.skip("needs NVRTC (make dev installs it where it exists)")
+
+
+def elf_sections(elf: bytes) -> dict[str, bytes]:
+    (start,) = struct.unpack_from("<Q", elf, 0x28)
+    size, count, names = struct.unpack_from("<HHH", elf, 0x3A)
+    # Of a header: name, type, …, offset, size
+    headers = [struct.unpack_from("<IIQQQQ", elf, start + i * size) for i in range(count)]
+
+    def text(offset: int) -> str:
+        begin = headers[names][4] + offset
+        return elf[begin : elf.index(b"\0", begin)].decode()
+
+    nobits = 8
+    return {
+        text(name): b"" if kind == nobits else elf[offset : offset + length]
+        for name, kind, _, _, offset, length in headers
+    }
+
+
+def symbols(table: bytes, names: bytes) -> Iterator[tuple[str, bool]]:
+    """Name, and whether it is defined."""
+    for name, _, _, section in (row[:4] for row in struct.iter_unpack("<IBBHQQ", table)):
+        yield names[name : names.index(b"\0", name)].decode(), section != 0
+
+
+def attributes(info: bytes) -> Iterator[tuple[int, bytes]]:
+    """What a cubin says of its kernels: number and content."""
+    at = 0
+    while at < len(info):
+        form, attribute, size = struct.unpack_from("<BBH", info, at)
+        at += 4
+        if form == 4:  # else the size is the content
+            yield attribute, info[at : at + size]
+            at += size
+
+
+@dataclass
+class Built:
+    """A kernel in a cubin."""
+
+    threads: int
+    parameters: list[int]  # bytes of each
+    local_bytes: int
+
+
+FRAME_SIZE, MAX_THREADS, PARAMETER = 0x11, 0x05, 0x17  # attributes of .nv.info
+
+
+def kernels_in(cubin: bytes) -> dict[str, Built]:
+    sections = elf_sections(cubin)
+    names = [name for name, _ in symbols(sections[".symtab"], sections[".strtab"])]
+    local = {
+        names[symbol]: size
+        for attribute, content in attributes(sections[".nv.info"])
+        if attribute == FRAME_SIZE
+        for symbol, size in [struct.unpack("<II", content)]
+    }
+    found = {}
+    for section, content in sections.items():
+        if not section.startswith(".nv.info."):
+            continue
+        name = section.removeprefix(".nv.info.")
+        said = list(attributes(content))
+        (threads,) = (struct.unpack("<III", c)[0] for a, c in said if a == MAX_THREADS)
+        sizes = [struct.unpack("<IHHI", c)[3] >> 18 for a, c in said if a == PARAMETER]
+        found[name] = Built(threads, sizes, local[name])
+    return found
+
+
+def cubin_of(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> bytes:
+    """What `make native` made, if it is of these sources, else made now."""
+    source = nvrtc.path_of(file)
+    built = PACKAGE / "_lib" / "cuda" / f"sm_{architecture}" / f"{file}.cubin"
+    made_of = [*nvrtc.sources(source), Path(nvrtc.__file__)]
+    if built.exists() and built.stat().st_mtime > max(p.stat().st_mtime for p in made_of):
+        return built.read_bytes()
+    return compiler.compile(source, f"sm_{architecture}")[0]
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_compiles_without_a_warning(file, compiler):
+    for architecture in (ARCHITECTURES[0], ARCHITECTURES[-1]):
+        cubin, log = compiler.compile(nvrtc.path_of(file), f"sm_{architecture}")
+        assert log == ""
+        assert cubin.startswith(b"\x7fELF")
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.parametrize("file", FILES)
+def test_cubins_hold_what_is_launched(file, architecture, compiler):
+    expected = {name: kernel for name, kernel in KERNELS.items() if kernel.file == file}
+    found = kernels_in(cubin_of(file, architecture, compiler))
+    assert {name.removesuffix("_f64") for name in found} == set(expected)
+    for name in expected:
+        assert name in found
+        if f"{name}_f64" in cpu_entries():
+            assert f"{name}_f64" in found
+    for name, built in found.items():
+        assert built.threads == expected[name.removesuffix("_f64")].threads
+        assert set(built.parameters) == {8}, "launch() passes 8 bytes each"
+        if not name.endswith("_f64"):
+            assert built.local_bytes <= LOCAL_BYTES, name
+
+
+def test_a_cubin_says_its_local_memory(compiler, tmp_path):
+    source = tmp_path / "spills.cu"
+    source.write_text(
+        '#include "cuda/device.h"\n'
+        "SNOW_KERNEL(spills, 96, (int64_t n, const int32_t* in, double x, int32_t* out)) {\n"
+        "  int32_t row[40];\n"
+        "  for (int i = 0; i < 40; i++) row[in[i]] = i;\n"
+        "  out[0] = row[n];\n"
+        "}\n"
+    )
+    for architecture in ARCHITECTURES:
+        (built,) = kernels_in(compiler.compile(source, f"sm_{architecture}")[0]).values()
+        assert built == Built(96, [8, 8, 8, 8], 160)
+
+
+def cpu_entries() -> set[str]:
+    """The functions of the CPU's library."""
+    sections = elf_sections((PACKAGE / "_lib" / "libsnowsplat_baseline.so").read_bytes())
+    return {name for name, here in symbols(sections[".dynsym"], sections[".dynstr"]) if here}
+
+
+def called(names: tuple[str, ...]) -> set[str]:
+    """Texts that the ops give to these functions first."""
+    found = set()
+    for path in (PACKAGE / "ops").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+                function = node.func
+                name = function.id if isinstance(function, ast.Name) else None
+                if name in names:
+                    found.add(node.args[0].value)
+    return found
+
+
+def test_every_function_is_on_both_kinds_of_device():
+    launched = called(("launch", "variant", "ask"))
+    assert {"project_cull", "blend_fwd", "adam_step", "tiles_parts", "neighbours"} <= launched
+    on_gpu = set(KERNELS) | set(SEQUENCES)
+    assert launched - on_gpu == set()
+    assert launched - cpu_entries() == set()
+    # Names that reach launch() in other ways: any text in the ops that the CPU knows.
+    constants = {
+        node.value
+        for path in (PACKAGE / "ops").glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    about_the_cpu = {"built_isa", "best_isa", "set_num_threads", "get_num_threads"}
+    assert (constants & cpu_entries()) - about_the_cpu - on_gpu == set()
+
+
+def test_sources_of_a_kernel_are_all_that_it_includes(tmp_path):
+    found = nvrtc.sources(nvrtc.path_of("statistic"))
+    assert [path.name for path in found] == ["statistic.cu", "device.h", "portable.h"]
+    assert all(path.is_absolute() for path in found)
+
+
+def test_what_does_not_compile_says_why_and_where(compiler, tmp_path):
+    source = tmp_path / "wrong.cu"
+    source.write_text(
+        '#include "cuda/device.h"\nSNOW_KERNEL(wrong, 32, (int64_t n)) { nonsense(); }\n'
+    )
+    with pytest.raises(nvrtc.CompileError, match=r"wrong.cu does not compile for sm_90: (.|\n)*"):
+        compiler.compile(source, "sm_90")
+    script = [sys.executable, nvrtc.__file__, source, "--target", "sm_90"]
+    result = subprocess.run(
+        [*script, "--output", tmp_path / "wrong.cubin"], capture_output=True, text=True
+    )
+    assert result.returncode == 1
+    assert 'wrong.cu(2): error: identifier "nonsense" is undefined' in result.stderr
+    assert not (tmp_path / "wrong.cubin").exists()
+
+
+def test_the_script_needs_nothing_but_python(compiler, tmp_path):
+    """As the build of a wheel runs it: neither torch nor snowsplat can be imported."""
+    source, cubin = nvrtc.path_of("statistic"), tmp_path / "in a folder" / "statistic.cubin"
+    library = nvrtc.find((12,))
+    script = [sys.executable, "-I", "-S", nvrtc.__file__, source, "--target", "sm_86"]
+    script += ["--output", cubin, "--depfile", f"{cubin}.d", "--library", library, "--lineinfo"]
+    result = subprocess.run(script, capture_output=True, text=True)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    assert "accumulate_screen_statistics_f64" in kernels_in(cubin.read_bytes())
+    assert b".debug_line" in cubin.read_bytes()
+    target, *names = Path(f"{cubin}.d").read_text().replace(r"\ ", "?").split()
+    assert target == f"{cubin}:".replace(" ", "?")
+    assert [Path(name).name for name in names] == ["statistic.cu", "device.h", "portable.h"]
+    # The same code every time, without the paths of this machine.
+    once, again = (compiler.compile(source, "sm_86")[0] for _ in range(2))
+    assert once == again
+    assert str(REPOSITORY).encode() not in once
+
+
+def test_without_nvrtc_it_says_so():
+    script = [sys.executable, "-I", "-S", nvrtc.__file__, "--find"]
+    result = subprocess.run(script, capture_output=True, text=True, env={})
+    if result.returncode == 0:
+        pytest.skip("the loader finds an NVRTC of the system")
+    assert (result.returncode, result.stdout, result.stderr) == (1, "", "NVRTC is not installed\n")

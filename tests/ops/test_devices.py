@@ -1,0 +1,215 @@
+"""Which device is computed on, and what is said where it cannot be a GPU."""
+
+import importlib
+import sys
+import warnings
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from snowsplat import ops
+from snowsplat.errors import UserError
+from snowsplat.ops.cuda import availability
+
+TOO_OLD = "A card (compute capability 6.1) is too old; it takes 7.5, which came in 2018, or newer"
+
+
+@pytest.fixture(autouse=True)
+def machine(monkeypatch) -> SimpleNamespace:
+    """A machine with a GPU of use, to be made worse."""
+    monkeypatch.delenv("SNOWSPLAT_DEVICE", raising=False)
+    here = SimpleNamespace(
+        usable=True, capabilities=[(8, 6), (9, 0)], architectures=["sm_75", "sm_80", "sm_90"]
+    )
+    here.driver = SimpleNamespace(error=0, cuda=(12, 4))
+    cuda = torch.cuda
+    monkeypatch.setattr(torch.version, "cuda", "12.6")
+    monkeypatch.setattr(cuda, "is_available", lambda: here.usable)
+    monkeypatch.setattr(cuda, "device_count", lambda: len(here.capabilities))
+    monkeypatch.setattr(cuda, "get_device_name", lambda index: "A card")
+    monkeypatch.setattr(cuda, "get_device_capability", lambda index: here.capabilities[index])
+    monkeypatch.setattr(cuda, "get_arch_list", lambda: here.architectures)
+    monkeypatch.setattr(cuda, "is_initialized", lambda: False)
+    monkeypatch.setattr(availability, "why_unusable", availability.why_unusable.__wrapped__)
+    monkeypatch.setattr(availability, "_driver", lambda: here.driver)
+    monkeypatch.setitem(sys.modules, "cuda.bindings.driver", SimpleNamespace())
+    return here
+
+
+def chosen(text: str | None = None) -> tuple[str, list[str]]:
+    notes: list[str] = []
+    return str(ops.resolve_device(text, notes.append)), notes
+
+
+def refused(text: str) -> str:
+    with pytest.raises(UserError) as error:
+        ops.resolve_device(text)
+    return str(error.value)
+
+
+def test_a_gpu_is_the_default(monkeypatch):
+    assert chosen() == ("cuda:0", [])
+    assert ops.default_device() == torch.device("cuda", 0)
+    assert chosen("cpu") == chosen("cpu:0") == ("cpu", [])
+    assert chosen("cuda") == ("cuda:0", [])
+    assert chosen("cuda:1") == ("cuda:1", [])
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    assert chosen() == chosen("cuda") == ("cuda:1", [])
+
+
+def test_the_environment_names_the_default(monkeypatch):
+    monkeypatch.setenv("SNOWSPLAT_DEVICE", "cpu")
+    assert chosen() == ("cpu", [])
+    assert chosen("cuda:1") == ("cuda:1", [])
+    monkeypatch.setenv("SNOWSPLAT_DEVICE", "cuda:2")
+    with pytest.raises(UserError) as error:
+        chosen()
+    assert str(error.value) == (
+        "SNOWSPLAT_DEVICE=cuda:2: there is no cuda:2; this machine has cuda:0 to cuda:1; "
+        "set it to cpu to use the CPU"
+    )
+    monkeypatch.setenv("SNOWSPLAT_DEVICE", "")
+    assert chosen() == ("cuda:0", [])
+
+
+@pytest.mark.parametrize("text", ["gpu", "mps", "cuda:x", "cuda:-1", "", "0"])
+def test_what_is_no_device(text):
+    assert refused(text) == f"--device {text}: this is no device for us; use cpu, cuda or cuda:1"
+
+
+def test_a_machine_without_a_gpu_is_told_nothing(machine):
+    machine.usable = False
+    for driver in (None, SimpleNamespace(error=availability._NO_DEVICE, cuda=(12, 4))):
+        machine.driver = driver
+        assert chosen() == ("cpu", [])
+    assert refused("cuda") == (
+        "--device cuda: there is no NVIDIA GPU that the driver knows; "
+        "leave --device out to use the CPU"
+    )
+    machine.driver = None
+    assert refused("cuda:0") == (
+        "--device cuda:0: there is no NVIDIA driver; install one if there is an NVIDIA GPU; "
+        "leave --device out to use the CPU"
+    )
+
+
+def unused(reason: str) -> None:
+    """The CPU is used, and the line says why; who asks for the GPU is refused."""
+    line = f"the GPU cannot be used: {reason}; computing on the CPU"
+    assert chosen() == ("cpu", [line])
+    assert "\n" not in line
+    assert ops.default_device() == torch.device("cpu")
+    assert refused("cuda") == f"--device cuda: {reason}; leave --device out to use the CPU"
+
+
+def test_torch_without_cuda(machine, monkeypatch):
+    monkeypatch.setattr(torch.version, "cuda", None)
+    unused("this PyTorch is built without CUDA; install one with it (pytorch.org says how)")
+    machine.driver = None
+    assert chosen() == ("cpu", [])
+
+
+def test_too_old_a_driver(machine):
+    machine.usable, machine.driver.cuda = False, (11, 4)
+    unused(
+        "the NVIDIA driver is too old: it knows CUDA 11.4 and this PyTorch needs 12.6; update the "
+        "driver, or install a PyTorch for an older CUDA (pytorch.org says how)"
+    )
+
+
+def test_a_driver_that_fails(machine):
+    machine.usable, machine.driver.error = False, 999
+    unused("the NVIDIA driver fails (error 999); restart the machine or reinstall it")
+
+
+def test_what_torch_says_becomes_the_line(machine, monkeypatch):
+    def unavailable() -> bool:
+        warnings.warn("CUDA: it is\nbroken (Triggered internally at x.cpp:1.)", stacklevel=1)
+        return False
+
+    monkeypatch.setattr(torch.cuda, "is_available", unavailable)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        unused("PyTorch cannot use it: CUDA: it is broken")
+    machine.usable = False
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    unused("PyTorch cannot use it: torch.cuda.is_available() is false")
+
+
+@pytest.mark.parametrize("capability", [(6, 1), (7, 0), (7, 2)])
+def test_too_old_a_card(capability, machine):
+    machine.capabilities[0] = capability
+    unused(TOO_OLD.replace("6.1", f"{capability[0]}.{capability[1]}"))
+    assert chosen("cuda:1") == ("cuda:1", [])
+
+
+@pytest.mark.parametrize(
+    ("capability", "architectures", "runs"),
+    [
+        ((12, 0), ["sm_80", "sm_90"], False),
+        ((12, 0), ["sm_80", "sm_90", "compute_90"], True),
+        ((8, 9), ["sm_80"], True),
+        ((8, 0), ["sm_86", "compute_90"], False),
+        ((9, 0), ["sm_90a"], True),
+        ((10, 3), ["sm_75", "sm_100", "sm_120"], True),
+        ((12, 1), ["sm_120"], True),
+        ((8, 6), [], True),
+    ],
+)
+def test_a_card_that_this_torch_does_not_know(capability, architectures, runs, machine):
+    machine.capabilities, machine.architectures = [capability], architectures
+    if runs:
+        assert chosen() == ("cuda:0", [])
+    else:
+        shown = f"A card (compute capability {capability[0]}.{capability[1]})"
+        unused(
+            f"this PyTorch, for CUDA 12.6, has no kernels for {shown}; "
+            "install another PyTorch (pytorch.org says how)"
+        )
+
+
+def test_a_device_that_is_not_there(machine):
+    machine.capabilities = [(8, 6)]
+    assert "there is no cuda:1; this machine has cuda:0 alone;" in refused("cuda:1")
+
+
+def test_without_the_bindings(monkeypatch):
+    plain = importlib.import_module
+
+    def missing(name: str, package: str | None = None):
+        if name.startswith("cuda."):
+            raise ModuleNotFoundError(name)
+        return plain(name, package)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    unused("the package cuda-bindings is missing: pip install cuda-bindings")
+
+
+def test_the_driver_is_asked_directly(monkeypatch):
+    monkeypatch.undo()
+    asked = availability._driver.__wrapped__
+
+    class Library:
+        def __init__(self, error: int) -> None:
+            self.cuInit = lambda flags: error
+
+        def cuDriverGetVersion(self, version) -> int:
+            version._obj.value = 12080
+            return 0
+
+    for error, there in ((0, True), (100, True), (999, True), (34, False)):
+        monkeypatch.setattr(availability.ctypes, "CDLL", lambda name, e=error: Library(e))
+        driver = asked()
+        assert (driver is not None) == there
+        if driver is not None:
+            assert (driver.error, driver.cuda) == (error, (12, 8))
+        monkeypatch.setattr(availability, "_driver", lambda found=driver: found)
+        assert availability.gpu_there() == (error in (0, 999))
+
+    def absent(name: str) -> None:
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr(availability.ctypes, "CDLL", absent)
+    assert asked() is None

@@ -1,0 +1,524 @@
+"""Loading and launching on a GPU, with something in the place of its driver that writes down."""
+
+import ctypes
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import snowsplat
+from snowsplat.errors import UserError
+from snowsplat.ops import native
+from snowsplat.ops.cuda import cubins, driver, nvrtc
+from snowsplat.ops.cuda.kernels import Kernel
+
+KERNEL = Kernel("statistic", threads=128, items=64)
+BUILT = (75, 80, 86, 89, 90, 100, 120)  # as in CMakeLists.txt
+
+
+class OnGpu(torch.Tensor):
+    """A tensor that says it is on cuda:`index`."""
+
+    index = 0
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @property
+    def device(self):
+        return torch.device("cuda", self.index)
+
+
+class OnSecondGpu(OnGpu):
+    index = 1
+
+
+def on_gpu(tensor: torch.Tensor, kind: type = OnGpu) -> torch.Tensor:
+    return tensor.as_subclass(kind)
+
+
+class FakeDriver:
+    """What cuda.bindings.driver is to us: each function gives an error number and results."""
+
+    def __init__(self):
+        self.calls = []
+        self.launches = []
+        self.fails = {}  # function → error, or code → error
+        self._contexts = threading.local()
+
+    def _call(self, name, *args):
+        self.calls.append((name, *args))
+        return self.fails.get(name, 0)
+
+    def count(self, name):
+        return sum(call[0] == name for call in self.calls)
+
+    def cuInit(self, flags):
+        return (self._call("cuInit"),)
+
+    def cuDriverGetVersion(self):
+        return 0, 12090
+
+    def cuDeviceGet(self, index):
+        return self._call("cuDeviceGet", index), index
+
+    def cuDevicePrimaryCtxRetain(self, device):
+        return self._call("cuDevicePrimaryCtxRetain", device), 1000 + device
+
+    def _stack(self):
+        return self._contexts.__dict__.setdefault("stack", [0])
+
+    def cuCtxGetCurrent(self):
+        return 0, self._stack()[-1]
+
+    def cuCtxPushCurrent(self, context):
+        self._stack().append(context)
+        return (self._call("cuCtxPushCurrent", context),)
+
+    def cuCtxPopCurrent(self):
+        return self._call("cuCtxPopCurrent"), self._stack().pop()
+
+    def cuLibraryLoadData(self, code, *rest):
+        assert rest == (None, None, 0, None, None, 0)
+        return self._call("cuLibraryLoadData", code) or self.fails.get(code, 0), code
+
+    def cuLibraryGetKernel(self, library, name):
+        return self._call("cuLibraryGetKernel", library, name), (library, name)
+
+    def cuKernelGetFunction(self, kernel):
+        return self._call("cuKernelGetFunction", kernel), (*kernel, self._stack()[-1])
+
+    def cuLaunchKernel(self, function, *rest):
+        gx, gy, gz, bx, by, bz, shared, stream, parameters, extra = rest
+        assert (gy, gz, by, bz, shared, extra) == (1, 1, 1, 1, 0, 0)
+        pointers = (ctypes.c_void_p * 30).from_address(parameters)
+        launch = SimpleNamespace(
+            function=function,
+            blocks=gx,
+            threads=bx,
+            stream=stream,
+            context=self._stack()[-1],
+            values=[ctypes.string_at(pointer, 8) for pointer in pointers],
+        )
+        self.launches.append(launch)
+        return (self._call("cuLaunchKernel"),)
+
+    def cuGetErrorName(self, error):
+        return 0, f"CUDA_ERROR_{error}".encode()
+
+    def cuGetErrorString(self, error):
+        return 0, b"in words"
+
+
+@pytest.fixture
+def built(tmp_path, monkeypatch) -> Path:
+    """Cubins for each architecture that the wheel has; they say which they are."""
+    folder = tmp_path / "built"
+    for number in BUILT:
+        (folder / f"sm_{number}").mkdir(parents=True)
+        for file in ("statistic", "blend"):
+            (folder / f"sm_{number}" / f"{file}.cubin").write_bytes(f"{file} {number}".encode())
+    monkeypatch.setattr(cubins, "_BUILT", folder)
+    return folder
+
+
+@pytest.fixture
+def gpus(built, monkeypatch) -> FakeDriver:
+    """Two cards, of compute capability 8.6 and 9.0, each with a stream of its own."""
+    fake = FakeDriver()
+    monkeypatch.setattr(driver, "_bindings", lambda: fake)
+    monkeypatch.setattr(driver, "_gpus", {})
+    monkeypatch.setattr(driver, "why_unusable", lambda index: None)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda i: ((8, 6), (9, 0))[i])
+    streams = [SimpleNamespace(cuda_stream=70 + index) for index in range(2)]
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: streams[index])
+    return fake
+
+
+class FakeCompiler:
+    version = (12, 9)
+    architectures = (50, 75, 80, 86, 87, 89, 90, 100, 103, 120)
+
+    def __init__(self):
+        self.compiled = []
+
+    def compile(self, source, target):
+        self.compiled.append((source.stem, target))
+        return f"{source.stem} for {target}, {len(self.compiled)}".encode(), ""
+
+
+@pytest.fixture
+def compiler(tmp_path, monkeypatch) -> FakeCompiler:
+    """In NVRTC's place, with a cache of its own."""
+    fake = FakeCompiler()
+    monkeypatch.setattr(cubins, "_nvrtc", lambda cuda_major: fake)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return fake
+
+
+# ---- launching
+
+
+def as_int(value: bytes) -> int:
+    return int.from_bytes(value, sys.byteorder, signed=True)
+
+
+def as_float(value: bytes) -> float:
+    return ctypes.c_double.from_buffer_copy(value).value
+
+
+def test_arguments_arrive_where_the_driver_reads_them(gpus):
+    tensor = on_gpu(torch.zeros(5))
+    numbers = [-(2**40), 2**62, True, 0.1, -1e300]
+    driver.run(KERNEL, "some_kernel", 7, (3, tensor, None, *numbers))
+    (launch,) = gpus.launches
+    assert (launch.blocks, launch.threads, launch.stream) == (7, 128, 70)
+    values = launch.values
+    assert [as_int(value) for value in values[:6]] == [3, tensor.data_ptr(), 0, -(2**40), 2**62, 1]
+    assert [as_float(value) for value in values[6:8]] == [0.1, -1e300]
+    assert launch.function == (b"statistic 86", b"some_kernel", 1000)
+
+
+def test_code_is_loaded_once_for_each_file_and_device(gpus):
+    first, second = on_gpu(torch.zeros(1)), on_gpu(torch.zeros(1), OnSecondGpu)
+    blend = Kernel("blend", threads=32, items=32)
+    for _ in range(3):
+        driver.run(KERNEL, "one", 1, (1, first))
+        driver.run(KERNEL, "one_f64", 1, (1, first))
+        driver.run(KERNEL, "one", 1, (1, None, second))
+        driver.run(blend, "two", 1, (1, second))
+    loaded = [call[1] for call in gpus.calls if call[0] == "cuLibraryLoadData"]
+    assert loaded == [b"statistic 86", b"statistic 90", b"blend 90"]
+    assert gpus.count("cuLibraryGetKernel") == 4
+    assert gpus.count("cuDevicePrimaryCtxRetain") == 2
+    assert [(x.context, x.stream) for x in gpus.launches[:4]] == [
+        (1000, 70),
+        (1000, 70),
+        (1001, 71),
+        (1001, 71),
+    ]
+
+
+def test_the_context_is_that_of_the_device_and_left_as_it_was(gpus):
+    first, second = on_gpu(torch.zeros(1)), on_gpu(torch.zeros(1), OnSecondGpu)
+    driver.run(KERNEL, "one", 1, (1, first))
+    driver.run(KERNEL, "one", 1, (1, second))
+    assert gpus.cuCtxGetCurrent() == (0, 0)
+    gpus.cuCtxPushCurrent(1000)
+    pushes = gpus.count("cuCtxPushCurrent")
+    driver.run(KERNEL, "one", 1, (1, first))  # is current: nothing to do
+    assert gpus.count("cuCtxPushCurrent") == pushes
+    driver.run(KERNEL, "one", 1, (1, second))
+    assert gpus.cuCtxGetCurrent() == (0, 1000)
+    assert [launch.context for launch in gpus.launches] == [1000, 1001, 1000, 1001]
+
+
+def test_threads_have_arguments_of_their_own(gpus):
+    tensor = on_gpu(torch.zeros(1))
+    driver.run(KERNEL, "one", 1, (0, tensor))
+    addresses, wrong = set(), []
+    barrier = threading.Barrier(4)
+
+    def many(number: int) -> None:
+        addresses.add(driver._parameters.address)
+        barrier.wait()
+        for i in range(200):
+            value = number * 1000 + i
+            driver.run(KERNEL, "one", value, (value, tensor))
+
+    threads = [threading.Thread(target=many, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    wrong = [x for x in gpus.launches[1:] if as_int(x.values[0]) != x.blocks or x.context != 1000]
+    assert len(gpus.launches) == 801
+    assert not wrong
+    assert len(addresses) == 4
+
+
+def test_launching_costs_little(gpus):
+    """What Python does for 20 arguments; the driver's own time comes on top."""
+    tensors = [on_gpu(torch.zeros(1)), *(torch.zeros(1) for _ in range(11))]
+    args = (5, *tensors, None, *range(4), 0.5, 1.5)
+    driver.run(KERNEL, "one", 1, args)
+    gpus.cuCtxPushCurrent(1000)
+    gpus.cuLaunchKernel = lambda *args: (0,)
+
+    def batch() -> float:
+        start = time.perf_counter()
+        for _ in range(200):
+            driver.run(KERNEL, "one", 1, args)
+        return (time.perf_counter() - start) / 200
+
+    assert min(batch() for _ in range(10)) < 30e-6  # 5 µs on an idle machine
+
+
+@pytest.mark.parametrize(
+    ("function", "error", "do"),
+    [
+        ("cuLaunchKernel", 700, "update the NVIDIA driver, or use device cpu"),
+        (
+            "cuLibraryLoadData",
+            2,
+            "close other programs that use the GPU, or make the scene smaller",
+        ),
+        ("cuLibraryGetKernel", 500, "the built kernels are older .*: rebuild them .make native."),
+        ("cuKernelGetFunction", 3, "update the NVIDIA driver, or use device cpu"),
+    ],
+)
+def test_errors_of_the_driver_are_lines_for_the_user(function, error, do, gpus):
+    gpus.fails[function] = error
+    line = f"^cuda:1: some_kernel: CUDA_ERROR_{error}, in words; {do}$"
+    for _ in range(2):
+        with pytest.raises(UserError, match=line):
+            driver.run(KERNEL, "some_kernel", 1, (1, on_gpu(torch.zeros(1), OnSecondGpu)))
+    assert gpus.cuCtxGetCurrent() == (0, 0)
+    gpus.fails.clear()
+    driver.run(KERNEL, "some_kernel", 1, (1, on_gpu(torch.zeros(1), OnSecondGpu)))
+
+
+def test_a_driver_that_does_not_start_is_a_line_too(gpus):
+    gpus.fails["cuInit"] = 803
+    with pytest.raises(UserError, match="^cuda:0: CUDA_ERROR_803, in words; update"):
+        driver.run(KERNEL, "one", 1, (1, on_gpu(torch.zeros(1))))
+
+
+def test_a_gpu_that_cannot_be_used_says_why(gpus, monkeypatch):
+    monkeypatch.setattr(driver, "why_unusable", lambda index: "it is too old")
+    with pytest.raises(UserError, match="^cuda:0: it is too old$"):
+        native.launch("accumulate_screen_statistics", 1, on_gpu(torch.zeros(1)))
+
+
+@pytest.mark.parametrize("error", [200, 209, 218, 222])
+@pytest.mark.parametrize("where", ["loading", "finding"])
+def test_a_cubin_that_does_not_fit_is_followed_by_one_made_here(error, where, gpus, compiler):
+    if where == "loading":
+        gpus.fails[b"statistic 86"] = error
+    else:
+        plain = gpus.cuKernelGetFunction
+        gpus.cuKernelGetFunction = lambda k: (error, None) if k[0][-2:] == b"86" else plain(k)
+    driver.run(KERNEL, "one", 1, (1, on_gpu(torch.zeros(1))))
+    assert compiler.compiled == [("statistic", "sm_86")]
+    assert gpus.launches[0].function[0] == b"statistic for sm_86, 1"
+
+
+def test_nothing_of_the_driver_is_loaded_for_the_cpu():
+    code = (
+        "import torch, sys; before = set(sys.modules);"
+        "from snowsplat import ops; from snowsplat.ops.cuda import driver, cubins;"
+        "ops.neighbours(torch.rand(9, 3), 2); new = set(sys.modules) - before;"
+        "print(driver._bindings.cache_info().currsize, cubins._nvrtc.cache_info().currsize,"
+        "[name for name in new if name.startswith('cuda')])"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True)
+    assert result.stdout == b"0 0 []\n", result.stderr
+
+
+THROUGH_THE_BINDINGS = """
+import ctypes, sys, torch
+from types import SimpleNamespace
+from snowsplat.ops.cuda import cubins, driver
+from snowsplat.ops.cuda.kernels import Kernel
+
+stub = ctypes.CDLL("libcuda.so.1")
+driver.why_unusable = lambda index: None
+torch.cuda.get_device_capability = lambda index: (9, 0)
+torch.cuda.current_stream = lambda index: SimpleNamespace(cuda_stream=0x77)
+cubins.candidates = lambda file, capability, major: [b"code", file, capability, major][:1]
+
+class OnGpu(torch.Tensor):
+    device = torch.device("cuda", 0)
+
+tensor = torch.zeros(3).as_subclass(OnGpu)
+driver.run(Kernel("some", 96, 96), "some_kernel", 5, (-6, tensor, None, 0.5))
+values = (ctypes.c_int64 * 4).in_dll(stub, "recorded_values")
+sizes = (ctypes.c_int * 6).in_dll(stub, "recorded_size")
+pointer = lambda name: ctypes.c_void_p.in_dll(stub, name).value
+assert list(sizes) == [5, 1, 1, 96, 1, 1], list(sizes)
+assert values[:3] == [-6, tensor.data_ptr(), 0], list(values)
+assert ctypes.c_double.from_buffer(values, 24).value == 0.5
+assert pointer("recorded_stream") == 0x77 and pointer("recorded_function")
+assert pointer("recorded_context") == driver._gpus[0].context != 0
+assert (ctypes.c_char * 4).in_dll(stub, "recorded_code").raw == b"code"
+assert (ctypes.c_char * 64).in_dll(stub, "recorded_name").value == b"some_kernel"
+assert ctypes.c_int.in_dll(stub, "pushed").value == 2  # to load, and to launch
+ctypes.c_int.in_dll(stub, "fail_next").value = 700
+try:
+    driver.run(Kernel("some", 96, 96), "some_kernel", 5, (-6, tensor, None, 0.5))
+except driver.UserError as error:
+    print(error)
+"""
+
+
+def test_the_way_through_the_real_bindings(tmp_path):
+    pytest.importorskip("cuda.bindings.driver")
+    source = Path(__file__).with_name("driver_stub.cpp")
+    compiler, library = os.environ.get("CXX", "c++"), tmp_path / "libcuda.so.1"
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", source, "-o", library], check=True)
+    environment = os.environ | {
+        "LD_LIBRARY_PATH": str(tmp_path),
+        "PYTHONPATH": str(Path(snowsplat.__file__).parents[1]),
+    }
+    result = subprocess.run(
+        [sys.executable, "-c", THROUGH_THE_BINDINGS],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert result.stdout == (
+        "cuda:0: some_kernel: CUDA_ERROR_ILLEGAL_ADDRESS, an illegal memory access; "
+        "update the NVIDIA driver, or use device cpu\n"
+    ), result.stderr
+
+
+# ---- the code for a card
+
+
+@pytest.mark.parametrize(
+    ("capability", "cubin"),
+    [
+        ((7, 5), 75),
+        ((8, 0), 80),
+        ((8, 6), 86),
+        ((8, 7), 86),
+        ((8, 9), 89),
+        ((9, 0), 90),
+        ((10, 0), 100),
+        ((10, 3), 100),
+        ((12, 0), 120),
+        ((12, 1), 120),
+    ],
+)
+def test_the_nearest_built_cubin_comes_first(capability, cubin, built, compiler):
+    codes = cubins.candidates("statistic", capability, 13)
+    assert next(codes) == f"statistic {cubin}".encode()
+    assert not compiler.compiled
+    number = 10 * capability[0] + capability[1]
+    target = f"sm_{number}" if number != 121 else "compute_120"  # that it does not know
+    assert list(codes) == [f"statistic for {target}, 1".encode()]
+
+
+def test_a_card_of_another_major_version_has_its_code_made_here(built, compiler):
+    # Not known to this compiler: the driver translates PTX for the newest that is.
+    assert list(cubins.candidates("statistic", (13, 0), 13)) == [b"statistic for compute_120, 1"]
+    assert list(cubins.candidates("statistic", (11, 0), 13)) == [b"statistic for compute_103, 2"]
+    assert list(cubins.candidates("statistic", (5, 0), 12)) == [b"statistic for sm_50, 3"]
+
+
+def test_without_built_kernels_all_are_made_here(tmp_path, monkeypatch, compiler):
+    monkeypatch.setattr(cubins, "_BUILT", tmp_path / "nothing")
+    assert list(cubins.candidates("blend", (8, 6), 12)) == [b"blend for sm_86, 1"]
+
+
+@pytest.mark.parametrize(("major", "package"), [(12, "nvrtc-cu12"), (13, "nvrtc")])
+def test_without_nvrtc_the_line_names_the_package(major, package, built, monkeypatch):
+    def nothing(majors):
+        assert list(majors) == list(range(major, 11, -1))
+        raise nvrtc.NotFound
+
+    monkeypatch.setattr(nvrtc, "find", nothing)
+    assert next(cubins.candidates("blend", (8, 6), major)) == b"blend 86"
+    with pytest.raises(
+        UserError, match=rf"capability 13.0, and .*: pip install nvidia-cuda-{package}$"
+    ):
+        list(cubins.candidates("blend", (13, 0), major))
+
+
+# ---- the cache
+
+
+def compiled(capability: tuple[int, int] = (13, 0)) -> bytes:
+    (code,) = cubins.candidates("statistic", capability, 12)
+    return code
+
+
+def test_what_was_compiled_is_kept(built, compiler, tmp_path):
+    first = compiled()
+    assert compiled() == first
+    assert len(compiler.compiled) == 1
+    (file,) = (tmp_path / "cache" / "snowsplat" / "kernels").iterdir()
+    assert file.name.startswith("statistic-compute_120-")
+    assert compiled((14, 0)) == first  # the same PTX
+    assert compiled((11, 0)) != first
+
+
+@pytest.mark.parametrize("damage", [b"", b"short", None, "cut", "changed"])
+def test_a_damaged_file_is_made_anew(damage, built, compiler, tmp_path):
+    compiled()
+    (file,) = (tmp_path / "cache" / "snowsplat" / "kernels").iterdir()
+    whole = file.read_bytes()
+    if damage is None:
+        file.unlink()
+    else:
+        other = whole[:-1] + bytes([whole[-1] ^ 1])
+        file.write_bytes({"cut": whole[:-1], "changed": other}.get(damage, damage))
+    assert compiled().endswith(b", 2")
+    assert compiled().endswith(b", 2")
+    assert len(compiler.compiled) == 2
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(built, compiler, tmp_path, monkeypatch):
+    (tmp_path / "cache").write_text("a file, where a folder should be")
+    assert compiled().endswith(b", 1")
+    assert compiled().endswith(b", 2")
+
+    def nobody():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", nobody)
+    assert compiled().endswith(b", 3")
+
+
+def test_the_cache_is_where_it_is_by_custom(monkeypatch, tmp_path):
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    expected = tmp_path / ".cache" / "snowsplat" / "kernels" / "blend-sm_90-key"
+    assert cubins._cache_path("blend", "sm_90", "key") == expected
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # is to be ignored
+    assert cubins._cache_path("blend", "sm_90", "key") == expected
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "Local"))
+    assert (
+        cubins._cache_path("a", "b", "c") == tmp_path / "Local" / "snowsplat" / "kernels" / "a-b-c"
+    )
+
+
+def test_the_key_changes_with_all_that_the_code_depends_on(tmp_path, monkeypatch):
+    source = tmp_path / "one.cu"
+    (tmp_path / "one.h").write_text("// a header")
+    source.write_text('#include "one.h"\n#include "cuda/device.h"\n')
+    keys = [cubins._key((12, 9), "sm_90", source) for _ in range(2)]
+    assert keys[0] == keys[1]
+    keys = keys[:1]
+    keys.append(cubins._key((12, 8), "sm_90", source))
+    keys.append(cubins._key((12, 9), "sm_89", source))
+    (tmp_path / "one.h").write_text("// another header")
+    keys.append(cubins._key((12, 9), "sm_90", source))
+    source.write_text('#include "one.h"\n#include "cuda/device.h"\n ')
+    keys.append(cubins._key((12, 9), "sm_90", source))
+    monkeypatch.setattr(nvrtc, "OPTIONS", ())
+    keys.append(cubins._key((12, 9), "sm_90", source))
+    assert len(set(keys)) == len(keys)
+
+
+def test_a_real_compiler_fills_the_cache(tmp_path, monkeypatch):
+    try:
+        nvrtc.find()
+    except nvrtc.NotFound:
+        pytest.skip("needs NVRTC")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(cubins, "_BUILT", tmp_path)
+    monkeypatch.setattr(cubins, "_nvrtc", cubins._nvrtc.__wrapped__)
+    (code,) = cubins.candidates("statistic", (8, 6), 13)
+    assert code.startswith(b"\x7fELF")
+    assert list(cubins.candidates("statistic", (8, 6), 13)) == [code]
+    (ptx,) = cubins.candidates("statistic", (99, 0), 13)
+    assert b".visible .entry accumulate_screen_statistics_f64(" in ptx
+    assert ptx.endswith(b"\0")  # the driver reads it as a C string
