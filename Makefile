@@ -1,5 +1,6 @@
 # make demo     takes photos of a small scene and makes it anew from them, with `snowsplat make`
-# make test     all that must hold: format, lint, types, layers, tests on every instruction set
+# make test     all that must hold: format, lint, types, layers, tests on every instruction set, and
+#               the kernels of a GPU, on the CPU
 # make dev      the environment to work in; then, quickly: make check, make format, make native
 #
 # Each works by itself on a fresh clone and needs Python >= 3.10 and a C++ compiler. Everything goes
@@ -24,14 +25,16 @@ export PYTHONPATH := $(CURDIR)/src
 BUILD := build/native
 # Two builds in one checkout wait for each other.
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
+# One precision is enough: the two have the same source.
+SANITIZED := emulated-float32
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo test dev check format native compiler lint types layers pytest clean
+.PHONY: demo test dev check format native compiler lint types layers pytest sanitized clean
 
 demo: native
 	$(PYTHON) examples/demo.py out/demo
 
-test: check
+test: check sanitized
 
 dev: native
 
@@ -78,14 +81,28 @@ types: $(ENVIRONMENT)
 layers: $(ENVIRONMENT)
 	lint-imports --no-logo
 
-# All tests on the best instruction set, then those of the ops on each of the others.
+# All tests on the best instruction set, then those of the ops on each of the others, less those of
+# a GPU's kernels, which have none.
 pytest: native
 	$(PYTHON) -m pytest
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
 	    for isa in $$isas; do \
 	        echo "SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops"; \
-	        SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops || exit 1; \
+	        SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops -m 'not emulated and not gpu' || exit 1; \
 	    done
+
+# The kernels of a GPU, on the CPU, under AddressSanitizer and UndefinedBehaviorSanitizer, and with the
+# threads of a block in the other order: what misses a barrier can be right in one of the two alone.
+# GCC's sanitizers, since they can be loaded into a Python that was built without them.
+sanitized: native
+	@if [ -f "$$(g++ -print-file-name=libasan.so)" ]; then \
+	    echo "sanitized: $(PYTHON) -m pytest tests/ops -m emulated -k $(SANITIZED)"; \
+	    LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" \
+	    ASAN_OPTIONS=detect_leaks=0 CXX=g++ SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
+	        $(PYTHON) -m pytest tests/ops -m emulated -k $(SANITIZED); \
+	else \
+	    echo "sanitized: skipped; it needs g++ with its sanitizers"; \
+	fi
 
 clean:
 	rm -rf build dist src/snowsplat/_lib src/snowsplat/_viewer .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

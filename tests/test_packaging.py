@@ -14,6 +14,7 @@ import torch
 
 from snowsplat import __version__
 from snowsplat.ops import native
+from snowsplat.ops.cuda import nvrtc
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 THIRD_PARTY = REPOSITORY / "third_party"
@@ -56,6 +57,74 @@ def test_wheel_carries_the_libraries_and_all_of_python(wheel):
     assert sources <= names
     assert "snowsplat/py.typed" in names
     assert not any(name.startswith("snowsplat/native/cpu") for name in names)
+
+
+def test_wheel_carries_the_kernels_of_a_gpu_built_and_as_sources(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    native_folder = REPOSITORY / "src" / "snowsplat" / "native"
+    sources = [*native_folder.glob("*.h"), *native_folder.glob("cuda/*")]
+    assert {f"snowsplat/native/{p.relative_to(native_folder).as_posix()}" for p in sources} <= names
+    cubins = {name for name in names if name.startswith("snowsplat/_lib/cuda/")}
+    try:
+        nvrtc.find((12,))
+    except nvrtc.NotFound:
+        assert not cubins
+        return
+    files = [path.stem for path in native_folder.glob("cuda/*.cu")]
+    assert cubins == {
+        f"snowsplat/_lib/cuda/sm_{number}/{file}.cubin"
+        for number in (75, 80, 86, 89, 90, 100, 120)
+        for file in files
+    }
+    assert wheel.stat().st_size < 10e6
+
+
+def test_source_distribution_carries_all_that_a_build_needs(tmp_path):
+    build = pytest.importorskip("scikit_build_core.build")
+    before = os.getcwd()
+    os.chdir(REPOSITORY)
+    try:
+        name = build.build_sdist(str(tmp_path))
+    finally:
+        os.chdir(before)
+    with tarfile.open(tmp_path / name) as archive:
+        names = {member.name.partition("/")[2] for member in archive.getmembers()}
+    needed = ["CMakeLists.txt", "pyproject.toml", "README.md", "src/snowsplat/ops/cuda/nvrtc.py"]
+    folders = ("src/snowsplat/native", "third_party")
+    needed += [
+        path.relative_to(REPOSITORY).as_posix()
+        for folder in folders
+        for path in (REPOSITORY / folder).rglob("*")
+        if path.is_file()
+    ]
+    assert set(needed) <= names
+
+
+def test_without_nvrtc_the_kernels_of_a_gpu_are_left_out_with_a_line(tmp_path):
+    """Only CMake's part, up to what would be built."""
+    cmake = shutil.which("cmake", path=f"{Path(sys.executable).parent}{os.pathsep}/usr/bin")
+    ninja = shutil.which("ninja", path=f"{Path(sys.executable).parent}{os.pathsep}/usr/bin")
+    if cmake is None or ninja is None:
+        pytest.skip("needs cmake and ninja (make dev installs them)")
+    lonely = tmp_path / "python"
+    lonely.write_text(f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
+    lonely.chmod(0o755)
+    line = "snowsplat: built without GPU kernels; they are compiled when first used"
+    command = [cmake, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={ninja}", "-S", REPOSITORY]
+    command += ["-B", tmp_path / "build", f"-DPython3_EXECUTABLE={lonely}"]
+    result = run(*command, env={k: v for k, v in os.environ.items() if k != "LD_LIBRARY_PATH"})
+    assert result.returncode == 0, result.stderr
+    if line not in result.stderr.splitlines():
+        assert nvrtc_of_the_system()
+        return
+    rules = (tmp_path / "build" / "build.ninja").read_text()
+    assert ".cubin" not in rules
+    assert "libsnowsplat_baseline.so" in rules
+
+
+def nvrtc_of_the_system() -> bool:
+    result = run(sys.executable, "-I", "-S", nvrtc.__file__, "--find")
+    return result.returncode == 0
 
 
 def test_wheel_carries_the_viewer_and_its_licence(wheel):
