@@ -95,6 +95,8 @@ class Runner:
             for child in list(self._running):
                 child.kill()
                 self._end(child, Outcome(child.job.name, "failed", child.seconds, "interrupted"))
+            for job in waiting:
+                self._add(Outcome(job.name, "not run", 0.0, "interrupted"))
 
     def _may_begin(self, job: Job) -> bool:
         if not self._running:
@@ -171,7 +173,8 @@ class _Child:
             return Outcome(self.job.name, "done", self.seconds)
         if code < 0:
             name = signal.Signals(-code).name
-            return Outcome(self.job.name, "failed", self.seconds, f"{name}; {self.last_line}")
+            said = f"; {self.last_line}" if self.last_line else ""
+            return Outcome(self.job.name, "failed", self.seconds, name + said)
         return Outcome(self.job.name, "failed", self.seconds)
 
     def read(self, on_finding: Callable[[str, Finding], None]) -> None:

@@ -42,7 +42,13 @@ STAGES = {
 REST = "rest (Python)"
 TOTAL = "total"
 #: These answer a question about sizes at once: part of the rest.
-QUERIES = ("tiles_parts", "blend_block_bytes")
+QUERIES = (
+    "blend_sums_in_order",
+    "splat_record_bytes",
+    "tiles_parts",
+    "tiles_workspace_bytes",
+    "blend_block_bytes",
+)
 
 
 class Stopwatch:
@@ -64,11 +70,11 @@ class Stopwatch:
     def on_launches(self) -> Iterator[None]:
         """Time each `launch` of the op modules, which hold the name that is replaced here."""
 
-        def timed(name: str, n: int, *args: Any) -> int:
+        def timed(name: str, n: int, *args: Any, **options: Any) -> int:
             if name in QUERIES:
-                return native.launch(name, n, *args)
+                return native.launch(name, n, *args, **options)
             with self.stage(STAGES.get(name, name)):
-                return native.launch(name, n, *args)
+                return native.launch(name, n, *args, **options)
 
         holders = [
             module
