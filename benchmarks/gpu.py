@@ -138,7 +138,6 @@ def main() -> int:
     findings = Findings()
     findings.add("probe", found)
     when = time.strftime("%Y-%m-%d")
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # children end with us, too
 
     def write(running: bool = True) -> str:
         text = page(findings, runner.outcomes, when, running)
@@ -163,15 +162,20 @@ def main() -> int:
         write()
 
     written = 0.0
+    received: list[int] = []
     log = flags.out / "gpu.log"
     log.write_bytes(b"")
     with tempfile.TemporaryDirectory(prefix="snowsplat-gpu-") as scratch:
         until = began + 60 * flags.minutes - 10
         runner = Runner(Path(scratch), log, until, flags.width, on_finding, say)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda number, _: (received.append(number), runner.stop()))
         try:
             runner.run(jobs(flags, Path(scratch)))
         finally:
             print("\n" + write(running=False), flush=True)
+    if received:
+        return 128 + received[0]
     well = all(outcome.state == "done" for outcome in runner.outcomes) and not findings.wrong()
     return 0 if well else 1
 

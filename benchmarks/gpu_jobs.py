@@ -77,12 +77,17 @@ class Runner:
         self._folder, self._log, self._until, self._width = folder, log, until, width
         self._on_finding, self._say = on_finding, say
         self._running: list[_Child] = []
+        self._stopped = False
+
+    def stop(self) -> None:
+        """Ends `run` soon. For handlers of signals: an exception could lose a child."""
+        self._stopped = True
 
     def run(self, jobs: Sequence[Job]) -> None:
-        """Runs all. Whatever ends this ends the children too."""
+        """Runs all, or until `stop`. Whatever ends this ends the children too."""
         waiting = list(jobs)
         try:
-            while waiting or self._running:
+            while (waiting or self._running) and not self._stopped:
                 for child in list(self._running):
                     child.read(self._on_finding)
                     outcome = child.outcome()

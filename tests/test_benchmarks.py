@@ -20,6 +20,8 @@ from snowsplat.ops.native import LAUNCHERS
 
 ROOT = Path(__file__).resolve().parents[1]
 BENCHMARKS = ROOT / "benchmarks"
+#: Seconds that no other process sleeps, so that it is known whose they are.
+LONG = 70 + os.getpid() * 1e-7
 
 
 def benchmark(script: str, *arguments: object) -> str:
@@ -220,7 +222,7 @@ def test_a_job_that_crashes_or_is_late_stops_no_other(gpu_modules, tmp_path):
     tell = 'print(\'@@ {"kind": "x", "value": 1}\', flush=True); '
     outcomes, found, log = run_jobs(
         tmp_path,
-        job("a child of its own", "import subprocess; subprocess.run(['sleep', '77.25'])", 1.0),
+        job("a child of its own", f"import subprocess; subprocess.run(['sleep', '{LONG}'])", 1.0),
         job("late", tell + "import time; time.sleep(60)", limit=1.5),
         job("crash", tell + "import os; print('last words', flush=True); os.abort()"),
         job("error", tell + "raise ValueError('what was wrong')"),
@@ -246,7 +248,7 @@ def test_a_job_that_crashes_or_is_late_stops_no_other(gpu_modules, tmp_path):
     assert "last words" in log
     assert "kind" not in log
     running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
-    assert "sleep 77.25" not in running
+    assert f"sleep {LONG}" not in running
 
 
 def test_what_is_timed_runs_alone_and_nothing_begins_too_late(gpu_modules, tmp_path):
@@ -766,7 +768,7 @@ sys.exit(gpu.main())
 """
 
 
-@pytest.mark.parametrize("long", [0, 77.5], ids=["to its end", "killed"])
+@pytest.mark.parametrize("long", [0, LONG], ids=["to its end", "killed"])
 def test_a_whole_run_leaves_its_page(tmp_path, long):
     run = subprocess.Popen(
         [sys.executable, "-c", FAKE_RUN.replace("LONG", str(long)), "--out", str(tmp_path)],
@@ -799,4 +801,4 @@ def test_a_whole_run_leaves_its_page(tmp_path, long):
     assert kinds == ["gpu", "failure", "tests"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["gpu.json", "gpu.log", "gpu.md"]
     running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
-    assert "import time; time.sleep(77.5)" not in running
+    assert f"time.sleep({LONG})" not in running
