@@ -68,3 +68,12 @@ def native(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> V
 def double(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
     """The float64 implementations: for finite differences."""
     return _running(request, monkeypatch)
+
+
+@pytest.fixture
+def sums_in_order() -> Iterator[None]:
+    """Gradients are summed in a fixed order, on a GPU too."""
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(before)

@@ -8,11 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from snowsplat.ops.splats import Splats2D
+
 from .scenes import (
     PARAMETERS,
     Scene,
     Variant,
     as_float32,
+    assert_close,
     generator,
     leaf_splats,
     normal,
@@ -201,3 +204,23 @@ def test_splats_of_any_size(variant: Variant, scale: float) -> None:
     assert depth is not None
     (image.sum() + alpha.sum() + depth.sum()).backward()
     assert_finite({"image": image, "alpha": alpha, "depth": depth, "gradient": leaf.packed.grad})
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_splat_that_is_not_finite_draws_nothing(native: Variant, value: float) -> None:
+    """Where its mean or its conic is not; and the others see nothing of it."""
+    splats = random_splats(3, 120, 23, 17)
+    broken = splats.packed.clone()
+    for i in range(0, 120, 7):
+        broken[i, i % 5] = value
+    rows = broken.isfinite().all(dim=1)
+    images, grads = [], []
+    for packed in (broken, splats.packed[rows]):
+        leaf = leaf_splats(Splats2D(packed, None, 3), native.dtype)
+        image, _, _ = native.ops.rasterize(leaf, 23, 17)
+        image.square().sum().backward()
+        assert leaf.packed.grad is not None
+        images.append(image.detach())
+        grads.append(leaf.packed.grad)
+    assert_close(images[0], images[1], native.forward)
+    assert_close(grads[0][rows], grads[1], native.backward)

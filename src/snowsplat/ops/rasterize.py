@@ -271,7 +271,7 @@ def _background_grad(grad_image: Tensor, alpha: Tensor) -> Tensor:
         alpha,
         rows,
     )
-    # In order, whatever torch's number of threads. On a GPU a sum has one order, and cumsum none that
-    # torch.use_deterministic_algorithms would allow.
+    # In order, whatever torch's number of threads. On a GPU a sum has one order, and cumsum none
+    # that torch.use_deterministic_algorithms would allow.
     total = rows.sum(0) if rows.is_cuda else rows.cumsum(0)[-1]
     return total.to(alpha.dtype)

@@ -21,8 +21,8 @@
 // each splat and tile: it goes to its slot, or is added to the splat's row atomically.
 //
 // w and q are kept between the steps. To find them again with a thread a splat, the states of
-// pixels passing from lane to lane, would be some 50 instructions, two of them slow, for every pixel
-// of the tile, where step 2 is 23 for the pixels of rectangles that the splat touches.
+// pixels passing from lane to lane, would be some 50 instructions, two of them slow, for every
+// pixel of the tile, where step 2 is 23 for the pixels of rectangles that the splat touches.
 //
 // Instructions of a warp, counted in the code for sm_80 to sm_120 with three channels, not timed:
 // forward 26 to 30 for a splat and its rectangle, that is 32 pixels; backward 38 to 42 for the same
