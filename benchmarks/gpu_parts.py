@@ -416,7 +416,6 @@ def stages(size: str, folder: Path, repeats: int) -> None:
 
     scene = _scene(folder, size)
     finding("scene", size=size, source=scene.source)
-    torch.cuda.reset_peak_memory_stats()
     step = Step(scene, GPU)
     for _ in range(4):  # room for the instances, kernels, torch's memory
         step.run()
@@ -473,6 +472,7 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
         **({} if iterations is None else {"iterations": iterations}),
     )
     if on_gpu:
+        torch.cuda.synchronize()  # what follows asks for a GPU that is in use
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     begin = time.perf_counter()

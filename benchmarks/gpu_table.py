@@ -115,7 +115,7 @@ def _machine(findings: Findings, name: str, when: str, running: bool) -> str:
         measured.append(f"{1e3 * mark['milliseconds']:.1f} µs between two marks of time")
     if measured:
         lines += ["", f"Measured on {name}: {'; '.join(measured)}."]
-    return "\n".join(lines)
+    return "\n".join(lines).rstrip()
 
 
 def _tests(findings: Findings, name: str) -> str:

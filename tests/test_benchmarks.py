@@ -633,8 +633,15 @@ def fake_gpu(gpu_modules, monkeypatch):
         return 1 << 20
 
     monkeypatch.setattr(torch.cuda, "Event", FakeEvent)
-    for name in ("synchronize", "_sleep", "empty_cache", "reset_peak_memory_stats"):
+    for name in ("_sleep", "empty_cache"):
         monkeypatch.setattr(torch.cuda, name, nothing)
+    begun = []
+
+    def reset():
+        assert begun  # as PyTorch does
+
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: begun.append(True))
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", reset)
     for name in ("memory_allocated", "max_memory_allocated"):
         monkeypatch.setattr(torch.cuda, name, nothing)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 20, 1 << 20))
