@@ -9,7 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from snowsplat.errors import UserError
-from snowsplat.viewer.static_server import ServedFile, StaticServer, is_own_host
+from snowsplat.viewer.hosts import is_own_host
+from snowsplat.viewer.static_server import ServedFile, StaticServer
 
 SCENE = bytes(range(256)) * 4096  # 1 MiB
 FILES = {

@@ -48,8 +48,9 @@ class View:
 
     def run(self) -> int:
         """Gives the exit code: 0, after Ctrl-C too, which is how one leaves."""
+        from snowsplat.viewer.hosts import ANY_HOST
         from snowsplat.viewer.static_scene import site
-        from snowsplat.viewer.static_server import ANY_HOST, StaticServer
+        from snowsplat.viewer.static_server import StaticServer
 
         if self.path is None:
             raise UserError("view needs a scene; name a file or the output folder of a training")

@@ -51,6 +51,8 @@ class PageFlags:
         host = self.host or LOCAL
         viewer = NetworkViewer(capture, background, host=host, port=self.port, label=label)
         print(f"watch it in a browser: {viewer.url}", flush=True)
+        if viewer.others is not None:
+            print(f"from other computers: {viewer.others}", flush=True)
         if host == LOCAL:
             port = viewer.url.rpartition(":")[2]
             print(f"from another computer: ssh -L {port}:localhost:{port} THIS_ONE", flush=True)

@@ -7,10 +7,11 @@ cannot reach it through a name that it makes point here (DNS rebinding).
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import hmac
-import ipaddress
+import io
 import logging
 import re
 import secrets
@@ -18,6 +19,7 @@ import socket
 import socketserver
 import sys
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,12 +28,21 @@ from http.server import BaseHTTPRequestHandler
 from typing import Any, cast
 
 from snowsplat.errors import UserError
-
-#: Hosts that mean all addresses of this machine.
-ANY_HOST = ("", "0.0.0.0", "::")
+from snowsplat.viewer.hosts import ANY_HOST, is_own_host, is_own_page
 
 _BLOCK = 1 << 18  # bytes sent at once
-_IDLE_SECONDS = 60.0  # after which a connection that says nothing is closed
+# Seconds after which a connection is closed that asks nothing, whose request is not all there, that
+# does not take a block.
+_IDLE_SECONDS, _REQUEST_SECONDS, _SEND_SECONDS = 60.0, 10.0, 60.0
+_REQUEST = 16 << 10  # bytes of a request at most
+# Connections open at once. A new one takes the place of the oldest of those that have not been
+# answered anything but refusals; where there is none, it is closed.
+_CONNECTIONS = 256
+# A line that asks and lines of headers, as the protocol has them and in no other way: what one
+# reader takes for the end of a request, another might not.
+_HEAD = re.compile(
+    rb"[!-~]+ [!-~]+ HTTP/1\.[01](\r\n[!#$%&'*+.^_`|~0-9A-Za-z-]+:[\t -~\x80-\xff]*)*\r\n\r\n"
+)
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 _log = logging.getLogger(__name__)
@@ -92,6 +103,7 @@ class StaticServer:
         """Stop; downloads under way are cut off."""
         self._server.shutdown()
         self._server.server_close()
+        self._server.hang_up()
 
     def __enter__(self) -> StaticServer:
         return self
@@ -111,11 +123,53 @@ class _Server(socketserver.ThreadingTCPServer):
     headers: dict[str, str]
     host: str
 
+    def __init__(self, *args: Any) -> None:
+        self._lock = threading.Lock()
+        self._strangers: dict[socket.socket, None] = {}  # in the order in which they came
+        self._known: set[socket.socket] = set()  # have been given something
+        super().__init__(*args)
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        """Whether there is room for a connection."""
+        with self._lock:
+            if len(self._strangers) + len(self._known) >= _CONNECTIONS:
+                if not self._strangers:
+                    return False
+                oldest = next(iter(self._strangers))
+                del self._strangers[oldest]
+                _hang_up(oldest)  # its thread sees that, and ends
+            self._strangers[request] = None
+            return True
+
+    def know(self, request: socket.socket) -> None:
+        """This one has the address."""
+        with self._lock:
+            if request in self._strangers:
+                del self._strangers[request]
+                self._known.add(request)
+
+    def shutdown_request(self, request: Any) -> None:
+        with self._lock:
+            self._strangers.pop(request, None)
+            self._known.discard(request)
+        super().shutdown_request(request)
+
+    def hang_up(self) -> None:
+        """Cut all connections off."""
+        with self._lock:
+            for request in (*self._strangers, *self._known):
+                _hang_up(request)
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         # A browser that leaves in the middle of a download is not an error.
         error = sys.exc_info()[1]
         if not isinstance(error, ConnectionError | TimeoutError):
             _log.error("the viewer's server: %s: %s", type(error).__name__, error)
+
+
+def _hang_up(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 class _Server6(_Server):
@@ -143,7 +197,55 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version = "snowsplat"
     sys_version = ""
-    timeout = _IDLE_SECONDS
+    timeout = _SEND_SECONDS
+
+    def setup(self) -> None:
+        super().setup()
+        self._received = b""
+
+    def handle_one_request(self) -> None:
+        """As the library's, but for a request that is all there, in its time and of its size."""
+        head = self._receive()
+        self.close_connection = True
+        if not head:
+            return
+        status = HTTPStatus.BAD_REQUEST
+        if len(head) > _REQUEST:
+            status = HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
+        elif _HEAD.fullmatch(head):
+            self.rfile = io.BufferedReader(io.BytesIO(head))
+            self.raw_requestline = self.rfile.readline()
+            if not self.parse_request():
+                return
+            getattr(self, f"do_{self.command}", self._refuse_method)()
+            return
+        self.requestline, self.request_version, self.command = "", self.protocol_version, ""
+        self._send_empty(status, {"Connection": "close"})
+
+    def _receive(self) -> bytes | None:
+        """The next request as far as its empty line, or too much of one; None: it does not come."""
+        started: float | None = time.monotonic() if self._received else None
+        while (end := self._received.find(b"\r\n\r\n")) < 0:
+            if len(self._received) > _REQUEST:
+                return self._received
+            left = _IDLE_SECONDS
+            if started is not None:
+                left = started + _REQUEST_SECONDS - time.monotonic()
+            if left <= 0.0:
+                return None
+            try:
+                self.connection.settimeout(left)
+                more = self.connection.recv(_REQUEST)
+            except OSError:
+                return None
+            finally:
+                self.connection.settimeout(self.timeout)
+            if not more:
+                return None
+            started = started or time.monotonic()
+            self._received += more
+        head, self._received = self._received[: end + 4], self._received[end + 4 :]
+        return head
 
     def do_GET(self) -> None:
         self._answer(with_body=True)
@@ -155,20 +257,20 @@ class _Handler(BaseHTTPRequestHandler):
         self.close_connection = True  # its body was not read
         self._send_empty(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": "GET, HEAD"})
 
-    do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = do_CONNECT = _refuse_method
-
     @property
     def _ours(self) -> _Server:
         return cast(_Server, self.server)
 
     def _answer(self, with_body: bool) -> None:
-        if not is_own_host(self.headers.get("Host", ""), self._ours.host):
-            self._send_empty(HTTPStatus.MISDIRECTED_REQUEST)
+        refusal = self._refusal()
+        if refusal is not None:
+            self._send_empty(refusal)
             return
         file = self._file()
         if file is None:
             self._send_empty(HTTPStatus.NOT_FOUND)
             return
+        self._ours.know(self.connection)
         common = {"ETag": file.etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
         if file.etag in (self.headers.get("If-None-Match") or ""):
             self._send_empty(HTTPStatus.NOT_MODIFIED, common)
@@ -190,6 +292,24 @@ class _Handler(BaseHTTPRequestHandler):
             content = memoryview(file.content)
             for at in range(start, end, _BLOCK):
                 self.wfile.write(content[at : min(at + _BLOCK, end)])
+
+    def _refusal(self) -> HTTPStatus | None:
+        """Why a request is not looked at."""
+        hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
+        # What has a body, or might have one to somebody else, would be two requests to us.
+        bodies = (
+            self.headers.get_all("Content-Length", []),
+            self.headers.get_all("Transfer-Encoding", []),
+        )
+        if len(hosts) > 1 or len(origins) > 1 or bodies not in (([], []), (["0"], [])):
+            self.close_connection = True
+            return HTTPStatus.BAD_REQUEST
+        host = hosts[0] if hosts else ""
+        if not is_own_host(host, self._ours.host):
+            return HTTPStatus.MISDIRECTED_REQUEST
+        if not all(is_own_page(origin, host) for origin in origins):
+            return HTTPStatus.FORBIDDEN
+        return None
 
     def _file(self) -> ServedFile | None:
         """What the path names, taken as it stands: no name of ours needs decoding."""
@@ -239,35 +359,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         _log.debug(format, *args)
-
-
-def is_own_host(header: str, listening: str) -> bool:
-    """Whether the Host of a request is a name of this machine, as seen by one who may ask.
-
-    The port is not looked at: with SSH forwarding it is another one. A server that listens on this
-    machine alone is called by its loopback names; one that listens to others also by any address,
-    since only names can be made to point here.
-    """
-    match = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^:\[\]]+)(?::\d*)?", header.strip())
-    if match is None:
-        return False
-    name = match[1].strip("[]").rstrip(".").lower()
-    if name in ("localhost", listening.lower()):
-        return True
-    try:
-        address = ipaddress.ip_address(name)
-    except ValueError:
-        return not _is_loopback(listening) and name in _names_of_this_machine()
-    return address.is_loopback or not _is_loopback(listening)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
-
-
-def _names_of_this_machine() -> set[str]:
-    name = socket.gethostname().lower()
-    return {name, name.partition(".")[0], f"{name.partition('.')[0]}.local"}

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
+import time
 
 import viser
 
 from snowsplat.camera import Camera
 from snowsplat.camera_list import entries_of
-from snowsplat.viewer.network.page import note
+from snowsplat.viewer.network.page import at_once, note
 from snowsplat.viewer.network.session import Visitor
 
 FILE = "cameras.json"
+# Views that a browser may keep, and seconds between two downloads of them.
+_MOST, _PAUSE = 500, 2.0
 _NONE = "Go somewhere, keep the view, go on: two or more make a film."
 
 
@@ -21,20 +25,27 @@ class KeyCameras:
     def __init__(self, client: viser.ClientHandle, visitor: Visitor) -> None:
         self.cameras: list[Camera] = []
         self._client, self._visitor = client, visitor
+        self._sent = -math.inf
         gui = client.gui
         with gui.add_folder("Film", order=4, expand_by_default=False):
             self._status = gui.add_html(note(_NONE))
             keep = gui.add_button("Keep this view")
             self._forget = gui.add_button("Forget the last", disabled=True)
             self._save = gui.add_button("Download them", disabled=True)
-        keep.on_click(lambda _: self.keep())
-        self._forget.on_click(lambda _: self.forget())
-        self._save.on_click(lambda _: client.send_file_download(FILE, self.content()))
+        keep.on_click(at_once(self.keep))
+        self._forget.on_click(at_once(self.forget))
+        self._save.on_click(at_once(self._download))
+
+    def _download(self) -> None:
+        now = time.monotonic()
+        if now - self._sent > _PAUSE:  # what a browser does not fetch is kept for it
+            self._sent = now
+            self._client.send_file_download(FILE, self.content())
 
     def keep(self) -> None:
         """Add where the browser looks from."""
         pose = self._visitor.pose
-        if pose is not None:
+        if pose is not None and len(self.cameras) < _MOST:
             self.cameras.append(pose.camera(pose.width, pose.height))
             self._show()
 

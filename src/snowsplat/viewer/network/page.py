@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import html
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import numpy as np
@@ -46,6 +48,23 @@ def note(text: str) -> str:
     return f'<div style="{style}">{text}</div>'
 
 
+def at_once(run: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
+    """A callback of a control that runs in the thread of the server, not in one of many.
+
+    So what is asked is done in order, and nothing is read from a browser before it is.
+    """
+
+    async def called(_: Any) -> None:
+        run()
+
+    return called
+
+
+def within(value: Any, low: float, high: float) -> float:
+    """The value of a slider, which browsers may set to whatever they like."""
+    return min(max(float(value), low), high)
+
+
 class TrainingPanel:
     """How the training goes, and its controls: the same for all browsers."""
 
@@ -66,23 +85,23 @@ class TrainingPanel:
             )
             self._loss = _plot(server, "Loss", "#4a7fe0")
             self._psnr = _plot(server, "PSNR (dB)", "#e08a2a")
-        self._pause.on_click(self._pause_clicked)
-        self._step.on_click(self._step_clicked)
-        self._share.on_update(self._share_changed)
+        self._pause.on_click(at_once(self._pause_clicked))
+        self._step.on_click(at_once(self._step_clicked))
+        self._share.on_update(at_once(self._share_changed))
 
-    def _pause_clicked(self, _: Any) -> None:
+    def _pause_clicked(self) -> None:
         if self._session.paused:
             self._session.resume()
         else:
             self._session.pause()
         self._name_pause()
 
-    def _step_clicked(self, _: Any) -> None:
+    def _step_clicked(self) -> None:
         self._session.step()
         self._name_pause()
 
-    def _share_changed(self, _: Any) -> None:
-        self._session.share = self._share.value / 100.0
+    def _share_changed(self) -> None:
+        self._session.share = within(self._share.value, 5, 95) / 100.0
 
     def _name_pause(self) -> None:
         self._pause.label = "Go on" if self._session.paused else "Pause"
@@ -149,6 +168,8 @@ class Controls:
         self._client, self._session, self._visitor = client, session, visitor
         self._photos = photos
         self._stand: int | None = None
+        self._next: int | None = None  # where it is to stand when that photo is read
+        self._going: asyncio.Task[None] | None = None
         self._hidden: viser.FrameHandle | None = None  # of this browser, in place of all frustums
         self._add_picture()
         self._add_photos()
@@ -176,17 +197,23 @@ class Controls:
                 *("Most pixels", 320, 2560, 80, self._visitor.longest),
                 hint="The longer side of a picture when the camera stands still",
             )
-        self._mode.on_update(lambda _: self._mode_chosen())
-        degree.on_update(lambda _: self._look(sh_degree=int(degree.value)))
-        scale.on_update(lambda _: self._look(scale=scale.value / 100.0))
-        finest.on_update(lambda _: self._session.change(self._visitor, longest=int(finest.value)))
+
+        def size_chosen() -> None:
+            longest = int(within(finest.value, 320, 2560))
+            self._session.change(self._visitor, longest=longest)
+
+        self._mode.on_update(at_once(self._mode_chosen))
+        degree.on_update(at_once(lambda: self._look(sh_degree=int(within(degree.value, 0, 3)))))
+        scale.on_update(at_once(lambda: self._look(scale=within(scale.value, 2, 100) / 100.0)))
+        finest.on_update(at_once(size_chosen))
 
     def _mode_chosen(self) -> None:
-        self._look(mode=_MODES[self._mode.value])
-        self._say_legend()
+        if self._mode.value in _MODES:
+            self._look(mode=_MODES[self._mode.value])
+            self._say_legend()
 
     def _say_legend(self) -> None:
-        mode = _MODES[self._mode.value]
+        mode = self._visitor.look.mode
         missing = mode == "error" and self._stand is None
         self._legend.content = note(_NEEDS_PHOTO if missing else _LEGENDS[mode])
 
@@ -203,10 +230,14 @@ class Controls:
             self._flip = gui.add_button_group("Show only", ("Render", "Photo"), visible=False)
             self._move = gui.add_button_group("Go to", ("Previous", "Next"))
         self._show_frustums()
-        self._shown.on_update(lambda _: self._show_frustums())
-        self._wipe.on_update(lambda _: self._look(wipe=self._wipe.value / 100.0))
-        self._flip.on_click(lambda _: self._wipe_to(100 if self._flip.value == "Photo" else 0))
-        self._move.on_click(lambda _: self._go(1 if self._move.value == "Next" else -1))
+        self._shown.on_update(at_once(self._show_frustums))
+        self._wipe.on_update(
+            at_once(lambda: self._look(wipe=within(self._wipe.value, 0, 100) / 100.0))
+        )
+        self._flip.on_click(
+            at_once(lambda: self._wipe_to(100 if self._flip.value == "Photo" else 0))
+        )
+        self._move.on_click(at_once(lambda: self._go(1 if self._move.value == "Next" else -1)))
 
     def _wipe_to(self, percent: int) -> None:
         self._wipe.value = percent  # type: ignore[misc]
@@ -214,16 +245,29 @@ class Controls:
 
     def _go(self, by: int) -> None:
         count = len(self._photos.views)
-        self.stand_at(0 if self._stand is None else (self._stand + by) % count)
+        now = self._stand if self._next is None else self._next
+        self.stand_at(0 if now is None else (now + by) % count)
 
     def stand_at(self, index: int) -> None:
-        """Go to where a photo was taken."""
-        try:
-            self._photos.stand(self._client, self._visitor, index)
-        except UserError as error:
-            self._where.content = note(html.escape(str(error)))
-            return
-        self.follow()
+        """Go to where a photo was taken, once it has been read; the last that was asked for."""
+        self._next = index
+        if self._going is None or self._going.done():
+            self._going = asyncio.get_running_loop().create_task(self._go_on())
+
+    async def _go_on(self) -> None:
+        while self._next is not None:
+            index = self._next
+            try:
+                stand = await self._photos.read(self._visitor, index)
+            except UserError as error:
+                self._where.content = note(html.escape(str(error)))
+                stand = None
+            if self._next != index:
+                continue  # another one was asked for meanwhile
+            self._next = None
+            if stand is not None:
+                self._photos.send(self._client, self._visitor, stand)
+                self.follow()
 
     def follow(self) -> None:
         """Show whether the browser stands at a photo, if that has changed."""
@@ -266,12 +310,12 @@ class Controls:
                 for i, name in enumerate(("x (right)", "y (down)", "z (forward)"))
             ]
         for control in (self._crop, *self._ranges):
-            control.on_update(lambda _: self._crop_changed())  # type: ignore[attr-defined]
+            control.on_update(at_once(self._crop_changed))  # type: ignore[attr-defined]
 
     def _crop_changed(self) -> None:
         crop = None
         if self._crop.value:
-            ranges = [sorted(map(float, control.value)) for control in self._ranges]
+            ranges = [sorted(map(float, control.value)) or [0.0] for control in self._ranges]
             low, high = zip(*((values[0], values[-1]) for values in ranges), strict=True)
             crop = (low, high)
         self._look(crop=crop)

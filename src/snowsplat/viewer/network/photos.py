@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import math
 import threading
@@ -67,6 +68,7 @@ class Photos:
             self._length = min(max(_LENGTH * float(spacing), 0.2 * self._length), self._length)
         self._centre = centre.to(torch.float64)
         self._background = background
+        self._reading = asyncio.Semaphore(1)
         self._began = threading.Event()  # reading the small photos
         self._closed = threading.Event()
         self._frustums: dict[int, viser.CameraFrustumHandle] = {}
@@ -108,30 +110,37 @@ class Photos:
 
         def register(index: int, frustum: viser.CameraFrustumHandle) -> None:
             @frustum.on_click
-            def _(event: viser.SceneNodePointerEvent) -> None:
+            async def _(event: viser.SceneNodePointerEvent) -> None:
                 stand_at(event.client, index)
 
         for index, frustum in self._frustums.items():
             register(index, frustum)
 
-    def stand(self, client: viser.ClientHandle, visitor: Visitor, index: int) -> None:
-        """Send a browser to where a photo was taken. The photo is decoded in this thread.
+    async def read(self, visitor: Visitor, index: int) -> Stand:
+        """Where a photo was taken, and the photo; one is read at a time, whoever asks.
 
         Raises:
             UserError: the photo is absent or damaged.
         """
         view = self.views[index]
-        photo = load_image(view.image, self._background.tolist())
+        async with self._reading:
+            started = time.monotonic()
+            photo = await asyncio.to_thread(load_image, view.image, self._background.tolist())
+            if self._session.training:  # which has its share of the time
+                await asyncio.sleep(time.monotonic() - started)
         now = visitor.pose
         width, height = (now.width, now.height) if now else (view.camera.width, view.camera.height)
-        pose = self._pose(view.camera, width, height)
-        self._session.send(visitor, Stand(index, view.camera, photo, pose))
-        up = -view.camera.cam_from_world[1, :3].detach()
+        return Stand(index, view.camera, photo, self._pose(view.camera, width, height))
+
+    def send(self, client: viser.ClientHandle, visitor: Visitor, stand: Stand) -> None:
+        """Send a browser there."""
+        self._session.send(visitor, stand)
+        up = -stand.camera.cam_from_world[1, :3].detach()
         with client.atomic():
-            client.camera.fov = pose.fov
-            client.camera.position = pose.position.numpy()
+            client.camera.fov = stand.pose.fov
+            client.camera.position = stand.pose.position.numpy()
             client.camera.up_direction = up.numpy()
-            client.camera.look_at = self._look_at(view.camera).numpy()
+            client.camera.look_at = self._look_at(stand.camera).numpy()
 
     def _pose(self, camera: Camera, width: int, height: int) -> Pose:
         """Of a browser that sees the whole photo in a window of this size."""

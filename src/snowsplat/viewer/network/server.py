@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
 import io
-import ipaddress
-import re
+import secrets
 import socket
 import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import viser
 import websockets.asyncio.server
 
 from snowsplat.errors import UserError
+from snowsplat.viewer.hosts import ANY_HOST, is_loopback
+from snowsplat.viewer.network.guard import Guard, govern
 
 DEFAULT_PORT = 8080
 # How many ports are tried where none was asked for.
 _TRIED = 20
-
-
-# Pages that may connect to a server of this computer alone: its own, by whatever port they came
-# through SSH, and programs that are no browsers. Any page on the web could try to.
-_OWN_PAGES = (re.compile(r"http://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"), None)
 
 
 class _Server(viser.ViserServer):
@@ -33,40 +29,55 @@ class _Server(viser.ViserServer):
         return None
 
 
-def start_server(host: str, port: int | None, label: str) -> viser.ViserServer:
+@dataclass(frozen=True)
+class Door:
+    """A server, and the address that lets in.
+
+    Attributes:
+        url: for a browser on this machine, or on another where the host is this machine's name.
+        others: for one on another computer, where that is let in and is another address.
+    """
+
+    server: viser.ViserServer
+    url: str
+    others: str | None
+
+
+def start_server(host: str, port: int | None, label: str) -> Door:
     """Listen at ``host`` and ``port``; without one, at 8080 or the next that is free.
+
+    Where other machines reach it, only who has the address gets in.
 
     Raises:
         UserError: the port is taken, or the host is not one of this machine.
     """
     free = free_port(host, port)
+    token = None if is_loopback(host) else secrets.token_urlsafe(16)
+    guard = Guard(host, token)
     # Viser welcomes in the terminal by itself, and complains of browsers that left.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    with contextlib.redirect_stdout(io.StringIO()), _refusing_other_pages(host):
+    with contextlib.redirect_stdout(io.StringIO()), _guarded(guard):
         server = _Server(host=host, port=free, label=label, verbose=False)
+    if not guard.serves:
+        stop_server(server)
+        raise RuntimeError(f"viser {viser.__version__} starts its server in another way")
     if server.get_port() != free:  # taken since, and viser takes the next by itself
         stop_server(server)
         raise UserError(f"port {free} is taken; name another: --port {free + 1}")
-    return server
+    govern(server.get_event_loop())
+    others = address(socket.gethostname(), free, token) if host in ANY_HOST else None
+    return Door(server, address(host, free, token), others)
 
 
 @contextlib.contextmanager
-def _refusing_other_pages(host: str) -> Iterator[None]:
-    """Viser has no word for it, so what it starts its server with is given one meanwhile."""
+def _guarded(guard: Guard) -> Iterator[None]:
+    """Viser takes no word on how to listen, so what it listens with is ours meanwhile."""
     serve = websockets.asyncio.server.serve
-    if _is_local(host):
-        refusing = functools.partial(serve, origins=_OWN_PAGES)
-        websockets.asyncio.server.serve = refusing  # type: ignore[assignment,misc]
+    websockets.asyncio.server.serve = guard.serve  # type: ignore[assignment,misc]
     try:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
-
-
-def _is_local(host: str) -> bool:
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
 
 
 def stop_server(server: viser.ViserServer) -> None:
@@ -75,10 +86,11 @@ def stop_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def address(host: str, port: int) -> str:
+def address(host: str, port: int, token: str | None = None) -> str:
     """For a browser on this machine, or on another where ``host`` is this machine's name there."""
-    shown = {"": "localhost", "0.0.0.0": "localhost", "::": "localhost"}.get(host, host)
-    return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
+    shown = "localhost" if host in ANY_HOST else host
+    root = f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
+    return root if token is None else f"{root}/{token}/"
 
 
 def free_port(host: str, port: int | None) -> int:

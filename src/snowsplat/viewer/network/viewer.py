@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -18,7 +19,7 @@ from snowsplat.viewer.network.look import Pose
 from snowsplat.viewer.network.page import Controls, ScenePanel
 from snowsplat.viewer.network.photos import Photos, placed_photo
 from snowsplat.viewer.network.pictures import draw
-from snowsplat.viewer.network.server import address, start_server, stop_server
+from snowsplat.viewer.network.server import start_server, stop_server
 from snowsplat.viewer.network.session import Due, Session, Visitor
 
 # Quality of the JPEG pictures, of a camera that moves and of one that is still.
@@ -27,6 +28,10 @@ _QUALITY = {"moving": 60, "still": 90, "idle": 90}
 _TICK, _LONG_TICK = 0.02, 0.5
 # Seconds between two looks at whether there is a newer scene.
 _POLL = 2.0
+# Lengths of quaternions and distances are within this and one by this.
+_SMALL = 1e-9
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -72,8 +77,8 @@ class NetworkViewer:
         self.session = Session()
         self.background = torch.tensor(background, dtype=torch.float32)
         self._bounds = capture.bounds
-        self.server = start_server(host, port, label)
-        self.url = address(host, self.server.get_port())
+        door = start_server(host, port, label)
+        self.server, self.url, self.others = door.server, door.url, door.others
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._photos = Photos(
             *(self.server, self.session, capture.train, capture.test, capture.extent),
@@ -90,9 +95,9 @@ class NetworkViewer:
         self._photos.close()
         stop_server(self.server)
 
-    # Threads of the server
+    # The thread of the server: one thing after the other, no faster than messages are read
 
-    def _entered(self, client: viser.ClientHandle) -> None:
+    async def _entered(self, client: viser.ClientHandle) -> None:
         visitor = self.session.enter(client.client_id)
         controls = Controls(client, self.session, visitor, self._photos, self._bounds)
         KeyCameras(client, visitor)
@@ -100,21 +105,16 @@ class NetworkViewer:
             self._browsers[client.client_id] = client, visitor, controls
         self._photos.begin()
 
-        def moved(camera: viser.CameraHandle) -> None:
+        async def moved(camera: viser.CameraHandle) -> None:
             pose = _pose(camera)
             if pose is not None:
                 self.session.move(visitor, pose)
                 controls.follow()
 
-        async def moved_in_order(camera: viser.CameraHandle) -> None:
-            moved(camera)  # in the server's own thread: of two poses, the later one stays
+        await moved(client.camera)
+        client.camera.on_update(moved)
 
-        moved(client.camera)
-        client.camera.on_update(moved_in_order)
-        if client.client_id not in self.server.get_clients():  # it has left meanwhile
-            self._left(client)
-
-    def _left(self, client: viser.ClientHandle) -> None:
+    async def _left(self, client: viser.ClientHandle) -> None:
         self.session.leave(client.client_id)
         with self._lock:
             self._browsers.pop(client.client_id, None)
@@ -138,15 +138,21 @@ class NetworkViewer:
         if due is None:
             return False
         started = time.monotonic()
-        picture = self._draw(due, gaussians)
+        try:
+            picture = self._draw(due, gaussians)
+            self._send(due, picture)
+        except Exception:  # whatever somebody wanted to see: the training does not end of it
+            _log.debug("a picture was not made", exc_info=True)
+        self.session.spent(due, scene, time.monotonic() - started)
+        return True
+
+    def _send(self, due: Due, picture: np.ndarray) -> None:
         with self._lock:
             client = next((c for c, v, _ in self._browsers.values() if v is due.visitor), None)
         if client is not None:  # else it has left while this was drawn
             quality = _QUALITY[due.kind]
             client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
             client.flush()
-        self.session.spent(due, scene, time.monotonic() - started)
-        return True
 
     def _draw(self, due: Due, gaussians: Gaussians) -> np.ndarray:
         if due.stand is None:
@@ -180,7 +186,10 @@ class NetworkViewer:
 def _pose(camera: viser.CameraHandle) -> Pose | None:
     """Where a browser looks from; None where that makes no sense."""
     quat, position = torch.from_numpy(camera.wxyz.copy()), torch.from_numpy(camera.position.copy())
-    sane = bool(torch.isfinite(quat).all() and torch.isfinite(position).all())
-    if not sane or min(camera.image_width, camera.image_height) < 1 or not camera.fov > 0:
+    turned = _SMALL < float(quat.norm()) < 1.0 / _SMALL
+    near = float(position.norm()) < 1.0 / _SMALL
+    if not (turned and near) or min(camera.image_width, camera.image_height) < 1:
+        return None
+    if not camera.fov > 0:
         return None
     return Pose(quat, position, camera.fov, camera.image_width, camera.image_height)

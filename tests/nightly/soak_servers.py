@@ -1,0 +1,288 @@
+"""Both servers for an hour, with visitors who come, look and go, some abruptly, some hostile.
+
+A small real training with --view and a `view` of a scene run as processes of their own. Their
+memory, threads and file descriptors are taken down every few seconds. At the end each must be
+alive, memory must be flat (its slope over the last half, by least squares, below BOUND), threads
+and descriptors within LIMITS, the training have made steps all the time, and nothing have been
+written to the terminal that a user would not understand.
+
+    python tests/nightly/soak_servers.py CAPTURE --minutes 60
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from websockets.exceptions import InvalidHandshake, WebSocketException
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from tests.viewer.clients import (  # noqa: E402
+    HOSTILE,
+    HOSTILE_TO_ANY,
+    Visitor,
+    get,
+    hostile,
+    open_socket,
+    path,
+    reset,
+    status,
+)
+
+BOUND = 0.5  # MiB a minute
+LIMITS = {"threads": 320, "descriptors": 400}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"}
+
+
+def _hear() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@dataclass
+class Server:
+    """A process, and what it was measured to use."""
+
+    name: str
+    process: subprocess.Popen[str]
+    url: str = ""
+    output: list[str] = field(default_factory=list)
+    samples: list[tuple[float, float, int, int, int]] = field(default_factory=list)
+
+    @classmethod
+    def start(cls, name: str, *command: object) -> Server:
+        words = [sys.executable, "-m", "snowsplat", *map(str, command)]
+        process = subprocess.Popen(
+            words,
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            # What a shell runs in the background hears no Ctrl-C, nor do its children.
+            preexec_fn=_hear,
+        )
+        server = cls(name, process)
+        threading.Thread(target=server._read, daemon=True).start()
+        while not (found := re.search(r"http://127\S+", "".join(server.output))):
+            assert process.poll() is None, server.output
+            time.sleep(0.1)
+        server.url = found[0]
+        return server
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.output.append(line)
+
+    @property
+    def step(self) -> int:
+        """The last that was told of."""
+        told = [line for line in self.output[-50:] if line.startswith("step ")]
+        return int(re.findall(r"\d+", told[-1].replace(",", ""))[0]) if told else 0
+
+    def sample(self, seconds: float) -> None:
+        folder = Path(f"/proc/{self.process.pid}")
+        pages = int((folder / "statm").read_text().split()[1])
+        rss = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+        threads = len(os.listdir(folder / "task"))
+        self.samples.append((seconds, rss, threads, len(os.listdir(folder / "fd")), self.step))
+
+    def end(self) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+        return self.process.wait(120)
+
+    def defects(self) -> list[str]:
+        """What is not as promised."""
+        table = np.array(self.samples)
+        last = table[len(table) // 2 :]
+        slope = 60.0 * np.polyfit(last[:, 0], last[:, 1], 1)[0]
+        drift = np.median(last[-len(last) // 4 :, 1]) - np.median(last[: len(last) // 4, 1])
+        print(f"{self.name}: memory over the last half {slope:+.3f} MiB a minute ({drift:+.1f} MiB")
+        print(f"  between its first and last quarters); threads at most {table[:, 2].max():.0f},")
+        print(f"  descriptors at most {table[:, 3].max():.0f}")
+        found = []
+        if slope > BOUND:
+            found.append(f"{self.name}: memory grows by {slope:.2f} MiB a minute")
+        for column, (what, most) in enumerate(LIMITS.items(), 2):
+            if table[:, column].max() > most:
+                found.append(f"{self.name}: {table[:, column].max():.0f} {what}")
+        if self.process.returncode not in (0, 130):
+            found.append(f"{self.name}: ended with {self.process.returncode}")
+        strange = re.compile("Traceback|Error|Warning|viser|websockets|asyncio", re.IGNORECASE)
+        for line in self.output:
+            if strange.search(line) and not line.startswith("step "):
+                found.append(f"{self.name}: said {line.strip()!r}")
+        return found
+
+
+class Crowd:
+    """Threads of visitors."""
+
+    def __init__(self, training: Server, scene: Server, seed: int) -> None:
+        self._training, self._scene = training, scene
+        self._over = threading.Event()
+        self.done: Counter[str] = Counter()
+        self.wrong: list[str] = []
+        self._threads = [
+            threading.Thread(target=self._come, args=(seed + i, kind), daemon=True)
+            for i, kind in enumerate([*"vvvv", *"ss", *"hh"])
+        ]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join(30)
+
+    def _come(self, seed: int, kind: str) -> None:
+        rng = random.Random(seed)
+        while not self._over.is_set():
+            visit = {"v": self._visit, "s": self._load, "h": self._attack}[kind]
+            try:
+                self.done[visit(rng)] += 1
+            except (OSError, TimeoutError, WebSocketException, InvalidHandshake):
+                self.done["was cut off"] += 1
+            self._over.wait(rng.uniform(0.0, 3.0))
+
+    def _visit(self, rng: random.Random) -> str:
+        """Look around in the training."""
+        visitor = Visitor(self._training.url)
+        size = rng.choice([(320, 240), (640, 480), (800, 200)])
+        pictures = 0
+        for _ in range(rng.randrange(1, 12)):
+            position = [rng.uniform(-2, 2) for _ in range(3)]
+            visitor.look(position=position, image_width=size[0], image_height=size[1])
+            pictures += visitor.pictures(rng.uniform(0.1, 2.0))
+            label = rng.choice(["Show", "SH degree", "Gaussian size", "Go to", "Keep this view"])
+            value = {
+                "Show": rng.choice(["Depth", "Colour", "Points", "Normals"]),
+                "SH degree": rng.randrange(4),
+                "Gaussian size": rng.randrange(2, 101, 2),
+                "Go to": rng.choice(["Next", "Previous"]),
+            }.get(label, True)
+            if label in visitor.controls:
+                visitor.press(label, value)
+        self.done["pictures"] += pictures
+        if rng.random() < 0.5:
+            visitor.__exit__()
+            return "visits"
+        reset(visitor.socket.socket)
+        return "visits that end abruptly"
+
+    def _load(self, rng: random.Random) -> str:
+        """Load the static page, or the other one; or leave in the middle of it."""
+        url = rng.choice([self._scene.url, self._scene.url, self._training.url])
+        if rng.random() < 0.3:
+            client = open_socket(url)
+            client.sendall(f"GET {path(url)} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+            client.recv(1000)
+            reset(client)
+            return "pages left"
+        if rng.random() < 0.3:
+            wanted, what = 404, "refusals"
+            answer = get(url, "/no/such/page")
+        else:
+            wanted, what = 200, "pages"
+            answer = get(url)
+        # Among hundreds of others it may be turned away, but not be given another answer.
+        if status(answer) in (0, 503):
+            return "turned away"
+        if status(answer) != wanted:
+            self.wrong.append(f"{url}: {answer[:200]!r}")
+        return what
+
+    def _attack(self, rng: random.Random) -> str:
+        kind = rng.choice(list(HOSTILE))
+        servers = [self._training, self._scene] if kind in HOSTILE_TO_ANY else [self._training]
+        hostile(kind, rng.choice(servers).url, rng.uniform(1.0, 8.0))
+        return f"hostile: {kind}"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("capture", type=Path, help="a capture to train on")
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--width", type=int, default=160, help="of the photos, pixels")
+    parser.add_argument("--gaussians", type=int, default=3000)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        out, small = Path(folder, "out"), Path(folder, "small")
+        flags = ["-r", arguments.width, "--max-gaussians", arguments.gaussians, "--threads", 1]
+        short = ["train", arguments.capture, "-o", small, "--iterations", 50, *flags, "-q"]
+        subprocess.run(
+            [sys.executable, "-m", "snowsplat", *map(str, short)], env=ENVIRONMENT, check=True
+        )
+        training = Server.start(
+            *("training", "train", arguments.capture, "-o", out, "--iterations", 50_000_000),
+            *(*flags, "--view"),
+        )
+        stack.callback(training.process.kill)
+        scene = Server.start("scene", "view", small, "--no-browser")
+        stack.callback(scene.process.kill)
+        while not training.step:
+            time.sleep(0.2)
+        crowd = Crowd(training, scene, arguments.seed)
+        crowd.start()
+        began = time.monotonic()
+        tell, steps, found = 0.0, [], []
+        print("minute  training: MiB threads  fds   steps/s   scene: MiB threads fds")
+        while (passed := time.monotonic() - began) < 60.0 * arguments.minutes:
+            alive = [server for server in (training, scene) if server.process.poll() is None]
+            if len(alive) < 2:
+                found += [
+                    f"{server.name}: ended by itself with {server.process.returncode}; at last: "
+                    + "".join(server.output[-20:])
+                    for server in (training, scene)
+                    if server not in alive
+                ]
+                break
+            for server in alive:
+                server.sample(passed)
+            if passed >= tell:
+                a, b = training.samples[-1], scene.samples[-1]
+                before = training.samples[max(0, len(training.samples) - 13)]
+                rate = (a[4] - before[4]) / max(a[0] - before[0], 1e-9)
+                steps.append(rate)
+                print(
+                    f"{passed / 60:6.1f}  {a[1]:13.1f} {a[2]:7d} {a[3]:4d}  {rate:8.1f}  "
+                    f"{b[1]:11.1f} {b[2]:7d} {b[3]:3d}",
+                    flush=True,
+                )
+                tell += max(60.0, 60.0 * arguments.minutes / 30)
+            time.sleep(5.0)
+        crowd.stop()
+        for server in (training, scene):
+            server.end()
+        found += [*training.defects(), *scene.defects(), *crowd.wrong]
+        if min(steps[1:], default=1.0) <= 0.0:
+            found.append("the training stood still")
+        for what, times in sorted(crowd.done.items()):
+            print(f"{times:7d} {what}")
+    print(*found, sep="\n")
+    print(f"{len(found)} defects in {arguments.minutes:g} minutes")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,354 @@
+"""Clients of both servers, on real sockets: those that behave like a browser, and others.
+
+    with Visitor(url) as visitor:
+        visitor.look()
+        visitor.pictures(1.0)
+
+    HOSTILE["pings"](url)
+
+Nothing here looks at what the servers are made of.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+import viser
+import zstandard
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+PROTOCOL = f"viser-v{viser.__version__}"
+POSE = {
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, -3.0],
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 1000.0,
+    "image_height": 240,
+    "image_width": 320,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, -1.0, 0.0],
+}
+
+
+def camera(**changes: object) -> bytes:
+    """What a page says of its camera."""
+    return msgspec.msgpack.encode({"type": "ViewerCameraMessage", **POSE, **changes})
+
+
+def update(uuid: str, value: object, name: str = "value") -> bytes:
+    """What a page says of a control."""
+    return msgspec.msgpack.encode(
+        {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {name: value}}
+    )
+
+
+class Visitor:
+    """A page, without the browser: says where it looks from, and takes what it is sent."""
+
+    def __init__(self, url: str, **options: Any) -> None:
+        """``options``: as those of `websockets.sync.client.connect`."""
+        options = {"open_timeout": 20, "close_timeout": 2, **options}
+        self.socket: ClientConnection = connect(
+            url.replace("http://", "ws://").rstrip("/"),
+            **{"subprotocols": [PROTOCOL], "max_size": None, **options},  # type: ignore[arg-type]
+        )
+        self.controls: dict[str, str] = {}  # uuid by label
+        self.shown = 0  # pictures
+
+    def __enter__(self) -> Visitor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError, ConnectionClosed):
+            self.socket.close()
+
+    def look(self, **changes: object) -> None:
+        """Say where it looks from."""
+        self.socket.send(camera(**changes))
+
+    def pictures(self, seconds: float, most: int = 1 << 30) -> int:
+        """Take what comes in this time, or until there are ``most`` pictures; how many came."""
+        before, end = self.shown, time.monotonic() + seconds
+        while self.shown - before < most and (left := end - time.monotonic()) > 0:
+            try:
+                data = self.socket.recv(timeout=left)
+            except TimeoutError:
+                break
+            assert isinstance(data, bytes)
+            self._take(data)
+        return self.shown - before
+
+    def press(self, label: str, value: object = True) -> None:
+        """Set a control that it was told of."""
+        self.socket.send(update(self.controls[label], value))
+
+    def _take(self, data: bytes) -> None:
+        compressed = int.from_bytes(data[8:16], "little")
+        plain = zstandard.ZstdDecompressor().decompress(data[16 : 16 + compressed])
+        for message in msgspec.msgpack.decode(plain)["messages"]:
+            self.shown += message["type"] == "BackgroundImageMessage"
+            label = (message.get("props") or {}).get("label")
+            if isinstance(label, str) and "uuid" in message:
+                self.controls[label] = message["uuid"]
+
+
+def place(url: str) -> tuple[str, int]:
+    """Host and port."""
+    parts = urlsplit(url)
+    assert parts.hostname
+    assert parts.port
+    return parts.hostname, parts.port
+
+
+def path(url: str) -> str:
+    return urlsplit(url).path or "/"
+
+
+def open_socket(url: str, seconds: float = 10.0) -> socket.socket:
+    return socket.create_connection(place(url), timeout=seconds)
+
+
+def ask(url: str, request: bytes, seconds: float = 10.0) -> bytes:
+    """What is answered to these bytes, up to the end of the connection."""
+    answer = b""
+    with open_socket(url, seconds) as client, contextlib.suppress(ConnectionError):
+        client.sendall(request)
+        while more := client.recv(1 << 16):
+            answer += more
+    return answer
+
+
+def get(url: str, target: str | None = None, *headers: str, method: str = "GET") -> bytes:
+    """A request as it stands, nothing encoded; the answer, head and body."""
+    host, port = place(url)
+    lines = [f"{method} {path(url) if target is None else target} HTTP/1.1"]
+    if not any(line.lower().startswith("host:") for line in headers):
+        lines.append(f"Host: {host}:{port}")
+    lines += [*headers, "Connection: close", "", ""]
+    return ask(url, "\r\n".join(lines).encode("utf-8", "surrogateescape"))
+
+
+def status(answer: bytes) -> int:
+    """0: the connection was closed without a word."""
+    return int(answer.split(b" ", 2)[1]) if answer else 0
+
+
+def upgrade(url: str) -> socket.socket:
+    """A websocket whose frames are written by hand."""
+    client = open_socket(url)
+    host, port = place(url)
+    client.sendall(
+        f"GET {path(url).rstrip('/') or '/'} HTTP/1.1\r\nHost: {host}:{port}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n".encode()
+    )
+    answer = b""
+    while b"\r\n\r\n" not in answer:
+        more = client.recv(1)
+        if not more:
+            raise ConnectionError("refused")
+        answer += more
+    if b" 101 " not in answer:
+        client.close()
+        raise ConnectionError(answer.split(b"\r\n")[0].decode())
+    return client
+
+
+def frame(payload: bytes, opcode: int = 2, fin: bool = True, length: int | None = None) -> bytes:
+    """A frame of a client. ``length``: that is said to be the payload's."""
+    said = len(payload) if length is None else length
+    head = bytes([opcode | (0x80 if fin else 0)])
+    if said < 126:
+        head += bytes([0x80 | said])
+    elif said < 1 << 16:
+        head += b"\xfe" + struct.pack(">H", said)
+    else:
+        head += b"\xff" + struct.pack(">Q", said)
+    return head + bytes(4) + payload  # a mask of zeros
+
+
+def reset(client: socket.socket) -> None:
+    """Leave without a goodbye."""
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    client.close()
+
+
+def pour(client: socket.socket, data: bytes, seconds: float, read: bool = False) -> int:
+    """Send the same again and again, until that is over or the other end has had enough."""
+    sent, end = 0, time.monotonic() + seconds
+    client.settimeout(0.2)
+    while time.monotonic() < end:
+        try:
+            sent += client.send(data)
+            if read:
+                client.recv(1 << 16)
+        except TimeoutError:
+            continue
+        except OSError:
+            break
+    return sent
+
+
+# Those that do not behave. Each takes an address and some seconds.
+
+
+def _garbage(url: str, seconds: float) -> None:
+    with upgrade(url) as client:
+        for _ in range(200):
+            client.sendall(frame(os.urandom(random.randrange(1, 300)), random.choice((1, 2))))
+        client.sendall(frame(msgspec.msgpack.encode({"type": "NoSuchMessage"})))
+        client.sendall(frame(b"\x91" * 60_000))  # lists within lists
+        client.sendall(frame(bytes(100), opcode=11))
+
+
+def _wrong_types(url: str, seconds: float) -> None:
+    bad = [float("nan"), float("inf"), -1, 0, 1e300, -(2**63), 2**64 - 1, "x", None, [], {}, b"x"]
+    with upgrade(url) as client:
+        client.sendall(frame(camera()))
+        for name, good in POSE.items():
+            for value in bad:
+                client.sendall(frame(camera(**{name: value})))
+                if isinstance(good, list):
+                    client.sendall(frame(camera(**{name: [value] * len(good)})))
+        for kind in ("GuiUpdateMessage", "FileTransferStartUpload", "ShareUrlRequest"):
+            client.sendall(frame(msgspec.msgpack.encode({"type": kind, "uuid": 5, "updates": 7})))
+
+
+def _huge_frame(url: str, seconds: float) -> None:
+    with upgrade(url) as client:
+        client.sendall(frame(b"", length=1 << 62))
+        pour(client, bytes(1 << 16), seconds)
+
+
+def _pings(url: str, seconds: float) -> None:
+    with upgrade(url) as client:
+        pour(client, frame(bytes(125), opcode=9) * 400, seconds)
+
+
+def _millions(url: str, seconds: float) -> None:
+    with upgrade(url) as client:
+        pour(client, frame(camera()) * 200, seconds)
+
+
+def _pieces(url: str, seconds: float) -> None:
+    with upgrade(url) as client:
+        client.sendall(frame(b"x", fin=False))
+        pour(client, frame(b"", opcode=0, fin=False) * 1000, seconds)
+
+
+def _forms(url: str, seconds: float) -> None:
+    """What viser would keep for ever."""
+    with upgrade(url) as client:
+        client.sendall(frame(camera()))
+        for i in range(900):
+            dirty = {"type": "GuiFormDirtyMessage", "uuid": f"{i}" + "x" * 5000}
+            client.sendall(frame(msgspec.msgpack.encode(dirty)))
+
+
+def _never_reads(url: str, seconds: float) -> None:
+    with upgrade(url) as client:
+        end = time.monotonic() + seconds
+        turn = 0.0
+        with contextlib.suppress(OSError):
+            while time.monotonic() < end:
+                turn += 0.1
+                client.sendall(frame(camera(position=[turn, 0.0, -3.0])))
+                time.sleep(0.05)
+
+
+def _half_open(url: str, seconds: float) -> None:
+    """A request that comes a byte a second, many times."""
+    clients = []
+    with contextlib.suppress(OSError):
+        clients = [open_socket(url) for _ in range(100)]
+    end = time.monotonic() + seconds
+    request = f"GET {path(url)} HTTP/1.1\r\nHost: localhost\r\nX-Padding: ".encode() + b"x" * 999
+    at = 0
+    while time.monotonic() < end:
+        for client in clients:
+            with contextlib.suppress(OSError):
+                client.send(request[at : at + 1])
+        at += 1
+        time.sleep(min(1.0, seconds / 3))
+    for client in clients:
+        client.close()
+
+
+def _long_head(url: str, seconds: float) -> None:
+    with open_socket(url) as client:
+        client.sendall(f"GET {path(url)} HTTP/1.1\r\nHost: localhost\r\n".encode())
+        pour(client, b"X-Padding: " + b"x" * 4000 + b"\r\n", seconds)
+
+
+def _strangers(url: str, seconds: float) -> None:
+    """Connections as fast as they come, each gone at once."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        client = open_socket(url)
+        with contextlib.suppress(OSError):
+            client.sendall(random.choice((b"", b"\x16\x03\x01\x02", b"GET /x HTTP/1.1\r\n\r\n")))
+        reset(client)
+
+
+def _comers(url: str, seconds: float) -> None:
+    """Browsers that come and go at once."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        with contextlib.suppress(ConnectionError):
+            client = upgrade(url)
+            client.sendall(frame(camera()))
+            reset(client)
+
+
+#: Of the network viewer.
+HOSTILE: dict[str, Callable[[str, float], None]] = {
+    "garbage": _garbage,
+    "wrong types": _wrong_types,
+    "huge frame": _huge_frame,
+    "pings": _pings,
+    "millions of messages": _millions,
+    "pieces": _pieces,
+    "forms": _forms,
+    "never reads": _never_reads,
+    "half open": _half_open,
+    "long head": _long_head,
+    "strangers": _strangers,
+    "comers": _comers,
+}
+#: Of any server.
+HOSTILE_TO_ANY = ("half open", "long head", "strangers")
+
+
+def hostile(kind: str, url: str, seconds: float) -> None:
+    """Until it is over or the server has had enough of it."""
+    with contextlib.suppress(OSError):
+        HOSTILE[kind](url, seconds)
+
+
+def _many(kind: str, url: str, seconds: float, count: int) -> None:
+    threads = [
+        threading.Thread(target=hostile, args=(kind, url, seconds), daemon=True)
+        for _ in range(count)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(seconds + 30)
+
+
+if __name__ == "__main__":  # KIND URL SECONDS COUNT: as a process of its own, which says "begun"
+    print("begun", flush=True)
+    _many(sys.argv[1], sys.argv[2], float(sys.argv[3]), int(sys.argv[4]))
