@@ -46,6 +46,8 @@ def ask_for_the_same_bits() -> None:
     # What cuBLAS asks for; it looks when it is used first.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=True)
+    # Otherwise torch fills all new memory, for those who read what they have not written.
+    torch.utils.deterministic.fill_uninitialized_memory = False
 
 
 def _note(line: str) -> None:
