@@ -24,8 +24,8 @@ ARCHITECTURES = re.search(
     r"set\(gpu_architectures ([\d ]+)\)", (REPOSITORY / "CMakeLists.txt").read_text()
 )[1].split()
 
-# Bytes of local memory (spilled registers, arrays with dynamic indices) that a thread may have: a few
-# registers. Kernels for float64 are for tests, and may have more.
+# Bytes of local memory (spilled registers, arrays with dynamic indices) that a thread may have: a
+# few registers. Kernels for float64 are for tests, and may have more.
 LOCAL_BYTES = 16
 
 

@@ -255,7 +255,7 @@ def test_launching_costs_little(gpus):
             driver.run(KERNEL, "one", 1, args)
         return (time.perf_counter() - start) / 200
 
-    assert min(batch() for _ in range(10)) < 30e-6  # 5 µs on an idle machine
+    assert min(batch() for _ in range(10)) < 30e-6  # 7 to 9 µs on a busy machine
 
 
 @pytest.mark.parametrize(
