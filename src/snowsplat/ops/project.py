@@ -13,6 +13,7 @@ from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
 from snowsplat.ops.splats import Splats2D, packed_width
+from snowsplat.ops.sums import sum_of_rows
 
 
 def project(
@@ -162,8 +163,7 @@ def _pose_grad(cam_from_world: Tensor, pose: Tensor | None) -> Tensor | None:
     """(3, 4) from the kernel's sums: 9 for R, 3 for t, 3 for the camera's centre c = −Rᵀ t."""
     if pose is None:
         return None
-    # Summed in order: a reduction by torch depends on its number of threads.
-    total = torch.cat([pose.new_zeros(1, 15), pose]).cumsum(0)[-1]
+    total = sum_of_rows(pose)
     d_rotation, d_translation, d_centre = total[:9].view(3, 3), total[9:12], total[12:]
     rotation, translation = cam_from_world[:, :3].double(), cam_from_world[:, 3].double()
     d_rotation = d_rotation - torch.outer(translation, d_centre)

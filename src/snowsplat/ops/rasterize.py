@@ -14,6 +14,7 @@ from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
 from snowsplat.ops.room import Room
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
+from snowsplat.ops.sums import sum_of_rows
 
 TILE = 16
 _GROUP = 4  # channels that one pass of blending carries
@@ -271,7 +272,4 @@ def _background_grad(grad_image: Tensor, alpha: Tensor) -> Tensor:
         alpha,
         rows,
     )
-    # In order, whatever torch's number of threads. On a GPU a sum has one order, and cumsum none
-    # that torch.use_deterministic_algorithms would allow.
-    total = rows.sum(0) if rows.is_cuda else rows.cumsum(0)[-1]
-    return total.to(alpha.dtype)
+    return sum_of_rows(rows).to(alpha.dtype)
