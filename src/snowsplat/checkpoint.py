@@ -8,6 +8,7 @@ file can also rot or be cut in a copy.
 """
 
 import json
+import os
 import re
 import warnings
 import zlib
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from snowsplat.errors import UserError
 from snowsplat.files import atomic_path
+from snowsplat.untrusted import parse_json
 
 #: One more whenever the meaning of the tensors changes, so that an old file is refused.
 VERSION = 1
@@ -74,7 +76,10 @@ def save(
         try:
             safetensors.torch.save_file(whole, temporary, metadata={_HEADER: json.dumps(header)})
         except safetensors.SafetensorError as error:
-            raise OSError(f"{path}: cannot be written ({error})") from None
+            number = re.search(r"os error (\d+)", str(error))
+            if number is None:
+                raise OSError(f"{path}: cannot be written ({error})") from None
+            raise OSError(int(number[1]), os.strerror(int(number[1]))) from None
     for _, old in files(folder)[keep:]:
         old.unlink(missing_ok=True)
     return path
@@ -89,7 +94,7 @@ def load(path: Path | str) -> Checkpoint:
     path = Path(path)
     try:
         with safetensors.safe_open(path, framework="pt", device="cpu") as file:
-            header = json.loads((file.metadata() or {})[_HEADER])
+            header = parse_json((file.metadata() or {})[_HEADER].encode("utf-8", "replace"))
             if header["version"] != VERSION:
                 raise UserError(
                     f"{path}: a checkpoint of version {header['version']}, this program reads "
@@ -100,7 +105,7 @@ def load(path: Path | str) -> Checkpoint:
         checkpoint = Checkpoint(path, int(header["step"]), tensors, dict(header["meta"]))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError):
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OverflowError):
         raise UserError(f"{path}: damaged, or not a checkpoint") from None
     if not whole:
         raise UserError(f"{path}: damaged (its checksums do not match)")
