@@ -142,7 +142,17 @@ def write_compressed_ply(path: Path | str, gaussians: Gaussians) -> None:
     Raises:
         OSError: the folder is absent or not writable, or the disk is full.
     """
-    path = Path(path)
+    parts = _contents(Path(path), gaussians)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(parts)
+
+
+def compressed_ply(path: Path, gaussians: Gaussians) -> bytes:
+    """What `write_compressed_ply` writes into ``path``, which is not touched here."""
+    return b"".join(_contents(path, gaussians))
+
+
+def _contents(path: Path, gaussians: Gaussians) -> list[bytes]:
     arrays = packing.to_arrays(path, gaussians)
     order = morton_order(torch.from_numpy(arrays[0])).numpy()
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = (array[order] for array in arrays)
@@ -170,11 +180,8 @@ def write_compressed_ply(path: Path | str, gaussians: Gaussians) -> None:
     ]
     if k:
         elements.append(("sh", n, [("uchar", f"f_rest_{i}") for i in range(3 * k)]))
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(header_of(elements))
-        file.write(np.concatenate(bounds, 1).astype("<f4").tobytes())
-        file.write(words.tobytes())
-        file.write(sh.tobytes())
+    limits = np.concatenate(bounds, 1).astype("<f4")
+    return [header_of(elements), limits.tobytes(), words.tobytes(), sh.tobytes()]
 
 
 def _bounds(values: np.ndarray) -> np.ndarray:

@@ -7,12 +7,11 @@ it as a compressed PLY file in base64; a page is written, never read.
 from __future__ import annotations
 
 import base64
-import tempfile
 from pathlib import Path
 
 from snowsplat.errors import UserError
 from snowsplat.files import write_text
-from snowsplat.formats.compressed_ply import write_compressed_ply
+from snowsplat.formats.compressed_ply import compressed_ply
 from snowsplat.gaussians import Gaussians
 from snowsplat.start_view import StartView, overview
 from snowsplat.viewer_page import settings, whole_page
@@ -51,15 +50,13 @@ def write_html(path: Path | str, gaussians: Gaussians, start: StartView | None =
     path = Path(path)
     if not len(gaussians):
         raise UserError(f"{path}: a scene without Gaussians shows nothing; no page is made of it")
-    with tempfile.TemporaryDirectory(prefix="snowsplat-") as folder:
-        scene = Path(folder) / "scene.compressed.ply"
-        write_compressed_ply(scene, gaussians)
-        if scene.stat().st_size > _LARGEST:
-            raise UserError(
-                f"{path}: {len(gaussians):,} Gaussians are too many for one page; "
-                "decimate them, or drop SH degrees"
-            )
-        encoded = base64.b64encode(scene.read_bytes()).decode("ascii")
+    scene = compressed_ply(path, gaussians)
+    if len(scene) > _LARGEST:
+        raise UserError(
+            f"{path}: {len(gaussians):,} Gaussians are too many for one page; "
+            "decimate them, or drop SH degrees"
+        )
+    encoded = base64.b64encode(scene).decode("ascii")
     background = (0.0, 0.0, 0.0)
     bootstrap = {
         "settings": settings(start or overview(gaussians), background),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from snowsplat.camera import Camera
 from snowsplat.edit import transform
-from snowsplat.formats.compressed_ply import write_compressed_ply
+from snowsplat.formats.compressed_ply import compressed_ply
 from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import Similarity
 from snowsplat.photos.orient import VIEWING_DISTANCE
@@ -41,7 +40,7 @@ def site(
         "": ServedFile(index.encode(), "text/html; charset=utf-8"),
         "index.css": ServedFile(asset("index.css").encode(), "text/css; charset=utf-8"),
         "index.js": ServedFile(asset("index.js").encode(), "text/javascript; charset=utf-8"),
-        _SCENE: ServedFile(_compressed(gaussians), "application/octet-stream"),
+        _SCENE: ServedFile(compressed_ply(Path(_SCENE), gaussians), "application/octet-stream"),
     }
     own = "'self'"
     policy = f"{content_policy(index, own)}; frame-ancestors 'none'"
@@ -110,10 +109,3 @@ def _depth_ahead(gaussians: Gaussians, camera: Camera) -> float:
     distances = distances[distances.isfinite()]
     found = float(distances.median()) if len(distances) else 0.0
     return found if found > 0 else 1.0
-
-
-def _compressed(gaussians: Gaussians) -> bytes:
-    with tempfile.TemporaryDirectory(prefix="snowsplat-") as folder:
-        path = Path(folder) / _SCENE
-        write_compressed_ply(path, gaussians)
-        return path.read_bytes()
