@@ -63,7 +63,7 @@ def open_database(path: Path, photos: list[Photo], camera_model: str, fingerprin
 
 def remove_database(path: Path) -> None:
     """Remove the database, if there is one, and what SQLite keeps beside it."""
-    for suffix in ("", "-wal", "-shm"):
+    for suffix in ("", "-journal", "-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 

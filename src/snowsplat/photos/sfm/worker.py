@@ -66,6 +66,9 @@ def _work(job: dict[str, Any], teller: Teller) -> SfmResult:
     pycolmap.set_random_seed(SEED)
     pycolmap.logging.alsologtostderr = False
     pycolmap.logging.logtostderr = True
+    # The mapper takes that back: then there is to be no file in the folder for temporary ones.
+    for level in pycolmap.logging.Level.__members__.values():
+        pycolmap.logging.set_log_destination(level, "")
     options = SfmOptions(**job["options"])
     effort, threads = EFFORTS[options.effort], thread_count(options.threads)
     if job["gentle"]:
