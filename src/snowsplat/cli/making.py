@@ -83,6 +83,7 @@ class Making:
         folder = OutputFolder(self.out / SCENE)
         outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
         scene = self._stage("scene", settings, outputs, lambda: self._train(settings))
+        shutil.rmtree(folder.checkpoints, ignore_errors=True)  # now that it is finished
         pictures = folder.path / "test" / f"ours_{scene.result['iteration']}"
         self._stage("pictures", {}, [pictures], self._render)
         print(
@@ -151,7 +152,6 @@ class Making:
         metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
         with atomic_path(self.file) as temporary:
             shutil.copyfile(folder.scene_path(metrics["iteration"]), temporary)
-        shutil.rmtree(folder.checkpoints, ignore_errors=True)
         kept = {word: metrics[word] for word in ("iteration", "psnr", "ssim")}
         return kept | {"views": len(metrics["views"])}
 

@@ -28,7 +28,8 @@ from typing import TYPE_CHECKING, Any
 
 from snowsplat import __version__
 from snowsplat.errors import UserError
-from snowsplat.files import remove_temporaries, write_json, write_text
+from snowsplat.files import is_temporary, remove_temporaries, write_json, write_text
+from snowsplat.untrusted import from_json, read_json
 
 if TYPE_CHECKING:
     from snowsplat.capture import Capture
@@ -36,6 +37,11 @@ if TYPE_CHECKING:
     from snowsplat.evaluate import Evaluation
     from snowsplat.gaussians import Gaussians
 
+# A text, a name or number, or a sign; and those of which the value is taken.
+_WORD = re.compile(r"""\s*('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S)""", re.DOTALL)
+_LITERAL = re.compile(r"""['"].*['"]|True|False|None|-?[\d.]+(?:e[+-]?\d+)?""", re.DOTALL)
+_NAMESPACE_LIMIT = 1 << 20  # characters
+_PART = 4  # words of a part that are kept: one more than are wanted
 _SCENE = re.compile(r"iteration_(\d+)")
 _RESULTS = ("point_cloud", "checkpoints", "train", "test", "films")
 _REPORTS = ("metrics.json", "history.json", "report.html")
@@ -103,7 +109,8 @@ class OutputFolder:
             return
         if not self.path.is_dir():
             raise UserError(f"{self.path}: is a file; name a folder for the output")
-        if any(self.path.iterdir()) and not self.is_one():
+        others = (entry for entry in self.path.iterdir() if not is_temporary(entry, _FILES))
+        if any(others) and not self.is_one():
             raise UserError(f"{self.path}: holds other files; name a new or an empty folder")
         if self.is_one() and not resume and not overwrite:
             raise UserError(
@@ -118,6 +125,7 @@ class OutputFolder:
         for name in _REPORTS:
             (self.path / name).unlink(missing_ok=True)
         self.path.mkdir(parents=True, exist_ok=True)
+        self.write_config(settings, config)  # from here on the folder is known to be ours
         from snowsplat.camera_list import write_cameras
 
         if capture.points is not None:
@@ -128,13 +136,15 @@ class OutputFolder:
         views = [*capture.train, *capture.test]
         cameras = ((Path(view.name).stem, view.camera) for view in views)
         write_cameras(self.path / "cameras.json", cameras)
-        self.write_config(settings, config)
 
     def write_config(self, settings: CaptureSettings, config: TrainConfig) -> None:
         """`config.json` and `cfg_args`; what a kill has left of earlier ones goes."""
         from snowsplat.config import config_to_json
 
         remove_temporaries(self.path, _FILES)
+        for folder in (self.path / "point_cloud").glob("iteration_*"):
+            if not (folder / "point_cloud.ply").exists():
+                shutil.rmtree(folder, ignore_errors=True)
         whole = {
             "snowsplat": __version__,
             "capture": asdict(settings),
@@ -220,11 +230,11 @@ class OutputFolder:
         ours, theirs = self.path / "config.json", self.path / "cfg_args"
         try:
             if ours.is_file():
-                whole = json.loads(ours.read_text(encoding="utf-8"))
-                capture = CaptureSettings(**whole["capture"])
+                whole = read_json(ours)
+                capture = from_json(CaptureSettings, whole["capture"])
                 white = whole["training"]["background"] == "white"
             elif theirs.is_file():
-                values = _namespace(theirs.read_text(encoding="utf-8"))
+                values = _namespace(theirs)
                 capture = CaptureSettings(
                     path=str(values["source_path"]),
                     images=str(values.get("images", "images")),
@@ -236,15 +246,33 @@ class OutputFolder:
                 raise UserError(
                     f"{self.path}: not the output folder of a training (no config.json)"
                 )
-        except (KeyError, TypeError, ValueError, SyntaxError, AttributeError):
+        except (KeyError, TypeError, ValueError, SyntaxError, OverflowError):
             where = ours if ours.is_file() else theirs
             raise UserError(f"{where}: damaged; it does not name the capture") from None
         return capture, (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
 
 
-def _namespace(text: str) -> dict[str, Any]:
-    """The values of ``Namespace(name=literal, …)``, without running anything."""
-    call = ast.parse(text.strip(), mode="eval").body
-    if not isinstance(call, ast.Call):
-        raise ValueError("not a Namespace")
-    return {word.arg: ast.literal_eval(word.value) for word in call.keywords if word.arg}
+def _namespace(path: Path) -> dict[str, Any]:
+    """Texts, numbers, True, False and None of ``Namespace(name=value, …)``; all else is left out.
+
+    Only single words are given to Python's own reader of literals: it runs nothing, but deep nesting
+    ends the program.
+    """
+    with open(path, encoding="utf-8") as file:
+        words = (match[0].strip() for match in _WORD.finditer(file.read(_NAMESPACE_LIMIT)))
+        if [next(words, ""), next(words, "")] != ["Namespace", "("]:
+            raise ValueError("not a Namespace")
+        values, depth, part = {}, 1, list[str]()
+        for word in words:
+            if word in ("'", '"'):
+                raise ValueError("a text without an end")
+            depth += (word in "([{") - (word in ")]}")
+            if depth > 1 or (depth == 1 and word != ","):
+                part = [*part, word][:_PART]
+                continue
+            if len(part) == _PART - 1 and part[1] == "=" and _LITERAL.fullmatch(part[2]):
+                values[part[0]] = ast.literal_eval(part[2])
+            part = []
+            if depth < 1:
+                return values
+    raise ValueError("no end")

@@ -84,10 +84,10 @@ class TrainingRun:
             self._measured(progress.step, progress.metrics)
         if not self.quiet:
             self.progress(progress)
-        if self._checkpoint_is_due(progress.step):
-            self._save_checkpoint()
         if progress.step in self.save_iterations:
             self.out.write_scene(progress.step, self.trainer.gaussians)
+        if self._checkpoint_is_due(progress.step):  # last: who goes on from there has all the rest
+            self._save_checkpoint()
         if self.viewer is not None:
             paused = self.viewer.after_step(
                 progress.step, progress.iterations, progress.loss, self.trainer.gaussians
