@@ -4,7 +4,8 @@ A small real training with --view and a `view` of a scene run as processes of th
 memory, threads and file descriptors are taken down every few seconds. At the end each must be
 alive, memory must be flat (its slope over the last half, by least squares, below BOUND), threads
 and descriptors within LIMITS, the training have made steps all the time, and nothing have been
-written to the terminal that a user would not understand.
+written to the terminal that a user would not understand. Before that, a thousand connections must
+leave the training RATIO of its steps a second.
 
     python tests/nightly/soak_servers.py CAPTURE --minutes 60
 """
@@ -45,6 +46,7 @@ from tests.viewer.clients import (  # noqa: E402
 )
 
 BOUND = 0.5  # MiB a minute
+RATIO = 0.7  # of the steps a second that a training makes alone
 LIMITS = {"threads": 320, "descriptors": 400}
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"}
 
@@ -128,6 +130,36 @@ class Server:
             if strange.search(line) and not line.startswith("step "):
                 found.append(f"{self.name}: said {line.strip()!r}")
         return found
+
+
+def undisturbed(training: Server) -> float:
+    """Steps a second among a thousand connections, idle and hammering, relative to those without.
+
+    By turns, since on a machine that does other things no two minutes are alike.
+    """
+    rates: dict[bool, list[float]] = {False: [], True: []}
+    clients = ROOT / "tests/viewer/clients.py"
+    for _ in range(8):
+        for attacked in (False, True):
+            command = [sys.executable, clients, training.url, "8", "half open=10", "strangers=2"]
+            process = None
+            if attacked:
+                process = subprocess.Popen(
+                    command, stdout=subprocess.PIPE, text=True, preexec_fn=lambda: os.nice(9)
+                )
+                assert process.stdout is not None
+                process.stdout.readline()
+                time.sleep(1.0)
+            began, first = time.monotonic(), training.step
+            time.sleep(6.0)
+            rates[attacked].append((training.step - first) / (time.monotonic() - began))
+            if process is not None:
+                process.kill()
+                process.wait()
+    quiet, noisy = (float(np.median(rates[attacked])) for attacked in (False, True))
+    print(f"steps a second: {quiet:.1f} alone, {noisy:.1f} among 1000 connections, idle and")
+    print(f"  hammering: {noisy / quiet:.2f} of it (medians of 8 turns of 6 s)")
+    return noisy / quiet
 
 
 class Crowd:
@@ -242,10 +274,13 @@ def main() -> int:
         stack.callback(scene.process.kill)
         while not training.step:
             time.sleep(0.2)
+        found = []
+        if undisturbed(training) < RATIO:
+            found.append("a thousand connections disturb the training")
         crowd = Crowd(training, scene, arguments.seed)
         crowd.start()
         began = time.monotonic()
-        tell, steps, found = 0.0, [], []
+        tell, steps = 0.0, []
         print("minute  training: MiB threads  fds   steps/s   scene: MiB threads fds")
         while (passed := time.monotonic() - began) < 60.0 * arguments.minutes:
             alive = [server for server in (training, scene) if server.process.poll() is None]

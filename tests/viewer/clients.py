@@ -338,9 +338,11 @@ def hostile(kind: str, url: str, seconds: float) -> None:
         HOSTILE[kind](url, seconds)
 
 
-def _many(kind: str, url: str, seconds: float, count: int) -> None:
+def crowd(url: str, seconds: float, kinds: dict[str, int]) -> None:
+    """So many of each, at once."""
     threads = [
         threading.Thread(target=hostile, args=(kind, url, seconds), daemon=True)
+        for kind, count in kinds.items()
         for _ in range(count)
     ]
     for thread in threads:
@@ -349,6 +351,7 @@ def _many(kind: str, url: str, seconds: float, count: int) -> None:
         thread.join(seconds + 30)
 
 
-if __name__ == "__main__":  # KIND URL SECONDS COUNT: as a process of its own, which says "begun"
+if __name__ == "__main__":  # URL SECONDS KIND=COUNT …: as a process of its own
     print("begun", flush=True)
-    _many(sys.argv[1], sys.argv[2], float(sys.argv[3]), int(sys.argv[4]))
+    _kinds = dict(argument.split("=") for argument in sys.argv[3:])
+    crowd(sys.argv[1], float(sys.argv[2]), {kind: int(n) for kind, n in _kinds.items()})

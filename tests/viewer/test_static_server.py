@@ -1,16 +1,22 @@
 """The small web server: what it gives, what it refuses, and that nobody's leaving stops it."""
 
+import contextlib
 import http.client
+import os
 import re
 import socket
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from snowsplat.errors import UserError
+from snowsplat.viewer import static_server
 from snowsplat.viewer.hosts import is_own_host
 from snowsplat.viewer.static_server import ServedFile, StaticServer
+
+from . import clients
 
 SCENE = bytes(range(256)) * 4096  # 1 MiB
 FILES = {
@@ -155,6 +161,114 @@ def test_hosts_when_others_are_let_in():
     assert not is_own_host("evil.example", "0.0.0.0")
     assert not is_own_host(socket.gethostname() + ".evil.example", "0.0.0.0")
     assert not is_own_host("192.168.1.7", "127.0.0.1")
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "", "http://localhost:1", "http://127.0.0.1:{port}.x"]
+)
+def test_foreign_pages_are_refused(server, origin):
+    response, body = ask(server, Origin=origin.format(port=server.port))
+    assert (response.status, body) == (403, b"")
+    assert ask(server, Origin=f"http://127.0.0.1:{server.port}")[0].status == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        ["Content-Length: 5"],
+        ["Content-Length: 0", "Content-Length: 5"],
+        ["Transfer-Encoding: chunked"],
+        ["Transfer-Encoding: chunked", "Content-Length: 3"],
+        ["Host: localhost", "Host: evil.example"],
+        ["Host : localhost"],
+        ["X: y\r\n folded"],
+        ["X: y\n\nGET /"],
+        ["X: \0"],
+        ["no colon"],
+        [f"X: {'y' * 17_000}"],
+        [f"X-{i}: {'y' * 900}" for i in range(40)],
+        [f"X-{i}: y" for i in range(300)],
+    ],
+)
+def test_requests_that_could_be_two(server, headers):
+    """One answer, that refuses, and the end of the connection."""
+    path = "/" + server.url.split("/", 3)[3]
+    body = f"GET {path}scene.ply HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    answer = clients.ask(
+        server.url,
+        "\r\n".join([f"GET {path} HTTP/1.1", "Host: localhost", *headers, "", body]).encode(),
+    )
+    assert clients.status(answer) in (400, 431)
+    assert answer.count(b"HTTP/1.1") == 1
+    assert ask(server)[0].status == 200
+
+
+def test_two_requests_at_once_get_two_answers(server):
+    path = "/" + server.url.split("/", 3)[3]
+    request = f"GET {path} HTTP/1.1\r\nHost: localhost\r\n"
+    both = f"{request}\r\n{request}Connection: close\r\n\r\n".encode()
+    assert clients.ask(server.url, both).count(b"<!doctype html>") == 2
+
+
+def test_a_request_has_its_time(monkeypatch):
+    """However often another byte of it comes."""
+    monkeypatch.setattr(static_server, "_REQUEST_SECONDS", 0.5)
+    with StaticServer(FILES, POLICY) as server, clients.open_socket(server.url) as client:
+        began = time.monotonic()
+        with contextlib.suppress(ConnectionError):
+            for byte in b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 100:
+                client.send(bytes([byte]))
+                time.sleep(0.05)
+        assert time.monotonic() - began < 3.0
+
+
+def test_a_client_that_takes_nothing_is_left(monkeypatch):
+    monkeypatch.setattr(static_server._Handler, "timeout", 0.5)
+    threads = threading.active_count()
+    big = {"big": ServedFile(bytes(64 << 20), "application/octet-stream")}
+    with StaticServer(big, {}) as server:
+        path = "/" + server.url.split("/", 3)[3] + "big"
+        stuck = [clients.open_socket(server.url) for _ in range(20)]
+        for client in stuck:
+            client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        end = time.monotonic() + 20
+        while threading.active_count() > threads + 1:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        for client in stuck:
+            client.close()
+
+
+def test_a_thousand_connections(server):
+    """Half a request each: those who ask are served, threads and descriptors are bounded."""
+    threads, descriptors = threading.active_count(), len(os.listdir("/proc/self/fd"))
+    known = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    path = "/" + server.url.split("/", 3)[3]
+    known.request("GET", path)
+    known.getresponse().read()
+    strangers = []
+    try:
+        for i in range(1000):
+            client = clients.open_socket(server.url)
+            with contextlib.suppress(OSError):
+                client.sendall(b"GET / HT" if i % 2 else b"")
+            strangers.append(client)
+            if i % 100 == 99:
+                assert ask(server)[0].status == 200
+        most = static_server._CONNECTIONS
+        assert threading.active_count() - threads <= most + 20
+        own = len(os.listdir("/proc/self/fd")) - descriptors - len(strangers)
+        assert own <= most + 20
+        known.request("GET", path)  # who has the address keeps its connection
+        assert known.getresponse().read() == b"<!doctype html>"
+    finally:
+        known.close()
+        for client in strangers:
+            client.close()
+    end = time.monotonic() + 20
+    while threading.active_count() > threads:
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def test_two_clients_and_one_connection_for_many(server):
