@@ -1,7 +1,9 @@
 """The door of the network viewer: who comes in, and what those can do who should not."""
 
 import contextlib
+import gc
 import http.client
+import logging
 import os
 import socket
 import threading
@@ -234,7 +236,15 @@ def test_messages():
     assert not is_sane(camera().decode("latin-1"))
 
 
-def test_who_says_what_no_page_says_is_not_heard(local, capfd):
+def test_a_program_of_another_version_is_refused(local, capfd):
+    """viser would write into the terminal what such a one calls itself."""
+    assert refused(local.url, subprotocols=["viser-v0.0.0"]) == 400
+    assert refused(local.url, subprotocols=None) == 400
+    assert refused(local.url, subprotocols=[PROTOCOL, "x"]) == 400
+    assert capfd.readouterr() == ("", "")
+
+
+def test_who_says_what_no_page_says_is_not_heard(local, capfd, caplog):
     """Not a word in the terminal, nothing kept, and the next one is served as ever."""
     names: list[str] = []
     slider = local.server.gui.add_slider("x", 0, 10, 1, 5)
@@ -260,6 +270,9 @@ def test_who_says_what_no_page_says_is_not_heard(local, capfd):
         visitor.look()
         wait(lambda: len(local.server.get_clients()) == 1)
     assert capfd.readouterr() == ("", "")
+    gc.collect()  # asyncio tells of errors that nobody asked for
+    time.sleep(0.1)
+    assert [each for each in caplog.records if each.levelno >= logging.WARNING] == []
 
 
 def is_cut_off(client: socket.socket, seconds: float = 5.0) -> bool:

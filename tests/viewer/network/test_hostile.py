@@ -167,12 +167,12 @@ def test_a_picture_that_cannot_be_made_costs_no_training(watched):
         while not session._visitors:
             watched.step()
         (seen,) = session._visitors.values()
-        session.change(seen, look=dataclasses.replace(seen.look, sh_degree=99))
+        session.change(seen, look=dataclasses.replace(seen.look, crop=((0.0,), (1.0, 2.0))))
         time.sleep(0.3)  # it is still
         for _ in range(20):
             watched.step()
         assert seen.shown_version == seen.version  # it is not tried again and again
-        session.change(seen, look=dataclasses.replace(seen.look, sh_degree=3))
+        session.change(seen, look=dataclasses.replace(seen.look, crop=None))
         shown = visitor.shown
         end = time.monotonic() + 20
         while visitor.shown == shown:

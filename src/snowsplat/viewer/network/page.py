@@ -315,7 +315,7 @@ class Controls:
     def _crop_changed(self) -> None:
         crop = None
         if self._crop.value:
-            ranges = [sorted(map(float, control.value)) or [0.0] for control in self._ranges]
+            ranges = [sorted(map(float, control.value)) for control in self._ranges]
             low, high = zip(*((values[0], values[-1]) for values in ranges), strict=True)
             crop = (low, high)
         self._look(crop=crop)
