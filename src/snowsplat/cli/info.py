@@ -12,6 +12,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.output import OutputFolder
 from snowsplat.errors import UserError
+from snowsplat.untrusted import read_json
 
 if TYPE_CHECKING:
     from snowsplat.formats import Format
@@ -171,7 +172,7 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
     metrics = folder.path / "metrics.json"
     if metrics.is_file():
         try:
-            figures = json.loads(metrics.read_text(encoding="utf-8"))
+            figures = read_json(metrics)
             facts["metrics"] = {name: v for name, v in figures.items() if name != "views"}
         except (ValueError, AttributeError):
             raise UserError(f"{metrics}: damaged; it is not JSON") from None

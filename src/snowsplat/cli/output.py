@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import json
 import re
 import shutil
 from dataclasses import asdict, dataclass
@@ -119,15 +118,19 @@ class OutputFolder:
             )
 
     def begin(self, capture: Capture, settings: CaptureSettings, config: TrainConfig) -> None:
-        """Make the folder and write what is known before the first step, without old results."""
+        """Make the folder, without old results, and `describe` the training."""
         for name in _RESULTS:
             shutil.rmtree(self.path / name, ignore_errors=True)
         for name in _REPORTS:
             (self.path / name).unlink(missing_ok=True)
-        self.path.mkdir(parents=True, exist_ok=True)
-        self.write_config(settings, config)  # from here on the folder is known to be ours
+        self.describe(capture, settings, config)
+
+    def describe(self, capture: Capture, settings: CaptureSettings, config: TrainConfig) -> None:
+        """Write what is known before the first step."""
         from snowsplat.camera_list import write_cameras
 
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.write_config(settings, config)  # from here on the folder is known to be ours
         if capture.points is not None:
             from snowsplat.capture.points_ply import write_points
 
@@ -255,8 +258,8 @@ class OutputFolder:
 def _namespace(path: Path) -> dict[str, Any]:
     """Texts, numbers, True, False and None of ``Namespace(name=value, …)``; all else is left out.
 
-    Only single words are given to Python's own reader of literals: it runs nothing, but deep nesting
-    ends the program.
+    Only single words are given to Python's own reader of literals: it runs nothing, but deep
+    nesting may end the program.
     """
     with open(path, encoding="utf-8") as file:
         words = (match[0].strip() for match in _WORD.finditer(file.read(_NAMESPACE_LIMIT)))
