@@ -5,6 +5,7 @@ Everything here is a pure function of the file, so it may run in any thread and 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +16,21 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from snowsplat.errors import UserError
+from snowsplat.untrusted import is_file
 
 # What photographs come as (a phone's MPO counts as JPEG). Pillow also knows formats that start
 # other programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
+#: The largest image that is read; its size is known before it is decoded. Pillow's own limit, which
+#: is enough for the backs of the largest cameras (151 million) and the sides of any JPEG.
+MOST_PIXELS, LONGEST_SIDE = 178_956_970, 65_535
+# A tile of a TIFF may be larger than the image; a scan of a JPEG costs time for each pixel, and few
+# bytes. Both are far above what any program writes for an image of that size.
+_MOST_TILE_PIXELS, _MOST_SCANNED_PIXELS = 1 << 22, 3_000_000_000
+_MOST_SEGMENTS = 100_000  # of a JPEG
+# What begins a segment of a JPEG; in the data of a scan are only those that this leaves out.
+_MARKER, _SCAN, _END = re.compile(rb"\xff[^\x00\xd0-\xd8\xff]"), b"\xff\xda", b"\xff\xd9"
+_BAND_PIXELS = 1 << 20  # what is held at a time while pixels are rearranged
 #: The endings that are tried where a capture names its images without one.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 _EXIF_ORIENTATION = 0x0112
@@ -81,6 +93,72 @@ class Header:
     sideways: bool  # its EXIF orientation exchanges width and height
 
 
+def open_image(path: Path, formats: Sequence[str], *, header_only: bool = False) -> Image.Image:
+    """An image file whose pixels are not yet read; with ``header_only`` they must not be.
+
+    Raises:
+        ValueError: larger than `MOST_PIXELS` or `LONGEST_SIDE`, or made to do harm. And whatever
+            Pillow raises on damaged files.
+    """
+    image = Image.open(path, formats=list(formats))
+    try:
+        _check(image)
+        if not header_only and image.format in ("JPEG", "MPO"):
+            _check_scans(image, path)
+    except BaseException:
+        image.close()
+        raise
+    return image
+
+
+def _check(image: Image.Image) -> None:
+    width, height = image.size
+    if width * height > MOST_PIXELS or max(width, height) > LONGEST_SIDE:
+        raise ValueError(TOO_LARGE)
+    # Decoders in Python take a second for a million pixels; one of them trusts any skip it reads.
+    if any(tile[0] in Image.DECODERS for tile in getattr(image, "tile", ())):
+        raise ValueError(f"a {image.format} of a kind that is slow to read; save it as PNG")
+    if image.format == "TIFF":
+        tags = getattr(image, "tag_v2", {})
+        sides = [tags.get(tag, 1) for tag in (322, 323)]
+        if not all(isinstance(side, int) for side in sides) or (
+            sides[0] * sides[1] > max(_MOST_TILE_PIXELS, width * height)
+        ):
+            raise ValueError("has tiles larger than the image")
+
+
+def _check_scans(image: Image.Image, path: Path) -> None:
+    data = path.read_bytes()
+    scans, at = 0, 2
+    for _ in range(_MOST_SEGMENTS):
+        marker = _MARKER.search(data, at)
+        if marker is None or marker[0] == _END:
+            break
+        at = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+        scans += marker[0] == _SCAN
+    else:
+        raise ValueError("absurdly many segments")
+    if scans * image.width * image.height > _MOST_SCANNED_PIXELS:
+        raise ValueError(f"{scans} scans of all its pixels")
+
+
+def reason_of(error: Exception) -> str:
+    """Why an image cannot be read, in a few words, from what Pillow or `open_image` raised."""
+    if isinstance(error, Image.UnidentifiedImageError):
+        return "not an image of a known format"
+    if isinstance(error, Image.DecompressionBombError):
+        return TOO_LARGE
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
+TOO_LARGE = (
+    f"more than {MOST_PIXELS // 1_000_000} million pixels, or {LONGEST_SIDE:,} a side; make it "
+    "smaller"
+)
+
+
 def read_header(path: Path) -> Header:
     """Size and orientation of an image file; cheap.
 
@@ -88,7 +166,7 @@ def read_header(path: Path) -> Header:
         UserError: absent, or not an image that can be read.
     """
     try:
-        with Image.open(path, formats=_FORMATS) as image:
+        with open_image(path, _FORMATS, header_only=True) as image:
             # Where a PNG has no such note up front, getexif() would decode all of it to find one.
             noted = "exif" in image.info or image.format == "TIFF"
             orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if noted else 1
@@ -107,7 +185,7 @@ def load_image(source: ImageSource, background: Sequence[float] | None = None) -
         UserError: absent, damaged, or not an image.
     """
     try:
-        with Image.open(source.path, formats=_FORMATS) as opened:
+        with open_image(source.path, _FORMATS) as opened:
             image = ImageOps.exif_transpose(opened) if source.turn else opened
             planes = _planes(image)
     except Exception as error:  # as above
@@ -157,7 +235,7 @@ def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
         return np.stack([np.asarray(Image.fromarray(plane).reduce(factors)) for plane in planes])
     resized = np.empty((planes.shape[0], height, width), np.uint8)
     for plane, out in zip(planes, resized, strict=True):
-        rows = _mean_over_columns(plane.astype(np.float64), width)
+        rows = _mean_over_columns(plane, width)
         out[...] = np.rint(_mean_over_columns(rows.T, height).T)
     return resized
 
@@ -168,11 +246,16 @@ def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:
     edges = np.arange(count + 1) * (size / count)
     whole = np.minimum(edges.astype(np.int64), size - 1)
     part = edges - whole
-    # The integral from 0 to each edge, of the row as a step function.
-    integral = np.zeros((values.shape[0], size + 1))
-    np.cumsum(values, axis=1, out=integral[:, 1:])
-    at_edges = integral[:, whole] + part * values[:, whole]
-    return np.diff(at_edges, axis=1) * (count / size)
+    means: np.ndarray = np.empty((len(values), count))
+    rows = max(1, _BAND_PIXELS // size)
+    for top in range(0, len(values), rows):
+        band = values[top : top + rows].astype(np.float64)
+        # The integral from 0 to each edge, of the row as a step function.
+        integral = np.zeros((len(band), size + 1))
+        np.cumsum(band, axis=1, out=integral[:, 1:])
+        at_edges = integral[:, whole] + part * band[:, whole]
+        means[top : top + rows] = np.diff(at_edges, axis=1) * (count / size)
+    return means
 
 
 def _planes(image: Image.Image) -> np.ndarray:
@@ -183,31 +266,32 @@ def _planes(image: Image.Image) -> np.ndarray:
     if image.mode == "F":
         raise ValueError("floating-point pixels")
     transparent = image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
-    pixels = np.asarray(image.convert("RGBA" if transparent else "RGB"))
-    planes = np.ascontiguousarray(pixels.transpose(2, 0, 1))
+    mode = "RGBA" if transparent else "RGB"
+    planes: np.ndarray = np.empty((len(mode), image.height, image.width), np.uint8)
+    rows = max(1, _BAND_PIXELS // image.width)
+    for top in range(0, image.height, rows):
+        band = image.crop((0, top, image.width, min(top + rows, image.height)))
+        planes[:, top : top + rows] = np.asarray(band.convert(mode)).transpose(2, 0, 1)
     if transparent and planes[3].min() == 255:
         return planes[:3].copy()
     return planes
 
 
 def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.ndarray:
-    """(4, H, W) straight RGBA to (4, H, W) premultiplied, or to (3, H, W) over the background."""
-    alpha = planes[3].astype(np.float32) / 255
-    colours = planes[:3] * alpha
-    if background is None:
-        premultiplied = planes.copy()
-        premultiplied[:3] = np.rint(colours)
-        return premultiplied
-    behind = 255 * np.asarray(background, np.float32)[:, None, None]
-    return np.rint(colours + (1 - alpha) * behind).clip(0, 255).astype(np.uint8)
+    """(4, H, W) straight RGBA to (4, H, W) premultiplied, or to (3, H, W) over the background.
 
-
-def is_file(path: Path) -> bool:
-    """Whether a file is there; a name that a damaged file gave may be no name at all."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
+    Changes ``planes``.
+    """
+    rows = max(1, _BAND_PIXELS // planes.shape[2])
+    for top in range(0, planes.shape[1], rows):
+        band = planes[:, top : top + rows]
+        alpha = band[3].astype(np.float32) / 255
+        colours = band[:3] * alpha
+        if background is not None:
+            behind = 255 * np.asarray(background, np.float32)[:, None, None]
+            colours = (colours + (1 - alpha) * behind).clip(0, 255)
+        band[:3] = np.rint(colours)
+    return planes if background is None else planes[:3].copy()
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
@@ -215,8 +299,6 @@ def _unreadable(path: Path, error: Exception) -> UserError:
         return UserError(f"{path}: no such image")
     if isinstance(error, PermissionError):
         return UserError(f"{path}: may not be read (permissions)")
-    if isinstance(error, Image.UnidentifiedImageError):
-        reason = "not an image of a known format"
-    else:
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-    return UserError(f"{path}: cannot be decoded ({reason}); replace the file or remove it")
+    return UserError(
+        f"{path}: cannot be decoded ({reason_of(error)}); replace the file or remove it"
+    )

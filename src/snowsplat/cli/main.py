@@ -130,6 +130,8 @@ def _say_notes_and_warnings_in_one_line() -> None:
         _tell(f"warning: {message}")
 
     warnings.showwarning = show
+    # Of a damaged photo Pillow notes each word that it could not read; we say once what it costs.
+    warnings.filterwarnings("ignore", module=r"PIL\.")
     logger = logging.getLogger("snowsplat")
     if not logger.handlers:
         logger.addHandler(_Notes())

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
+from snowsplat.capture.decode import reason_of
 from snowsplat.errors import UserError
 from snowsplat.files import shown
 from snowsplat.photos.photo_files import Header, open_image, turned
@@ -28,8 +29,7 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
             image = ImageOps.exif_transpose(opened).convert("RGBA")
     except Exception as error:  # Pillow's parsers raise anything on damaged files
         raise UserError(
-            f"{shown(path)}: the mask cannot be decoded ({' '.join(str(error).split())[:120]}); "
-            "replace or remove it"
+            f"{shown(path)}: the mask cannot be decoded ({reason_of(error)}); replace or remove it"
         ) from None
     stored, upright = (photo.width, photo.height), photo.size(None)
     if not noted and image.size == stored:

@@ -16,6 +16,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image, ImageOps
 
+from snowsplat.capture import decode as capture_decode
+from snowsplat.capture.decode import reason_of
 from snowsplat.photos.exif import ORIENTATION, Notes, notes_for_copy, read_notes
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
@@ -87,7 +89,7 @@ def read_header(path: Path) -> Header:
         Unusable: not an image of a known format, or too small.
     """
     try:
-        with open_image(path) as image:
+        with open_image(path, header_only=True) as image:
             # Where a PNG has no such note up front, getexif() would decode all of it to find one.
             noted = "exif" in image.info or image.format == "TIFF"
             exif = image.getexif() if noted else Image.Exif()
@@ -105,7 +107,7 @@ def read_header(path: Path) -> Header:
                 notes=read_notes(exif, width, height),
             )
     except Exception as error:  # Pillow's parsers raise anything on damaged files
-        raise Unusable(f"cannot be decoded ({_reason(error)})") from None
+        raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
     return header
@@ -130,12 +132,12 @@ def _bits(path: Path, image: Image.Image) -> int:
     return 8
 
 
-def open_image(path: Path) -> Image.Image:
-    """A lazily read image of a format that photos have."""
+def open_image(path: Path, *, header_only: bool = False) -> Image.Image:
+    """A lazily read image of a format that photos have; raises as `capture.decode.open_image`."""
     from pillow_heif import register_heif_opener
 
     register_heif_opener()
-    return Image.open(path, formats=_FORMATS)
+    return capture_decode.open_image(path, _FORMATS, header_only=header_only)
 
 
 def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
@@ -148,7 +150,7 @@ def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
         with open_image(path) as opened:
             image = _eight_bits(ImageOps.exif_transpose(opened))
     except Exception as error:  # as above
-        raise Unusable(f"cannot be decoded ({_reason(error)})") from None
+        raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if image.mode == "RGBA" and image.getchannel("A").getextrema()[0] == 255:
         image = image.convert("RGB")
     return resized(image, header.size(longest))
@@ -164,7 +166,7 @@ def decode_small(path: Path, side: int) -> Image.Image:
             opened.draft("RGB", scaled_size(opened.width, opened.height, 2 * side))
             return _eight_bits(opened)
     except Exception as error:  # as above
-        raise Unusable(f"cannot be decoded ({_reason(error)})") from None
+        raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
 
 
 def _eight_bits(image: Image.Image) -> Image.Image:
@@ -192,7 +194,7 @@ def save(image: Image.Image, path: Path, source: Path | None = None) -> None:
     """
     extra: dict[str, bytes] = {}
     if source is not None:
-        with open_image(source) as original:
+        with open_image(source, header_only=True) as original:
             exif = notes_for_copy(original.getexif(), *image.size)
             profile = original.info.get("icc_profile")
             coloured = original.mode not in ("CMYK", "LAB", "I;16")
@@ -219,11 +221,3 @@ def turned(image: Image.Image, orientation: int) -> Image.Image:
     exif = image.getexif()
     exif[ORIENTATION] = orientation
     return ImageOps.exif_transpose(image)
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, Image.UnidentifiedImageError):
-        return "not an image of a known format"
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.capture.decode import resize_area
+from snowsplat.capture.decode import open_image, reason_of, resize_area
 from snowsplat.capture.images import available_memory
 from snowsplat.errors import UserError
 from snowsplat.files import atomic_path
@@ -211,11 +211,11 @@ def _undistort_mask(capture: Path, job: _Job, opaque: np.ndarray | None) -> bool
 
 def _opened(path: Path, job: _Job) -> Image.Image:
     try:
-        image = Image.open(path, formats=list(_SAVING))
+        image = open_image(path, list(_SAVING))
     except FileNotFoundError:
         raise UserError(f"{path}: no such image; its pose was found before it went away") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error}); replace it") from None
+    except Exception as error:  # Pillow's parsers raise anything on damaged files
+        raise UserError(f"{path}: cannot be read ({reason_of(error)}); replace it") from None
     if image.size != job.camera_size:
         image.close()
         raise UserError(
@@ -228,8 +228,8 @@ def _opened(path: Path, job: _Job) -> Image.Image:
 def _decoded(opened: Image.Image, path: Path) -> Image.Image:
     try:
         opened.load()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be decoded ({error}); replace it") from None
+    except Exception as error:  # as above
+        raise UserError(f"{path}: cannot be decoded ({reason_of(error)}); replace it") from None
     return opened
 
 
