@@ -17,6 +17,7 @@ import numpy as np
 from snowsplat.errors import UserError
 
 _HEADER_LIMIT = 1 << 20
+_LINE_LIMIT, _NUMBER_LIMIT = 1 << 12, 1 << 10  # bytes of a row, and of each number in it
 _CHUNK_BYTES = 4 << 20  # rows are converted in pieces that stay in the cache
 _SCALARS = {
     "char": "i1",
@@ -95,7 +96,8 @@ class PlyTable:
         return rows
 
     def _read_ascii(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
-        lines = (file.readline() for _ in range(count))
+        limit = _LINE_LIMIT + _NUMBER_LIMIT * len(self.columns)
+        lines = (self._line(file, limit) for _ in range(count))
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # numpy warns of no rows; the count below tells it
@@ -116,6 +118,12 @@ class PlyTable:
             for column, name in enumerate(self.columns):
                 rows[name] = values[:, column]
         return rows
+
+    def _line(self, file: BinaryIO, limit: int) -> bytes:
+        line = file.readline(limit)
+        if len(line) == limit:
+            raise UserError(f"{self.path}: a row of the PLY file is far too long; export it again")
+        return line
 
     def _truncated(self) -> UserError:
         return _truncated(self.path)

@@ -24,10 +24,10 @@ from snowsplat.capture.colmap_files import (
     read_model,
     read_points,
 )
-from snowsplat.capture.decode import is_file
 from snowsplat.capture.points_ply import read_points as read_points_ply
 from snowsplat.errors import UserError
 from snowsplat.geometry import rotation_from_quat
+from snowsplat.untrusted import inside, is_file
 
 logger = logging.getLogger(__name__)
 
@@ -86,6 +86,11 @@ def read_colmap(
         )
     posed, missing = [], []
     for image in model.images:
+        if inside(image_folder, image.name) is None:
+            raise UserError(
+                f"{folder}: names the image {image.name[:80]!r}, which is not in {image_folder}; "
+                "run COLMAP again, with the images in one folder"
+            )
         if not is_file(image_folder / image.name):
             missing.append(image.name)
             continue
@@ -101,7 +106,7 @@ def read_colmap(
     if not posed:
         raise UserError(
             f"{image_folder}: none of the {len(missing)} images of the model is here (the first is "
-            f"{missing[0]!r}); name the right folder with --images"
+            f"{missing[0][:80]!r}); name the right folder with --images"
         )
     if missing:
         logger.warning(
@@ -109,7 +114,7 @@ def read_colmap(
             image_folder,
             len(missing),
             len(model.images),
-            missing[0],
+            missing[0][:80],
         )
     points = read_points(folder)
     ply = folder / "points3D.ply"
@@ -129,13 +134,15 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
     colmap = model.cameras.get(image.camera_id)
     if colmap is None:
         raise UserError(
-            f"{model.folder}: image {image.name} has camera {image.camera_id}, which the model "
-            "does not hold; copy the model again"
+            f"{model.folder}: image {image.name[:80]} has camera {image.camera_id}, which the "
+            "model does not hold; copy the model again"
         )
     fx, fy, cx, cy = _pinhole(model.folder, colmap)
     quat, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
     if not (0.5 < float(quat.norm()) < 2.0 and float(translation.abs().max()) < 1e15):
-        raise UserError(f"{model.folder}: the pose of image {image.name} is damaged; copy it again")
+        raise UserError(
+            f"{model.folder}: the pose of image {image.name[:80]} is damaged; copy it again"
+        )
     pose = torch.cat([rotation_from_quat(quat), translation[:, None]], 1)
     return Camera(colmap.width, colmap.height, fx, fy, cx, cy, pose)
 

@@ -6,12 +6,12 @@ promise must fit into the file before anything is allocated.
 
 from __future__ import annotations
 
-import io
 import logging
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,9 @@ CAMERA_MODELS = (
     ("THIN_PRISM_FISHEYE", 12),
 )
 _MAX_SIDE = 1_000_000  # pixels; anything larger is a damaged file
+_MOST_IMAGES = 200_000  # and cameras; each takes some 400 bytes of memory
+_MOST_WORDS = 20  # of a camera
+_LINES_AT_ONCE, _PIECE = 50_000, 1 << 20  # of a text, characters of a line
 
 _CAMERA_HEAD = struct.Struct("<IiQQ")  # id, model, width, height
 _IMAGE_HEAD = struct.Struct("<I4d3dI")  # id, quaternion wxyz, translation, camera id; then its name
@@ -184,6 +187,11 @@ def _damaged(path: Path, what: str) -> UserError:
     return UserError(f"{path}: damaged: {what}; copy the file again or run COLMAP again")
 
 
+def _check_number(path: Path, kind: str, count: int) -> None:
+    if count > _MOST_IMAGES:
+        raise UserError(f"{path}: more than {_MOST_IMAGES:,} {kind}, the most that I take")
+
+
 def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
@@ -199,6 +207,7 @@ def _checked_camera(path: Path, model: str, width: int, height: int, params: tup
 
 def _read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
     cursor = _Cursor(path, "cameras", _CAMERA_HEAD.size + 3 * 8)
+    _check_number(path, "cameras", cursor.count)
     cameras = {}
     for _ in range(cursor.count):
         camera_id, number, width, height = cursor.take(_CAMERA_HEAD)
@@ -216,6 +225,7 @@ def _read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
 
 def _read_images_binary(path: Path) -> list[ColmapImage]:
     cursor = _Cursor(path, "images", _IMAGE_HEAD.size + 1 + _COUNT.size)
+    _check_number(path, "images", cursor.count)
     images = []
     for _ in range(cursor.count):
         _, *pose, camera_id = cursor.take(_IMAGE_HEAD)
@@ -258,10 +268,23 @@ def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text file, without comments."""
-    text = _read(path).decode("utf-8", errors="surrogateescape")
-    for line in io.StringIO(text):
-        if not line.startswith("#"):
-            yield line.strip()
+    try:
+        with open(path, encoding="utf-8", errors="surrogateescape") as file:
+            for line in file:
+                if not line.startswith("#"):
+                    yield line.strip()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def _count_words(line: str) -> int:
+    """How many `str.split` gives, which takes 60 bytes of memory for each: piece by piece."""
+    count = 0
+    for start in range(0, len(line), _PIECE):
+        piece = line[start : start + _PIECE]
+        goes_on = start > 0 and not line[start - 1].isspace() and not piece[0].isspace()
+        count += len(piece.split()) - goes_on
+    return count
 
 
 def _warn_if_fewer(path: Path, kind: str, count: int) -> None:
@@ -279,15 +302,16 @@ def _read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
     counts = dict(CAMERA_MODELS)
     cameras = {}
     for line in filter(None, _lines(path)):
-        words = line.split()
+        words = line.split(maxsplit=_MOST_WORDS)
         try:
             camera_id, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
             raise _damaged(path, f"no camera in the line {line[:60]!r}") from None
         if len(params) != counts.get(model, len(params)):
-            raise _damaged(path, f"{len(params)} parameters for camera model {model}")
+            raise _damaged(path, f"{len(params)} parameters for camera model {model[:40]}")
         cameras[camera_id] = _checked_camera(path, model, width, height, params)
+        _check_number(path, "cameras", len(cameras))
     _warn_if_fewer(path, "cameras", len(cameras))
     return cameras
 
@@ -303,29 +327,34 @@ def _read_images_text(path: Path) -> list[ColmapImage]:
         except (ValueError, IndexError):
             raise _damaged(path, f"no image in the line {line[:60]!r}") from None
         images.append(image)
+        _check_number(path, "images", len(images))
         observations = next(lines, "")  # x, y, point id of each; the line may be empty
-        if len(observations.split()) % 3:
-            raise _damaged(path, f"the line after image {image.name} should be its observations")
+        if _count_words(observations) % 3:
+            name = image.name[:80]
+            raise _damaged(path, f"the line after image {name} should be its observations")
     _warn_if_fewer(path, "images", len(images))
     return images
 
 
 def _read_points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    # Rows have tracks of different lengths; numpy's reader is fast and takes the first columns.
-    lines = [line for line in _lines(path) if line]
-    if not lines:
-        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
-    try:
-        values = np.loadtxt(
-            lines, np.float64, comments=None, usecols=(1, 2, 3, 4, 5, 6, 7), ndmin=2
-        )
-    except (ValueError, IndexError) as error:
-        raise _damaged(path, f"no points ({' '.join(str(error).split())[:90]})") from None
-    _warn_if_fewer(path, "points", len(values))
-    rgb = values[:, 3:6]
-    if not ((rgb >= 0) & (rgb <= 255)).all():
-        raise _damaged(path, "a colour is outside 0..255")
-    return values[:, :3], rgb.astype(np.uint8)
+    # Rows have tracks of different lengths; numpy's reader is fast and takes the first columns, of
+    # which we give it no more: it would make words of the whole track.
+    lines = (" ".join(line.split(maxsplit=8)[:8]) for line in _lines(path) if line)
+    xyz, rgb = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
+    while piece := list(islice(lines, _LINES_AT_ONCE)):
+        try:
+            values = np.loadtxt(
+                piece, np.float64, comments=None, usecols=(1, 2, 3, 4, 5, 6, 7), ndmin=2
+            )
+        except (ValueError, IndexError) as error:
+            raise _damaged(path, f"no points ({' '.join(str(error).split())[:90]})") from None
+        colours = values[:, 3:6]
+        if not ((colours >= 0) & (colours <= 255)).all():
+            raise _damaged(path, "a colour is outside 0..255")
+        xyz.append(values[:, :3].copy())
+        rgb.append(colours.astype(np.uint8))
+    _warn_if_fewer(path, "points", sum(map(len, xyz)))
+    return np.concatenate(xyz), np.concatenate(rgb)
 
 
 # Writing

@@ -10,9 +10,10 @@ from pathlib import Path
 
 from snowsplat.capture.capture import Capture, Points, PosedImage, View, scene_extent
 from snowsplat.capture.colmap import find_models, read_colmap
-from snowsplat.capture.decode import IMAGE_SUFFIXES, Header, ImageSource, is_file, read_header
+from snowsplat.capture.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
 from snowsplat.capture.nerf import find_transforms, read_nerf
 from snowsplat.errors import UserError
+from snowsplat.untrusted import is_file
 
 logger = logging.getLogger(__name__)
 
@@ -239,6 +240,8 @@ def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]
     """Names may be whole, without their folder, or without their ending, as long as it is clear."""
     if isinstance(test_list, str | Path):
         try:
+            if Path(test_list).exists() and not is_file(Path(test_list)):
+                raise ValueError("no file")
             lines = Path(test_list).read_text(encoding="utf-8").splitlines()
         except (OSError, ValueError) as error:
             raise UserError(
@@ -258,6 +261,6 @@ def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]
             problem = (
                 "is the name of several images" if matches else "is not an image of the capture"
             )
-            raise UserError(f"the list of test images: {line!r} {problem}")
+            raise UserError(f"the list of test images: {line[:80]!r} {problem}")
         tested |= matches
     return tested

@@ -12,9 +12,10 @@ in OpenCV axes. Worlds are taken as they are, neither centred nor scaled.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
+from collections import ChainMap
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,10 +26,11 @@ from snowsplat.camera import Camera
 from snowsplat.capture.capture import Points, PosedImage, safe_name
 from snowsplat.capture.colmap import find_models
 from snowsplat.capture.colmap_files import make_points, read_points
-from snowsplat.capture.decode import IMAGE_SUFFIXES, is_file, read_header
+from snowsplat.capture.decode import IMAGE_SUFFIXES, read_header
 from snowsplat.capture.points_ply import read_points as read_points_ply
 from snowsplat.errors import UserError
 from snowsplat.geometry import invert_rigid, transform_points
+from snowsplat.untrusted import inside, is_file, read_json
 
 logger = logging.getLogger(__name__)
 
@@ -66,8 +68,10 @@ def read_nerf(files: list[Path], images: str) -> tuple[list[PosedImage], Points 
     posed: dict[str, PosedImage] = {}
     missing: list[str] = []
     frame_count = 0
+    first_scene: _Json = {}
     for index, path in enumerate(files):
         scene = _read_json(path)
+        first_scene = first_scene or scene
         split: _Split | None = None
         if len(files) > 1:
             split = "train" if index == 0 else "test"
@@ -77,12 +81,13 @@ def read_nerf(files: list[Path], images: str) -> tuple[list[PosedImage], Points 
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
                 raise UserError(f"{where} has no file_path; export the file again")
             frame_count += 1
-            file = _find_file(path.parent, frame["file_path"], images)
+            file = _find_file(where, path.parent, frame["file_path"], images)
             if file is None:
-                missing.append(frame["file_path"])
+                missing.append(frame["file_path"][:80])
                 continue
-            _check_model(where, {**scene, **frame})
-            camera = _camera(where, {**scene, **frame}, path.parent / file)
+            values = ChainMap(frame, scene)
+            _check_model(where, values)
+            camera = _camera(where, values, path.parent / file)
             name = safe_name(file)
             first, slash, _ = file.partition("/")
             folder = path.parent / first if first and slash else (path.parent / file).parent
@@ -111,15 +116,15 @@ def read_nerf(files: list[Path], images: str) -> tuple[list[PosedImage], Points 
             frame_count,
             missing[0],
         )
-    return list(posed.values()), _points(files[0].parent, _read_json(files[0])), shown
+    return list(posed.values()), _points(files[0].parent, first_scene), shown
 
 
 def _read_json(path: Path) -> _Json:
     try:
-        scene = json.loads(path.read_text(encoding="utf-8-sig"))
+        scene = read_json(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (ValueError, RecursionError) as error:  # not JSON, or not even text
+    except ValueError as error:  # not JSON, or not even text
         raise UserError(
             f"{path}: not a whole JSON file ({str(error)[:80]}); copy it again"
         ) from None
@@ -128,7 +133,7 @@ def _read_json(path: Path) -> _Json:
     return scene
 
 
-def _check_model(where: str, values: _Json) -> None:
+def _check_model(where: str, values: Mapping[str, Any]) -> None:
     model = str(values.get("camera_model", "PINHOLE")).upper()
     if model not in _PINHOLE_MODELS or values.get("is_fisheye"):
         kind = model if model not in _PINHOLE_MODELS else "fisheye"
@@ -148,8 +153,20 @@ def _named_splits(scene: _Json) -> dict[str, _Split]:
     return splits
 
 
-def _find_file(root: Path, name: str, images: str) -> str | None:
+def _at_home(where: str, root: Path, name: str) -> Path:
+    """``root / name``, where the name does not lead out of the folder ``root``."""
+    path = inside(root, name.replace("\\", "/"))
+    if path is None:
+        raise UserError(
+            f"{where} names {name[:80]!r}, which is not in the folder of the file; copy it there "
+            "and name it from there"
+        )
+    return path
+
+
+def _find_file(where: str, root: Path, name: str, images: str) -> str | None:
     """The image that a frame names, as a path from ``root``; None if it is absent."""
+    _at_home(where, root, name)
     name = name.replace("\\", "/").removeprefix("./")
     if images != "images" and name.startswith("images/"):
         name = f"{images}/{name.removeprefix('images/')}"
@@ -163,7 +180,7 @@ def _mask(where: str, root: Path, frame: _Json) -> Path | None:
     name = frame.get("mask_path")
     if not isinstance(name, str) or not name:
         return None
-    path = root / name.replace("\\", "/")
+    path = _at_home(where, root, name)
     if not is_file(path):
         raise UserError(
             f"{where} names the mask {path}, which is absent; add it or remove its entry"
@@ -171,7 +188,7 @@ def _mask(where: str, root: Path, frame: _Json) -> Path | None:
     return path
 
 
-def _number(where: str, values: _Json, key: str) -> float | None:
+def _number(where: str, values: Mapping[str, Any], key: str) -> float | None:
     value = values.get(key)
     if value is None:
         return None
@@ -182,7 +199,7 @@ def _number(where: str, values: _Json, key: str) -> float | None:
     return float(value)
 
 
-def _camera(where: str, values: _Json, image: Path) -> Camera:
+def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
     """The camera of a frame; ``values`` are the file's, overridden by the frame's own."""
     distortion = {key: _number(where, values, key) for key in _DISTORTION}
     if any(distortion.values()):
@@ -216,7 +233,7 @@ def _camera(where: str, values: _Json, image: Path) -> Camera:
     )
 
 
-def _focal(where: str, values: _Json, axis: str, size: int) -> float | None:
+def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
     """Focal length in pixels along an axis, from any of its spellings."""
     pixels = _number(where, values, f"fl_{axis}")
     if pixels is not None:
@@ -232,7 +249,7 @@ def _focal(where: str, values: _Json, axis: str, size: int) -> float | None:
     return 0.5 * size / math.tan(0.5 * angle)
 
 
-def _pose(where: str, frame: _Json) -> torch.Tensor:
+def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
     """cam_from_world (3, 4) float64, OpenCV axes, of a frame's transform_matrix."""
     try:
         matrix = np.array(frame["transform_matrix"], np.float64)
@@ -262,7 +279,9 @@ def _points(root: Path, scene: _Json) -> Points | None:
     since.
     """
     named = scene.get("ply_file_path")
-    path = root / named.replace("\\", "/") if isinstance(named, str) else root / "points3d.ply"
+    path = root / "points3d.ply"
+    if isinstance(named, str):
+        path = _at_home(f"{root}: ply_file_path", root, named)
     if is_file(path):
         return make_points(path, *read_points_ply(path))
     if isinstance(named, str):
@@ -275,7 +294,7 @@ def _points(root: Path, scene: _Json) -> Points | None:
         transform = torch.tensor(scene["applied_transform"], dtype=torch.float64)[:3]
         scale = float(scene.get("applied_scale", 1.0))
         xyz = transform_points(transform, points.xyz.to(torch.float64)) * scale
-    except (TypeError, ValueError, IndexError, RuntimeError):
+    except (TypeError, ValueError, IndexError, RuntimeError, OverflowError):
         logger.warning("%s: applied_transform makes no sense; COLMAP's points are left out", root)
         return None
     return make_points(models[0], xyz.numpy(), points.rgb.numpy())
