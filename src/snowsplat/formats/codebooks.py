@@ -59,13 +59,16 @@ def palette_for(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     cluster = _nearest(rows, coarse)
     order = np.argsort(cluster, kind="stable")
     ends = np.cumsum(np.bincount(cluster, minlength=len(coarse)))
-    # Shares by rounding the running total, so that they add up to the count.
-    shares = np.diff(np.rint(ends / len(rows) * count).astype(int), prepend=0)
+    # One for each cluster; of the others shares by rounding the running total, so that all of them
+    # add up to the count.
+    sizes = np.diff(ends, prepend=0)
+    spare = count - np.count_nonzero(sizes)
+    shares = (sizes > 0) + np.diff(np.rint(ends / len(rows) * spare).astype(int), prepend=0)
     parts, labels, start = [], np.empty(len(rows), np.int64), 0
     for members, share in zip(np.split(order, ends[:-1]), shares, strict=True):
         if not len(members):
             continue
-        own = _kmeans(rows[members], max(1, share), random)
+        own = _kmeans(rows[members], share, random)
         labels[members] = start + _nearest(rows[members], own)
         parts.append(own)
         start += len(own)

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 
 from snowsplat.geometry import rotation_from_quat
+from snowsplat.untrusted import parse_json
 
 MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
-_JSON_LIMIT = 16 << 20
+_MOST_NODES = 1 << 16  # each takes some microseconds
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 #: numpy's name, and by what a normalised value is divided.
 _COMPONENTS = {
@@ -55,11 +56,11 @@ def unpack(data: bytes) -> tuple[dict[str, Any], memoryview]:
             raise Damaged("has a chunk that is larger than the file")
         chunks.append((kind, memoryview(data)[position + 8 : position + 8 + size]))
         position += 8 + size
-    if not chunks or chunks[0][0] != _JSON or len(chunks[0][1]) > _JSON_LIMIT:
+    if not chunks or chunks[0][0] != _JSON:
         raise Damaged("does not begin with a chunk of JSON")
     try:
-        document = json.loads(bytes(chunks[0][1]))
-    except (ValueError, RecursionError):
+        document = parse_json(bytes(chunks[0][1]))
+    except ValueError:
         document = None
     if not isinstance(document, dict):
         raise Damaged("its JSON is none")
@@ -124,6 +125,8 @@ def meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarra
     else:
         inner = {child for node in nodes for child in node.get("children", [])}
         roots = [index for index in range(len(nodes)) if index not in inner]
+    if max(len(nodes), len(roots)) > _MOST_NODES:
+        raise Damaged("has more nodes than I take")
     waiting = deque((root, np.eye(4)) for root in roots)
     visits = 0
     while waiting:
@@ -144,9 +147,10 @@ def _local(node: dict[str, Any]) -> np.ndarray:
     """(4, 4) ``parent_from_node``."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # column-major
-    x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
     local = np.eye(4)
-    local[:3, :3] = rotation_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64)).numpy()
+    if "rotation" in node:
+        x, y, z, w = (float(v) for v in node["rotation"])
+        local[:3, :3] = rotation_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64)).numpy()
     local[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
     local[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
     return local

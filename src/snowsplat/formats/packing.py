@@ -19,6 +19,8 @@ logger = logging.getLogger(__name__)
 #: means, log_scales, quats, opacity_logits, sh_dc, sh_rest.
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
+#: Gaussians that a file of any size may hold.
+ALWAYS_ALLOWED = 1 << 16
 _FLAT = 1e-12  # instead of a standard deviation of 0, which has no logarithm
 
 
@@ -32,6 +34,22 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def check_count(path: Path, count: int, file_size: int) -> None:
+    """Hold what a packed file promises against its size, before memory is taken for it.
+
+    Real scenes take five bytes a Gaussian or more in any format; of equal ones a few bytes can be
+    millions, and each takes up to 600 bytes of memory while it is read.
+
+    Raises:
+        UserError: more Gaussians than bytes, and than a file may always have.
+    """
+    if count > max(ALWAYS_ALLOWED, file_size):
+        raise UserError(
+            f"{path}: a file of {file_size} bytes that promises {count} Gaussians; it is damaged "
+            "or made to do harm"
+        )
 
 
 def to_arrays(path: Path, gaussians: Gaussians) -> Arrays:

@@ -40,8 +40,6 @@ _PALETTE_LIMIT = 1 << 16  # labels have 16 bits
 _PALETTE_COLUMNS = 64
 _SH_LIMIT = np.float32(1e6)
 _SIDE_LIMIT = 16_383  # of a WebP picture
-# A real scene takes five bytes a Gaussian or more; less than 1/8 is a picture of nothing, blown up.
-_GAUSSIANS_A_BYTE, _ALWAYS_ALLOWED = 8, 1 << 18
 _STEPS = np.arange(256) / 255
 
 
@@ -63,8 +61,7 @@ def read_sog(path: Path | str) -> Gaussians:
     try:
         with Bundle(path) as files:
             layout = _layout(files.meta())
-            if layout.count > _ALWAYS_ALLOWED + _GAUSSIANS_A_BYTE * files.size:
-                raise Damaged(f"promises {layout.count} Gaussians in {files.size} bytes")
+            packing.check_count(path, layout.count, files.bytes_with(layout.files.values()))
             arrays = _decode(files, layout)
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None

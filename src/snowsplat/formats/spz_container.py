@@ -16,6 +16,7 @@ from pathlib import Path
 import zstandard
 
 from snowsplat.errors import UserError
+from snowsplat.formats.packing import check_count
 
 #: Bits of `Header.flags`.
 ANTIALIASED = 1
@@ -26,10 +27,6 @@ _GZIP = b"\x1f\x8b"
 _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fraction, flags, streams
 _HEADER_BYTES = 32  # of version 4
 _EXTENSION_LIMIT = 1 << 16
-# Real scenes are at most twice as large when unpacked, uniform ones a thousand times: a file may
-# promise this many bytes, or so many times its size, before it is refused as one made to do harm.
-_UNPACKED_LIMIT = 64 << 20
-_UNPACKED_RATIO = 64
 
 _GZIP_LEVEL = 4
 _ZSTD_LEVEL = 5
@@ -120,12 +117,7 @@ def _header(path: Path, head: bytes, file_size: int) -> Header:
         raise UserError(f"{path}: version {header.version} of .spz; I read 1 to 4")
     if header.sh_degree > 4 or header.fractional_bits > 31:
         raise _damaged(path)
-    size = sum(header.columns()) * header.count
-    if size > max(_UNPACKED_LIMIT, _UNPACKED_RATIO * file_size):
-        raise UserError(
-            f"{path}: an .spz file of {file_size} bytes that promises {header.count} Gaussians; "
-            "it is damaged or made to do harm"
-        )
+    check_count(path, header.count, file_size)
     return header
 
 
@@ -151,7 +143,8 @@ def _unpack_streams(path: Path, data: bytes, header: Header) -> Contents:
             raise _damaged(path)
         columns.append(column)
         entry, start = entry + 16, start + packed
-    return Contents(header, columns, data[_HEADER_BYTES:table] if header.flags & EXTENDED else b"")
+    end = min(table, _HEADER_BYTES + _EXTENSION_LIMIT)
+    return Contents(header, columns, data[_HEADER_BYTES:end] if header.flags & EXTENDED else b"")
 
 
 def pack(header: Header, columns: Sequence[bytes]) -> bytes:
