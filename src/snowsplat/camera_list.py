@@ -6,7 +6,7 @@ pixels. The principal point is not in it: it is taken as the middle of the pictu
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from snowsplat.camera import Camera
 from snowsplat.errors import UserError
 from snowsplat.files import write_json
 from snowsplat.geometry import quat_from_rotation, rotation_from_quat
+from snowsplat.untrusted import read_json
 
 _LARGEST = 100_000  # pixels along a side
 
@@ -53,7 +54,7 @@ def read_cameras(path: Path) -> tuple[list[str], list[Camera]]:
         UserError: absent, damaged, or none in it.
     """
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        entries = read_json(path)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; name a list of cameras (JSON)") from None
     except (ValueError, OSError):
@@ -80,7 +81,7 @@ def _camera(entry: dict[str, Any]) -> Camera:
     error = rotation @ rotation.T - torch.eye(3, dtype=torch.float64)
     is_one = float(error.abs().max()) < 1e-3 and float(torch.linalg.det(rotation)) > 0
     fx, fy = float(entry["fx"]), float(entry["fy"])
-    if not (is_one and bool(position.isfinite().all()) and max(fx, fy) < float("inf")):
+    if not (is_one and bool(position.isfinite().all()) and math.isfinite(fx + fy)):
         raise ValueError("not a rotation, or not finite")
     if max(width, height) > _LARGEST:
         raise ValueError("too large")

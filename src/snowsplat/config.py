@@ -9,6 +9,7 @@ from snowsplat.density import AdaptiveDensity, DensityConfig, McmcDensity
 from snowsplat.errors import UserError
 from snowsplat.optim import LearningRates
 from snowsplat.schedule import Schedule, When
+from snowsplat.untrusted import from_json
 
 
 @dataclass(frozen=True)
@@ -124,16 +125,16 @@ def config_from_json(values: dict[str, Any]) -> TrainConfig:
     """What `config_to_json` wrote down.
 
     Raises:
-        UserError: of another version of the program.
+        UserError: of another version of the program, or damaged.
     """
-    controls = {kind.__name__: kind for kind in (AdaptiveDensity, McmcDensity)}
-    values = dict(values)
+    controls: dict[str, Any] = {kind.__name__: kind for kind in (AdaptiveDensity, McmcDensity)}
     try:
-        density = controls[values.pop("density_control")](**values.pop("density"))
-        rates = LearningRates(**values.pop("learning_rates"))
-        lists = {name: tuple(v) for name, v in values.items() if isinstance(v, (list, tuple))}
-        return TrainConfig(**(values | lists), density=density, learning_rates=rates)
-    except (KeyError, TypeError):
+        values = dict(values)
+        density = from_json(controls[values.pop("density_control")], values.pop("density"))
+        rates = from_json(LearningRates, values.pop("learning_rates"))
+        config = from_json(TrainConfig, values)
+        return replace(config, density=density, learning_rates=rates)
+    except (KeyError, TypeError, ValueError):
         raise UserError(
             "this configuration was written by another version of snowsplat; go on with that one"
         ) from None

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from snowsplat.files import write_json
+from snowsplat.untrusted import from_json, read_json
 
 #: Most points of a curve; when there are more, neighbours become one.
 MOST_POINTS = 400
@@ -99,13 +99,15 @@ class History:
         to go on with a training.
         """
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            stretches = [Stretch(**stretch) for stretch in values["stretches"]]
-            measured = [Measured(**figures) for figures in values["measured"]]
+            values = read_json(path)
+            stretches = [from_json(Stretch, stretch) for stretch in values["stretches"]]
+            measured = [from_json(Measured, figures) for figures in values["measured"]]
+            if any(stretch.steps < 1 for stretch in stretches):
+                raise ValueError("of no steps")
             return cls(
                 [stretch for stretch in stretches if stretch.step <= last_step],
                 [figures for figures in measured if figures.step <= last_step],
                 max(1, int(values["stride"])),
             )
-        except (OSError, ValueError, TypeError, KeyError):
+        except (OSError, ValueError, TypeError, KeyError, OverflowError):
             return cls()

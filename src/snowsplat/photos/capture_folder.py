@@ -26,10 +26,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from snowsplat.errors import UserError
 from snowsplat.files import remove_temporaries
-from snowsplat.photos.inputs import GatherOptions, find_inputs, gather
+from snowsplat.photos.inputs import Gathered, GatherOptions, find_inputs, gather
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.sfm import SfmOptions, describe_model, estimate_poses
 from snowsplat.photos.stages import Outcome, Stages
+from snowsplat.untrusted import from_json, inside
 
 if TYPE_CHECKING:
     from snowsplat.photos.progress import Report
@@ -136,7 +137,7 @@ def _run(
         ["input", "distorted/masks"],
         gather_photos,
     )
-    photos = [_photo(values) for values in outcomes["photos"].result["photos"]]
+    photos = _photos(folder, outcomes["photos"].result)
 
     def find_poses(report: Report) -> dict[str, Any]:
         if options.skip_matching:
@@ -296,9 +297,15 @@ def _fingerprint(files: Sequence[Path]) -> str:
     return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
 
 
-def _photo(values: dict[str, Any]) -> Photo:
-    location = values["location"]
-    return Photo(**(values | {"location": None if location is None else tuple(location)}))
+def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
+    """Raises UserError: they are not what was written down."""
+    try:
+        photos = from_json(Gathered, gathered).photos
+        if not all(inside(folder / "input", photo.name) for photo in photos):
+            raise ValueError("a photo elsewhere")
+    except ValueError:
+        raise UserError(f"{folder / RECORD}: damaged; delete it to begin anew") from None
+    return photos
 
 
 def _plain(options: CaptureOptions) -> dict[str, Any]:

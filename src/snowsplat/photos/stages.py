@@ -11,13 +11,14 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from snowsplat import __version__
 from snowsplat.errors import UserError
 from snowsplat.files import write_json
+from snowsplat.untrusted import from_json, read_json
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,18 @@ class Outcome:
     result: dict[str, Any]
     seconds: float  # what the stage took when it was done
     again: bool  # finished in an earlier run, and left as it is
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What is written down of a finished stage."""
+
+    key: str  # a hash of the settings, and of all that came before
+    settings: dict[str, Any]
+    outputs: dict[str, int]  # how many files each has
+    seconds: float
+    result: dict[str, Any]
+    digest: str = ""  # of the result: what was damaged may still be JSON. None in older files
 
 
 class Stages:
@@ -43,8 +56,11 @@ class Stages:
         self._parent = ""
         if file.is_file():
             try:
-                whole = json.loads(file.read_text(encoding="utf-8"))
-                self._records = dict(whole.pop("stages"))
+                whole = read_json(file)
+                records = dict(whole.pop("stages"))
+                self._records = {
+                    name: asdict(from_json(_Record, record)) for name, record in records.items()
+                }
                 whole.pop("snowsplat")
                 self.about = whole
             except (ValueError, KeyError, TypeError, AttributeError):
@@ -81,7 +97,8 @@ class Stages:
         if record is not None:
             self.save()
         start = time.monotonic()
-        result = json.loads(json.dumps(work()))
+        # As it will be read again: with null for what is not finite.
+        result = json.loads(json.dumps(work()), parse_constant=lambda _: None)
         seconds = round(time.monotonic() - start, 2)
         self._records[name] = {
             "key": key,
@@ -89,6 +106,7 @@ class Stages:
             "outputs": {_shown(path, self.file.parent): _count(path) for path in outputs},
             "seconds": seconds,
             "result": result,
+            "digest": _digest(result),
         }
         self.save()
         return Outcome(result, seconds, False)
@@ -105,6 +123,8 @@ class Stages:
         self, record: dict[str, Any], key: str, settings: dict[str, Any], outputs: Sequence[Path]
     ) -> str:
         """Why the stage must be done again; empty if it need not."""
+        if record["digest"] not in ("", _digest(record["result"])):
+            return "what was written down of it is damaged"
         before = record["settings"]
         changed = [word for word in settings if settings[word] != before.get(word)]
         if changed or settings.keys() != before.keys():
@@ -114,6 +134,10 @@ class Stages:
         if record["outputs"] != {_shown(p, self.file.parent): _count(p) for p in outputs}:
             return "files of it are missing"
         return ""
+
+
+def _digest(result: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(result, sort_keys=True).encode()).hexdigest()
 
 
 def _shown(path: Path, folder: Path) -> str:
