@@ -4,10 +4,11 @@ It needs the weights of a network trained on photographs and of its five linear 
 ours to carry: the user names a file that holds both. Such a file is made, wherever the `lpips`
 package is installed, with
 
-    torch.save(lpips.LPIPS(net="vgg").state_dict(), "lpips_vgg.pth")
+    weights = {name: w.clone() for name, w in lpips.LPIPS(net="vgg").state_dict().items()}
+    safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
 
-Names in the file, which may be safetensors or what `torch.save` wrote (read without executing
-code):
+Not what `torch.save` writes: that is a program (a pickle), and even where torch holds it to a few
+harmless functions, a hundred bytes of it can ask for any amount of memory. Names in the file:
 
     features.N.weight, features.N.bias    backbone, N as in torchvision's AlexNet or VGG16
     (or net.sliceM.N.weight, …)           the same, as the `lpips` package spells it
@@ -173,17 +174,12 @@ def _unit(features: Tensor) -> Tensor:
 
 def _read_state(path: Path) -> dict[str, Tensor]:
     try:
-        with open(path, "rb") as file:
-            start = file.read(9)
-        if start[8:9] == b"{":  # safetensors: eight bytes of length, then JSON
-            return safetensors.torch.load_file(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        if path.exists() and not path.is_file():
+            raise UserError(f"{path}: is no file")
+        return safetensors.torch.load_file(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except Exception:  # on bytes that are no weights, torch's reader raises whatever comes
+    except (safetensors.SafetensorError, ValueError, KeyError):
         raise UserError(
-            f"{path}: neither a safetensors file nor weights that torch saved"
+            f"{path}: not a safetensors file; see snowsplat evaluate --help for how one is made"
         ) from None
-    if not isinstance(state, dict):
-        raise UserError(f"{path}: holds no named weights")
-    return {str(name): value for name, value in state.items() if isinstance(value, Tensor)}

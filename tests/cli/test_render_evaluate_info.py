@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from PIL import Image
 
@@ -80,12 +81,12 @@ def test_evaluate_with_lpips(run, refused, trained, tmp_path):
         state[f"features.{index}.weight"] = torch.randn(o, i, s, s) / (i * s * s) ** 0.5
         state[f"features.{index}.bias"] = torch.zeros(o)
         state[f"lin{k}.model.1.weight"] = torch.rand(1, o, 1, 1)
-    torch.save(state, tmp_path / "alex.pth")
-    result = run("evaluate", trained, "--lpips", tmp_path / "alex.pth")
+    safetensors.torch.save_file(state, tmp_path / "alex.safetensors")
+    result = run("evaluate", trained, "--lpips", tmp_path / "alex.safetensors")
     assert result.code == 0, result.err
     assert "LPIPS (alex)" in result.out
     assert json.loads((trained / "metrics.json").read_text())["lpips"] > 0
-    assert "cannot be read" in refused("evaluate", trained, "--lpips", tmp_path / "absent.pth")
+    assert "cannot be read" in refused("evaluate", trained, "--lpips", tmp_path / "absent")
     assert run("evaluate", trained).code == 0
 
 

@@ -21,12 +21,13 @@ class Evaluate(SceneFlags):
     Examples:
       snowsplat evaluate out/garden
       snowsplat evaluate out/garden --split train
-      snowsplat evaluate out/garden --lpips lpips_vgg.pth
+      snowsplat evaluate out/garden --lpips lpips_vgg.safetensors
 
     The figures of each view and their means are printed, and written to OUT/metrics.json. Renders
     are clamped to 0..1 and not rounded to 8 bits. The weights file for LPIPS is made once, where
     the package lpips is installed, by
-      torch.save(lpips.LPIPS(net="vgg").state_dict(), "lpips_vgg.pth")
+      weights = {name: w.clone() for name, w in lpips.LPIPS(net="vgg").state_dict().items()}
+      safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
     """
 
     split: Annotated[Literal["test", "train"], flag("{test,train}", default="test")] = "test"
