@@ -11,6 +11,16 @@ from typing import TYPE_CHECKING
 from snowsplat.errors import UserError
 from snowsplat.files import shown
 
+# Containers that cameras, phones and programs make, by FFmpeg's names.
+_FORMATS = ",".join(
+    [
+        *("mov", "mp4", "m4a", "3gp", "3g2", "mj2", "matroska", "webm", "avi", "flv", "asf", "gif"),
+        *("mpeg", "mpegts", "mpegvideo", "m4v", "h264", "hevc", "vc1", "av1", "obu", "ivf", "ogg"),
+        *("mjpeg", "dv", "mxf"),
+    ]
+)
+_MOST_PIXELS = 1 << 26  # of a frame: 8192×8192
+
 if TYPE_CHECKING:
     from av import VideoFrame
     from av.container import InputContainer
@@ -35,10 +45,8 @@ def is_video(path: Path) -> bool:
     import av
 
     try:
-        with av.open(str(path)) as container:
-            # FFmpeg takes any text for the art of old terminals, and single pictures for films.
-            still = container.format.name == "tty" or "image2" in container.format.name
-            return bool(container.streams.video) and not still
+        with open_video(path) as container:
+            return bool(container.streams.video)
     except (av.FFmpegError, OSError, ValueError):
         return False
 
@@ -56,6 +64,11 @@ def read_clip(path: Path) -> Clip:
     try:
         with open_video(path) as container:
             stream = container.streams.video[0]
+            if stream.width * stream.height > _MOST_PIXELS:
+                raise UserError(
+                    f"{shown(path)}: its frames have {stream.width}x{stream.height} pixels, more "
+                    f"than {_MOST_PIXELS // 1_000_000} million; save it with smaller ones"
+                )
             rate = float(stream.average_rate or 30)
             # The header is trusted for this alone: to say how much of a damaged file is absent.
             promised = stream.frames
@@ -113,10 +126,23 @@ def upright_size(frame: VideoFrame, aspect: float) -> tuple[int, int]:
 
 
 def open_video(path: Path) -> InputContainer:
+    """Open a file of a kind that cameras make; raises what `av.open` does.
+
+    FFmpeg knows many more kinds of files, among them lists of other files and addresses to play. Of
+    what is left, frames larger than any camera's are refused before memory is taken for them.
+    """
     import av
 
-    # Some tags of cameras are no UTF-8; they do not matter here.
-    return av.open(str(path), metadata_errors="replace")
+    options = {
+        "format_whitelist": _FORMATS,
+        "protocol_whitelist": "file",
+        "max_pixels": str(_MOST_PIXELS),
+    }
+    # A name may look like an address. Some tags of cameras are no UTF-8; they do not matter here.
+    container = av.open(f"file:{path.absolute()}", options=options, metadata_errors="replace")
+    for stream in container.streams.video:
+        stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
+    return container
 
 
 def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
