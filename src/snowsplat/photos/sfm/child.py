@@ -120,7 +120,7 @@ def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmRes
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log_file,
-            env=_environment(threads),
+            env=child_environment(threads),
             text=True,
             encoding="utf-8",
         ) as child,
@@ -185,7 +185,8 @@ def _report_rows(report: Report, database: str, table: str, total: int, what: st
         report(min(rows, total), total, what)
 
 
-def _environment(threads: int) -> dict[str, str]:
+def child_environment(threads: int) -> dict[str, str]:
+    """For a child that runs our modules, COLMAP with so many threads."""
     # The child finds the modules that this process finds, from a checkout or a wheel, and not
     # what happens to lie in the current folder.
     paths: Sequence[str] = [os.path.abspath(path) for path in sys.path if path]

@@ -9,7 +9,9 @@ import pycolmap
 
 from snowsplat.errors import UserError
 from snowsplat.photos.photo import Photo
+from snowsplat.photos.sfm.check_model import can_be_read
 from snowsplat.photos.sfm.options import SfmResult
+from snowsplat.untrusted import inside
 
 
 def result_of(
@@ -68,14 +70,21 @@ def describe_model(capture: Path, photos: Sequence[Photo]) -> SfmResult:
         raise UserError(f"{sparse / '0'}: no COLMAP model here; leave out --skip-matching")
     models = []
     for folder in numbered:
-        try:
-            models.append(pycolmap.Reconstruction(folder))
-        except (RuntimeError, ValueError):
+        if not can_be_read(folder):
             raise UserError(
-                f"{folder}: this COLMAP model cannot be read; leave out --skip-matching"
-            ) from None
+                f"{folder}: this COLMAP model is damaged, or COLMAP cannot read it; leave out "
+                "--skip-matching"
+            )
+        models.append(pycolmap.Reconstruction(folder))
         models[-1].update_point_3d_errors()
     names = names_in(models[0])
+    for name in names:
+        # Images are written under the names of the photos.
+        if inside(capture / "input", name) is None:
+            raise UserError(
+                f"{numbered[0]}: names the photo {name[:80]!r}, which is not in "
+                f"{capture / 'input'}; leave out --skip-matching"
+            )
     if not names & {photo.name for photo in photos}:
         raise UserError(
             f"{numbered[0]}: the COLMAP model has none of the photos in {capture / 'input'}; "
