@@ -106,7 +106,7 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
         return launch_by(record, name, n, args)
 
     trainer = Trainer(capture, config)
-    camera, photo = trainer._next_view(1)
+    _, camera, photo = trainer._next_view(1)
     monkeypatch.setitem(LAUNCHERS, "cuda", launch)
     monkeypatch.setattr(Tensor, "backward", backward_by_hand)
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
@@ -120,7 +120,8 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
         for name, statistic in trainer._density.state_tensors().items():
             setattr(trainer._density, name, there(statistic))
         trainer._room = ops.Room(5000, there(torch.zeros(1, dtype=torch.int64)))
-        trainer._readback = Readback(2, torch.device("cpu"))
+        trainer._optimizer.held = there(trainer._optimizer.held)
+        trainer._readback = Readback(8, torch.device("cpu"))
         camera = replace(camera, cam_from_world=there(camera.cam_from_world))
         photo = LoadedImage(there(photo.planes), there(photo.mask))
         torch.use_deterministic_algorithms(deterministic)

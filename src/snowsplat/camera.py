@@ -39,6 +39,11 @@ class Camera:
         if self.cam_from_world.shape != (3, 4):
             raise ValueError(f"cam_from_world is (3, 4), not {tuple(self.cam_from_world.shape)}")
 
+    def is_finite(self) -> bool:
+        """Whether all of it is, in the single precision of kernels."""
+        pose = self.cam_from_world.detach().reshape(-1).tolist()
+        return all(abs(n) < 1e38 for n in (self.fx, self.fy, self.cx, self.cy, *pose))
+
     @property
     def world_from_cam(self) -> Tensor:
         """(3, 4), the inverse of ``cam_from_world``."""

@@ -3,8 +3,8 @@
 A checkpoint is a set of named tensors (parameters, optimiser moments, random states, statistics,
 the order of the views) and a JSON value, in ONE safetensors file: a format that holds numbers only
 and cannot execute code. It appears under its name when it is whole and on disk, so a kill at any
-moment leaves the one before. Each tensor's CRC-32 is in the header and is checked on load, as a
-file can also rot or be cut in a copy.
+moment leaves the one before. Each tensor's CRC-32 is in the header, which has one of its own, and
+all are checked on load, as a file can also rot or be cut in a copy.
 """
 
 import json
@@ -24,6 +24,7 @@ from torch import Tensor
 
 from snowsplat.errors import UserError
 from snowsplat.files import atomic_path
+from snowsplat.health import check_finite
 from snowsplat.untrusted import parse_json
 
 #: One more whenever the meaning of the tensors changes, so that an old file is refused.
@@ -57,9 +58,11 @@ def save(
         meta: JSON values.
 
     Raises:
+        UserError: a state that is not finite. Older checkpoints are as they were.
         OSError: the folder is not writable, or the disk is full. Older checkpoints are as they
         were.
     """
+    check_finite(f"the state of step {step}", tensors, "older checkpoints are as they were")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(".*tmp*"):  # of a save that was killed
@@ -71,10 +74,13 @@ def save(
         "step": step,
         "meta": dict(meta),
         "crc32": {name: _crc32(tensor) for name, tensor in whole.items()},
+        "layout": _layout(whole),
     }
+    text = json.dumps(header)
+    metadata = {_HEADER: text, "crc32": str(zlib.crc32(text.encode()))}
     with atomic_path(path) as temporary:
         try:
-            safetensors.torch.save_file(whole, temporary, metadata={_HEADER: json.dumps(header)})
+            safetensors.torch.save_file(whole, temporary, metadata=metadata)
         except safetensors.SafetensorError as error:
             number = re.search(r"os error (\d+)", str(error))
             if number is None:
@@ -89,12 +95,14 @@ def load(path: Path | str) -> Checkpoint:
     """Read one checkpoint and check every byte of it.
 
     Raises:
-        UserError: absent, cut, damaged, not a checkpoint, or one of another version.
+        UserError: absent, cut, damaged, not finite, not a checkpoint, or one of another version.
     """
     path = Path(path)
     try:
         with safetensors.safe_open(path, framework="pt", device="cpu") as file:
-            header = parse_json((file.metadata() or {})[_HEADER].encode("utf-8", "replace"))
+            metadata = file.metadata() or {}
+            text = metadata[_HEADER].encode("utf-8", "replace")
+            header = parse_json(text)
             if header["version"] != VERSION:
                 raise UserError(
                     f"{path}: a checkpoint of version {header['version']}, this program reads "
@@ -102,6 +110,9 @@ def load(path: Path | str) -> Checkpoint:
                 )
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         whole = header["crc32"] == {name: _crc32(tensor) for name, tensor in tensors.items()}
+        # Not in older files, where a damaged header may go unseen.
+        whole = whole and header.get("layout", _layout(tensors)) == _layout(tensors)
+        whole = whole and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
         checkpoint = Checkpoint(path, int(header["step"]), tensors, dict(header["meta"]))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
@@ -109,6 +120,7 @@ def load(path: Path | str) -> Checkpoint:
         raise UserError(f"{path}: damaged, or not a checkpoint") from None
     if not whole:
         raise UserError(f"{path}: damaged (its checksums do not match)")
+    check_finite(str(path), checkpoint.tensors, "remove it, and go on from an earlier one")
     return checkpoint
 
 
@@ -143,6 +155,10 @@ def _owned(tensor: Tensor) -> Tensor:
     tensor = tensor.detach().cpu().contiguous()
     alone = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
     return tensor if alone else tensor.clone()
+
+
+def _layout(tensors: Mapping[str, Tensor]) -> dict[str, list[Any]]:
+    return {name: [str(tensor.dtype), list(tensor.shape)] for name, tensor in tensors.items()}
 
 
 def _crc32(tensor: Tensor) -> int:

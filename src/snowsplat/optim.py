@@ -61,6 +61,9 @@ class LearningRates:
 class Adam:
     """The moments of every parameter, in the rows' order, and the rates of the coming step.
 
+    ``held`` (6,) int32 counts, a parameter each in their order, the rows of which a step left
+    something out, as it was not finite (`ops.adam_step`); it grows until `load_state`.
+
     It does not own the Gaussians. Whoever changes their rows (density control) makes the same
     change here with `select`, so that row i of every moment belongs to Gaussian i.
     """
@@ -82,6 +85,7 @@ class Adam:
         parameters = gaussians.parameters()
         self.exp_avg = {name: torch.zeros_like(p) for name, p in parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in parameters.items()}
+        self.held = torch.zeros(len(parameters), dtype=torch.int32, device=gaussians.means.device)
 
     def rates_at(self, step: int) -> dict[str, float]:
         """Learning rate by parameter at ``step``, counted from 1."""
@@ -122,6 +126,7 @@ class Adam:
             step=step,
             visible_only=self.visible_only,
             valid=valid,
+            held=self.held,
         )
         for parameter in parameters.values():
             parameter.grad = None
@@ -150,6 +155,7 @@ class Adam:
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Take over (copy) what `state_tensors` gave."""
+        self.held.zero_()
         for name, average in self.exp_avg.items():
             for moments, key in ((self.exp_avg, "exp_avg"), (self.exp_avg_sq, "exp_avg_sq")):
                 moments[name] = tensors[f"{key}.{name}"].to(average.device, copy=True)

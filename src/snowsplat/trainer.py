@@ -10,22 +10,22 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from snowsplat import ops
+from snowsplat import health, ops
 from snowsplat.camera import Camera
-from snowsplat.capture.capture import Capture, Points
+from snowsplat.capture.capture import Capture, View
 from snowsplat.capture.decode import LoadedImage
 from snowsplat.capture.images import ImageLoader
 from snowsplat.config import TrainConfig
 from snowsplat.errors import UserError
 from snowsplat.evaluate import Evaluation, evaluate_views
 from snowsplat.gaussians import Gaussians
-from snowsplat.geometry import morton_order
 from snowsplat.losses import view_loss
 from snowsplat.ops.readback import Readback
 from snowsplat.optim import Adam
 from snowsplat.process import interrupts_between_steps, single_threaded
 from snowsplat.render import project
 from snowsplat.schedule import Schedule
+from snowsplat.start import first_scene
 
 __all__ = ["Progress", "TrainConfig", "Trainer"]
 
@@ -67,7 +67,7 @@ class Trainer:
         ``device``: to train on; default: the CPU.
 
         Raises:
-            UserError: a capture without training views.
+            UserError: a capture without training views, or with points that lead nowhere.
         """
         if not capture.train:
             raise UserError("the capture has no training views; check its folder and its split")
@@ -93,7 +93,7 @@ class Trainer:
             device=self.device,
         )
         with single_threaded():
-            self.gaussians = self._start()
+            self.gaussians = first_scene(capture, config, self._generators["start"], self.device)
         self._optimizer = Adam(
             self.gaussians,
             config.learning_rates,
@@ -112,27 +112,7 @@ class Trainer:
         # The CPU makes the room that it needs; a GPU is told how much there is: a guess at first.
         enough = sys.maxsize if self.device.type == "cpu" else 4 * len(self.gaussians)
         self._room = ops.Room(enough, torch.zeros(1, dtype=torch.int64, device=self.device))
-        self._readback = Readback(2, self.device)
-
-    def _start(self) -> Gaussians:
-        """One Gaussian a point: those of the capture, or random ones; no more than the cap."""
-        config, generator = self.config, self._generators["start"]
-        points = self.capture.points
-        cap = config.density.max_gaussians or math.inf
-        if points is None:
-            count = int(min(config.initial_points, cap))
-            gaussians = Gaussians.random_in_bounds(
-                self.capture.bounds, count, generator, config.sh_degree, config.initial_opacity
-            )
-        else:
-            if len(points) > cap:
-                chosen = torch.randperm(len(points), generator=generator)[: int(cap)]
-                points = Points(points.xyz[chosen], points.rgb[chosen])
-            points = points.to(self.device)
-            gaussians = Gaussians.from_points(points, config.sh_degree, config.initial_opacity)
-        gaussians = gaussians.to(self.device)
-        gaussians.log_scales += math.log(config.initial_scale)
-        return gaussians.select(morton_order(gaussians.means))
+        self._readback = Readback(2 + len(self._optimizer.held), self.device)
 
     def run(
         self, on_progress: Callable[[Progress], None] | None = None, until: int | None = None
@@ -141,7 +121,7 @@ class Trainer:
 
         Raises:
             KeyboardInterrupt: Ctrl-C, after the step that it fell into: the state is whole.
-            UserError: the loss is no longer finite.
+            Diverged: loss, gradients or parameters are no longer finite; the step is named.
         """
         last = math.inf if until is None else until
         with interrupts_between_steps() as let_interrupt:
@@ -153,13 +133,14 @@ class Trainer:
                     count = len(self.gaussians)
                     on_progress(Progress(self.step, loss, count, iterations, downscale, metrics))
                 let_interrupt()
+        health.check_updates(self.step, self._optimizer.held.tolist(), self.gaussians)
 
     @torch.no_grad()
     def step_once(self) -> float:
         """One iteration of Algorithm 1; gives its loss.
 
         Raises:
-            UserError: the loss is not finite.
+            Diverged: the loss is not finite, or the update of the step before was not.
         """
         with single_threaded():
             # The refinement that ends an iteration of the paper waits for the next one to begin, so
@@ -169,7 +150,7 @@ class Trainer:
                     self.step, self.gaussians, self._optimizer
                 )
             step = self.step + 1
-            camera, photo = self._next_view(step)
+            view, camera, photo = self._next_view(step)
             background = self._background
             if background is None:
                 background = torch.rand(3, generator=self._generators["background"])
@@ -177,17 +158,14 @@ class Trainer:
             while True:
                 self._queue_step(step, camera, photo, background)
                 # All of the step is queued by now: a GPU works on it while this waits for the loss.
-                loss, needed = self._readback.wait()
+                loss, needed, *held = self._readback.wait()
                 enough = needed <= self._room.instances
                 if needed > 0.9 * self._room.instances:
                     self._room = replace(self._room, instances=int(1.3 * needed))
                 if enough:
                     break
-            if not math.isfinite(loss):
-                raise UserError(
-                    f"the loss is {loss} at step {step}: training has diverged; "
-                    "lower the learning rates, or go on from an earlier checkpoint"
-                )
+            health.check_updates(self.step, held, self.gaussians)  # a GPU tells it a step later
+            health.check_loss(step, loss, self.gaussians, view, photo)
             self.step = step
             return loss
 
@@ -196,7 +174,7 @@ class Trainer:
     ) -> None:
         """One iteration, from the splats to the new parameters; nothing here waits for a GPU.
 
-        Nothing changes where the loss is not finite, or the room was too small: `_readback` tells.
+        Nothing changes where ``valid`` is False; `_readback` tells why.
         """
         sh_degree = self.config.sh_degree_at(step)
         splats = project(self.gaussians, camera, sh_degree)
@@ -205,8 +183,9 @@ class Trainer:
             splats.packed.requires_grad_()
             image, _, _ = ops.rasterize(splats, *size, background, room=self._room)
             loss = view_loss(image, photo, background, self.config.ssim_weight)
-            self._readback.post(loss, self._room.needed)
+            self._readback.post(loss, self._room.needed, self._optimizer.held)
             valid = loss.detach().isfinite() & (self._room.needed <= self._room.instances)
+            valid &= ~self._optimizer.held.any()
             loss.backward()
         self._density.after_backward(step, self.gaussians, splats, *size, valid)
         self._optimizer.step(self.gaussians, splats, camera, sh_degree, step, valid)
@@ -217,8 +196,8 @@ class Trainer:
         with single_threaded():
             return evaluate_views(self.gaussians, self.capture.test, background=background)
 
-    def _next_view(self, step: int) -> tuple[Camera, LoadedImage]:
-        """The next of endlessly shuffled views, and its photo at this step's resolution."""
+    def _next_view(self, step: int) -> tuple[View, Camera, LoadedImage]:
+        """The next of endlessly shuffled views; its camera and photo at this step's resolution."""
         downscale = self._downscale(step)
         if len(self._order) <= LOOKAHEAD:
             while len(self._order) <= LOOKAHEAD:
@@ -227,9 +206,9 @@ class Trainer:
             self._prefetch(downscale)
         elif downscale != self._downscale(step - 1):
             self._prefetch(downscale)
-        view = self._order.pop(0)
-        photo = self._images.get(self.capture.train[view], downscale)
-        return self._cameras[view].downscaled(downscale), photo
+        i = self._order.pop(0)
+        view, camera = self.capture.train[i], self._cameras[i].downscaled(downscale)
+        return view, camera, self._images.get(view, downscale)
 
     def _downscale(self, step: int) -> int:
         return self.config.downscale_at(step, self.schedule)
@@ -254,33 +233,18 @@ class Trainer:
         schedule are equal.
 
         Raises:
-            UserError: it is of another density control, SH degree or capture.
+            UserError: it is of another density control, SH degree or capture, or not finite.
         """
-        own = self.state_tensors()
-        fits = own.keys() == tensors.keys() and all(
-            (mine.dtype, mine.ndim, mine.shape[1:]) == (other.dtype, other.ndim, other.shape[1:])
-            for mine, other in ((own[name], tensors[name]) for name in own)
-        )
-        # The kernels take one number of rows for all; random states are of one length.
-        fixed = ("random.", "step", "order")
-        rows = {len(t) for name, t in tensors.items() if not name.startswith(fixed) and t.ndim}
-        fits = fits and len(rows) == 1
-        fits = fits and all(
-            own[name].shape == tensors[name].shape for name in own if name.startswith("random.")
-        )
-        if not fits or not set(tensors["order"].tolist()) <= set(range(len(self.capture.train))):
-            raise UserError(
-                "the checkpoint is of another capture or recipe; go on with those it was made with"
-            )
-        parts: dict[str, dict[str, Tensor]] = {}
-        for name, tensor in tensors.items():
-            part, _, key = name.partition(".")
-            parts.setdefault(part, {})[key] = tensor
-        self.gaussians = Gaussians(**parts["gaussians"]).clone().to(self.device)
-        self._optimizer.load_state(parts["optimizer"])
-        self._density.load_state(parts.get("density", {}))
+        health.check_state(self.state_tensors(), tensors, len(self.capture.train))
+
+        def part(of: str) -> dict[str, Tensor]:
+            return {n[len(of) :]: t for n, t in tensors.items() if n.startswith(of)}
+
+        self.gaussians = Gaussians(**part("gaussians.")).clone().to(self.device)
+        self._optimizer.load_state(part("optimizer."))
+        self._density.load_state(part("density."))
         for name, random in self._generators.items():
-            random.set_state(parts["random"][name])
+            random.set_state(tensors[f"random.{name}"])
         self.step = int(tensors["step"])
         self._order = tensors["order"].tolist()
         self._prefetch(self._downscale(self.step + 1))

@@ -176,12 +176,12 @@ def test_no_image_at_all(capture_copy):
 
 
 def test_points_that_are_not_finite_are_left_out(tmp_path, caplog):
-    xyz = np.array([[0, 0, 1.0], [0, np.nan, 1], [1e300, 0, 0], [1, 2, 3]])
-    write_model(tmp_path, {}, [], xyz, np.zeros((4, 3), np.uint8))
+    xyz = np.array([[0, 0, 1.0], [0, np.nan, 1], [1e300, 0, 0], [1, 2, 3], [0, -1e20, 0]])
+    write_model(tmp_path, {}, [], xyz, np.zeros((5, 3), np.uint8))
     with caplog.at_level(logging.WARNING):
         points = read_points(tmp_path)
     assert points.xyz.tolist() == [[0, 0, 1], [1, 2, 3]]
-    assert "2 points are not finite" in caplog.text
+    assert "3 points are not finite, or absurdly far" in caplog.text
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])

@@ -12,6 +12,7 @@ import pytest
 
 from snowsplat import checkpoint
 from snowsplat.cli.train import _KNOBS, Train
+from snowsplat.formats import read_gaussians
 from snowsplat.recipes import RECIPES, recipe
 
 QUICK = ("--iterations", 30, "--threads", 1)
@@ -306,4 +307,26 @@ def test_bad_captures_write_nothing(refused, capture, tmp_path):
     refused("train", damaged, "-o", out)
     assert "needs a capture" in refused("train", "-o", out)
     assert "add -o" in refused("train", capture)
+    assert not out.exists()
+
+
+def test_divergence_names_the_last_good_checkpoint(refused, run, capture, tmp_path):
+    """And it makes a scene; nothing that diverged is on disk."""
+    out = tmp_path / "out"
+    # The rate grows 60-fold a step, until single precision has no number for it.
+    rates = ["--lr-means-final", 1e40, "--lr-means-steps", 25]
+    line = refused("train", capture, "-o", out, *QUICK, *rates, "--checkpoint-every", 3, "-q")
+    diverged = int(re.search(r"not finite at step (\d+), .* means \(", line)[1])
+    step = diverged // 3 * 3
+    path = out / "checkpoints" / f"step_{step:06d}.safetensors"
+    assert f"the last good checkpoint is {path}, --resume --iterations {step} " in line
+    assert all(tensor.isfinite().all() for tensor in checkpoint.load(path).tensors.values())
+    assert run("train", "-o", out, "--resume", "--iterations", step, "-q").code == 0
+    assert read_gaussians(out / f"point_cloud/iteration_{step}/point_cloud.ply").finite_rows().all()
+
+
+def test_divergence_without_a_checkpoint(refused, capture, tmp_path):
+    out = tmp_path / "out"
+    line = refused("train", capture, "-o", out, "--iterations", 40, "--lr-sh-dc", "inf", "-q")
+    assert line.endswith("there is no checkpoint yet")
     assert not out.exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,6 +13,7 @@ from torch import Tensor
 from snowsplat.camera import Camera
 from snowsplat.capture.bounds import scene_bounds
 from snowsplat.capture.decode import ImageSource
+from snowsplat.errors import UserError
 
 
 @dataclass
@@ -41,10 +43,13 @@ class View:
 
 @dataclass
 class Capture:
-    """What training needs; always posed.
+    """What training needs; always posed, all of it finite.
 
     ``train`` and ``test`` are in the order of their names. ``points`` is None where the capture
     came without: then `bounds` says where to begin.
+
+    Raises:
+        UserError: cameras or points that are not finite.
     """
 
     train: list[View]
@@ -52,6 +57,24 @@ class Capture:
     points: Points | None
     extent: float  # world units: 1.1 × the largest distance of a training camera from their mean
     description: str = ""  # which files it was read from, for people
+
+    def __post_init__(self) -> None:
+        of = f"{self.description}: " if self.description else ""
+        views = [*self.train, *self.test]
+        bad = [view.name for view in views if not view.camera.is_finite()]
+        if bad:
+            raise UserError(
+                f"{of}{len(bad)} of {len(views)} cameras are not finite, that of {bad[0]} first; "
+                "correct their poses or leave these photos out"
+            )
+        if not 0.0 < self.extent < math.inf:
+            raise UserError(f"{of}the extent of its cameras is {self.extent}; correct them")
+        if self.points is not None:
+            rows = int((~self.points.xyz.isfinite().all(dim=1)).sum())
+            if rows:
+                raise UserError(
+                    f"{of}{rows:,} of {len(self.points):,} points are not finite; remove them"
+                )
 
     @property
     def bounds(self) -> Tensor:

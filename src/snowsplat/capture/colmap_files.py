@@ -37,6 +37,7 @@ CAMERA_MODELS = (
     ("THIN_PRISM_FISHEYE", 12),
 )
 _MAX_SIDE = 1_000_000  # pixels; anything larger is a damaged file
+_FARTHEST = 1e18  # where a point may be: squares of distances have to be finite in float32
 _MOST_IMAGES = 200_000  # and cameras; each takes some 400 bytes of memory
 _MOST_WORDS = 20  # of a camera
 _LINES_AT_ONCE, _PIECE = 50_000, 1 << 20  # of a text, characters of a line
@@ -113,7 +114,7 @@ def read_model(folder: Path) -> ColmapModel:
 def read_points(folder: Path) -> Points | None:
     """The 3D points of the model in a folder; None where it has none.
 
-    Points that are not finite are left out, with a warning.
+    Points that are not finite, or absurdly far, are left out, with a warning.
 
     Raises:
         UserError: a damaged file.
@@ -129,12 +130,16 @@ def read_points(folder: Path) -> Points | None:
 
 
 def make_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> Points | None:
-    """Points of positions (P, 3), those that are not finite in float32 left out with a warning."""
+    """Points of positions (P, 3), as float32; those that it does not fit left out with a warning.
+
+    It fits those whose squares of distances are finite, too.
+    """
     with np.errstate(over="ignore"):
         xyz = np.ascontiguousarray(xyz, np.float32)
-    finite = np.isfinite(xyz).all(axis=1)
+    finite = (np.abs(xyz) < _FARTHEST).all(axis=1)
     if not finite.all():
-        logger.warning("%s: %d points are not finite; left out", path, (~finite).sum())
+        count = (~finite).sum()
+        logger.warning("%s: %d points are not finite, or absurdly far; left out", path, count)
         xyz, rgb = xyz[finite], rgb[finite]
     if not len(xyz):
         return None

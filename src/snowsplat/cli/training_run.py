@@ -12,6 +12,7 @@ from snowsplat.cli.memory_budget import MemoryBudget
 from snowsplat.cli.output import CaptureSettings, OutputFolder
 from snowsplat.cli.progress import TrainingProgress, duration, held_out_line, peak_bytes
 from snowsplat.cli.timed import TimeBudget
+from snowsplat.errors import UserError
 from snowsplat.history import History
 
 if TYPE_CHECKING:
@@ -57,7 +58,13 @@ class TrainingRun:
         self.history = History.read(self.out.history, self.first_step)
 
     def run(self) -> int:
-        """Gives the exit code: 0, or 130 after Ctrl-C."""
+        """Gives the exit code: 0, or 130 after Ctrl-C.
+
+        Raises:
+            UserError: the training came to numbers that are not finite.
+        """
+        from snowsplat.health import Diverged
+
         stopped = False
         try:
             with nullcontext() if self.quiet else self.progress:
@@ -68,6 +75,9 @@ class TrainingRun:
                 self.out.discard()
                 raise
             stopped = True
+        except Diverged as error:
+            self.out.discard()
+            raise UserError(f"{error}; {self._kept()}") from None
         except BaseException:
             self.out.discard()
             raise
@@ -127,6 +137,15 @@ class TrainingRun:
         )
         self.last_checkpoint = time.monotonic()
         return path
+
+    def _kept(self) -> str:
+        from snowsplat import checkpoint
+
+        kept = checkpoint.files(self.out.checkpoints)
+        if not kept:
+            return "there is no checkpoint yet"
+        step, path = kept[0]
+        return f"the last good checkpoint is {path}, --resume --iterations {step} makes it a scene"
 
     def _measured(self, step: int, evaluation: Evaluation) -> None:
         self.evaluation = (step, evaluation)

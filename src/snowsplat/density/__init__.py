@@ -47,6 +47,9 @@ class DensityControl(Protocol):
 
         The trainer calls this as late as it can, at the beginning of step + 1, so that what is
         evaluated and saved between two steps is never a scene that was just cloned or reset.
+
+        Raises:
+            Diverged: where it refines, parameters that are not finite.
         """
         ...
 

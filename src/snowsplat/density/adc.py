@@ -16,6 +16,7 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import morton_order, rotation_from_quat
+from snowsplat.health import check_parameters
 from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam
 from snowsplat.schedule import Schedule, When
@@ -141,6 +142,7 @@ class AdaptiveDensityControl:
         """Densify, prune and reset where this step is one that does."""
         knobs = self.knobs
         if self.first <= step <= self.last and step % knobs.densify_interval == 0:
+            check_parameters(step, gaussians)
             gaussians = self._refine(step, gaussians, optimizer)
         if self._resets_at(step):
             limit = math.log(RESET_OPACITY / (1.0 - RESET_OPACITY))
@@ -158,7 +160,7 @@ class AdaptiveDensityControl:
         knobs = self.knobs
         grads = self.grad_sum / self.views.clamp_min(1.0)
         size = gaussians.log_scales.amax(dim=1).exp() / self.extent
-        alive = (gaussians.opacities >= knobs.prune_opacity) & gaussians.finite_rows()
+        alive = gaussians.opacities >= knobs.prune_opacity
         dense = self._densified(grads, alive)
         split = dense & (size > knobs.percent_dense)
         # A split parent makes way for two children; every other survivor stays as it is, and a

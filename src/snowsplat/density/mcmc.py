@@ -19,6 +19,7 @@ from torch import Tensor
 from snowsplat.errors import UserError
 from snowsplat.gaussians import Gaussians
 from snowsplat.geometry import morton_order, rotation_from_quat
+from snowsplat.health import check_parameters
 from snowsplat.ops.splats import Splats2D
 from snowsplat.optim import Adam
 from snowsplat.schedule import Schedule, When
@@ -112,6 +113,7 @@ class McmcDensityControl:
         """Noise at every step; relocation and growth where this step is one that does."""
         self._add_noise(gaussians, optimizer.rates_at(step)["means"])
         if self.first <= step <= self.last and step % self.knobs.densify_interval == 0:
+            check_parameters(step, gaussians)
             gaussians = self._relocate(gaussians, optimizer)
         return gaussians
 
@@ -127,15 +129,15 @@ class McmcDensityControl:
             there.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             eta = torch.randn(len(gate), 3, 1, generator=there, device=gate.device)
         rotations = rotation_from_quat(gaussians.quats[rows])
-        variances = (2.0 * gaussians.log_scales[rows]).exp()[:, :, None]
+        # Finite in single precision, whatever the scales are.
+        variances = (2.0 * gaussians.log_scales[rows]).clamp(max=40.0).exp()[:, :, None]
         noise = (rotations @ (variances * (rotations.mT @ eta)))[:, :, 0]
         gaussians.means[rows] += rate * self.knobs.noise * gate[rows, None] * noise
 
     def _relocate(self, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         count = len(gaussians)
         opacities = gaussians.opacities
-        alive = (opacities > self.knobs.prune_opacity) & gaussians.finite_rows()
-        survivors = torch.nonzero(alive)[:, 0]
+        survivors = torch.nonzero(opacities > self.knobs.prune_opacity)[:, 0]
         if len(survivors) == 0:
             return gaussians
         grown = min(self.knobs.max_gaussians, int((1.0 + self.knobs.growth) * count))

@@ -48,6 +48,12 @@ SNOW_INLINE float rsqrt(float a) { return 1.f / ::sqrtf(a); }
 SNOW_INLINE float reciprocal_estimate(float a) { return 1.f / a; }
 #endif
 
+// Neither infinite nor NaN: infinity minus itself is NaN, which every comparison refuses.
+template <class Real>
+SNOW_INLINE auto is_finite(Real a) {
+  return a - a >= Real(0.f);
+}
+
 constexpr double kLog2E = 1.4426950408889634;
 constexpr double kLn2 = 0.6931471805599453;
 constexpr double kLn255 = 5.541263545158426;

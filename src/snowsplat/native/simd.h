@@ -99,6 +99,9 @@ struct Simd {
   }
   SNOW_INLINE static Mask first(int n) { return Simd(T(n)) > iota(); }
   SNOW_INLINE static uint32_t bits(Mask m) {
+#if defined(__SSE2__)
+    if constexpr (sizeof(Vec) == 16) return uint32_t(_mm_movemask_ps(__m128(m.m)));
+#endif
     uint32_t r = 0;
     for (int l = 0; l < W; l++) r |= uint32_t(m.m[l] & 1) << l;
     return r;

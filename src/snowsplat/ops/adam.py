@@ -37,6 +37,7 @@ def adam_step(
     eps: float = 1e-15,
     visible_only: bool = False,
     valid: Tensor | None = None,
+    held: Tensor | None = None,
 ) -> None:
     """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
 
@@ -54,6 +55,9 @@ def adam_step(
 
     valid: (1,) bool; where it is False nothing changes. It says so from the device, so that nobody
         has to wait for what decides it. None: always.
+    held: (6,) int32, in the order of the parameters; None: nobody asks. A number that the step
+        would make infinite or NaN keeps its value and moments, and here their rows are counted:
+        added to what is there. So no gradient, however broken, gets into the parameters.
 
     Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
     p −= lr · m̂ / √(v̂ + eps²) (Kingma & Ba 2015, with ε inside the root).
@@ -79,6 +83,13 @@ def adam_step(
         raise ValueError(
             f"adam_step: ids must be torch.int32 on {means.device}, got {ids.dtype} on {ids.device}"
         )
+    if held is not None:
+        fits = held.shape == (len(PARAMETERS),) and held.dtype == torch.int32
+        if not (fits and held.device == means.device and held.is_contiguous()):
+            raise ValueError(
+                f"adam_step: held must be (6,) torch.int32 on {means.device}, "
+                f"got {tuple(held.shape)} {held.dtype} on {held.device}"
+            )
     if step < 1:
         raise ValueError(f"adam_step: step counts from 1, got {step}")
     per_parameter: list[Tensor | float | None] = []
@@ -107,6 +118,7 @@ def adam_step(
         float(eps),
         visible_only,
         valid,
+        held,
     )
     if done < 0:
         raise ValueError(

@@ -21,8 +21,8 @@ class Readback:
         self._device = device
 
     def post(self, *numbers: Tensor) -> None:
-        """``numbers``: tensors of one element each, on the device."""
-        gathered = torch.cat([number.detach().double().reshape(1) for number in numbers])
+        """``numbers``: tensors on the device, with ``count`` elements together."""
+        gathered = torch.cat([number.detach().double().reshape(-1) for number in numbers])
         self._numbers.copy_(gathered, non_blocking=True)
         if self._arrived is not None:
             self._arrived.record(torch.cuda.current_stream(self._device))

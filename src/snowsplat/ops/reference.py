@@ -385,17 +385,19 @@ def accumulate_screen_statistics(
     """Adds one view to what density control (section 5.2) knows of the Gaussians that it sees.
 
     The gradient of the position (M, 2) is stated for a screen that spans [-1, 1] in x and y.
-    Nothing is added where `valid` (1,) is False.
+    Nothing is added where it is not finite, or `valid` (1,) is False.
     """
     if valid is not None and not valid:
         return
     assert splats.ids is not None
     assert splats.packed.grad is not None
-    rows, grad = splats.ids.long(), splats.packed.grad
-    norm_sum[rows] += (grad[:, :2] * grad.new_tensor([width / 2, height / 2])).norm(dim=1)
+    norms = (splats.packed.grad[:, :2] * norm_sum.new_tensor([width / 2, height / 2])).norm(dim=1)
+    counts = norms.isfinite()
+    rows = splats.ids.long()[counts]
+    norm_sum[rows] += norms[counts]
     views[rows] += 1
     if max_radii is not None:
-        max_radii[rows] = torch.maximum(max_radii[rows], splats.radii)
+        max_radii[rows] = torch.maximum(max_radii[rows], splats.radii[counts])
 
 
 # ------------------------------------------------------------------------------------- adam_step
@@ -423,6 +425,7 @@ def adam_step(
     eps: float = 1e-15,
     visible_only: bool = False,
     valid: Tensor | None = None,
+    held: Tensor | None = None,
 ) -> None:
     """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
 
@@ -434,6 +437,8 @@ def adam_step(
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
     valid: (1,) bool; where it is False nothing changes.
+    held: (6,) int32, to which rows are added, a count a parameter, with numbers that the step would
+        make infinite or NaN: those keep their values and moments.
 
     Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
     p −= lr · m̂ / √(v̂ + eps²), where the paper has √v̂ + eps. The two agree for v̂ ≫ eps² and at
@@ -449,7 +454,7 @@ def adam_step(
         grads = torch.autograd.grad(splats.packed, selected, packed_grad)
 
     beta1, beta2 = betas
-    for name, visible_grad in zip(PARAMETERS, grads, strict=True):
+    for i, (name, visible_grad) in enumerate(zip(PARAMETERS, grads, strict=True)):
         p = params[name]
         grad = torch.zeros_like(p)
         grad[rows] = visible_grad
@@ -466,6 +471,10 @@ def adam_step(
             taken[rows] = True
         if name == "sh_rest":
             taken[:, (sh_degree + 1) ** 2 - 1 :] = False
+        broken = taken & ~(v.isfinite() & stepped.isfinite())
+        if held is not None:
+            held[i] += broken.reshape(len(p), -1).any(dim=1).sum() if broken.numel() else 0
+        taken &= ~broken
         p.copy_(torch.where(taken, stepped, p))
         exp_avg[name].copy_(torch.where(taken, m, exp_avg[name]))
         exp_avg_sq[name].copy_(torch.where(taken, v, exp_avg_sq[name]))

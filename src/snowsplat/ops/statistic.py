@@ -26,7 +26,8 @@ def accumulate_screen_statistics(
     norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|, views (N,) += 1, and
     max_radii (N,) = max(max_radii, `splats.radii`) unless None. The factor states the gradient for
     a screen that spans [-1, 1], as the paper's threshold is (section 5.2). Rows of id −1 are
-    passed over, and where `valid` (1,) bool is False all are.
+    passed over, as those of a gradient that is not finite, and where `valid` (1,) bool is False
+    all are.
 
     Raises ValueError where there is no gradient, no ids, or shapes or dtypes do not fit.
     """

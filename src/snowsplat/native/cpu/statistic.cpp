@@ -1,9 +1,11 @@
 // accumulate_screen_statistics: what density control has to know of the splats of a view, in one pass.
-// Rows are distinct Gaussians, so no two threads share a sum.
+// Rows are distinct Gaussians, so no two threads share a sum. One whose gradient is not finite does
+// not count.
 #include <cmath>
 #include <cstdint>
 
 #include "cpu/pool.h"
+#include "portable.h"
 
 namespace snow {
 namespace {
@@ -21,7 +23,9 @@ void accumulate(int64_t m, const int32_t* ids, const T* packed, const T* grad_pa
       if (row < 0) continue;
       const T* g = grad_packed + i * stride;
       const T x = g[0] * half_width, y = g[1] * half_height;
-      norm_sum[row] += std::sqrt(x * x + y * y);
+      const T norm = std::sqrt(x * x + y * y);
+      if (!is_finite(norm)) continue;
+      norm_sum[row] += norm;
       views[row] += T(1);
       if (max_radii) {
         T& largest = max_radii[row];

@@ -1,5 +1,6 @@
 // accumulate_screen_statistics: what density control has to know of the splats of a view. A thread a
-// splat; rows are distinct Gaussians, so no two threads share a sum.
+// splat; rows are distinct Gaussians, so no two threads share a sum. One whose gradient is not finite
+// does not count.
 #include "cuda/device.h"
 
 namespace snow {
@@ -16,7 +17,9 @@ SNOW_INLINE void accumulate(int64_t m, const int32_t* ids, const T* packed, cons
   if (row < 0) return;
   const T* g = grad_packed + i * stride;
   const T x = g[0] * half_width, y = g[1] * half_height;
-  norm_sum[row] += sqrt(x * x + y * y);
+  const T norm = sqrt(x * x + y * y);
+  if (!is_finite(norm)) return;
+  norm_sum[row] += norm;
   views[row] += T(1);
   if (max_radii) max_radii[row] = max(packed[i * stride + 7], max_radii[row]);
 }
