@@ -18,7 +18,7 @@ import pytest
 import viser
 from websockets.exceptions import InvalidMessage, InvalidStatus
 
-from snowsplat.viewer.network.guard import _BROWSERS, _PAGES, _WAITING, Guard, is_sane
+from snowsplat.viewer.network.guard import _BROWSERS, _PAGES, _WAITING, Guard, govern, is_sane
 from snowsplat.viewer.network.server import Door, start_server, stop_server
 
 from ..clients import (
@@ -42,6 +42,8 @@ from ..clients import (
 @pytest.fixture
 def local() -> Iterator[Door]:
     door = start_server("127.0.0.1", None, "a scene")
+    govern(door.server.get_event_loop(), lambda: True)
+    door.open()
     yield door
     stop_server(door.server)
 
@@ -50,6 +52,7 @@ def local() -> Iterator[Door]:
 def shared() -> Iterator[Door]:
     """For others too; its address is that for this machine."""
     door = start_server("0.0.0.0", None, "a scene")
+    door.open()
     yield door
     stop_server(door.server)
 
@@ -136,6 +139,7 @@ def test_others_need_the_address(shared):
         assert refused(root + path) == 404, path
     assert refused(f"{root}/%2e/{token}") == 404
     other = start_server("0.0.0.0", None, "a scene")
+    assert status(get(other.url)) == 503  # nobody comes in before it is opened
     stop_server(other.server)
     assert other.url.split("/")[3] != token
     with pytest.raises(ValueError, match="needs a token"):

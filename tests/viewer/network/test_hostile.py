@@ -4,12 +4,14 @@ import dataclasses
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from viser.infra._async_message_buffer import AsyncMessageBuffer
 
 from snowsplat import ops
 from snowsplat.capture import Capture, load_capture
@@ -111,6 +113,30 @@ def test_it_goes_on_to_the_bit(watched, capture, capfd):
     ours, theirs = plain.state_tensors(), watched.trainer.state_tensors()
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     assert capfd.readouterr() == ("", "")
+
+
+def test_viser_is_changed_in_its_own_thread_alone(watched, monkeypatch):
+    """Its buffers are no good to two: a browser that came at that moment ended a training."""
+    threads = set()
+    push = AsyncMessageBuffer.push
+
+    def noting(buffer: AsyncMessageBuffer, message: object) -> None:
+        threads.add(threading.current_thread().name)
+        push(buffer, message)
+
+    monkeypatch.setattr(AsyncMessageBuffer, "push", noting)
+    with Visitor(watched.viewer.url) as visitor:
+        visitor.look()
+        while len(visitor.controls) < 20 or not visitor.shown:
+            watched.step()
+            visitor.pictures(0.05)
+        for label, value in (("Show", "Depth"), ("Cameras", True), ("Go to", "Next")):
+            visitor.press(label, value)
+        visitor.press("Keep this view")
+        end = time.monotonic() + 2.5
+        while time.monotonic() < end:
+            watched.step()
+    assert threads == {watched.viewer.server._websock_server._server_thread.name}
 
 
 def test_controls_take_what_is_there(watched):

@@ -28,6 +28,7 @@ def test_a_page_is_served_and_the_port_given_back(capfd):
     port = free_port("127.0.0.1", None)
     assert DEFAULT_PORT <= port < DEFAULT_PORT + 20
     door = start_server("127.0.0.1", port, "a scene")
+    door.open()
     server, url = door.server, door.url
     try:
         assert url == f"http://127.0.0.1:{port}"

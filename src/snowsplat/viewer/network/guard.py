@@ -8,12 +8,16 @@ in the process that trains. So what it starts its server with is `Guard.serve`:
 - So many connections are open, pages under way, browsers connected, and no more.
 - A message is passed on if it is one of the three that our page sends and every number in it is
   one. Who says more than a page can is sent away; who does not read is not listened to.
-- All of it may take a fifth of a core: a training in this process keeps the rest.
+- All of it may take a fifth of a core while this process trains.
+
+And it all happens in viser's thread, what comes from the training too (`tell`): its buffers may
+break when another thread adds to them while a browser comes or goes.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import hmac
 import http
@@ -76,6 +80,7 @@ class Guard:
         if token is None and not is_loopback(host):
             raise ValueError(f"{host}: a server that others reach needs a token")
         self.serves = False  # viser has started its server with this
+        self.is_open = False  # what browsers are to find is in its place
         self._host, self._token = host, token
         self._waiting: dict[_Connection, None] = {}  # in the order in which they came
         self._pages: set[_Connection] = set()
@@ -121,6 +126,8 @@ class Guard:
             headers = Headers([*more, ("Content-Length", "0"), ("Connection", "close")])
             return Response(status, status.phrase, headers)
 
+        if not self.is_open:
+            return refuse(http.HTTPStatus.SERVICE_UNAVAILABLE, ("Retry-After", "1"))
         values = {name: request.headers.get_all(name) for name in ("Host", "Origin", "Upgrade")}
         if any(len(given) > 1 for given in values.values()) or not values["Host"]:
             return refuse(http.HTTPStatus.BAD_REQUEST)
@@ -297,14 +304,17 @@ def is_sane(data: Data) -> bool:
 # The thread of the server
 
 
-def govern(loop: asyncio.AbstractEventLoop) -> None:
-    """Hold what runs in ``loop`` to its share of a core, and its errors to our own log."""
+def govern(loop: asyncio.AbstractEventLoop, training: Callable[[], bool]) -> None:
+    """Hold what runs in ``loop`` to its share of a core, while there is a training to share with.
+
+    Its errors go to our own log.
+    """
     measured = [0.0, 0.0]  # seconds of this thread and of the clock
 
     def look() -> None:
         used, passed = time.thread_time() - measured[0], time.monotonic() - measured[1]
         rest = used / _SHARE - passed
-        if rest > 0.0:
+        if rest > 0.0 and training():
             time.sleep(min(rest, _LONGEST_REST))
         measured[:] = time.thread_time(), time.monotonic()
         loop.call_later(_TICK, look)
@@ -315,6 +325,12 @@ def govern(loop: asyncio.AbstractEventLoop) -> None:
         look()
 
     loop.call_soon_threadsafe(begin)
+
+
+def tell(server: viser.ViserServer, run: Callable[[], None]) -> None:
+    """Run it in the thread of the server, soon; after its end, not at all."""
+    with contextlib.suppress(RuntimeError):
+        server.get_event_loop().call_soon_threadsafe(run)
 
 
 def _note(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from snowsplat.errors import UserError
 from snowsplat.viewer.network.gauge import Curve
+from snowsplat.viewer.network.guard import tell
 from snowsplat.viewer.network.look import Mode
 from snowsplat.viewer.network.photos import FRUSTUMS, Photos
 from snowsplat.viewer.network.session import Session, Visitor
@@ -69,7 +70,11 @@ class TrainingPanel:
     """How the training goes, and its controls: the same for all browsers."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._session = session
+        self._server, self._session = server, session
+        tell(server, self._add)
+
+    def _add(self) -> None:
+        server, session = self._server, self._session
         with server.gui.add_folder("Training", order=0):
             self._status = server.gui.add_html(note("waiting for the first step"))
             self._bar = server.gui.add_progress_bar(0.0)
@@ -112,17 +117,26 @@ class TrainingPanel:
             status: lines about the training.
             share: of its steps that are made, 0..1.
         """
-        self._status.content = note("<br>".join(map(html.escape, status)))
-        self._bar.value = 100.0 * share  # type: ignore[misc]  # viser's setter has another type
-        for plot, curve in ((self._loss, loss), (self._psnr, psnr)):
-            if len(curve) > 1:
-                plot.data = curve.arrays()
-                plot.visible = True
+        curves = loss.arrays(), psnr.arrays()
+
+        def put() -> None:
+            self._status.content = note("<br>".join(map(html.escape, status)))
+            self._bar.value = 100.0 * share  # type: ignore[misc]  # viser's setter has another type
+            for plot, curve in zip((self._loss, self._psnr), curves, strict=True):
+                if len(curve[0]) > 1:
+                    plot.data = curve
+                    plot.visible = True
+
+        tell(self._server, put)
 
     def end(self) -> None:
         """Nothing is left to be paused."""
-        for control in (self._pause, self._step, self._share):
-            control.visible = False
+
+        def hide() -> None:
+            for control in (self._pause, self._step, self._share):
+                control.visible = False
+
+        tell(self._server, hide)
 
 
 def _plot(server: viser.ViserServer, name: str, color: str) -> viser.GuiUplotHandle:
@@ -145,12 +159,20 @@ class ScenePanel:
     """What is shown, where nothing is trained."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        with server.gui.add_folder("Scene", order=0):
-            self._status = server.gui.add_html(note("nothing yet"))
+        self._server = server
+        tell(server, self._add)
+
+    def _add(self) -> None:
+        with self._server.gui.add_folder("Scene", order=0):
+            self._status = self._server.gui.add_html(note("nothing yet"))
 
     def show(self, status: list[str]) -> None:
         """Lines about the scene."""
-        self._status.content = note("<br>".join(map(html.escape, status)))
+
+        def put() -> None:
+            self._status.content = note("<br>".join(map(html.escape, status)))
+
+        tell(self._server, put)
 
 
 class Controls:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import functools
 import math
 import threading
 import time
@@ -21,6 +22,7 @@ from snowsplat.capture.decode import load_image
 from snowsplat.errors import UserError
 from snowsplat.geometry import quat_from_rotation
 from snowsplat.paths.sight import up_of
+from snowsplat.viewer.network.guard import tell
 from snowsplat.viewer.network.look import Placed, Pose, fit
 from snowsplat.viewer.network.pictures import Photo
 from snowsplat.viewer.network.session import Session, Stand, Visitor
@@ -59,7 +61,7 @@ class Photos:
             background: (3,) behind transparent photos.
         """
         self.views = [*train, *test]
-        self._session = session
+        self._server, self._session = server, session
         self._extent = extent
         self._length = _LONGEST * extent
         if len(self.views) > 1:
@@ -176,7 +178,8 @@ class Photos:
                 continue  # the training, or standing there, will say so
             if self._closed.is_set():
                 return
-            frustum.image = planes.permute(1, 2, 0).contiguous().numpy()
+            pixels = planes.permute(1, 2, 0).contiguous().numpy()
+            tell(self._server, functools.partial(setattr, frustum, "image", pixels))
             rest = (1.0 / _READING - 1.0) if self._session.training else 0.0
             if self._closed.wait(rest * (time.monotonic() - started)):
                 return

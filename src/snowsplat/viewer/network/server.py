@@ -16,7 +16,7 @@ import websockets.asyncio.server
 
 from snowsplat.errors import UserError
 from snowsplat.viewer.hosts import ANY_HOST, is_loopback
-from snowsplat.viewer.network.guard import Guard, govern
+from snowsplat.viewer.network.guard import Guard
 
 DEFAULT_PORT = 8080
 # How many ports are tried where none was asked for.
@@ -41,12 +41,18 @@ class Door:
     server: viser.ViserServer
     url: str
     others: str | None
+    guard: Guard
+
+    def open(self) -> None:
+        """Let browsers in; from now on the server is changed in its own thread, see `tell`."""
+        self.guard.is_open = True
 
 
 def start_server(host: str, port: int | None, label: str) -> Door:
     """Listen at ``host`` and ``port``; without one, at 8080 or the next that is free.
 
-    Where other machines reach it, only who has the address gets in.
+    Nobody is let in before `Door.open`. Where other machines reach it, only who has the address
+    is.
 
     Raises:
         UserError: the port is taken, or the host is not one of this machine.
@@ -64,9 +70,8 @@ def start_server(host: str, port: int | None, label: str) -> Door:
     if server.get_port() != free:  # taken since, and viser takes the next by itself
         stop_server(server)
         raise UserError(f"port {free} is taken; name another: --port {free + 1}")
-    govern(server.get_event_loop())
     others = address(socket.gethostname(), free, token) if host in ANY_HOST else None
-    return Door(server, address(host, free, token), others)
+    return Door(server, address(host, free, token), others, guard)
 
 
 @contextlib.contextmanager

@@ -76,6 +76,7 @@ class Visitor:
     arrived: bool = False  # at the stand: from there, moving is leaving
     sent: float = 0.0  # when it was sent there
     longest: int = 1280  # pixels of the longer side of a full picture
+    sending: bool = False  # its last picture is under way
     version: int = 0  # of all above
     changed: float = 0.0  # when that was
     # What it was shown last.
@@ -86,7 +87,7 @@ class Visitor:
 
     def due(self, scene: int, now: float) -> Due | None:
         """The picture that would be right now, if it has not been shown."""
-        if self.pose is None:
+        if self.pose is None or self.sending:
             return None
         full = fit(self.pose.width, self.pose.height, self.longest)
         moving = now - self.changed < STILL
@@ -241,6 +242,12 @@ class Session:
         with self._changed:
             due.visitor.shown(due, scene, seconds)
         self.pay(_purse(due), seconds)
+
+    def sending(self, visitor: Visitor, under_way: bool) -> None:
+        """A picture is on its way to it, or is no longer: one at a time."""
+        with self._changed:
+            visitor.sending = under_way
+            self._notify()
 
     def may_pay(self, purse: Literal["asked", "idle"]) -> bool:
         """Whether the training has had its share since the last time."""

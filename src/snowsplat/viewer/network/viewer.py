@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import viser
 
 from snowsplat.capture import Capture
 from snowsplat.gaussians import Gaussians
+from snowsplat.viewer.network.guard import govern, tell
 from snowsplat.viewer.network.keys import KeyCameras
 from snowsplat.viewer.network.look import Pose
 from snowsplat.viewer.network.page import Controls, ScenePanel
@@ -52,6 +52,9 @@ class Scene:
 class NetworkViewer:
     """A page at `url` that shows Gaussians.
 
+    Attributes:
+        others: its address for other computers, where they are let in and it is another.
+
     Pictures are made by `serve` and `hold`, in the thread that calls them and in no other: nothing
     reads the Gaussians while they change, and nothing has to copy them.
     """
@@ -84,11 +87,12 @@ class NetworkViewer:
             *(self.server, self.session, capture.train, capture.test, capture.extent),
             *(self._bounds.mean(0), self.background),
         )
-        self._lock = threading.Lock()
         self._browsers: dict[int, tuple[viser.ClientHandle, Visitor, Controls]] = {}
         self._photos.on_click(self._clicked)
         self.server.on_client_connect(self._entered)
         self.server.on_client_disconnect(self._left)
+        govern(self.server.get_event_loop(), lambda: self.session.training)
+        door.open()
 
     def close(self) -> None:
         """Close the page."""
@@ -101,8 +105,7 @@ class NetworkViewer:
         visitor = self.session.enter(client.client_id)
         controls = Controls(client, self.session, visitor, self._photos, self._bounds)
         KeyCameras(client, visitor)
-        with self._lock:
-            self._browsers[client.client_id] = client, visitor, controls
+        self._browsers[client.client_id] = client, visitor, controls
         self._photos.begin()
 
         async def moved(camera: viser.CameraHandle) -> None:
@@ -116,14 +119,22 @@ class NetworkViewer:
 
     async def _left(self, client: viser.ClientHandle) -> None:
         self.session.leave(client.client_id)
-        with self._lock:
-            self._browsers.pop(client.client_id, None)
+        self._browsers.pop(client.client_id, None)
 
     def _clicked(self, client: viser.ClientHandle, index: int) -> None:
-        with self._lock:
-            browser = self._browsers.get(client.client_id)
+        browser = self._browsers.get(client.client_id)
         if browser is not None:
             browser[2].stand_at(index)
+
+    def _send(self, due: Due, picture: np.ndarray) -> None:
+        client = next((c for c, v, _ in self._browsers.values() if v is due.visitor), None)
+        try:
+            if client is not None:  # else it has left while this was drawn
+                quality = _QUALITY[due.kind]
+                client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+                client.flush()
+        finally:
+            self.session.sending(due.visitor, False)
 
     # The caller's thread
 
@@ -140,19 +151,12 @@ class NetworkViewer:
         started = time.monotonic()
         try:
             picture = self._draw(due, gaussians)
-            self._send(due, picture)
+            self.session.sending(due.visitor, True)
+            tell(self.server, lambda: self._send(due, picture))
         except Exception:  # whatever somebody wanted to see: the training does not end of it
             _log.debug("a picture was not made", exc_info=True)
         self.session.spent(due, scene, time.monotonic() - started)
         return True
-
-    def _send(self, due: Due, picture: np.ndarray) -> None:
-        with self._lock:
-            client = next((c for c, v, _ in self._browsers.values() if v is due.visitor), None)
-        if client is not None:  # else it has left while this was drawn
-            quality = _QUALITY[due.kind]
-            client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
-            client.flush()
 
     def _draw(self, due: Due, gaussians: Gaussians) -> np.ndarray:
         if due.stand is None:
