@@ -19,12 +19,13 @@ from snowsplat.cli.timed import TimeBudget
 from snowsplat.cli.training_run import TrainingRun
 from snowsplat.cli.viewing import PageFlags
 from snowsplat.errors import UserError
+from snowsplat.schedule import Schedule
+from snowsplat.untrusted import from_json
 
 if TYPE_CHECKING:
     from snowsplat.capture import Capture
     from snowsplat.checkpoint import Checkpoint
     from snowsplat.config import TrainConfig
-    from snowsplat.schedule import Schedule
     from snowsplat.trainer import Trainer
 
 # Flags that are knobs of the configuration, under the same name.
@@ -39,6 +40,32 @@ _KNOBS = (
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
 
 RECIPE = "the recipe's"
+
+
+@dataclass(frozen=True)
+class Noted:
+    """What a checkpoint says of its training, beside the numbers."""
+
+    capture: CaptureSettings
+    recipe: Literal["default", "paper", "mcmc"]
+    training: dict[str, Any]  # see `config_from_json`
+    time: dict[str, float] | None = None  # see `TimeBudget`
+    schedule: Schedule | None = None
+
+
+def read_meta(start: Checkpoint) -> Noted:
+    """What stands in a checkpoint, checked.
+
+    Raises:
+        UserError: not of a training, or damaged.
+    """
+    try:
+        noted = from_json(Noted, start.meta)
+        if noted.time is not None and noted.time.keys() != {"seconds", "spent"}:
+            raise ValueError("no time")
+    except ValueError as error:
+        raise UserError(f"{start.path}: not the checkpoint of a training ({error})") from None
+    return noted
 
 
 @dataclass
@@ -203,14 +230,15 @@ class Train:
         if self.deterministic:
             ask_for_the_same_bits()
         start = self._checkpoint(out) if self.resume else None
-        budget, schedule = self._length(start, started)
+        noted = None if start is None else read_meta(start)
+        budget, schedule = self._length(noted, started)
         slowness = 1.0
-        if start is None:
+        if start is None or noted is None:
             settings, config = self._capture_settings(None), self._config()
             recipe = self.recipe or "default"
         else:
-            settings = self._capture_settings(CaptureSettings(**start.meta["capture"]))
-            config, recipe = self._resumed_config(start), start.meta["recipe"]
+            settings = self._capture_settings(noted.capture)
+            config, recipe = self._resumed_config(start, noted), noted.recipe
         capture = settings.load()
         if budget is not None and start is None:
             plan = budget.plan(
@@ -261,21 +289,15 @@ class Train:
     # Flags -> settings
 
     def _length(
-        self, start: Checkpoint | None, started: float
+        self, noted: Noted | None, started: float
     ) -> tuple[TimeBudget | None, Schedule | None]:
         """The time that there is, and the schedule of a training that goes on.
 
         --iterations, given anew, takes the place of both.
         """
-        from snowsplat.schedule import Schedule
-
-        if start is None or self.iterations is not None:
+        if noted is None or self.iterations is not None:
             return TimeBudget.of(self.minutes, None, started), None
-        schedule = start.meta.get("schedule")
-        return (
-            TimeBudget.of(self.minutes, start.meta.get("time"), started),
-            None if schedule is None else Schedule(**schedule),
-        )
+        return TimeBudget.of(self.minutes, noted.time, started), noted.schedule
 
     def _capture_path(self) -> Path | None:
         if self.capture is not None and self.source_path is not None:
@@ -332,15 +354,13 @@ class Train:
         self._say(f"{out.path}: no checkpoint yet; beginning at step 0")
         return None
 
-    def _resumed_config(self, start: Checkpoint) -> TrainConfig:
+    def _resumed_config(self, start: Checkpoint, noted: Noted) -> TrainConfig:
         """The checkpoint's own; flags may change only what leaves the steps so far as they were."""
         from snowsplat.config import changed, config_from_json
 
-        config = config_from_json(start.meta["training"])
-        if self.recipe not in (None, start.meta["recipe"]):
-            raise UserError(
-                f"{start.path}: is of the recipe {start.meta['recipe']}; leave out --recipe"
-            )
+        config = config_from_json(noted.training)
+        if self.recipe not in (None, noted.recipe):
+            raise UserError(f"{start.path}: is of the recipe {noted.recipe}; leave out --recipe")
         resumed = changed(config, **self._knobs())
         same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
         if same != config:
