@@ -3,6 +3,7 @@
 import shutil
 import signal
 import socket
+import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -135,3 +136,19 @@ def test_the_folder_of_make_holds_that_of_a_training(trained, tmp_path):
     shutil.copytree(trained, tmp_path / "made" / "scene")
     assert Watch(output=tmp_path / "made").folder().path == tmp_path / "made" / "scene"
     assert Watch(output=trained).folder().path == trained
+
+
+def test_other_computers_are_told_an_address_that_cannot_be_guessed(start, trained):
+    process = start("watch", trained, "--host", "0.0.0.0")
+    url = url_of(process)
+    others = process.stdout.readline()
+    token = url.rstrip("/").rpartition("/")[2]
+    assert len(token) >= 20
+    assert others.startswith("from other computers: http://")
+    assert others.endswith(f"/{token}/\n")
+    assert b"<html" in page_at(url)
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        page_at(url.replace(token, ""))
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")

@@ -65,7 +65,7 @@ class Make:
     port: Annotated[int | None, flag("N", default="8080, or the next that is free")] = None
     """Where that page is: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer alone")] = None
-    """Who may look; 0.0.0.0: everybody in the network."""
+    """Who may look; 0.0.0.0: all in the network who have the address, which is printed."""
 
     def run(self) -> int:
         """Gives the exit code: 0, or 130 after Ctrl-C."""

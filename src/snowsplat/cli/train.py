@@ -122,7 +122,7 @@ class Train:
     port: Annotated[int | None, flag("N", default="8080, or the next that is free")] = None
     """Where that page is: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer alone")] = None
-    """Who may look; 0.0.0.0: everybody in the network."""
+    """Who may look; 0.0.0.0: all in the network who have the address, which is printed."""
 
     max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Most Gaussians that the scene may have: memory and time follow it. 0: no limit."""

@@ -40,7 +40,7 @@ class Watch(SceneFlags):
     port: Annotated[int | None, flag("N", default="8080, or the next that is free")] = None
     """Where the page is: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer alone")] = None
-    """Who may look; 0.0.0.0: everybody in the network."""
+    """Who may look; 0.0.0.0: all in the network who have the address, which is printed."""
 
     def folder(self) -> OutputFolder:
         folder = super().folder()
