@@ -1,5 +1,5 @@
-"""The kernels of the CPU under sanitizers: AddressSanitizer and UndefinedBehaviorSanitizer with tests
-of the ops, on each instruction set that runs here, and ThreadSanitizer for the threads.
+"""The kernels of the CPU under sanitizers: AddressSanitizer and UndefinedBehaviorSanitizer with the
+tests of the ops, on each instruction set that runs here, and ThreadSanitizer for the threads.
 
     python tests/nightly/sanitize_native.py              some minutes
     python tests/nightly/sanitize_native.py --isa avx2 --skip threads
@@ -84,7 +84,7 @@ def _isas(package: Path) -> list[str]:
 def _tests(package: Path, isa: str) -> bool:
     started = time.monotonic()
     command = [sys.executable, "-m", "pytest", "tests/ops", "-m", "not emulated and not gpu"]
-    # Not those that measure a call, load libraries of their own making, or have NVRTC compile, which
+    # Not those that measure a call, load libraries of their own making, or have NVRTC compile: it
     # does not find its parts under a sanitizer.
     for other in ("native", "emulation", "driver", "cuda_build"):
         command.append(f"--ignore=tests/ops/test_{other}.py")
