@@ -64,11 +64,6 @@ def read_clip(path: Path) -> Clip:
     try:
         with open_video(path) as container:
             stream = container.streams.video[0]
-            if stream.width * stream.height > _MOST_PIXELS:
-                raise UserError(
-                    f"{shown(path)}: its frames have {stream.width}x{stream.height} pixels, more "
-                    f"than {_MOST_PIXELS // 1_000_000} million; save it with smaller ones"
-                )
             rate = float(stream.average_rate or 30)
             # The header is trusted for this alone: to say how much of a damaged file is absent.
             promised = stream.frames
@@ -168,6 +163,7 @@ def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
 def nothing_decodes(path: Path, error: Exception | None) -> UserError:
     reason = f" ({getattr(error, 'strerror', None) or error})" if error else ""
     return UserError(
-        f"{shown(path)}: no frame of this video can be decoded{reason}; it may be cut off or "
-        "damaged: copy it again, or save it as mp4 (H.264)"
+        f"{shown(path)}: no frame of this video can be decoded{reason}; it may be cut off, damaged, "
+        f"or larger than {_MOST_PIXELS // 1_000_000} million pixels: copy it again, or save it as "
+        "mp4 (H.264)"
     )

@@ -1,0 +1,516 @@
+"""Every reader of the project, once: how a valid small file is made, and how it is read.
+
+A new format is a new line in `READERS`. The tests of this folder damage the files in CI;
+tests/nightly/fuzz_files.py does so for hours.
+"""
+
+from __future__ import annotations
+
+import functools
+import gzip
+import io
+import json
+import struct
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import safetensors.torch
+import torch
+from PIL import Image
+
+from snowsplat import checkpoint
+from snowsplat.camera_list import read_cameras, write_cameras
+from snowsplat.capture import load_capture
+from snowsplat.capture.decode import ImageSource, load_image, load_mask
+from snowsplat.capture.decode import read_header as read_image_header
+from snowsplat.capture.points_ply import read_points, write_points
+from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat.cli.info import describe
+from snowsplat.cli.output import CaptureSettings, OutputFolder
+from snowsplat.config import TrainConfig
+from snowsplat.errors import UserError
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats.spz import write_spz
+from snowsplat.formats.spz_container import unpack
+from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.history import History
+from snowsplat.lpips import Lpips
+from snowsplat.photos import capture_folder, clip, mask_files, photo_files, video
+from snowsplat.photos.inputs import Gathered
+from snowsplat.photos.photo import Photo
+from snowsplat.photos.progress import silent
+from snowsplat.photos.stages import Stages
+
+from ..formats.test_ksplat import ksplat, section
+from ..photos.pictures import exif, pan, photo, write_video
+
+_IMAGE_BYTES = 16  # of memory for each pixel, while an image is decoded
+_FRAME_BYTES = 96  # of a video: frames that follow each other are decoded at once
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader, and files that it reads without complaint.
+
+    Attributes:
+        file: what is damaged, in the folder that ``make`` fills.
+        read: reads that folder; what it gives is weighed.
+        json: also damage it as JSON.
+        pack: ``file`` is damaged before it is packed: behind a checksum there is more to break.
+        extra: memory that it may take beyond the general limit, by the file as it is.
+    """
+
+    name: str
+    file: str
+    make: Callable[[Path], object]
+    read: Callable[[Path], Any]
+    json: bool = False
+    pack: Callable[[bytes], bytes] | None = None
+    extra: Callable[[Path], int] = lambda path: 0
+
+    @functools.cached_property
+    def folder(self) -> Path:
+        """Valid files, made once."""
+        folder = Path(tempfile.mkdtemp(prefix="snowsplat-fuzz-", dir=_root().name))
+        self.make(folder)
+        return folder
+
+    @functools.cached_property
+    def valid(self) -> bytes:
+        """What is damaged."""
+        return (self.folder / self.file).read_bytes()
+
+    def write(self, data: bytes) -> int:
+        """Put these bytes in place of the valid ones; gives the size of the file."""
+        packed = data if self.pack is None else self.pack(data)
+        (self.folder / self.file).write_bytes(packed)
+        return len(packed)
+
+    def memory(self) -> int:
+        """Bytes beyond the general limit, for the file as it is."""
+        return self.extra(self.folder / self.file)
+
+
+@functools.cache
+def _root() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="snowsplat-fuzz-")
+
+
+# Scenes
+
+
+def make_scene(n: int, degree: int) -> Gaussians:
+    generator = torch.Generator().manual_seed(n + degree)
+    shapes = ((n, 3), (n, 3), (n, 4), (n,), (n, 1, 3), (n, SH_REST_COUNTS[degree], 3))
+    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
+
+
+def _scene(file: str, degree: int = 1, **more: Any) -> Reader:
+    return Reader(
+        f"scene {file}",
+        file,
+        lambda folder: write_gaussians(folder / file, make_scene(30, degree)),
+        lambda folder: read_gaussians(folder / file),
+        **more,
+    )
+
+
+def _spz(name: str, version: int, pack: Callable[[bytes], bytes] | None = None) -> Reader:
+    def make(folder: Path) -> None:
+        path = folder / "a.spz"
+        write_spz(path, make_scene(30, 2), max(version, 3))
+        if version == 4:
+            return
+        columns = unpack(path, path.read_bytes()).columns
+        if version == 1:
+            columns[0] = bytes(range(30)) * 6
+        if version < 3:
+            columns[4] = columns[4][: 30 * 3]
+        head = struct.pack("<4sIIBBBB", b"NGSP", version, 30, 2, 12, 0, 0)
+        path.write_bytes(head + b"".join(columns))
+
+    read = _reads("a.spz")
+    return Reader(name, "a.spz", make, read, pack=pack)
+
+
+def _ascii_ply(folder: Path) -> None:
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1"]
+    names += ["scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    lines = ["ply", "format ascii 1.0", "element other 2", "property int a", "element vertex 9"]
+    lines += [f"property float {name}" for name in names] + ["end_header", "1", "2"]
+    lines += [" ".join(f"{i + 0.1 * k:g}" for k in range(len(names))) for i in range(9)]
+    (folder / "a.ply").write_text("\n".join([*lines, ""]))
+
+
+def _ksplat(level: int) -> Reader:
+    def make(folder: Path) -> None:
+        sections = [
+            section(make_scene(11, 1), level, 2, [1, 2]),
+            section(make_scene(4, 0), level, 1, []),
+        ]
+        (folder / "a.ksplat").write_bytes(ksplat(sections, level, 15))
+
+    return Reader(f"scene ksplat level {level}", "a.ksplat", make, _reads("a.ksplat"))
+
+
+@functools.cache
+def _sog_members() -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        write_gaussians(Path(folder) / "a.sog", make_scene(30, 1))
+        with zipfile.ZipFile(Path(folder) / "a.sog") as bundle:
+            return {name: bundle.read(name) for name in bundle.namelist()}
+
+
+def _sog_bundle(name: str, data: bytes) -> bytes:
+    """A bundle with one member replaced, its sizes and checksums as they should be."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as bundle:
+        for member, content in (_sog_members() | {name: data}).items():
+            bundle.writestr(member, content)
+    return packed.getvalue()
+
+
+def _sog_part(member: str) -> Reader:
+    return Reader(
+        f"scene sog, its {member}",
+        "a.sog",
+        lambda folder: (folder / "a.sog").write_bytes(_sog_members()[member]),
+        _reads("a.sog"),
+        json=member.endswith("json"),
+        pack=lambda data: _sog_bundle(member, data),
+    )
+
+
+def _sog_folder(folder: Path) -> None:
+    for name, data in _sog_members().items():
+        (folder / name).write_bytes(data)
+
+
+def _glb_json(data: bytes) -> bytes:
+    """A GLB file with this JSON, and the numbers of the valid one."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.glb"
+        write_gaussians(path, make_scene(30, 1))
+        whole = path.read_bytes()
+    (size,) = struct.unpack_from("<I", whole, 12)
+    rest = whole[20 + size :]
+    data += b" " * (-len(data) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(data) + len(rest), len(data), 0x4E4F534A)
+    return head + data + rest
+
+
+def _make_glb_json(folder: Path) -> None:
+    write_gaussians(folder / "a.glb", make_scene(30, 1))
+    whole = (folder / "a.glb").read_bytes()
+    (size,) = struct.unpack_from("<I", whole, 12)
+    (folder / "a.glb").write_bytes(whole[20 : 20 + size])
+
+
+def _reads(file: str) -> Callable[[Path], Any]:
+    return lambda folder: read_gaussians(folder / file)
+
+
+# Captures
+
+
+def _capture(format: str, file: str, **more: Any) -> Reader:
+    def make(folder: Path) -> None:
+        write_synthetic_capture(folder, format, 5, 32, 24, n_points=20)  # type: ignore[arg-type]
+
+    def read(folder: Path) -> Any:
+        return load_capture(folder)
+
+    return Reader(f"capture {format}, its {Path(file).name}", file, make, read, **more)
+
+
+def _test_list(folder: Path) -> None:
+    write_synthetic_capture(folder, "colmap-bin", 5, 32, 24, n_points=20)
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    (folder / "test.txt").write_text("\n".join(names[:2]))
+
+
+# Images
+
+
+def _image_memory(path: Path) -> int:
+    try:
+        header = read_image_header(path)
+    except UserError:
+        with_heif = photo_files.open_image
+        try:
+            with with_heif(path) as image:
+                return _IMAGE_BYTES * image.width * image.height
+        except Exception:
+            return 0
+    return _IMAGE_BYTES * header.width * header.height
+
+
+_NOTES = {0x010F: "Maker", 0x0110: "Model", 0x0112: 6}
+_DETAILS = {0x920A: 4.2, 0xA405: 28, 0xA002: 320, 0xA003: 240, 0xA20E: 3000.0, 0xA210: 2}
+_PLACE = {1: "N", 2: (1.0, 2.0, 3.0), 3: "W", 4: (1.0, 2.0, 3.0), 5: 0, 6: 7.0}
+
+
+def _save_image(path: Path, kind: str) -> None:
+    image = photo(width=80, height=60)
+    options: dict[str, Any] = {}
+    if kind in ("jpg", "progressive", "webp", "heic", "tif", "png"):
+        options["exif"] = exif(_NOTES, _DETAILS, _PLACE)
+    if kind == "progressive":
+        options["progressive"] = True
+    elif kind in ("rgba", "lossless"):
+        image.putalpha(128)
+        options["lossless"] = True
+    elif kind == "palette":
+        image = image.quantize(7)
+        options["transparency"] = 3
+    elif kind == "deep":
+        image = Image.fromarray(np.arange(80 * 60, dtype=np.uint16).reshape(60, 80) * 13)
+    elif kind == "lzw":
+        options["compression"] = "tiff_lzw"
+    elif kind == "tif":
+        options["compression"] = "tiff_adobe_deflate"
+    elif kind == "rle":
+        image = image.quantize(7)
+    image.save(path, **options)
+
+
+#: Kind and ending.
+IMAGES = {
+    "jpg": "jpg", "progressive": "jpg", "png": "png", "rgba": "png", "palette": "png",
+    "deep": "png", "webp": "webp", "lossless": "webp", "tif": "tif", "lzw": "tif", "bmp": "bmp",
+    "ppm": "ppm",
+}  # fmt: skip
+
+
+def _png_with_checksums(data: bytes) -> bytes:
+    """The chunks of a PNG with the right checksums, as far as they are chunks."""
+    import zlib
+
+    out, at = data[:8], 8
+    while at + 12 <= len(data):
+        (size,) = struct.unpack_from(">I", data, at)
+        body = data[at + 4 : at + 8 + size]
+        out += data[at : at + 4] + body + struct.pack(">I", zlib.crc32(body))
+        at += 12 + size
+    return out + data[at:]
+
+
+def _image(kind: str, ending: str, what: str, read: Callable[[Path], Any]) -> Reader:
+    file = f"a.{ending}"
+    return Reader(
+        f"{what} {kind}",
+        file,
+        lambda folder: _save_image(folder / file, kind),
+        lambda folder: read(folder / file),
+        pack=_png_with_checksums if ending == "png" else None,
+        extra=_image_memory,
+    )
+
+
+def _read_image(path: Path) -> Any:
+    header = read_image_header(path)
+    source = ImageSource(path, header.width, header.height, header.sideways)
+    return load_image(source, (1.0, 1.0, 1.0)), load_mask(source)
+
+
+def _read_photo(path: Path) -> Any:
+    try:
+        header = photo_files.read_header(path)
+        image = photo_files.decode(path, header, 4000)
+        photo_files.decode_small(path, 320)
+        photo_files.save(
+            image, path.with_name("saved.jpg" if image.mode != "RGBA" else "s.png"), path
+        )
+        return image
+    except photo_files.Unusable as error:
+        raise UserError(str(error)) from None
+
+
+def _read_mask(folder: Path) -> Any:
+    header = photo_files.read_header(folder / "photo.jpg")
+    return mask_files.read_mask(folder / "a.png", header, header.size(None))
+
+
+def _make_mask(folder: Path) -> None:
+    photo(width=80, height=60).save(folder / "photo.jpg")
+    Image.effect_noise((80, 60), 90).save(folder / "a.png")
+
+
+# Videos
+
+
+def _video(name: str, file: str, **options: Any) -> Reader:
+    def make(folder: Path) -> None:
+        if file.endswith("gif"):
+            first, *others = [Image.fromarray(picture) for picture in pan(6)]
+            first.save(folder / file, save_all=True, append_images=others, duration=100)
+        else:
+            write_video(folder / file, pan(8), **options)
+
+    def read(folder: Path) -> Any:
+        path = folder / file
+        clip.is_video(path)
+        found = clip.read_clip(path)
+        return video.extract_frames(found, folder, 4, 640, silent)
+
+    def memory(path: Path) -> int:
+        try:
+            with clip.open_video(path) as container:
+                stream = container.streams.video[0]
+                return _FRAME_BYTES * stream.width * stream.height
+        except (av.FFmpegError, OSError, ValueError, IndexError):
+            return 0
+
+    return Reader(f"video {name}", file, make, read, extra=memory)
+
+
+# Records
+
+
+def _output(folder: Path) -> OutputFolder:
+    write_synthetic_capture(folder / "capture", "colmap-bin", 5, 32, 24, n_points=20)
+    capture = load_capture(folder / "capture")
+    out = OutputFolder(folder / "out")
+    out.begin(capture, CaptureSettings(str(folder / "capture")), TrainConfig())
+    out.write_scene(7, make_scene(5, 0))
+    figures = {"iteration": 7, "split": "test", "psnr": 20.5, "ssim": 0.9, "views": {"a": 1.0}}
+    (out.path / "metrics.json").write_text(json.dumps(figures))
+    history = History()
+    for step in range(1, 30):
+        history.step_begins()
+        history.step_ends(step, 0.5 / step, 100)
+    history.measure(29, 20.0, 0.9)
+    history.write(out.history)
+    return out
+
+
+def _read_settings(folder: Path) -> Any:
+    settings, background = OutputFolder(folder / "out").settings()
+    return asdict(settings), background
+
+
+def _make_cfg_args(folder: Path) -> None:
+    (_output(folder).path / "config.json").unlink()
+
+
+def _make_checkpoint(folder: Path) -> None:
+    from snowsplat.config import config_to_json
+
+    tensors = {"means": torch.rand(7, 3), "order": torch.arange(5), "none": torch.zeros(0, 3)}
+    meta = {
+        "capture": asdict(CaptureSettings("x")),
+        "recipe": "default",
+        "training": config_to_json(TrainConfig()),
+        "time": {"seconds": 60.0, "spent": 3.0},
+        "schedule": {"iterations": 30, "since": 0, "passed": 0.0},
+    }
+    checkpoint.save(folder, 5, tensors, meta)
+
+
+def _read_checkpoint(folder: Path) -> Any:
+    from snowsplat.cli.train import read_meta
+
+    loaded = checkpoint.load(folder / "step_000005.safetensors")
+    read_meta(loaded)
+    return loaded
+
+
+def _read_history(folder: Path) -> Any:
+    history = History.read(folder / "out" / "history.json", 20)
+    history.step_begins()
+    history.step_ends(21, 0.1, 5)
+    return history.stretches, history.measured, history.seconds
+
+
+_PHOTO = Photo("a.jpg", "a.jpg", 80, 60, "g", None, 70.5, (1.0, 2.0, 3.0), False, False)
+
+
+def _make_stages(folder: Path) -> None:
+    stages = Stages(folder / "capture.json", capture_folder.STAGES)
+    stages.about = {"inputs": ["x"]}
+    gathered = asdict(Gathered([_PHOTO], [("b.jpg", "is black")]))
+    stages.run("photos", {"size": None}, [folder], lambda: gathered)
+
+
+def _read_stages(folder: Path) -> Any:
+    stages = Stages(folder / "capture.json", capture_folder.STAGES)
+    done = stages.run(
+        "photos", {"size": None}, [folder], lambda: asdict(Gathered([_PHOTO], [])), lambda _: None
+    )
+    return capture_folder._photos(folder, done.result)
+
+
+def _make_lpips(folder: Path) -> None:
+    # Too small to be one: as large as those are, a file in a thousand would be damaged where it
+    # matters. The header is all that there is to break.
+    names = [f"features.{i}.{kind}" for i in (0, 3, 6) for kind in ("weight", "bias")]
+    tensors = {name: torch.zeros(2, 3) for name in names}
+    safetensors.torch.save_file(tensors, folder / "a.safetensors")
+
+
+def _make_cameras(folder: Path) -> None:
+    write_synthetic_capture(folder / "c", "colmap-bin", 3, 32, 24, n_points=20)
+    views = load_capture(folder / "c", hold_out=None).train
+    write_cameras(folder / "cameras.json", [(view.name, view.camera) for view in views])
+
+
+def _make_points(folder: Path) -> None:
+    random = np.random.default_rng(0)
+    write_points(folder / "a.ply", random.random((40, 3)), random.integers(0, 255, (40, 3)))
+
+
+READERS: tuple[Reader, ...] = (
+    _scene("a.ply"),
+    Reader("scene a.ply, ASCII", "a.ply", _ascii_ply, _reads("a.ply")),
+    _scene("a.compressed.ply"),
+    _scene("a.splat", 0),
+    *(_ksplat(level) for level in (0, 1, 2)),
+    *(_spz(f"scene spz {version}", version) for version in (1, 2, 3, 4)),
+    _spz("scene spz 3, in gzip", 3, gzip.compress),
+    _scene("a.sog"),
+    *(_sog_part(member) for member in ("meta.json", "means_l.webp", "shN_centroids.webp")),
+    Reader("scene sog, a folder", "meta.json", _sog_folder, _reads("meta.json"), json=True),
+    _scene("a.glb"),
+    Reader("scene glb, its JSON", "a.glb", _make_glb_json, _reads("a.glb"), True, _glb_json),
+    Reader("points a.ply", "a.ply", _make_points, lambda folder: read_points(folder / "a.ply")),
+    *(_capture("colmap-bin", f"sparse/0/{part}.bin") for part in ("cameras", "images", "points3D")),
+    *(_capture("colmap-txt", f"sparse/0/{part}.txt") for part in ("cameras", "images", "points3D")),
+    _capture("blender", "transforms_train.json", json=True),
+    Reader(
+        *("list of test images", "test.txt", _test_list),
+        lambda folder: load_capture(folder, test_list=folder / "test.txt"),
+    ),
+    *(_image(kind, ending, "image", _read_image) for kind, ending in IMAGES.items()),
+    *(_image(kind, end, "photo", _read_photo) for kind, end in (IMAGES | {"heic": "heic"}).items()),
+    Reader("mask", "a.png", _make_mask, _read_mask, pack=_png_with_checksums, extra=_image_memory),
+    _video("mp4", "a.mp4"),
+    _video("mkv", "a.mkv"),
+    _video("avi", "a.avi", codec="mjpeg"),
+    _video("ts", "a.ts", codec="mpeg2video", rate=25),
+    _video("gif", "a.gif"),
+    Reader("checkpoint", "step_000005.safetensors", _make_checkpoint, _read_checkpoint),
+    Reader(
+        *("cameras.json", "cameras.json", _make_cameras),
+        lambda folder: read_cameras(folder / "cameras.json"),
+        json=True,
+    ),
+    Reader("cfg_args", "out/cfg_args", _make_cfg_args, _read_settings),
+    Reader("config.json", "out/config.json", _output, _read_settings, json=True),
+    Reader(
+        *("metrics.json", "out/metrics.json", _output),
+        lambda folder: describe(folder / "out"),
+        json=True,
+    ),
+    Reader("history.json", "out/history.json", _output, _read_history, json=True),
+    Reader("capture.json", "capture.json", _make_stages, _read_stages, json=True),
+    Reader(
+        *("LPIPS weights", "a.safetensors", _make_lpips),
+        lambda folder: Lpips.load(folder / "a.safetensors"),
+    ),
+)

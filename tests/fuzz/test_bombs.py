@@ -1,0 +1,527 @@
+"""Files made to do harm, one for each way that is known: refused in a line, at once, in no memory.
+
+Each of these once did what it says. Where the reader takes no notice of the trick, what it gives is
+looked at instead.
+"""
+
+import io
+import json
+import logging
+import os
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat import checkpoint
+from snowsplat.camera_list import read_cameras
+from snowsplat.capture import load_capture
+from snowsplat.capture.decode import ImageSource, load_image, read_header
+from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat.cli.output import OutputFolder
+from snowsplat.errors import UserError
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats.spz_container import Header, pack
+from snowsplat.history import History
+from snowsplat.lpips import Lpips
+from snowsplat.photos import capture_folder
+from snowsplat.photos.clip import is_video, read_clip
+from snowsplat.photos.sfm.result import describe_model
+from snowsplat.photos.stages import Stages
+
+from ..photos.conftest import make_model
+from ..photos.pictures import pan, write_video
+from .limits import guarded
+from .readers import make_scene
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """Reads ``tmp_path`` under guard; gives the line with which the reader refuses."""
+
+    def refused(read) -> str:
+        size = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
+        result = guarded(read, tmp_path, size)
+        assert isinstance(result, UserError), result
+        return str(result)
+
+    return refused
+
+
+def decoded(path: Path):
+    return load_image(ImageSource(path, 64, 64))
+
+
+# Images
+
+
+def png(width: int, height: int) -> bytes:
+    """Black, of a thousandth of the bytes that it has pixels."""
+    packer = zlib.compressobj(9)
+    rows = b"".join(packer.compress(bytes(1 + 3 * width)) for _ in range(height)) + packer.flush()
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), (b"IDAT", rows)]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in [*chunks, (b"IEND", b"")]
+    )
+
+
+def bmp_that_skips(width: int) -> bytes:
+    """Packed by run lengths, with skips of 255 rows each."""
+    head = struct.pack("<IiiHHIIiiII", 40, width, 1, 1, 8, 1, 0, 0, 0, 256, 0) + bytes(1024)
+    return (
+        b"BM" + struct.pack("<IHHI", 0, 0, 0, 14 + len(head)) + head + b"\0\2\0\xff" * 4 + b"\0\1"
+    )
+
+
+def tiff(entries: list[tuple[int, int, int, int]], data: bytes) -> bytes:
+    body = b"".join(struct.pack("<HHII", *entry) for entry in entries)
+    return b"II*\0\x08\0\0\0" + struct.pack("<H", len(entries)) + body + bytes(4) + data
+
+
+def tiff_of_one_tile(side: int) -> bytes:
+    start = 8 + 2 + 12 * 11 + 4
+    sizes = [(256, 4, 1, 64), (257, 4, 1, 64), (258, 3, 1, 8), (259, 3, 1, 8), (262, 3, 1, 1)]
+    tile = [(277, 3, 1, 1), (284, 3, 1, 1), (322, 4, 1, side), (323, 4, 1, side)]
+    return tiff([*sizes, *tile, (324, 4, 1, start), (325, 4, 1, 100)], zlib.compress(bytes(99999)))
+
+
+def jpeg_of_scans(side: int, scans: int) -> bytes:
+    """Progressive, its last scan again and again: few bytes, but all pixels are gone through."""
+    packed = io.BytesIO()
+    Image.new("RGB", (side, side), (90, 99, 128)).save(packed, "JPEG", progressive=True, quality=50)
+    data = packed.getvalue()
+    last = data.rfind(b"\xff\xda")
+    return data[:-2] + data[last:-2] * scans + b"\xff\xd9"
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "line"),
+    [
+        ("wide.png", lambda: png(66_000, 2), "more than 178 million pixels, or 65,535 a side"),
+        ("large.png", lambda: png(13_500, 13_500), "more than 178 million pixels"),
+        ("skips.bmp", lambda: bmp_that_skips(60_000), "slow to read"),
+        ("long.bmp", lambda: bmp_that_skips(90_000_000), "65,535 a side"),
+        ("slow.ppm", lambda: b"P6 2000 2000 254\n" + bytes(12_000_000), "slow to read"),
+        ("text.ppm", lambda: b"P3 2000 2000 255\n" + b"0 " * 12_000_000, "slow to read"),
+        ("tile.tif", lambda: tiff_of_one_tile(46_000), "tiles larger than the image"),
+        ("scans.jpg", lambda: jpeg_of_scans(4000, 2000), "scans of all its pixels"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_images(tmp_path, refused, name, data, line):
+    path = tmp_path / name
+    path.write_bytes(data())
+    assert line in refused(lambda: decoded(path))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_large_flat_image_takes_no_more_than_its_pixels_deserve(tmp_path):
+    """16 bytes of each, whatever its file has."""
+    path = tmp_path / "a.png"
+    path.write_bytes(png(6000, 6000))
+    assert path.stat().st_size < 150_000
+    assert read_header(path).width == 6000
+    planes = guarded(lambda: decoded(path), tmp_path, path.stat().st_size, 16 * 6000 * 6000)
+    assert planes.shape == (3, 64, 64)
+
+
+def test_a_photo_with_a_film_behind_it_has_the_scans_that_it_has(tmp_path):
+    """Phones append films to photos, in which any two bytes may stand."""
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (4000, 3000)).save(path)
+    path.write_bytes(path.read_bytes() + b"\xff\xda\0\x08" * 1000)
+    assert decoded(path).shape == (3, 64, 64)
+
+
+# Scenes
+
+
+def test_spz_of_equal_gaussians(tmp_path, refused):
+    path, n = tmp_path / "a.spz", 1_000_000
+    columns = [bytes(width * n) for width in (9, 1, 3, 3, 4, 45)]
+    for version in (3, 4):
+        path.write_bytes(pack(Header(version, n, 3, 12, 0), columns))
+        assert path.stat().st_size < 100_000
+        assert "promises 1000000 Gaussians" in refused(lambda: read_gaussians(path))
+
+
+@pytest.fixture
+def members(tmp_path) -> dict[str, bytes]:
+    write_gaussians(tmp_path / "a.sog", make_scene(30, 1))
+    with zipfile.ZipFile(tmp_path / "a.sog") as bundle:
+        return {name: bundle.read(name) for name in bundle.namelist()}
+
+
+def bundle(path: Path, members: dict[str, bytes]) -> bytearray:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, data in members.items():
+            packed.writestr(name, data)
+    return bytearray(path.read_bytes())
+
+
+def test_sog_whose_member_is_larger_than_it_says(tmp_path, refused, members):
+    path, size = tmp_path / "a.sog", len(members["meta.json"])
+    data = bundle(path, {**members, "meta.json": members["meta.json"] + b" " * (400 << 20)})
+    for signature, offset in ((b"PK\3\4", 22), (b"PK\1\2", 24)):
+        struct.pack_into("<I", data, data.find(signature) + offset, size)
+    path.write_bytes(data)
+    assert "damaged meta.json" in refused(lambda: read_gaussians(path))
+
+
+def test_sog_of_countless_members(tmp_path, refused):
+    path, entries = tmp_path / "a.sog", 300_000
+    entry = b"PK\1\2" + struct.pack("<6H3I5H2I", *[20, 20], *[0] * 7, 1, *[0] * 6) + b"a"
+    end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 65535, 65535, len(entry) * entries, 34, 0)
+    path.write_bytes(b"PK\3\4" + bytes(30) + entry * entries + end)
+    assert "absurdly many parts" in refused(lambda: read_gaussians(path))
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"means": 1, "quats": [' + "[]," * 4_000_000 + "1]}"]
+)
+def test_sog_of_deep_or_endless_json(tmp_path, refused, members, text):
+    path = tmp_path / "a.sog"
+    bundle(path, {**members, "meta.json": text.encode()})
+    refused(lambda: read_gaussians(path))
+    (tmp_path / "meta.json").write_text('{"means": 1, "quats": [' + text)
+    refused(lambda: read_gaussians(tmp_path / "meta.json"))
+
+
+@pytest.mark.parametrize("name", ["../secret.webp", "/etc/hostname", "..", "", "a\0b", "pipe.webp"])
+def test_sog_folder_that_names_others(tmp_path, refused, members, name):
+    home = tmp_path / "home"
+    home.mkdir()
+    for member, data in members.items():
+        (home / member).write_bytes(data)
+    (tmp_path / "secret.webp").write_bytes(members["means_l.webp"])
+    os.mkfifo(home / "pipe.webp")
+    meta = json.loads(members["meta.json"])
+    meta["means"]["files"][0] = name
+    (home / "meta.json").write_text(json.dumps(meta))
+    refused(lambda: read_gaussians(home / "meta.json"))
+
+
+def test_sog_folder_of_many_gaussians(tmp_path):
+    """Its pictures account for them, not the few bytes of meta.json."""
+    write_gaussians(tmp_path / "a.sog", make_scene(70_000, 0))
+    with zipfile.ZipFile(tmp_path / "a.sog") as packed:
+        packed.extractall(tmp_path)
+    assert len(read_gaussians(tmp_path / "meta.json")) == 70_000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"scenes": [{"nodes": [' + "0," * 3_000_000 + '0]}], "nodes": [{}]}',
+        '{"nodes": [' + "{}," * 1_000_000 + "{}]}",
+        '{"meshes": [{"primitives": []}], "nodes": [{}'
+        + ',{"mesh":0,"rotation":[0,0,0,1]}' * 80_000
+        + "]}",
+    ],
+)
+def test_glb_of_countless_nodes(tmp_path, refused, text):
+    path, data = tmp_path / "a.glb", text.encode()
+    data += b" " * (-len(data) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(data), len(data), 0x4E4F534A)
+    path.write_bytes(head + data)
+    refused(lambda: read_gaussians(path))
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.glb", "a.sog", "a.splat"])
+def test_a_pipe_is_no_scene(tmp_path, refused, name):
+    os.mkfifo(tmp_path / name)
+    assert "pipe" in refused(lambda: read_gaussians(tmp_path / name))
+
+
+def test_ply_of_one_endless_line(tmp_path, refused):
+    path = tmp_path / "a.ply"
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1"]
+    names += ["scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    head = ["ply", "format ascii 1.0", "element vertex 1"]
+    head += [f"property float {name}" for name in names] + ["end_header", ""]
+    path.write_text("\n".join(head) + "1 " * 20_000_000)
+    assert "far too long" in refused(lambda: read_gaussians(path))
+
+
+# Captures
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A function that makes a capture in ``home``; a picture lies outside of it."""
+
+    def make(format: str) -> Path:
+        home = tmp_path / "home"
+        write_synthetic_capture(home, format, 5, 32, 24, n_points=20)
+        (tmp_path / "secret.png").write_bytes(next(home.rglob("*.png")).read_bytes())
+        return home
+
+    return make
+
+
+def outside(tmp_path: Path) -> list[str]:
+    return ["../secret.png", str(tmp_path / "secret.png"), "images/../../secret.png"]
+
+
+@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("format", ["colmap-bin", "colmap-txt"])
+def test_colmap_that_names_an_image_elsewhere(tmp_path, refused, capture, format, number):
+    home = capture(format)
+    name = ["../../secret.png", str(tmp_path / "secret.png"), "a/../../../secret.png"][number]
+    model = home / "sparse/0" / f"images.{format[-3:]}"
+    model.write_bytes(model.read_bytes().replace(b"view_02.png", name.encode()))
+    assert "which is not in" in refused(lambda: load_capture(home))
+
+
+@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("key", ["file_path", "mask_path"])
+def test_transforms_that_name_a_file_elsewhere(tmp_path, refused, capture, key, number):
+    home = capture("blender")
+    path = home / "transforms_train.json"
+    scene = json.loads(path.read_text())
+    scene["frames"][1][key] = outside(tmp_path)[number]
+    path.write_text(json.dumps(scene))
+    assert "which is not in the folder" in refused(lambda: load_capture(home))
+
+
+def test_transforms_that_name_points_elsewhere(tmp_path, refused, capture):
+    home = capture("blender")
+    path = home / "transforms_train.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "../a.ply"}))
+    assert "which is not in the folder" in refused(lambda: load_capture(home))
+
+
+def test_an_absolute_path_that_stays_inside_is_one_of_the_capture(capture):
+    home = capture("blender")
+    path = home / "transforms_train.json"
+    scene = json.loads(path.read_text())
+    for frame in scene["frames"]:
+        frame["file_path"] = str((home / frame["file_path"]).absolute())
+    path.write_text(json.dumps(scene))
+    assert len(load_capture(home, hold_out=None).train) == 5
+
+
+def test_transforms_with_countless_keys(tmp_path, refused, capture):
+    """Each frame looks a few up, and copies none."""
+    home = capture("blender")
+    path = home / "transforms_train.json"
+    scene = json.loads(path.read_text())
+    scene |= {f"{i:x}": 0 for i in range(200_000)}
+    frame, image = scene["frames"][0], home / "train" / "a.png"
+    image.parent.mkdir(exist_ok=True)
+    Image.new("RGB", (32, 24)).save(image)
+    scene["frames"] = []
+    for i in range(600):
+        os.link(image, image.with_name(f"{i}.png"))
+        scene["frames"].append({**frame, "file_path": f"train/{i}.png"})
+    path.write_text(json.dumps(scene))
+    size = path.stat().st_size + 600 * image.stat().st_size
+    found = guarded(lambda: load_capture(home, hold_out=None), tmp_path, size)
+    assert len(found.train) == 601  # and that of the test split
+
+
+def test_colmap_text_of_one_endless_line(tmp_path, refused, capture):
+    home = capture("colmap-txt")
+    images = home / "sparse/0/images.txt"
+    images.write_text("1 1 0 0 0 0 0 0 1 a.png\n" + "1 " * 10_000_000 + "\n")
+    assert "should be its observations" in refused(lambda: load_capture(home))
+    cameras = home / "sparse/0/cameras.txt"
+    cameras.write_text("1 PINHOLE " + "1 " * 10_000_000)
+    assert "damaged" in refused(lambda: load_capture(home))
+
+
+def test_colmap_of_countless_images(tmp_path, refused, capture):
+    home = capture("colmap-txt")
+    (home / "sparse/0/images.txt").write_text("1 1 0 0 0 0 0 0 1 a\n\n" * 600_000)
+    assert "more than 200,000 images" in refused(lambda: load_capture(home))
+
+
+def test_colmap_points_of_many_lines_take_little_memory(tmp_path, capture):
+    home = capture("colmap-txt")
+    points = home / "sparse/0/points3D.txt"
+    points.write_text("1 0 1 0 9 9 9 0\n" * 1_500_000)
+    found = guarded(lambda: load_capture(home), tmp_path, points.stat().st_size)
+    assert len(found.points) == 1_500_000
+
+
+def test_a_list_of_test_images_that_is_a_pipe(tmp_path, refused, capture):
+    home = capture("colmap-bin")
+    os.mkfifo(home / "test.txt")
+    assert "no file" in refused(lambda: load_capture(home, test_list=home / "test.txt"))
+
+
+# Photos and videos
+
+
+def placed(folder: Path, names: list[str]) -> None:
+    """A model of photos of these names in ``folder``, which are not there."""
+    generator = torch.Generator().manual_seed(0)
+    poses = torch.eye(4)[:3].repeat(len(names), 1, 1)
+    poses[:, 0, 3] = torch.arange(len(names)) * 0.3
+    poses[:, 2, 3] = 4
+    model = make_model(poses, torch.randn(30, 3, generator=generator), names=names)
+    (folder / "distorted/sparse/0").mkdir(parents=True)
+    model.write(folder / "distorted/sparse/0")
+
+
+@pytest.mark.parametrize("name", ["../../x.png", "/tmp/x.png"])
+def test_a_model_whose_photos_lie_elsewhere(tmp_path, name):
+    """Its images would be written there."""
+    placed(tmp_path, ["a.png", name])
+    with pytest.raises(UserError, match="which is not in .*input"):
+        describe_model(tmp_path, [])
+
+
+def test_a_model_that_makes_colmap_take_all_memory(tmp_path):
+    placed(tmp_path, ["a.png", "b.png"])
+    points = tmp_path / "distorted/sparse/0/points3D.bin"
+    data = bytearray(points.read_bytes())
+    struct.pack_into("<Q", data, 8 + 8 + 24 + 3 + 8, 1 << 34)  # the length of the first track
+    points.write_bytes(data)
+    with pytest.raises(UserError, match="damaged, or COLMAP cannot read it"):
+        describe_model(tmp_path, [])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "ffconcat version 1.0\nfile secret.mp4\n",
+        "#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nsecret.mp4\n#EXT-X-ENDLIST\n",
+        "v=0\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
+    ],
+)
+def test_a_video_that_is_a_list_of_others(tmp_path, text):
+    write_video(tmp_path / "secret.mp4", pan(4))
+    (tmp_path / "a.mp4").write_text(text)
+    assert is_video(tmp_path / "secret.mp4")
+    assert not is_video(tmp_path / "a.mp4")
+    with pytest.raises(UserError, match="can be decoded"):
+        read_clip(tmp_path / "a.mp4")
+
+
+def test_a_video_whose_name_looks_like_an_address(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_video(tmp_path / "secret.mp4", pan(4))
+    (tmp_path / "concat:secret.mp4").write_text("nothing")
+    assert not is_video(Path("concat:secret.mp4"))
+
+
+def test_a_video_of_huge_frames(tmp_path, refused):
+    path = tmp_path / "a.gif"
+    frames = [Image.new("P", (9000, 9000), i) for i in range(2)]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=100)
+    assert path.stat().st_size < 1_000_000
+    assert "larger than 67 million pixels" in refused(lambda: read_clip(path))
+    data = write_video(path.with_suffix(".avi"), pan(4), codec="mjpeg").read_bytes()
+    data = data.replace(struct.pack("<ii", 320, 240), struct.pack("<ii", 9000, 9000))
+    data = data.replace(struct.pack(">HH", 240, 320), struct.pack(">HH", 9000, 9000))
+    path.with_suffix(".avi").write_bytes(data)
+    assert "larger than 67" in refused(lambda: read_clip(path.with_suffix(".avi")))
+
+
+# Records
+
+
+DEEP, MANY = "[" * 100_000, "[" + "[]," * 4_000_000 + "0]"
+
+
+@pytest.mark.parametrize(
+    "text", [DEEP, '{"a": ' + DEEP, MANY, '{"stages": ' + MANY + "}", "-" * 99]
+)
+def test_json_of_any_kind(tmp_path, refused, text):
+    out, path = tmp_path / "out", tmp_path / "a.json"
+    out.mkdir()
+    path.write_text(text)
+    (out / "config.json").write_text(text)
+    refused(lambda: read_cameras(path))
+    refused(lambda: Stages(path, capture_folder.STAGES))
+    refused(lambda: load_capture(path))
+    refused(lambda: OutputFolder(out).settings())
+    empty = guarded(lambda: History.read(path, 9), tmp_path, path.stat().st_size)
+    assert empty.stretches == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "-" * 200_000 + "1",
+        "(" * 200_000,
+        "Namespace(a=" + "-" * 200_000 + "1)",
+        "Namespace(a=" + "1+" * 200_000 + "1)",
+        "Namespace(a=" + "[" * 200_000,
+        "Namespace(" + "a." * 200_000 + "b=1)",
+        "Namespace(a='" + "\\'" * 200_000,
+        "__import__('os').system('touch ran')",
+        "Namespace(source_path=__import__('os').system('touch ran'))",
+    ],
+)
+def test_cfg_args_that_is_a_program(tmp_path, refused, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cfg_args").write_text(text)
+    assert "does not name the capture" in refused(lambda: OutputFolder(tmp_path).settings())
+    assert not (tmp_path / "ran").exists()
+
+
+def test_weights_that_are_a_program(tmp_path, refused):
+    class Large:
+        def __reduce__(self):
+            return bytearray, (1 << 30,)  # which torch.load(weights_only=True) runs
+
+    torch.save({"x": Large()}, tmp_path / "a.pth")
+    assert "not a safetensors file" in refused(lambda: Lpips.load(tmp_path / "a.pth"))
+
+
+def test_a_checkpoint_whose_header_is_not_what_was_written(tmp_path, refused):
+    """Numbers that are whole, but of another shape, kind or meaning."""
+    tensors = {"a": torch.arange(12.0).reshape(4, 3), "b": torch.ones(3)}
+    path = checkpoint.save(tmp_path, 5, tensors, {"rate": 0.125})
+    whole = path.read_bytes()
+    for old, new in ((b"[4,3]", b"[3,4]"), (b'"F32"', b'"I32"'), (b"0.125", b"0.225")):
+        assert whole.count(old) >= 1, old
+        path.write_bytes(whole.replace(old, new))
+        assert "damaged" in refused(lambda: checkpoint.load(path))
+    path.write_bytes(whole)
+    assert checkpoint.load(path).meta == {"rate": 0.125}
+
+
+def test_history_of_things_that_are_no_numbers(tmp_path):
+    stretch = {"step": 1, "steps": 1, "loss": 0.5, "seconds": 0.1, "gaussians": 5}
+    for changed in ({"loss": "a"}, {"seconds": None}, {"steps": 0}, {"step": True}, {"more": 1}):
+        whole = {"stretches": [stretch | changed], "measured": [], "stride": 1}
+        (tmp_path / "history.json").write_text(json.dumps(whole))
+        assert History.read(tmp_path / "history.json", 9).stretches == []
+
+
+def test_a_record_of_stages_that_was_edited(tmp_path, caplog):
+    """A result that is not what was written down is made anew."""
+    path, done = tmp_path / "capture.json", []
+
+    def run() -> dict:
+        stages = Stages(path, ["one"])
+        return stages.run("one", {}, [], lambda: done.append(1) or {"x": float("nan")}).result
+
+    assert run() == run() == {"x": None}
+    assert len(done) == 1
+    path.write_text(path.read_text().replace('"x": null', '"x": 7'))
+    assert run() == {"x": None}
+    assert len(done) == 2
+    path.write_text(path.read_text().replace('"seconds"', '"hours"'))
+    with pytest.raises(UserError, match="delete it to begin anew"):
+        run()
+
+
+def test_an_image_list_does_not_grow_with_what_is_logged(tmp_path, caplog, capture):
+    """Names of images stand in warnings and errors, but not megabytes of them."""
+    home = capture("colmap-txt")
+    images = home / "sparse/0/images.txt"
+    images.write_text(images.read_text() + "9 1 0 0 0 0 0 0 1 " + "x" * 100_000 + "\n\n")
+    with caplog.at_level(logging.WARNING):
+        assert len(load_capture(home, hold_out=None).train) == 5
+    assert max(len(record.getMessage()) for record in caplog.records) < 1000
+    assert np.isfinite(load_capture(home).extent)

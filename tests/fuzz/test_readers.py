@@ -1,0 +1,70 @@
+"""Files of every kind, damaged: one line or a sound result, at once, in little memory, at home.
+
+SNOWSPLAT_FUZZ=2000 tries so many others a reader; without it they are few and the same each time.
+"""
+
+import logging
+import os
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from snowsplat.errors import UserError
+
+from .damage import KINDS, damaged, damaged_json
+from .limits import guarded
+from .readers import READERS, Reader
+
+EXAMPLES = int(os.environ.get("SNOWSPLAT_FUZZ", "0"))
+FUZZ = settings(
+    max_examples=EXAMPLES or 30,
+    derandomize=not EXAMPLES,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+change = st.tuples(
+    st.sampled_from(KINDS),
+    st.booleans(),
+    st.floats(0, 1),
+    st.integers(0, 255),
+    st.integers(0, 255),
+)
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    """Warnings about what was left out are not the subject."""
+    logging.disable(logging.WARNING)
+    yield
+    logging.disable(logging.NOTSET)
+
+
+def survives(reader: Reader, data: bytes) -> object:
+    size = reader.write(data)
+    return guarded(lambda: reader.read(reader.folder), reader.folder, size, reader.memory())
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_damaged(reader):
+    valid = reader.valid
+    result = survives(reader, valid)  # else the table is wrong; and libraries are loaded now
+    assert not isinstance(result, UserError) or reader.name == "LPIPS weights", result
+
+    @pytest.mark.filterwarnings("ignore")
+    @FUZZ
+    @given(changes=st.lists(change, min_size=1, max_size=4), as_json=st.booleans())
+    def attempt(changes, as_json):
+        break_it = damaged_json if reader.json and as_json else damaged
+        survives(reader, break_it(valid, changes))
+
+    attempt()
+    reader.write(valid)
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_nothing_and_noise(reader):
+    for data in (b"", b"\0", bytes(5000), bytes(range(256)) * 20, b"[" * 5000, b"\n" * 5000):
+        survives(reader, data)
+    reader.write(reader.valid)
