@@ -163,7 +163,7 @@ def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
 def nothing_decodes(path: Path, error: Exception | None) -> UserError:
     reason = f" ({getattr(error, 'strerror', None) or error})" if error else ""
     return UserError(
-        f"{shown(path)}: no frame of this video can be decoded{reason}; it may be cut off, damaged, "
-        f"or larger than {_MOST_PIXELS // 1_000_000} million pixels: copy it again, or save it as "
-        "mp4 (H.264)"
+        f"{shown(path)}: no frame of this video can be decoded{reason}; it may be cut off, "
+        f"damaged, or larger than {_MOST_PIXELS // 1_000_000} million pixels: copy it again, or "
+        "save it as mp4 (H.264)"
     )
