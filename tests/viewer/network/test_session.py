@@ -100,6 +100,19 @@ def test_the_share_while_it_moves(session, clock, share):
     assert viewing / (clock.now - start) == pytest.approx(share, rel=0.2)
 
 
+def test_one_picture_at_a_time_is_under_way(session, clock):
+    """They do not pile up where they cannot be sent as fast as they are made."""
+    visitor, other = session.enter(1), session.enter(2)
+    session.move(visitor, pose())
+    session.sending(visitor, True)
+    assert session.next_due(0, training=False) is None
+    session.move(other, pose())
+    assert session.next_due(0, training=False).visitor is other
+    session.leave(2)
+    session.sending(visitor, False)
+    assert session.next_due(0, training=False).visitor is visitor
+
+
 def test_the_share_while_nobody_moves(session, clock):
     visitor = session.enter(1)
     session.move(visitor, pose())
