@@ -20,6 +20,7 @@ from snowsplat.config import TrainConfig
 from snowsplat.trainer import Trainer
 from snowsplat.viewer.network import guard
 from snowsplat.viewer.network.gauge import Gauge
+from snowsplat.viewer.network.guard import tell
 from snowsplat.viewer.network.training import TrainingViewer
 from snowsplat.viewer.network.viewer import NetworkViewer
 
@@ -227,3 +228,21 @@ def test_views_kept_and_downloads_are_bounded(watched):
                 continue
         assert taken < 5_000_000
         assert status(clients.get(watched.viewer.url)) == 200
+
+
+def test_pictures_wait_for_one_another(watched, monkeypatch):
+    """Where the server's thread is held up, what it has to send does not pile up in memory."""
+    drawn = []
+    draw = watched.viewer._draw
+    monkeypatch.setattr(watched.viewer, "_draw", lambda *what: drawn.append(1) or draw(*what))
+    with Visitor(watched.viewer.url) as visitor:
+        visitor.look()
+        while not drawn:
+            watched.step()
+        (seen,) = watched.viewer.session._visitors.values()
+        tell(watched.viewer.server, lambda: time.sleep(1.0))
+        first, end = len(drawn), time.monotonic() + 0.8
+        while time.monotonic() < end:
+            watched.viewer.session.move(seen, seen.pose)
+            watched.step()
+        assert len(drawn) - first <= 1
