@@ -209,6 +209,26 @@ def test_a_checkpoint_of_something_else_is_refused(capture):
         Trainer(fewer, BUSY).load_state(trainer.state_tensors())
 
 
+def test_a_checkpoint_whose_tensors_do_not_fit_each_other_is_refused(capture):
+    """The kernels take one number of rows for all: more would be read than there is."""
+    trainer = Trainer(capture, BUSY)
+    trainer.run(until=1)
+    whole = trainer.state_tensors()
+    for name, changed in (
+        ("gaussians.means", whole["gaussians.means"][:3]),
+        ("optimizer.exp_avg.quats", whole["optimizer.exp_avg.quats"][:3]),
+        ("gaussians.quats", whole["gaussians.quats"].to(torch.int32)),
+        ("gaussians.opacity_logits", whole["gaussians.opacity_logits"][0]),
+        ("random.views", whole["random.views"][:5]),
+        ("order", whole["order"] - 100),
+        ("step", torch.tensor([1, 2])),
+    ):
+        assert name in whole
+        with pytest.raises(UserError, match="another capture or recipe"):
+            Trainer(capture, BUSY).load_state({**whole, name: changed})
+    Trainer(capture, BUSY).load_state(whole)
+
+
 def test_refinement_waits_for_the_next_step(capture):
     """What is evaluated and saved after step 20, which densifies, is the scene before that."""
     counts = []

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from snowsplat.formats import read_gaussians, sog, write_gaussians
+from snowsplat.formats.codebooks import palette_for
 from snowsplat.geometry import morton_order
 
 from . import json_damage
@@ -43,6 +44,18 @@ def test_round_trip(tmp_path, make_scene, rotation_error, degree, n):
     if degree:
         rough = (read.sh_rest - scene.sh_rest).square().mean() / scene.sh_rest.square().mean()
         assert float(rough) < (1e-3 if n < 100 else 0.6)  # noise does not cluster
+
+
+def test_a_palette_has_no_more_rows_than_labels_tell():
+    """Each of many small clusters takes a row; the large one does not get the rest on top."""
+    random = np.random.default_rng(0)
+    rows = np.zeros((40_000, 3), np.float32)
+    rows[:300] = random.normal(0, 1000, (300, 3))
+    rows[300:] = random.normal(0, 1e-3, (39_700, 3))
+    for count in (64, 1000, 10_000):
+        palette, labels = palette_for(rows, count)
+        assert len(palette) <= count
+        assert 0 <= labels.min() <= labels.max() < len(palette)
 
 
 def test_a_real_scene(tmp_path, shared, psnr):

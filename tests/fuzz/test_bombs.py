@@ -307,25 +307,6 @@ def test_an_absolute_path_that_stays_inside_is_one_of_the_capture(capture):
     assert len(load_capture(home, hold_out=None).train) == 5
 
 
-def test_transforms_with_countless_keys(tmp_path, refused, capture):
-    """Each frame looks a few up, and copies none."""
-    home = capture("blender")
-    path = home / "transforms_train.json"
-    scene = json.loads(path.read_text())
-    scene |= {f"{i:x}": 0 for i in range(200_000)}
-    frame, image = scene["frames"][0], home / "train" / "a.png"
-    image.parent.mkdir(exist_ok=True)
-    Image.new("RGB", (32, 24)).save(image)
-    scene["frames"] = []
-    for i in range(600):
-        os.link(image, image.with_name(f"{i}.png"))
-        scene["frames"].append({**frame, "file_path": f"train/{i}.png"})
-    path.write_text(json.dumps(scene))
-    size = path.stat().st_size + 600 * image.stat().st_size
-    found = guarded(lambda: load_capture(home, hold_out=None), tmp_path, size)
-    assert len(found.train) == 601  # and that of the test split
-
-
 def test_colmap_text_of_one_endless_line(tmp_path, refused, capture):
     home = capture("colmap-txt")
     images = home / "sparse/0/images.txt"
