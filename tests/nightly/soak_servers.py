@@ -98,8 +98,10 @@ class Server:
 
     def sample(self, seconds: float) -> None:
         folder = Path(f"/proc/{self.process.pid}")
-        pages = int((folder / "statm").read_text().split()[1])
-        rss = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+        # Not what is mapped from files, which comes and goes as the system likes.
+        kilobytes = re.search(r"RssAnon:\s+(\d+)", (folder / "status").read_text())
+        assert kilobytes is not None
+        rss = int(kilobytes[1]) / 1024
         threads = len(os.listdir(folder / "task"))
         self.samples.append((seconds, rss, threads, len(os.listdir(folder / "fd")), self.step))
 

@@ -18,7 +18,7 @@ import pytest
 import viser
 from websockets.exceptions import InvalidMessage, InvalidStatus
 
-from snowsplat.viewer.network.guard import _BROWSERS, _PAGES, _WAITING, Guard, govern, is_sane
+from snowsplat.viewer.network.guard import _BROWSERS, _PAGES, _WAITING, Governor, Guard, is_sane
 from snowsplat.viewer.network.server import Door, start_server, stop_server
 
 from ..clients import (
@@ -42,7 +42,7 @@ from ..clients import (
 @pytest.fixture
 def local() -> Iterator[Door]:
     door = start_server("127.0.0.1", None, "a scene")
-    govern(door.server.get_event_loop(), lambda: True)
+    Governor(door.server, lambda: True)
     door.open()
     yield door
     stop_server(door.server)

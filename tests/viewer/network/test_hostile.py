@@ -104,7 +104,7 @@ def test_it_goes_on_to_the_bit(watched, capture, capfd):
         began = time.monotonic()
         rate = watched.run(seconds)
         share = (watched.server_seconds() - before) / (time.monotonic() - began)
-        assert share < guard._SHARE + 0.1
+        assert share < guard._SHARE + 0.15
         assert rate > 0
         process.kill()
         process.wait()

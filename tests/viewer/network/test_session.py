@@ -104,13 +104,17 @@ def test_one_picture_at_a_time_is_under_way(session, clock):
     """They do not pile up where they cannot be sent as fast as they are made."""
     visitor, other = session.enter(1), session.enter(2)
     session.move(visitor, pose())
-    session.sending(visitor, True)
+    due = session.next_due(0, training=False)
+    session.send_to(visitor)
     assert session.next_due(0, training=False) is None
     session.move(other, pose())
     assert session.next_due(0, training=False).visitor is other
     session.leave(2)
-    session.sending(visitor, False)
+    session.sent(due, 0.1)
+    assert session.next_due(0, training=True) is None  # what sending took is the training's too
     assert session.next_due(0, training=False).visitor is visitor
+    clock.now += 0.11
+    assert session.next_due(0, training=True).visitor is visitor
 
 
 def test_the_share_while_nobody_moves(session, clock):

@@ -24,7 +24,7 @@ import http
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -304,27 +304,39 @@ def is_sane(data: Data) -> bool:
 # The thread of the server
 
 
-def govern(loop: asyncio.AbstractEventLoop, training: Callable[[], bool]) -> None:
-    """Hold what runs in ``loop`` to its share of a core, while there is a training to share with.
+class Governor:
+    """Holds the thread of a server to its share of a core while there is a training to share with.
 
     Its errors go to our own log.
     """
-    measured = [0.0, 0.0]  # seconds of this thread and of the clock
 
-    def look() -> None:
-        used, passed = time.thread_time() - measured[0], time.monotonic() - measured[1]
-        rest = used / _SHARE - passed
-        if rest > 0.0 and training():
+    def __init__(self, server: viser.ViserServer, training: Callable[[], bool]) -> None:
+        self._loop = server.get_event_loop()
+        self._training = training
+        self._used = self._seen = 0.0  # seconds of this thread and of the clock, when it looked
+        self._granted = 0.0
+        tell(server, self._begin)
+
+    def _begin(self) -> None:
+        self._loop.set_exception_handler(_note)
+        self._look()
+
+    def _look(self) -> None:
+        used = time.thread_time() - self._used - self._granted
+        rest = used / _SHARE - (time.monotonic() - self._seen)
+        if self._seen and rest > 0.0 and self._training():
             time.sleep(min(rest, _LONGEST_REST))
-        measured[:] = time.thread_time(), time.monotonic()
-        loop.call_later(_TICK, look)
+        self._used, self._seen, self._granted = time.thread_time(), time.monotonic(), 0.0
+        self._loop.call_later(_TICK, self._look)
 
-    def begin() -> None:
-        loop.set_exception_handler(_note)
-        measured[:] = time.thread_time(), time.monotonic()
-        look()
-
-    loop.call_soon_threadsafe(begin)
+    @contextlib.contextmanager
+    def granted(self) -> Iterator[None]:
+        """What happens within, the training itself has asked for: it does not count."""
+        before = time.thread_time()
+        try:
+            yield
+        finally:
+            self._granted += time.thread_time() - before
 
 
 def tell(server: viser.ViserServer, run: Callable[[], None]) -> None:

@@ -238,15 +238,21 @@ class Session:
         )
 
     def spent(self, due: Due, scene: int, seconds: float) -> None:
-        """The picture was made and sent in so many seconds."""
+        """The picture was made in so many seconds."""
         with self._changed:
             due.visitor.shown(due, scene, seconds)
         self.pay(_purse(due), seconds)
 
-    def sending(self, visitor: Visitor, under_way: bool) -> None:
-        """A picture is on its way to it, or is no longer: one at a time."""
+    def send_to(self, visitor: Visitor) -> None:
+        """A picture is on its way to it: until it is `sent`, no other is due."""
         with self._changed:
-            visitor.sending = under_way
+            visitor.sending = True
+
+    def sent(self, due: Due, seconds: float) -> None:
+        """It has taken so long in all, from its drawing on."""
+        self.pay(_purse(due), seconds)
+        with self._changed:
+            due.visitor.sending = False
             self._notify()
 
     def may_pay(self, purse: Literal["asked", "idle"]) -> bool:

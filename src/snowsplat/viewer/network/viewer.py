@@ -13,7 +13,7 @@ import viser
 
 from snowsplat.capture import Capture
 from snowsplat.gaussians import Gaussians
-from snowsplat.viewer.network.guard import govern, tell
+from snowsplat.viewer.network.guard import Governor, tell
 from snowsplat.viewer.network.keys import KeyCameras
 from snowsplat.viewer.network.look import Pose
 from snowsplat.viewer.network.page import Controls, ScenePanel
@@ -91,7 +91,7 @@ class NetworkViewer:
         self._photos.on_click(self._clicked)
         self.server.on_client_connect(self._entered)
         self.server.on_client_disconnect(self._left)
-        govern(self.server.get_event_loop(), lambda: self.session.training)
+        self._governor = Governor(self.server, lambda: self.session.training)
         door.open()
 
     def close(self) -> None:
@@ -126,15 +126,17 @@ class NetworkViewer:
         if browser is not None:
             browser[2].stand_at(index)
 
-    def _send(self, due: Due, picture: np.ndarray) -> None:
+    def _send(self, due: Due, picture: np.ndarray, drawing: float) -> None:
+        started = time.monotonic()
         client = next((c for c, v, _ in self._browsers.values() if v is due.visitor), None)
         try:
             if client is not None:  # else it has left while this was drawn
                 quality = _QUALITY[due.kind]
-                client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+                with self._governor.granted():
+                    client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
                 client.flush()
         finally:
-            self.session.sending(due.visitor, False)
+            self.session.sent(due, drawing + time.monotonic() - started)
 
     # The caller's thread
 
@@ -151,8 +153,9 @@ class NetworkViewer:
         started = time.monotonic()
         try:
             picture = self._draw(due, gaussians)
-            self.session.sending(due.visitor, True)
-            tell(self.server, lambda: self._send(due, picture))
+            self.session.send_to(due.visitor)
+            seconds = time.monotonic() - started
+            tell(self.server, lambda: self._send(due, picture, seconds))
         except Exception:  # whatever somebody wanted to see: the training does not end of it
             _log.debug("a picture was not made", exc_info=True)
         self.session.spent(due, scene, time.monotonic() - started)
