@@ -2,12 +2,14 @@
 
 import contextlib
 import os
+import resource
 import signal
 import subprocess
 import sys
 import time
 import warnings
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -85,6 +87,35 @@ def test_truncated_at_any_length_falls_back_with_a_warning(tmp_path):
             used = checkpoint.latest(tmp_path)
         assert used is not None
         assert used.step == 500
+
+
+def test_one_that_cannot_be_read_is_not_taken_for_damaged(tmp_path):
+    """Going on from an older one, or anew, would be for nothing."""
+    checkpoint.save(tmp_path, 500, some_tensors(), {})
+    checkpoint.save(tmp_path, 1000, some_tensors(), {})
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    for spare in (0, 1):  # torch opens it once more
+        taken = []
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(512, limits[0]), limits[1]))
+        try:
+            with contextlib.suppress(OSError):
+                while True:
+                    taken.append(os.open(tmp_path, os.O_RDONLY))
+            for _ in range(spare):
+                os.close(taken.pop())
+            os.close(taken.pop())  # for the list of the folder
+            found = checkpoint.files(tmp_path)
+            assert len(found) == 2
+            taken.append(os.open(tmp_path, os.O_RDONLY))
+            with (
+                mock.patch.object(checkpoint, "files", return_value=found),
+                pytest.raises(UserError, match=r"step_001000.*cannot be read"),
+            ):
+                checkpoint.latest(tmp_path)
+        finally:
+            for handle in taken:
+                os.close(handle)
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 def test_any_damaged_byte_is_noticed(tmp_path):

@@ -99,38 +99,24 @@ def load(path: Path | str) -> Checkpoint:
     """
     path = Path(path)
     try:
-        with safetensors.safe_open(path, framework="pt", device="cpu") as file:
-            metadata = file.metadata() or {}
-            text = metadata[_HEADER].encode("utf-8", "replace")
-            header = parse_json(text)
-            if header["version"] != VERSION:
-                raise UserError(
-                    f"{path}: a checkpoint of version {header['version']}, this program reads "
-                    f"{VERSION}; go on with the snowsplat that wrote it"
-                )
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        whole = header["crc32"] == {name: _crc32(tensor) for name, tensor in tensors.items()}
-        # Not in older files, where a damaged header may go unseen.
-        whole = whole and header.get("layout", _layout(tensors)) == _layout(tensors)
-        whole = whole and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
-        checkpoint = Checkpoint(path, int(header["step"]), tensors, dict(header["meta"]))
+        return _read(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: damaged, or not a checkpoint") from None
-    if not whole:
-        raise UserError(f"{path}: damaged (its checksums do not match)")
-    check_finite(str(path), checkpoint.tensors, "remove it, and go on from an earlier one")
-    return checkpoint
 
 
 def latest(folder: Path | str) -> Checkpoint | None:
-    """The newest whole checkpoint of ``folder``, or None; a warning for each newer, damaged one."""
+    """The newest whole checkpoint of ``folder``, or None; a warning for each newer, damaged one.
+
+    Raises:
+        UserError: one that cannot be read, which may be whole.
+    """
     for _, path in files(folder):
         try:
-            return load(path)
+            return _read(path)
         except UserError as error:
             warnings.warn(f"{error}; using the one before it", stacklevel=2)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
     return None
 
 
@@ -148,6 +134,37 @@ def files(folder: Path | str) -> list[tuple[int, Path]]:
         (int(match[1]), path) for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))
     ]
     return sorted(found, reverse=True)
+
+
+def _read(path: Path) -> Checkpoint:
+    """Raises: OSError: it cannot be read. UserError: what can be read is no whole checkpoint."""
+    try:
+        with safetensors.safe_open(path, framework="pt", device="cpu") as file:
+            metadata = file.metadata() or {}
+            text = metadata[_HEADER].encode("utf-8", "replace")
+            header = parse_json(text)
+            if header["version"] != VERSION:
+                raise UserError(
+                    f"{path}: a checkpoint of version {header['version']}, this program reads "
+                    f"{VERSION}; go on with the snowsplat that wrote it"
+                )
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        whole = header["crc32"] == {name: _crc32(tensor) for name, tensor in tensors.items()}
+        # Not in older files, where a damaged header may go unseen.
+        whole = whole and header.get("layout", _layout(tensors)) == _layout(tensors)
+        whole = whole and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
+        checkpoint = Checkpoint(path, int(header["step"]), tensors, dict(header["meta"]))
+    except RuntimeError as error:  # as torch says what the system said
+        number = re.search(r"\((\d+)\)$", str(error))
+        if number is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from None
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OverflowError):
+        raise UserError(f"{path}: damaged, or not a checkpoint") from None
+    if not whole:
+        raise UserError(f"{path}: damaged (its checksums do not match)")
+    check_finite(str(path), checkpoint.tensors, "remove it, and go on from an earlier one")
+    return checkpoint
 
 
 def _owned(tensor: Tensor) -> Tensor:
