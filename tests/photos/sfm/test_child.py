@@ -1,9 +1,8 @@
 """The child process: it ends with its parent, and its death is told or mended."""
 
-import errno
 import json
 import os
-import shutil
+import resource
 import signal
 import subprocess
 import sys
@@ -173,11 +172,14 @@ def test_what_goes_wrong_in_the_child_is_in_the_log(tmp_path, photos):
     assert "FileNotFoundError" in (tmp_path / "distorted" / "colmap.log").read_text()
 
 
-def test_a_full_disk_is_told_as_such(tmp_path, photos, monkeypatch):
-    for path in (tmp_path / "input").iterdir():
-        path.unlink()  # so that the child fails
-    full = shutil.disk_usage(tmp_path)._replace(free=1000)
-    monkeypatch.setattr("shutil.disk_usage", lambda _: full)
-    with pytest.raises(OSError, match="No space left") as caught:
-        estimate_poses(tmp_path, photos, DRAFT, silent)
-    assert caught.value.errno == errno.ENOSPC
+def test_files_that_cannot_grow_are_told_as_such(tmp_path, photos):
+    """As on a full disk, where the child ends in COLMAP's words; here by a limit, which is real."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            estimate_poses(tmp_path, photos, DRAFT, silent)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.filename == str(tmp_path / "distorted")
+    assert estimate_poses(tmp_path, photos, DRAFT, silent).registered

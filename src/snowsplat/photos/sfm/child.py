@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import errno
 import json
 import os
 import queue
-import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from snowsplat.photos.photo import Photo
 from snowsplat.photos.progress import Report
 from snowsplat.photos.sfm.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
 
-# A database that grows needs so many bytes for its next step.
+# A database that grows may need so many bytes for its next step.
 _ROOM = 8_000_000
 _MODULE = "snowsplat.photos.sfm.worker"
 _POLL_SECONDS = 0.5
@@ -102,9 +101,14 @@ def estimate_poses(
 
 
 def _check_disk(folder: Path) -> None:
-    """Raises: OSError: the disk is full, which is why the child has ended."""
-    if shutil.disk_usage(folder).free < _ROOM:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+    """Raises: OSError: files here cannot grow, which is why the child has ended."""
+    try:
+        largest = max(path.stat().st_size for path in folder.iterdir())
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.seek(largest)
+            file.write(bytes(_ROOM))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
 def _last_line(log: Path) -> str:
