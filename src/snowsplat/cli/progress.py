@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Column
 
 if TYPE_CHECKING:
     from snowsplat import trainer
@@ -37,7 +38,7 @@ class TrainingProgress:
         self._task = TaskID(0)
         if self.stream.isatty():
             self._bar = Progress(
-                TextColumn("{task.completed}/{task.total}"),
+                TextColumn("{task.completed}/{task.total}", table_column=_whole(total)),
                 BarColumn(bar_width=None),
                 TextColumn("{task.description}"),
                 console=Console(file=self.stream),
@@ -107,6 +108,11 @@ class TrainingProgress:
             f"{rate:.1f} it/s  loss {self._loss:.4f}  {progress.gaussians:,} Gaussians"
             f"{self._psnr}  {resident_bytes() / 1e6:.0f} MB  {remaining}"
         )
+
+
+def _whole(total: int) -> Column:
+    """Where the terminal is narrow, half a number would be another number: the rest is cut."""
+    return Column(no_wrap=True, min_width=2 * len(str(total)) + 1)
 
 
 def held_out_line(step: int, evaluation: Evaluation) -> str:

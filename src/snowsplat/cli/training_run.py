@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -95,7 +96,7 @@ class TrainingRun:
         if not self.quiet:
             self.progress(progress)
         if progress.step in self.save_iterations:
-            self.out.write_scene(progress.step, self.trainer.gaussians)
+            self._save_scene()
         if self._checkpoint_is_due(progress.step):  # last: who goes on from there has all the rest
             self._save_checkpoint()
         if self.viewer is not None:
@@ -119,10 +120,21 @@ class TrainingRun:
             return step % every == 0
         return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
 
+    def _save_scene(self) -> Path:
+        self._look_for_the_folder()
+        return self.out.write_scene(self.trainer.step, self.trainer.gaussians)
+
+    def _look_for_the_folder(self) -> None:
+        """Hours of training are not lost because somebody moved or removed it."""
+        if not self.out.is_one():
+            warnings.warn(f"{self.out.path}: is gone; it is made anew, to go on in", stacklevel=2)
+            self.out.describe(self.trainer.capture, self.settings, self.config)
+
     def _save_checkpoint(self) -> Path:
         from snowsplat import checkpoint
         from snowsplat.config import config_to_json
 
+        self._look_for_the_folder()
         meta = {
             "capture": asdict(self.settings),
             "recipe": self.recipe,
@@ -152,7 +164,7 @@ class TrainingRun:
         self.history.measure(step, evaluation.psnr, evaluation.ssim)
 
     def _stopped(self) -> int:
-        path = self.out.write_scene(self.trainer.step, self.trainer.gaussians)
+        path = self._save_scene()
         self._save_checkpoint()
         print(f"stopped after step {self.trainer.step}: {path}")
         print(f"go on with: {self.again}")
@@ -160,7 +172,7 @@ class TrainingRun:
 
     def _finished(self) -> int:
         step = self.trainer.step
-        path = self.out.write_scene(step, self.trainer.gaussians)
+        path = self._save_scene()
         steps = f"{step - self.first_step} more steps" if self.first_step else f"{step} steps"
         print(
             f"{path}: {len(self.trainer.gaussians):,} Gaussians, {steps} in "
