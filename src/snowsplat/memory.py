@@ -45,7 +45,7 @@ class Cost:
 
 # Measured on the CPU: 1.0 to 1.1 kB a Gaussian beside parameters and moments, where each touches
 # some seven tiles. On a GPU reckoned from what is allocated.
-CPU = Cost(fixed=50_000_000, pixel=170, gaussian=1150)
+CPU = Cost(fixed=66_000_000, pixel=170, gaussian=1150)
 GPU = Cost(fixed=50_000_000, pixel=70, gaussian=240)
 # A photo that is being decoded, bytes a pixel; on the CPU, and so many at a time.
 _DECODING = 18

@@ -17,7 +17,7 @@ from PIL import Image
 import snowsplat
 
 SOURCES = Path(snowsplat.__file__).parents[1]
-WIDTH, HEIGHT, BUDGET = 640, 480, 140_000_000
+WIDTH, HEIGHT, BUDGET = 640, 480, 170_000_000
 COUNT = 10 * BUDGET // (3 * WIDTH * HEIGHT)
 
 
