@@ -1,0 +1,41 @@
+"""Small inputs, and a process that starts commands; see `harness`."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from snowsplat.capture.synthetic import write_synthetic_capture
+
+from ..photos.sfm import scenes
+from .harness import Zygote
+
+if sys.platform != "linux":
+    collect_ignore = ["test_kills.py", "test_pressure.py"]  # fork, process groups, mounts
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory) -> Path:
+    """9 views, 48×36; not to be changed."""
+    root = tmp_path_factory.mktemp("kill")
+    return write_synthetic_capture(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory) -> Path:
+    """8 photos, 320×240; not to be changed."""
+    folder = tmp_path_factory.mktemp("kill") / "photos"
+    folder.mkdir()
+    boards = scenes.boards()
+    for i, pose in enumerate(scenes.arc(8)):
+        photo = Image.fromarray(scenes.photograph(boards, pose, i))
+        photo.save(folder / f"{i:03}.jpg", quality=95)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def zygote(tmp_path_factory) -> Iterator[Zygote]:
+    with Zygote(tmp_path_factory.mktemp("zygote")) as zygote:
+        yield zygote

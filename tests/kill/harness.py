@@ -1,0 +1,559 @@
+"""Kill a verb of the command line again and again; see that nothing is torn, lost or left behind.
+
+A `Job` is a command and what must come of it. `Killer.round` runs it on a new folder, kills it some
+times in a row by SIGKILL with its whole group, looks at all that has a final name after each kill,
+and runs the same command to its end, which must come with exit code 0 and the right result.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import safetensors
+import torch
+from PIL import Image
+
+import snowsplat
+from snowsplat import checkpoint
+from snowsplat.capture.colmap_files import ColmapImage, read_model, read_points
+from snowsplat.formats import read_gaussians
+from snowsplat.gaussians import Gaussians
+from snowsplat.geometry import rotation_from_quat
+from snowsplat.ply_table import open_table
+
+_MOST_DEFECTS = 20
+_SOURCE = str(Path(snowsplat.__file__).parents[1])
+
+
+class Defect(AssertionError):
+    """A promise that was not kept."""
+
+
+@dataclass
+class Ended:
+    """How a run ended: by itself, or killed; and what it printed."""
+
+    code: int
+    text: str
+    changes: int  # of files, by its Python, where it ended by itself
+    seconds: float
+
+    @property
+    def killed(self) -> bool:
+        return self.code == -signal.SIGKILL
+
+
+class Zygote:
+    """Starts commands; its own process has all modules, so that a kill hits work and not imports.
+
+    Use it as a context. ``folder`` is where commands run, logs and temporary files lie.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.temporary = folder, folder / "tmp"
+        self.temporary.mkdir(parents=True, exist_ok=True)
+        self._process = subprocess.Popen(
+            [sys.executable, Path(__file__).with_name("zygote.py")],
+            env={
+                **os.environ,
+                "PYTHONPATH": _SOURCE,
+                "TMPDIR": str(self.temporary),
+                "OPENBLAS_NUM_THREADS": "1",
+            },
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def __enter__(self) -> Zygote:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(timeout=60)
+
+    def run(
+        self,
+        argv: Sequence[object],
+        *,
+        at: int | None = None,
+        delay: float = 0.0,
+        after: float | None = None,
+        limits: dict[str, int] | None = None,
+        columns: int | None = None,
+        while_it_runs: Callable[[int], object] = lambda _: None,
+    ) -> Ended:
+        """Run a command to its end, or until it is killed.
+
+        Args:
+            at: kill it before the at-th change of a file, or ``delay`` seconds after that.
+            after: kill it so many seconds after its start.
+            limits: RLIMIT_… that it has; of open files, so many more than it has already.
+            columns: of the terminal that it has, else none.
+            while_it_runs: called with its number once it is started.
+        """
+        log = self.folder / "log.txt"
+        changes = self.folder / "log.txt.changes"
+        changes.unlink(missing_ok=True)
+        job = {
+            "argv": [str(word) for word in argv],
+            "log": str(log),
+            "watched": [str(self.folder)],
+            "at": at,
+            "delay": delay,
+            "limits": limits or {},
+            "columns": columns,
+        }
+        start = time.monotonic()
+        pid = self._ask(job)["pid"]
+        try:
+            while_it_runs(pid)
+            if after is not None:
+                time.sleep(max(0.0, start + after - time.monotonic()))
+                _kill(pid)
+        except BaseException:
+            _kill(pid)
+            raise
+        finally:
+            code = self._answer()["code"]
+        seconds = time.monotonic() - start
+        _wait_for_the_group(pid)
+        count = int(changes.read_text() or 0) if changes.is_file() else 0
+        return Ended(code, log.read_bytes().decode(errors="replace"), count, seconds)
+
+    def _ask(self, job: dict) -> dict:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(job) + "\n")
+        self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> dict:
+        assert self._process.stdout is not None
+        return json.loads(self._process.stdout.readline())
+
+
+def _kill(group: int) -> None:
+    with suppress(ProcessLookupError):  # it was quicker
+        os.killpg(group, signal.SIGKILL)
+
+
+def _wait_for_the_group(pid: int) -> None:
+    """Until the children of a process that was killed are gone, too: they write no more."""
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(pid, 0)
+        except (ProcessLookupError, PermissionError):
+            return
+        if all(_is_dead(member) for member in _members(pid)):
+            return
+        time.sleep(0.002)
+    raise Defect("a process of a killed command lives on")
+
+
+def _members(group: int) -> list[Path]:
+    found = []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            with suppress(OSError, ValueError, IndexError):
+                if int((folder / "stat").read_text().rpartition(")")[2].split()[2]) == group:
+                    found.append(folder)
+    return found
+
+
+def _is_dead(process: Path) -> bool:
+    try:
+        return (process / "stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except OSError:
+        return True
+
+
+# What has a final name is whole
+
+
+def check_whole(folder: Path) -> int:
+    """Raises: Defect: a file under a final name cannot be read to its end. Gives their number."""
+    count = 0
+    for path in sorted(folder.rglob("*")):
+        parts = path.relative_to(folder).parts
+        if any(part.startswith(".") for part in parts) or not path.is_file():
+            continue
+        if any(part.startswith("database") for part in parts) and path.suffix != ".db":
+            continue  # what COLMAP and SQLite keep beside the database
+        try:
+            _open(path)
+        except Exception as error:
+            raise Defect(f"{path.relative_to(folder)} is torn: {error!r}") from error
+        count += 1
+    return count
+
+
+def _open(path: Path) -> None:
+    name = path.name
+    if name in ("colmap.log", "cfg_args", "cameras.bin", "images.bin", "frames.bin", "rigs.bin"):
+        assert name == "colmap.log" or path.stat().st_size
+    elif name == "points3D.bin":  # the last one of a model: the others are there
+        read_model(path.parent)
+        read_points(path.parent)
+    elif path.suffix == ".db":
+        with TemporaryDirectory() as copies:  # as opening it takes back what was half done
+            for file in path.parent.glob(f"{name}*"):
+                shutil.copy(file, copies)
+            with closing(sqlite3.connect(Path(copies) / name)) as connection:
+                assert connection.execute("PRAGMA quick_check").fetchall() == [("ok",)]
+    elif path.suffix == ".json":
+        json.loads(path.read_text(encoding="utf-8"))
+    elif path.suffix == ".safetensors":
+        checkpoint.load(path)
+    elif path.suffix == ".html":
+        assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
+    elif name in ("input.ply", "points3D.ply"):
+        for _ in open_table(path).rows():
+            pass
+    elif path.suffix in (".png", ".jpg"):
+        with Image.open(path) as image:
+            image.load()
+    else:
+        read_gaussians(path)
+
+
+def leftovers(*folders: Path) -> list[str]:
+    """Names of temporary files and folders."""
+    found = []
+    for folder in folders:
+        for path in folder.rglob("*"):
+            name = path.name
+            odd = name.startswith(".") or name.endswith((".tmp", ".pairs", ".models", "-journal"))
+            if odd or name.endswith(("-wal", "-shm", "_strong.db")):
+                found.append(str(path.relative_to(folder)))
+    return found
+
+
+def names_in(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def digest(path: Path) -> str:
+    """Of its bytes; of a checkpoint, whose header has no fixed order, of its tensors and words."""
+    if path.suffix != ".safetensors":
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    with safetensors.safe_open(path, framework="np") as file:
+        whole = hashlib.sha256(json.dumps(sorted(file.metadata().items())).encode())
+        for name in sorted(file.keys()):
+            whole.update(name.encode() + file.get_tensor(name).tobytes())
+    return whole.hexdigest()
+
+
+# Jobs
+
+
+def some_gaussians(count: int, seed: int) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(
+        means=normal(count, 3),
+        log_scales=normal(count, 3) - 4.0,
+        quats=torch.nn.functional.normalize(normal(count, 4), dim=1),
+        opacity_logits=normal(count),
+        sh_dc=normal(count, 1, 3),
+        sh_rest=0.1 * normal(count, 15, 3),
+    )
+
+
+@dataclass
+class Job:
+    """A command, and what must come of it.
+
+    Attributes:
+        command: its words for an output; ``again``: whether it goes on after a kill.
+        prepare: puts into place what the output is to replace.
+        check_killed: looks at the output after a kill, beside `check_whole`.
+        check_done: compares the output with that of an undisturbed run.
+    """
+
+    name: str
+    verb: str
+    output: str
+    command: Callable[[Path, bool], list[object]]
+    check_done: Callable[[Path, Path], None]
+    prepare: Callable[[Path], None] = lambda _: None
+    check_killed: Callable[[Path, Path], None] = lambda *_: None
+
+
+@dataclass
+class Tally:
+    """What was done to a job."""
+
+    kills: int = 0
+    rounds: int = 0
+    files: int = 0  # that were looked at after kills
+    ended: int = 0  # runs that were quicker than the kill
+
+
+@dataclass
+class Killer:
+    """Kills jobs at moments that a seed decides."""
+
+    zygote: Zygote
+    seed: int
+    tallies: dict[str, Tally] = field(default_factory=dict)
+    _references: dict[str, tuple[Path, Ended]] = field(default_factory=dict)
+
+    def reference(self, job: Job) -> tuple[Path, Ended]:
+        """The folder with the output of an undisturbed run, and how that was."""
+        if job.name not in self._references:
+            folder = self.zygote.folder / f"whole {job.name}"
+            folder.mkdir()
+            job.prepare(folder / job.output)
+            ended = self.zygote.run(job.command(folder / job.output, False))
+            if ended.code != 0:
+                raise Defect(f"{job.name}, undisturbed: exit code {ended.code}\n{ended.text}")
+            check_whole(folder)
+            self._references[job.name] = folder, ended
+        return self._references[job.name]
+
+    def kill(self, jobs: Sequence[Job], kills: int, number: int = 0) -> list[Defect]:
+        """Rounds of the jobs in turn until so many kills were done; what was found."""
+        moments = random.Random(f"{self.seed} {number}")
+        found: list[Defect] = []
+        before = sum(tally.kills for tally in self.tallies.values())
+        while sum(tally.kills for tally in self.tallies.values()) < before + kills:
+            try:
+                self.round(jobs[number % len(jobs)], moments.randint(1, 5), number)
+            except Defect as defect:
+                found.append(defect)
+                if len(found) >= _MOST_DEFECTS:
+                    break
+            number += 1
+        return found
+
+    def round(self, job: Job, kills: int, number: int) -> None:
+        """Kill a job so many times in a row, then let it end.
+
+        Raises:
+            Defect: see `Job`; the folder stays, to be looked at.
+        """
+        tally = self.tallies.setdefault(job.name, Tally())
+        moments = random.Random(f"{self.seed} {job.name} {number}")
+        whole, undisturbed = self.reference(job)
+        folder = self.zygote.folder / f"killed {job.name} {number}"
+        folder.mkdir()
+        output = folder / job.output
+        job.prepare(output)
+        history = []
+        try:
+            for i in range(kills):
+                moment = _moment(moments, undisturbed)
+                ended = self.zygote.run(job.command(output, i > 0), **moment)
+                history.append(f"{moment} -> {ended.code}")
+                if not ended.killed:
+                    if ended.code != 0:
+                        raise Defect(f"exit code {ended.code} after a kill\n{ended.text}")
+                    tally.ended += 1
+                    break
+                tally.kills += 1
+                tally.files += check_whole(folder)
+                job.check_killed(output, whole / job.output)
+            ended = self.zygote.run(job.command(output, True))
+            if ended.code != 0:
+                raise Defect(f"exit code {ended.code} at last\n{ended.text}")
+            check_whole(folder)
+            left = leftovers(folder, self.zygote.temporary)
+            if left:
+                raise Defect(f"left behind: {', '.join(left)}")
+            job.check_done(output, whole / job.output)
+        except Exception as error:
+            story = "; ".join(history)
+            raise Defect(f"{job.name}, round {number} ({story}): {error}") from error
+        tally.rounds += 1
+        shutil.rmtree(folder)
+
+
+def _moment(moments: random.Random, undisturbed: Ended) -> dict[str, float]:
+    """Half of them at any time, the others near a change of a file."""
+    kind = moments.random()
+    if kind < 0.5:
+        return {"after": moments.uniform(0.0, undisturbed.seconds)}
+    at = moments.randint(1, max(1, undisturbed.changes))
+    return {"at": at, "delay": 0.0 if kind < 0.8 else moments.uniform(0.0, 0.005)}
+
+
+def convert_jobs(scene: Path, other: Path) -> list[Job]:
+    """Into each format that is written; over a file that is there, and with changes."""
+    targets = ["ply", "compressed.ply", "spz", "sog", "glb", "splat", "html"]
+
+    def job(suffix: str) -> Job:
+        def command(output: Path, _: bool) -> list[object]:
+            return ["convert", scene, output, "--sh-degree", 1, "--overwrite"]
+
+        def prepare(output: Path) -> None:
+            if suffix != "html":  # what is read back is told by its first bytes
+                shutil.copyfile(other, output)
+
+        def check_killed(output: Path, whole: Path) -> None:
+            if output.exists() and digest(output) not in (digest(other), digest(whole)):
+                raise Defect("neither the old file nor the new one")
+
+        def check_done(output: Path, whole: Path) -> None:
+            if digest(output) != digest(whole):
+                raise Defect("not the file of an undisturbed run")
+
+        # The name is the same in all rounds: a page has it as its title.
+        return Job(
+            f"convert {suffix}",
+            "convert",
+            f"scene.{suffix}",
+            command,
+            check_done,
+            prepare,
+            check_killed,
+        )
+
+    return [job(suffix) for suffix in targets]
+
+
+_STEPS = 60
+_PLAIN = (
+    *("--iterations", _STEPS, "--eval", "--checkpoint-every", 10, "--device", "cpu"),
+    *("--save-iterations", 20, 40, "--test-iterations", 30, "--threads", 1),
+)
+
+
+def train_jobs(capture: Path) -> list[Job]:
+    """With checkpoints, then --resume; with --memory; with --minutes; over an older training."""
+
+    def check_same(output: Path, whole: Path) -> None:
+        # But for times: in the curves and on the page, and where the folder is.
+        expected = names_in(whole)
+        if names_in(output) != expected:
+            raise Defect(f"files differ: {sorted(names_in(output) ^ expected)}")
+        timed = ("history.json", "report.html", "cfg_args")
+        for name in sorted(expected - set(timed)):
+            if digest(output / name) != digest(whole / name):
+                raise Defect(f"{name} is not that of an undisturbed run")
+        curves = [json.loads((each / "history.json").read_text()) for each in (output, whole)]
+        steps = [[stretch["step"] for stretch in curve["stretches"]] for curve in curves]
+        if steps[0] != steps[1] or curves[0]["measured"] != curves[1]["measured"]:
+            raise Defect("the curves lack steps")
+
+    def check_complete(output: Path, _: Path) -> None:
+        scenes = list((output / "point_cloud").iterdir())
+        metrics = json.loads((output / "metrics.json").read_text())
+        if f"iteration_{metrics['iteration']}" not in {scene.name for scene in scenes}:
+            raise Defect("no scene of the last step")
+        if not all((scene / "point_cloud.ply").is_file() for scene in scenes):
+            raise Defect("a folder without its scene")
+        if not (output / "report.html").is_file():
+            raise Defect("no report")
+
+    def plain(*more: object) -> Callable[[Path, bool], list[object]]:
+        def command(output: Path, again: bool) -> list[object]:
+            return ["train", capture, "-o", output, *_PLAIN, *more, *(["--resume"] * again)]
+
+        return command
+
+    def timed(output: Path, again: bool) -> list[object]:
+        words = ["train", capture, "-o", output, "--minutes", 0.05, "--eval", "--device", "cpu"]
+        return [*words, "--checkpoint-every", 5, "--threads", 1, *(["--resume"] * again)]
+
+    def replacing(output: Path, _: bool) -> list[object]:
+        return ["train", capture, "-o", output, *_PLAIN, "--overwrite"]
+
+    def older(output: Path) -> None:
+        """What a training of other settings leaves."""
+        shutil.copytree(_older_training(output.parents[1], capture), output)
+
+    return [
+        Job("train", "train", "out", plain(), check_same),
+        Job("train --memory", "train", "out", plain("--memory", "200MB"), check_same),
+        Job("train --minutes", "train", "out", timed, check_complete),
+        Job("train --overwrite", "train", "out", replacing, check_same, older),
+    ]
+
+
+def _older_training(folder: Path, capture: Path) -> Path:
+    out = folder / "older"
+    if not out.exists():
+        words = ["train", capture, "-o", out, "--iterations", 25, "--checkpoint-every", 5]
+        subprocess.run(
+            [sys.executable, "-m", "snowsplat", *map(str, words), "--device", "cpu", "--quiet"],
+            env={**os.environ, "PYTHONPATH": _SOURCE},
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
+    return out
+
+
+def capture_jobs(photos: Path) -> list[Job]:
+    """From photos, with smaller copies."""
+
+    def command(output: Path, _: bool) -> list[object]:
+        return ["capture", photos, "-o", output, "--quality", "draft", "--threads", 1, "--resize"]
+
+    return [Job("capture", "capture", "garden", command, _check_capture)]
+
+
+def make_jobs(photos: Path) -> list[Job]:
+    """From photos to pictures."""
+
+    def command(output: Path, _: bool) -> list[object]:
+        words = ["make", photos, "-o", output, "--quality", "draft", "--threads", 1]
+        return [*words, "--device", "cpu"]
+
+    def check_done(output: Path, whole: Path) -> None:
+        if names_in(output) != names_in(whole):
+            raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
+        _check_capture(output / "capture", whole / "capture")
+        record = json.loads((output / "make.json").read_text())
+        if list(record["stages"]) != ["scene", "pictures"]:
+            raise Defect("stages are not finished")
+        scene = output / f"{photos.name}.ply"
+        last = output / "scene/point_cloud/iteration_120/point_cloud.ply"
+        if digest(scene) != digest(last):
+            raise Defect("the scene is not that of the training")
+
+    return [Job("make", "make", "made", command, check_done)]
+
+
+def _check_capture(output: Path, whole: Path) -> None:
+    """The same files, and the same cameras but for rounding."""
+    if names_in(output) != names_in(whole):
+        raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
+    record = json.loads((output / "capture.json").read_text())
+    if list(record["stages"]) != ["photos", "poses", "images", "report"]:
+        raise Defect("stages are not finished")
+    centres = []
+    for folder in (output, whole):
+        model = read_model(folder / "sparse" / "0")
+        centres.append({image.name: _centre(image) for image in model.images})
+    if centres[0].keys() != centres[1].keys():
+        raise Defect("other photos are placed")
+    mine, theirs = (np.array([c[name] for name in sorted(c)]) for c in centres)
+    size = np.ptp(theirs, axis=0).max()
+    if np.abs(mine - theirs).max() > 1e-3 * size:
+        raise Defect(f"cameras are {np.abs(mine - theirs).max() / size:.2g} of the scene apart")
+
+
+def _centre(image: ColmapImage) -> np.ndarray:
+    rotation = rotation_from_quat(torch.tensor(image.pose[:4], dtype=torch.float64)).numpy()
+    return -rotation.T @ np.array(image.pose[4:])

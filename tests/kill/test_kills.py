@@ -1,0 +1,101 @@
+"""Some kills of each verb, at moments that a seed decides; nightly/kill_anywhere.py has more."""
+
+import shutil
+
+import pytest
+
+from snowsplat import checkpoint
+from snowsplat.formats import write_gaussians
+
+from .harness import (
+    Killer,
+    capture_jobs,
+    convert_jobs,
+    digest,
+    make_jobs,
+    names_in,
+    some_gaussians,
+    train_jobs,
+)
+
+
+@pytest.fixture(scope="module")
+def killer(zygote) -> Killer:
+    return Killer(zygote, seed=1)
+
+
+def test_convert(killer, tmp_path):
+    write_gaussians(tmp_path / "in.ply", some_gaussians(2000, 1))
+    write_gaussians(tmp_path / "other.ply", some_gaussians(100, 2))
+    assert not killer.kill(convert_jobs(tmp_path / "in.ply", tmp_path / "other.ply"), 4)
+
+
+@pytest.mark.slow
+def test_train(killer, capture):
+    assert not killer.kill(train_jobs(capture), 4)
+
+
+@pytest.mark.slow
+def test_capture(killer, photos):
+    assert not killer.kill(capture_jobs(photos), 3)
+
+
+@pytest.mark.slow
+def test_make(killer, photos):
+    assert not killer.kill(make_jobs(photos), 3)
+
+
+def test_train_at_its_very_beginning(zygote, capture):
+    """Before each of the first changes of files: the folder is ours from the first one on."""
+    out = zygote.folder / "begun"
+    command = ["train", capture, "-o", out, "--iterations", 3, "--device", "cpu", "--threads", 1]
+    for at in range(1, 8):
+        ended = zygote.run([*command, "--resume"], at=at)
+        assert ended.killed, ended.text
+    done = zygote.run([*command, "--resume"])
+    assert done.code == 0, done.text
+    assert not list(out.rglob("*.tmp"))
+
+
+def test_a_scene_that_a_kill_prevented(zygote, capture, tmp_path):
+    """Killed between the checkpoint of step 20 and the scene of step 20."""
+    out = tmp_path / "out"
+    command = ["train", capture, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
+    command += ["--save-iterations", 20, "--device", "cpu", "--threads", 1]
+    assert zygote.run(command).code == 0
+    early = out / "point_cloud/iteration_20/point_cloud.ply"
+    whole = digest(early)
+    early.unlink()
+    (out / "checkpoints/step_000030.safetensors").unlink()
+    done = zygote.run([*command, "--resume"])
+    assert done.code == 0, done.text
+    assert digest(early) == whole
+
+
+def test_damaged_checkpoints_are_not_begun_over(zygote, capture, tmp_path):
+    out = tmp_path / "out"
+    command = ["train", capture, "-o", out, "--iterations", 20, "--checkpoint-every", 10]
+    command += ["--device", "cpu", "--threads", 1]
+    assert zygote.run(command).code == 0
+    shutil.rmtree(out / "point_cloud")
+    for path in (out / "checkpoints").iterdir():
+        path.write_bytes(path.read_bytes()[:-1])
+    before = {name: (out / name).read_bytes() for name in names_in(out)}
+    ended = zygote.run([*command, "--resume"])
+    assert ended.code == 2
+    assert "holds checkpoints but no whole checkpoint to resume" in ended.text
+    assert {name: (out / name).read_bytes() for name in names_in(out)} == before
+
+
+def test_a_training_with_a_time_that_took_more_steps_than_planned(zygote, capture, tmp_path):
+    """The checkpoint at its end is beyond the plan that is written in it."""
+    out = tmp_path / "out"
+    command = ["train", capture, "-o", out, "--minutes", 0.02, "--checkpoint-every", 5]
+    command += ["--device", "cpu", "--threads", 1]
+    assert zygote.run(command).code == 0
+    newest = checkpoint.latest(out / "checkpoints")
+    assert newest is not None
+    newest.meta["training"]["iterations"] = newest.step - 3
+    checkpoint.save(out / "checkpoints", newest.step, newest.tensors, newest.meta)
+    done = zygote.run([*command, "--resume"])
+    assert done.code == 0, done.text

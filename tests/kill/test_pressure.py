@@ -1,0 +1,335 @@
+"""A full or read-only disk, folders that vanish, limits, a narrow terminal: one line, no loss."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from snowsplat import checkpoint
+
+from .harness import Ended, Zygote, check_whole, digest, leftovers, names_in
+
+CPU = ("--device", "cpu", "--threads", 1)
+
+
+@pytest.fixture(scope="module")
+def trained(zygote, capture) -> Path:
+    """With checkpoints of steps 20 and 30; not to be changed."""
+    out = zygote.folder / "trained"
+    ended = zygote.run(
+        ["train", capture, "-o", out, "--iterations", 30, "--checkpoint-every", 10, "--eval", *CPU]
+    )
+    assert ended.code == 0, ended.text
+    return out
+
+
+@pytest.fixture
+def place(zygote, tmp_path) -> Iterator[Path]:
+    """Where commands write; nothing of theirs stays in the folder for temporary files."""
+    folder = tmp_path / "place"
+    folder.mkdir()
+    yield folder
+    assert not leftovers(zygote.temporary)
+
+
+@contextmanager
+def mounted(folder: Path, *options: str) -> Iterator[None]:
+    """With a mount over ``folder``; skipped where that is not allowed."""
+    done = subprocess.run(["mount", *options, folder], capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip(f"needs the right to mount: {done.stderr.strip()}")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[None]:
+    """Even root writes nothing there."""
+    with mounted(folder, "--bind", str(folder)):
+        subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
+        yield
+
+
+@contextmanager
+def full(folder: Path, kilobytes: int) -> Iterator[None]:
+    """A disk of this size."""
+    with mounted(folder, "-t", "tmpfs", "-o", f"size={kilobytes}k", "none"):
+        yield
+
+
+def fill(folder: Path) -> None:
+    with suppress(OSError), open(folder / "filler", "wb", buffering=0) as filler:
+        while filler.write(bytes(4096)):
+            pass
+
+
+def refused(ended: Ended, pattern: str) -> None:
+    """It ended with one line on stderr, and the exit code of a mistake."""
+    assert ended.code == 2, ended.text
+    lines = [line for line in ended.text.splitlines() if line.startswith("snowsplat: ")]
+    assert len(lines) == 1, ended.text
+    assert ended.text.splitlines()[-1] == lines[0]
+    assert re.search(pattern, lines[0]), lines[0]
+
+
+def commands(place: Path, trained: Path, capture: Path, photos: Path) -> dict[str, list[object]]:
+    """One a verb, which writes below ``place``; ``place``/trained is a training."""
+    output = place / "trained"
+    return {
+        "convert": ["convert", trained, place / "a.html"],
+        "train": ["train", capture, "-o", place / "t", "--iterations", 9, *CPU],
+        "resume": ["train", "-o", output, "--resume", "--iterations", 60, *CPU],
+        "render": ["render", output, *CPU],
+        "film": ["render", output, "--path", "ellipse", "--seconds", 0.2, *CPU],
+        "evaluate": ["evaluate", output, *CPU],
+        "capture": ["capture", photos, "-o", place / "c", "--quality", "draft", "--threads", 1],
+        "make": ["make", photos, "-o", place / "m", "--quality", "draft", *CPU],
+    }
+
+
+VERBS = ["convert", "train", "resume", "render", "film", "evaluate", "capture", "make"]
+
+
+# Disks
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_read_only_folder(verb, zygote, place, trained, capture, photos):
+    shutil.copytree(trained, place / "trained")
+    before = {name: digest(place / name) for name in names_in(place)}
+    with read_only(place):
+        ended = zygote.run(commands(place, trained, capture, photos)[verb])
+    refused(ended, rf"{place}\S*: Read-only file system")
+    assert {name: digest(place / name) for name in names_in(place)} == before
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_full_disk(verb, zygote, place, trained, capture, photos):
+    # What is there fits, and hardly more.
+    used = sum((trained / name).stat().st_size // 4096 + 1 for name in names_in(trained)) * 4
+    with full(place, used + 60 + 4 * len(names_in(trained))):
+        shutil.copytree(trained, place / "trained")
+        fill(place)
+        before = {name: digest(place / name) for name in names_in(place)}
+        ended = zygote.run(commands(place, trained, capture, photos)[verb])
+        refused(ended, r"No space left on device|the disk is full|the disk has 0")
+        assert not leftovers(place)
+        after = {name: digest(place / name) for name in names_in(place)}
+        changed = {name for name in before if after.get(name) != before[name]}
+        assert not changed, f"{verb} changed {changed}"
+
+
+def test_a_disk_that_becomes_full_during_a_training(zygote, place, capture):
+    """The checkpoint before it stays whole; with room again it goes on to the same scene."""
+    out = place / "out"
+    command = ["train", capture, "-o", out, "--iterations", 60, "--checkpoint-every", 10, *CPU]
+    assert zygote.run(command).code == 0
+    scene = out / "point_cloud/iteration_60/point_cloud.ply"
+    whole = digest(scene)
+    size = max(path.stat().st_size for path in out.glob("checkpoints/*"))
+    shutil.rmtree(out)
+    # Two checkpoints and a half, and what else is there at first.
+    with full(place, 32 + int(2.5 * size) // 1024):
+        refused(zygote.run(command), rf"{out}/checkpoints/step_\S+: No space left on device")
+        check_whole(place)
+        newest = checkpoint.latest(out / "checkpoints")
+        assert newest is not None
+        assert not leftovers(place)
+        subprocess.run(["mount", "-o", "remount,size=10m", place], check=True)
+        again = zygote.run([*command, "--resume"])
+        assert again.code == 0, again.text
+        assert f"step {newest.step} of 60" in again.text
+        assert digest(scene) == whole
+
+
+def test_a_disk_that_becomes_full_during_a_capture(zygote, place, photos):
+    """Finished stages stay; with room again the same command goes on."""
+    out = place / "garden"
+    command = ["capture", photos, "-o", out, "--quality", "draft", "--threads", 1]
+    with full(place, 700):
+        refused(zygote.run(command), rf"{out}: the disk is full; make room, then give the same")
+        assert list(json.loads((out / "capture.json").read_text())["stages"]) == ["photos"]
+        subprocess.run(["mount", "-o", "remount,size=50m", place], check=True)
+        again = zygote.run(command)
+        assert again.code == 0, again.text
+        assert again.text.count("done before") == 1
+        assert not leftovers(place)
+
+
+# Folders that vanish
+
+
+def when(condition: Callable[[], bool], then: Callable[[], object]) -> Callable[[int], None]:
+    """For `Zygote.run`: do something as soon as something is so."""
+
+    def wait(pid: int) -> None:
+        while not condition():
+            if not Path(f"/proc/{pid}").exists():
+                return
+            time.sleep(0.001)
+        then()
+
+    return wait
+
+
+def has_checkpoint(out: Path) -> Callable[[], bool]:
+    return lambda: any(out.glob("checkpoints/step_*"))
+
+
+def test_a_training_whose_folder_is_moved_goes_on(zygote, place, capture):
+    """In a new one: hours of work are worth more than order."""
+    out, elsewhere = place / "out", place / "elsewhere"
+    command = ["train", capture, "-o", out, "--iterations", 400, "--checkpoint-every", 10, "--eval"]
+    ended = zygote.run(
+        [*command, *CPU],
+        while_it_runs=when(has_checkpoint(out), lambda: out.rename(elsewhere)),
+    )
+    assert ended.code == 0, ended.text
+    assert ended.text.count("snowsplat: ") == 1
+    assert f"snowsplat: warning: {out}: is gone; it is made anew" in ended.text
+    check_whole(place)
+    assert not leftovers(place)
+    assert checkpoint.latest(elsewhere / "checkpoints") is not None
+    assert (out / "point_cloud/iteration_400/point_cloud.ply").is_file()
+    assert zygote.run(["evaluate", out, *CPU]).code == 0
+
+
+def test_a_training_whose_photos_vanish(zygote, place, capture):
+    """At its beginning, and before it goes on: what is saved stays."""
+    mine, out = place / "capture", place / "out"
+    shutil.copytree(capture, mine)
+    command = ["train", mine, "-o", out, "--iterations", 40, "--checkpoint-every", 10, *CPU]
+    assert zygote.run(command).code == 0
+    before = {name: digest(out / name) for name in names_in(out)}
+    (mine / "images").rename(mine / "moved")
+    ended = zygote.run(["train", "-o", out, "--resume", "--iterations", 60, *CPU])
+    refused(ended, rf"{mine}/images")
+    assert {name: digest(out / name) for name in names_in(out)} == before
+
+    (mine / "moved").rename(mine / "images")
+    begun = (place / "two" / "config.json").exists
+    ended = zygote.run(
+        ["train", mine, "-o", place / "two", "--iterations", 40, *CPU],
+        while_it_runs=when(begun, lambda: shutil.rmtree(mine / "images")),
+    )
+    if ended.code:  # else all were read by then
+        refused(ended, rf"{mine}/images/\S+")
+    assert not leftovers(place)
+
+
+@pytest.mark.parametrize("verb", ["capture", "make"])
+def test_photos_or_the_folder_vanish_under_a_capture(verb, zygote, place, photos):
+    mine, out = place / "photos", place / "out"
+    shutil.copytree(photos, mine)
+    command = [verb, mine, "-o", out, "--quality", "draft", "--threads", 1]
+    inner = out / "capture" if verb == "make" else out
+    begun = (inner / "distorted" / "database.db").exists
+    # The photos are copied by then: it may end well, and does.
+    ended = zygote.run(command, while_it_runs=when(begun, lambda: shutil.rmtree(inner / "input")))
+    refused(ended, r"input|images")
+    shutil.rmtree(out, ignore_errors=True)
+    ended = zygote.run(command, while_it_runs=when(begun, lambda: out.rename(place / "moved")))
+    refused(ended, rf"{out}\S*: No such file or directory")
+    check_whole(place / "moved")
+
+
+# Limits
+
+
+@pytest.mark.parametrize("verb", ["convert", "train", "resume", "render", "film", "capture"])
+def test_a_limit_of_the_size_of_files(verb, zygote, place, trained, capture, photos):
+    shutil.copytree(trained, place / "trained")
+    before = {name: digest(place / name) for name in names_in(place)}
+    limit = {"capture": 50_000, "resume": 5000}.get(verb, 500)
+    ended = zygote.run(
+        commands(place, trained, capture, photos)[verb], limits={"RLIMIT_FSIZE": limit}
+    )
+    refused(ended, r"File too large")
+    assert not leftovers(place)
+    check_whole(place)
+    kept = {name for name in before if name not in ("trained/config.json", "trained/cfg_args")}
+    assert all(digest(place / name) == before[name] for name in kept)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_limit_of_open_files(verb, zygote, place, trained, capture, photos):
+    """So low that hardly one can be opened."""
+    shutil.copytree(trained, place / "trained")
+    before = names_in(place)
+    ended = zygote.run(commands(place, trained, capture, photos)[verb], limits={"RLIMIT_NOFILE": 1})
+    refused(ended, r"Too many open files")
+    assert not leftovers(place)
+    assert names_in(place) >= before
+    check_whole(place)
+
+
+# A terminal of 24 columns
+
+
+def shown(text: str) -> list[str]:
+    """What ends up on the screen, line by line; lines that are longer than it are wrapped there."""
+    lines = []
+    for line in text.split("\n"):
+        last = ""
+        for part in line.split("\r"):
+            part = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", part)
+            last = part or last
+        lines.append(last)
+    return lines
+
+
+def bars(text: str) -> list[str]:
+    """Each picture of the line that changes, which the next one takes the place of."""
+    found = re.findall(r"\r\x1b\[2K([^\r\n]*)(?=\r\x1b)", text)
+    return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", bar) for bar in found]
+
+
+def test_a_narrow_terminal(zygote, place, trained, capture, photos):
+    all_of_them = commands(place, trained, capture, photos)
+    shutil.copytree(trained, place / "trained")
+    longer = ["train", capture, "-o", place / "t", "--iterations", 500, *CPU]
+    for command in (longer, all_of_them["capture"], all_of_them["film"], all_of_them["evaluate"]):
+        ended = zygote.run(command, columns=24)
+        assert ended.code == 0, ended.text
+        assert "Traceback" not in ended.text
+        for bar in bars(ended.text):
+            assert len(bar) <= 24, bar
+        if command is longer:
+            steps = [re.match(r"(\d+)/500\b", bar) for bar in bars(ended.text)]
+            assert steps, ended.text
+            assert all(steps), bars(ended.text)  # not half a number
+            assert ended.text.count("\x1b[?25l") == ended.text.count("\x1b[?25h") == 1  # cursor
+    ended = zygote.run(["train", capture, "-o", place / "t", *CPU], columns=24)
+    assert ended.code == 2
+    assert len(shown(ended.text.strip())) == 1
+
+
+def test_view_of_what_is_not_there(zygote, place, trained):
+    """The one verb that writes nothing: a folder without its scene is one line."""
+    shutil.copytree(trained, place / "trained")
+    shutil.rmtree(place / "trained" / "point_cloud")
+    refused(zygote.run(["view", place / "trained", "--no-browser"]), "holds no scene")
+
+
+def test_zygote_runs_what_the_command_runs(zygote, trained, tmp_path):
+    """The harness is no other program: the file is that of a process started by the shell."""
+    assert isinstance(zygote, Zygote)
+    for folder in (zygote.folder / "by zygote", tmp_path):
+        folder.mkdir(exist_ok=True)
+    assert zygote.run(["convert", trained, zygote.folder / "by zygote" / "a.spz"]).code == 0
+    source = Path(checkpoint.__file__).parents[1]
+    subprocess.run(
+        ["python", "-m", "snowsplat", "convert", trained, tmp_path / "a.spz"],
+        env={**os.environ, "PYTHONPATH": str(source)},
+        check=True,
+    )
+    assert digest(tmp_path / "a.spz") == digest(zygote.folder / "by zygote" / "a.spz")

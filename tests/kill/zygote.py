@@ -1,0 +1,158 @@
+"""Runs `snowsplat` in forks of a process that has all its modules: a start takes milliseconds.
+
+    python zygote.py      one line of JSON a run on stdin, lines of JSON on stdout
+
+A run is {"argv", "log", "watched", "at", "delay", "limits", "columns"}. It is a process, and a
+group of processes, of its own. With "at" it kills its whole group by SIGKILL before the at-th time
+that its Python changes a file below a folder of "watched", or "delay" seconds after that; the
+changes are counted in the file LOG.changes where it ends by itself. The answers are {"pid"} and
+{"code"}.
+"""
+
+import fcntl
+import importlib
+import json
+import os
+import pty
+import resource
+import signal
+import struct
+import sys
+import termios
+import threading
+import time
+from contextlib import suppress
+from dataclasses import replace
+
+_CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate")
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+
+
+def _import_all() -> None:
+    import snowsplat.checkpoint
+    import snowsplat.cli.films
+    import snowsplat.cli.main
+    import snowsplat.cli.making
+    import snowsplat.cli.memory_budget
+    import snowsplat.edit
+    import snowsplat.evaluate
+    import snowsplat.formats
+    import snowsplat.photos.capture_folder
+    import snowsplat.photos.orient
+    import snowsplat.photos.report
+    import snowsplat.photos.undistort
+    import snowsplat.plan
+    import snowsplat.recipes
+    import snowsplat.trainer
+    import snowsplat.training_report
+    import snowsplat.viewer.static_scene
+    import snowsplat.viewer.static_server
+
+    # After zlib: its own would take the place of Python's.
+    importlib.import_module("pycolmap")
+    for verb in snowsplat.cli.main.VERBS:
+        snowsplat.cli.main._parse([verb])
+
+
+def _kill_at(at: int | None, delay: float, watched: list[str], changes: list[int]) -> None:
+    def end() -> None:
+        if delay:
+            time.sleep(delay)
+        os.killpg(0, signal.SIGKILL)
+
+    def hook(event: str, args: tuple) -> None:
+        if event == "open":
+            if not isinstance(args[2], int) or not args[2] & _WRITING:
+                return
+        elif event not in _CHANGES:
+            return
+        path = args[0]
+        if not isinstance(path, str | bytes | os.PathLike):
+            return
+        # What has a folder's handle goes by a bare name, as in rmtree.
+        name = os.fsdecode(path)
+        if os.path.isabs(name) and not name.startswith(tuple(watched)):
+            return
+        changes[0] += 1
+        if changes[0] == at:
+            if delay:
+                threading.Thread(target=end, daemon=True).start()
+            else:
+                end()
+
+    sys.addaudithook(hook)
+
+
+def _terminal(log: int, columns: int) -> int:
+    """One so wide, whose output goes into the log."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+
+    def copy() -> None:
+        while True:
+            os.write(log, os.read(ours, 65536))
+
+    threading.Thread(target=copy, daemon=True).start()
+    return theirs
+
+
+def _child(run: dict) -> None:
+    null = os.open(os.devnull, os.O_RDONLY)
+    log = os.open(run["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    if run.get("columns"):
+        log = _terminal(log, run["columns"])
+    os.dup2(null, 0)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
+    sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
+    sys.argv = ["snowsplat", *run["argv"]]
+    from snowsplat.cli import making
+    from snowsplat.cli.main import main
+
+    # `make` with a training of a moment, and checkpoints all the time.
+    making._CHECKPOINT_SECONDS = 0.1
+    making.PRESETS["draft"] = replace(making.PRESETS["draft"], iterations=120)
+    count = os.open(run["log"] + ".changes", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for name, value in run.get("limits", {}).items():
+        which = getattr(resource, name)
+        if name == "RLIMIT_NOFILE":
+            value += len(os.listdir("/proc/self/fd")) - 1  # one of them was for this list
+        resource.setrlimit(which, (value, resource.getrlimit(which)[1]))
+    changes = [0]
+    _kill_at(run.get("at"), run.get("delay", 0.0), run["watched"], changes)
+    try:
+        code = main(run["argv"])
+    except SystemExit as leaving:
+        code = int(leaving.code or 0)
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+        code = 1
+    sys.stdout.flush()
+    if run.get("columns"):
+        time.sleep(0.1)  # until the last words are copied
+    os.write(count, str(changes[0]).encode())
+    os._exit(code)
+
+
+def serve() -> None:
+    """Answer until stdin ends."""
+    _import_all()
+    for line in sys.stdin:
+        run = json.loads(line)
+        pid = os.fork()
+        if pid == 0:
+            try:
+                os.setpgid(0, 0)
+                _child(run)
+            finally:
+                os._exit(1)
+        with suppress(OSError):  # it was quicker
+            os.setpgid(pid, pid)
+        print(json.dumps({"pid": pid}), flush=True)
+        _, status = os.waitpid(pid, 0)
+        print(json.dumps({"code": os.waitstatus_to_exitcode(status)}), flush=True)
+
+
+if __name__ == "__main__":
+    serve()

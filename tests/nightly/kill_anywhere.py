@@ -1,0 +1,101 @@
+"""Kills `capture`, `train`, `make` and `convert` at random moments, and sees that nothing is lost.
+
+    PYTHONPATH=src python tests/nightly/kill_anywhere.py --kills 200
+
+Each round begins with a new folder, kills the command (SIGKILL, with its children) one to five
+times in a row, opens after each kill all that has a final name, then lets the same command run to
+its end: see tests/kill/harness.py. Exit code 1, and the folder is kept, where a promise is broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from kill.harness import (
+    Defect,
+    Job,
+    Killer,
+    Zygote,
+    capture_jobs,
+    convert_jobs,
+    make_jobs,
+    some_gaussians,
+    train_jobs,
+)
+from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat.formats import write_gaussians
+from snowsplat.photos.synthetic import write_synthetic_photos
+
+VERBS = ("capture", "train", "make", "convert")
+# Of all kills: those of a verb that takes long are fewer.
+_SHARES = {"capture": 0.2, "train": 0.35, "make": 0.15, "convert": 0.3}
+
+
+def jobs(folder: Path, verbs: list[str]) -> list[Job]:
+    """Those of the verbs, with small inputs in ``folder``."""
+    found: list[Job] = []
+    if "convert" in verbs:
+        write_gaussians(folder / "in.ply", some_gaussians(4000, 1))
+        write_gaussians(folder / "other.ply", some_gaussians(100, 2))
+        found += convert_jobs(folder / "in.ply", folder / "other.ply")
+    if "train" in verbs:
+        write_synthetic_capture(folder / "capture", "colmap-bin", 9, 48, 36, n_points=300)
+        found += train_jobs(folder / "capture")
+    if "capture" in verbs or "make" in verbs:
+        write_synthetic_photos(folder / "photos", n_views=16, width=320, height=240)
+        found += capture_jobs(folder / "photos") if "capture" in verbs else []
+        found += make_jobs(folder / "photos") if "make" in verbs else []
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--kills", type=int, default=200, help="in all, at least (default: 200)")
+    parser.add_argument("--verbs", nargs="+", choices=VERBS, default=list(VERBS))
+    parser.add_argument("--seed", type=int, default=int(time.time()), help="default: the time")
+    parser.add_argument("--folder", type=Path, help="to work in (default: a temporary one)")
+    flags = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="kill_anywhere_", dir=flags.folder))
+    print(f"seed {flags.seed}, in {folder}", flush=True)
+    everything = jobs(folder, flags.verbs)
+    share = sum(_SHARES[verb] for verb in flags.verbs)
+    defects: list[Defect] = []
+    start = time.monotonic()
+    with Zygote(folder / "work") as zygote:
+        killer = Killer(zygote, flags.seed)
+        for verb in flags.verbs:
+            of_verb = [job for job in everything if job.verb == verb]
+            found = killer.kill(of_verb, math.ceil(flags.kills * _SHARES[verb] / share))
+            print_tally(killer, verb)
+            for defect in found:
+                print(f"DEFECT {defect}", flush=True)
+            defects += found
+    kills = sum(tally.kills for tally in killer.tallies.values())
+    print(f"{kills} kills in {time.monotonic() - start:.0f} s, {len(defects)} defects")
+    if not defects:
+        shutil.rmtree(folder)
+    return 1 if defects else 0
+
+
+def print_tally(killer: Killer, verb: str) -> None:
+    for name, tally in killer.tallies.items():
+        if name.split()[0] == verb:
+            print(
+                f"{name:24}{tally.kills:5} kills in {tally.rounds} rounds, {tally.files} files "
+                f"opened after them; {tally.ended} runs ended before their kill",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
