@@ -346,9 +346,10 @@ class Train:
             raise UserError(
                 f"{out.path}: holds no whole checkpoint to resume; name the capture to begin anew"
             )
-        if out.scenes() and not self.overwrite:
+        if out.scenes() or checkpoint.exists(out.checkpoints):
+            what = "a scene" if out.scenes() else "checkpoints"
             raise UserError(
-                f"{out.path}: holds a scene but no whole checkpoint to resume; add --overwrite "
+                f"{out.path}: holds {what} but no whole checkpoint to resume; add --overwrite "
                 "instead of --resume to begin anew"
             )
         self._say(f"{out.path}: no checkpoint yet; beginning at step 0")
@@ -368,7 +369,8 @@ class Train:
                 f"{start.path}: was made with other settings; resume without flags that change the "
                 "training (--iterations, --test-iterations, --checkpoint-every may change)"
             )
-        if resumed.iterations < start.step:
+        # A training with a time may have gone beyond what was planned at first.
+        if self.iterations is not None and resumed.iterations < start.step:
             raise UserError(
                 f"{start.path}: is of step {start.step}, beyond --iterations {resumed.iterations}; "
                 "name more"

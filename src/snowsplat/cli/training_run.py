@@ -69,6 +69,7 @@ class TrainingRun:
         stopped = False
         try:
             with nullcontext() if self.quiet else self.progress:
+                self._save_what_a_kill_prevented()
                 self.history.step_begins()
                 self.trainer.run(self._record)
         except KeyboardInterrupt:
@@ -95,10 +96,10 @@ class TrainingRun:
             self._measured(progress.step, progress.metrics)
         if not self.quiet:
             self.progress(progress)
+        if self._checkpoint_is_due(progress.step):
+            self._save_checkpoint()
         if progress.step in self.save_iterations:
             self._save_scene()
-        if self._checkpoint_is_due(progress.step):  # last: who goes on from there has all the rest
-            self._save_checkpoint()
         if self.viewer is not None:
             paused = self.viewer.after_step(
                 progress.step, progress.iterations, progress.loss, self.trainer.gaussians
@@ -119,6 +120,12 @@ class TrainingRun:
         if every:
             return step % every == 0
         return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
+
+    def _save_what_a_kill_prevented(self) -> None:
+        """Between a checkpoint and the scene of the same step."""
+        step = self.first_step
+        if step in self.save_iterations and step not in self.out.scenes():
+            self._save_scene()
 
     def _save_scene(self) -> Path:
         self._look_for_the_folder()
