@@ -1,4 +1,7 @@
-"""Extreme input: whatever finite numbers the parameters hold, all results are finite."""
+"""Extreme input: whatever finite numbers the parameters hold, all results are finite.
+
+What hypothesis finds, here for seconds, in tests/nightly/fuzz_ops.py for as long as one likes.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,13 @@ import math
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from snowsplat.ops.splats import Splats2D
 
+from .extremes import CHECKS, LONG, check_photometric
 from .scenes import (
     PARAMETERS,
     Scene,
@@ -224,3 +230,106 @@ def test_a_splat_that_is_not_finite_draws_nothing(native: Variant, value: float)
         grads.append(leaf.packed.grad)
     assert_close(images[0], images[1], native.forward)
     assert_close(grads[0][rows], grads[1], native.backward)
+
+
+#: Cases, by the engine: emulation takes a hundred times as long.
+EXAMPLES = {"native": 25, "emulated": 3, "cuda": 25}
+
+
+@pytest.mark.parametrize("name", [name for name in CHECKS if name != "long images"])
+def test_whatever_hypothesis_finds(native: Variant, name: str) -> None:
+    """Projecting with its gradient and the step of Adam, blending with its gradient and the
+    statistics, the harm done to others by what is not finite, distances, the loss."""
+    strategies, holds = CHECKS[name]
+
+    @settings(
+        max_examples=EXAMPLES[native.engine],
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.tuples(*strategies))
+    def check(drawn: tuple) -> None:
+        holds(native, *drawn)
+
+    check()
+
+
+@pytest.mark.parametrize("size", LONG)
+def test_long_images(native: Variant, size: tuple[int, int]) -> None:
+    """Of 16384 by 3 pixels, and upright: the loss, and what is seen at both ends."""
+    if native.dtype == torch.float32:
+        check_photometric(native, (1, size, "noise", True), 0.2)
+    width, height = size
+    splats = random_splats(1, 40, width, height)
+    splats.packed[:2, :2] = torch.tensor([[1.0, 1.0], [width - 1.0, height - 1.0]])
+    leaf = leaf_splats(splats, native.dtype)
+    image, alpha, depth = native.ops.rasterize(leaf, width, height, with_depth=True)
+    assert depth is not None
+    (image.sum() + alpha.sum() + depth.sum()).backward()
+    assert_finite({"image": image, "alpha": alpha, "depth": depth, "gradient": leaf.packed.grad})
+    assert alpha[0, 0] > 0
+    assert alpha[-1, -1] > 0
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_no_gradient_gets_into_what_it_breaks(
+    variant: Variant, value: float, visible_only: bool
+) -> None:
+    """Rows with such numbers are counted; those keep what they had, all others take their step."""
+    scene = random_scene(6, 130)
+    ids = scene.to(variant.dtype, requires_grad=False).project(variant.ops).ids
+    assert ids is not None
+    grad = normal(generator(2), len(ids), 16)
+    extra = torch.zeros(130, dtype=variant.dtype)
+    breaks = value if variant.dtype == torch.float32 or value != 1e30 else 1e300
+    grad[3, 5], grad[8, 9] = breaks, breaks  # of an opacity, and of a colour
+    extra[int(ids[20])] = breaks
+    results = []
+    for packed_grad in (grad, torch.where(grad.abs() < 1e9, grad, 0.0)):
+        state = scene.to(variant.dtype, requires_grad=False)
+        m, v = ({n: torch.zeros_like(p) for n, p in state.params.items()} for _ in range(2))
+        held = torch.ones(6, dtype=torch.int32)
+        broken = packed_grad is grad
+        state.params["opacity_logits"].grad = extra if broken else torch.zeros_like(extra)
+        variant.ops.adam_step(
+            state.params,
+            m,
+            v,
+            ids,
+            packed_grad.to(variant.dtype),
+            state.cam_from_world,
+            lr=dict.fromkeys(m, 1e-3),
+            step=1,
+            visible_only=visible_only,
+            held=held,
+            **state.view,
+        )
+        for tensors in (state.params, m, v):
+            assert_finite(dict(tensors))
+        results.append((state.params, m, v))
+        # Added to what was there; a colour is of the direction, hence of the mean, too.
+        assert held.tolist() == ([2, 1, 1, 3, 2, 2] if broken else [1] * 6)
+    rows = ids[torch.tensor([3, 8, 20])].long()
+    others = torch.ones(130, dtype=torch.bool)
+    others[rows] = False
+    for broken, clean in zip(*results, strict=True):
+        for name in PARAMETERS:
+            assert torch.equal(broken[name][others], clean[name][others]), name
+    logits = results[0][0]["opacity_logits"][rows[[0, 2]]]
+    assert torch.equal(logits, scene.params["opacity_logits"].to(variant.dtype)[rows[[0, 2]]])
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_statistics_without_what_is_not_finite(variant: Variant, value: float) -> None:
+    splats = random_splats(2, 4, 23, 17)
+    packed = splats.packed.to(variant.dtype).requires_grad_()
+    packed.grad = torch.ones_like(packed)
+    packed.grad[1, 0] = value
+    seen = Splats2D(packed, torch.arange(4, dtype=torch.int32), 3)
+    sums = torch.zeros(3, 4, dtype=variant.dtype)
+    variant.ops.accumulate_screen_statistics(seen, 2, 2, *sums)
+    assert sums.isfinite().all()
+    assert sums[1].tolist() == [1.0, 0.0, 1.0, 1.0]
