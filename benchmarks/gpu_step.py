@@ -104,7 +104,7 @@ class Step:
         trainer = self.trainer
         while True:
             self.queue()
-            loss, needed = trainer._readback.wait()
+            loss, needed, *_ = trainer._readback.wait()
             if needed <= trainer._room.instances:
                 return loss
             trainer._room = replace(trainer._room, instances=int(1.3 * needed))
