@@ -34,7 +34,7 @@ CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp'
 demo: native
 	$(PYTHON) examples/demo.py out/demo
 
-test: check sanitized
+test: check
 
 dev: native
 
@@ -82,14 +82,21 @@ layers: $(ENVIRONMENT)
 	lint-imports --no-logo
 
 # All tests on the best instruction set, then those of the ops on each of the others, less those of
-# a GPU's kernels, which have none.
+# a GPU's kernels, which have none. Two halves side by side: most tests keep one core busy.
 pytest: native
-	$(PYTHON) -m pytest
+	@$(MAKE) --no-print-directory -j2 pytest-others pytest-ops
+
+pytest-others: native
+	$(PYTHON) -m pytest --ignore tests/ops
+
+pytest-ops: native
+	$(PYTHON) -m pytest tests/ops
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
 	    for isa in $$isas; do \
 	        echo "SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops"; \
 	        SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops -m 'not emulated and not gpu' || exit 1; \
 	    done
+	@$(MAKE) --no-print-directory sanitized
 
 # The kernels of a GPU, on the CPU, under AddressSanitizer and UndefinedBehaviorSanitizer, and with the
 # threads of a block in the other order: what misses a barrier can be right in one of the two alone.

@@ -150,6 +150,12 @@ def resident_bytes() -> int:
 def peak_bytes() -> int:
     """The most memory that this process has held; 0 where the system does not tell."""
     try:
+        # Not what getrusage says on Linux: there a process begins with the figure of its parent.
+        lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) << 10
+    except (OSError, StopIteration, ValueError, IndexError):
+        pass
+    try:
         import resource
     except ImportError:
         return 0
