@@ -1,6 +1,10 @@
 """Some kills of each verb, at moments that a seed decides; nightly/kill_anywhere.py has more."""
 
+import json
+import os
+import re
 import shutil
+import signal
 
 import pytest
 
@@ -99,3 +103,26 @@ def test_a_training_with_a_time_that_took_more_steps_than_planned(zygote, captur
     checkpoint.save(out / "checkpoints", newest.step, newest.tensors, newest.meta)
     done = zygote.run([*command, "--resume"])
     assert done.code == 0, done.text
+
+
+@pytest.mark.slow
+def test_make_keeps_its_checkpoints_until_the_scene_is_written_down(zygote, photos, tmp_path):
+    """Killed as soon as they are gone: what is made from them is finished, and stays so."""
+    out = tmp_path / "made"
+    command = ["make", photos, "-o", out, "--quality", "draft", "--device", "cpu", "--threads", 1]
+    checkpoints = out / "scene/checkpoints"
+
+    def kill_when_gone(pid: int) -> None:
+        seen = False
+        while not seen or checkpoints.exists():
+            seen = seen or checkpoints.exists()
+        os.killpg(pid, signal.SIGKILL)
+
+    assert zygote.run(command, while_it_runs=kill_when_gone).killed
+    assert "scene" in json.loads((out / "make.json").read_text())["stages"]
+    # As if it had been killed before.
+    checkpoints.mkdir()
+    again = zygote.run(command)
+    assert again.code == 0, again.text
+    assert re.search(r"scene +done before", again.text)
+    assert not checkpoints.exists()
