@@ -29,7 +29,7 @@ from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.spz_container import Header, pack
 from snowsplat.history import History
 from snowsplat.lpips import Lpips
-from snowsplat.photos import capture_folder
+from snowsplat.photos import capture_folder, photo_files
 from snowsplat.photos.clip import is_video, read_clip
 from snowsplat.photos.sfm.result import describe_model
 from snowsplat.photos.stages import Stages
@@ -118,6 +118,22 @@ def test_images(tmp_path, refused, name, data, line):
     path = tmp_path / name
     path.write_bytes(data())
     assert line in refused(lambda: decoded(path))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("ending", ["jpg", "tif"])
+def test_notes_that_are_all_of_one_place(tmp_path, ending):
+    """Each of thousands of tags is as large as all of them. (Pillow itself looks after this.)"""
+    path = tmp_path / f"a.{ending}"
+    if ending == "jpg":
+        tags = [(0x9000 + i, 7, 60_000, 0) for i in range(5000)]
+        Image.new("RGB", (64, 64)).save(path, exif=b"Exif\0\0" + tiff(tags, bytes(4000)))
+    else:
+        sizes = [(256, 4, 1, 64), (257, 4, 1, 64), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1)]
+        sizes += [(273, 4, 1, 8), (278, 4, 1, 64), (279, 4, 1, 4096)]
+        tags = [(500 + i, 7, 700_000, 0) for i in range(60_000)]
+        path.write_bytes(tiff(sizes + tags, b""))
+    guarded(lambda: (decoded(path), photo_files.read_header(path)), tmp_path, path.stat().st_size)
 
 
 @pytest.mark.filterwarnings("ignore")
