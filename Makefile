@@ -29,7 +29,7 @@ LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock
 SANITIZED := emulated-float32
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo test dev check format native compiler lint types layers pytest sanitized clean
+.PHONY: demo test dev check format native compiler lint types layers pytest pytest-others pytest-ops sanitized clean
 
 demo: native
 	$(PYTHON) examples/demo.py out/demo
@@ -82,9 +82,9 @@ layers: $(ENVIRONMENT)
 	lint-imports --no-logo
 
 # All tests on the best instruction set, then those of the ops on each of the others, less those of
-# a GPU's kernels, which have none. Two halves side by side: most tests keep one core busy.
+# a GPU's kernels, which have none. Two at a time, since most tests keep one core busy.
 pytest: native
-	@$(MAKE) --no-print-directory -j2 pytest-others pytest-ops
+	@$(MAKE) --no-print-directory -j2 pytest-others pytest-ops sanitized
 
 pytest-others: native
 	$(PYTHON) -m pytest --ignore tests/ops
@@ -96,7 +96,6 @@ pytest-ops: native
 	        echo "SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops"; \
 	        SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops -m 'not emulated and not gpu' || exit 1; \
 	    done
-	@$(MAKE) --no-print-directory sanitized
 
 # The kernels of a GPU, on the CPU, under AddressSanitizer and UndefinedBehaviorSanitizer, and with the
 # threads of a block in the other order: what misses a barrier can be right in one of the two alone.

@@ -19,6 +19,7 @@ import torch
 
 from snowsplat.capture.capture import Points
 from snowsplat.errors import UserError
+from snowsplat.files import shown
 
 logger = logging.getLogger(__name__)
 
@@ -312,7 +313,7 @@ def _read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
             camera_id, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
-            raise _damaged(path, f"no camera in the line {line[:60]!r}") from None
+            raise _damaged(path, f"no camera in the line {shown(line[:60])!r}") from None
         if len(params) != counts.get(model, len(params)):
             raise _damaged(path, f"{len(params)} parameters for camera model {model[:40]}")
         cameras[camera_id] = _checked_camera(path, model, width, height, params)
@@ -330,7 +331,7 @@ def _read_images_text(path: Path) -> list[ColmapImage]:
             pose = tuple(float(word) for word in words[1:8])
             image = ColmapImage(words[9], int(words[8]), pose)
         except (ValueError, IndexError):
-            raise _damaged(path, f"no image in the line {line[:60]!r}") from None
+            raise _damaged(path, f"no image in the line {shown(line[:60])!r}") from None
         images.append(image)
         _check_number(path, "images", len(images))
         observations = next(lines, "")  # x, y, point id of each; the line may be empty
