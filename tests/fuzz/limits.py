@@ -36,7 +36,8 @@ _FORBIDDEN = (
 _FORBIDDEN += ("socket.connect", "socket.getaddrinfo", "urllib.Request", "ctypes.dlopen")
 # Where libraries look for parts of themselves.
 _ALLOWED = tuple({sys.prefix, sys.base_prefix, "/usr", "/proc", "/sys", "/dev/null", "/lib"})
-_ALLOWED += (str(Path(__file__).parents[2] / "src"), "/etc/ld.so.cache", "/etc/nsswitch.conf")
+_ALLOWED += tuple(os.path.realpath(path) for path in sys.path if path)
+_ALLOWED += ("/etc/ld.so.cache", "/etc/nsswitch.conf")
 
 
 class Broken(BaseException):
