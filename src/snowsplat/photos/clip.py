@@ -136,6 +136,8 @@ def open_video(path: Path) -> InputContainer:
     # A name may look like an address. Some tags of cameras are no UTF-8; they do not matter here.
     container = av.open(f"file:{path.absolute()}", options=options, metadata_errors="replace")
     for stream in container.streams.video:
+        if stream.codec_context is None:  # so PyAV says that nobody can decode it
+            raise ValueError("a codec that is not known")
         stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
     return container
 
