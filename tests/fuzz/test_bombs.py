@@ -331,6 +331,9 @@ def test_colmap_text_of_one_endless_line(tmp_path, refused, capture):
     cameras = home / "sparse/0/cameras.txt"
     cameras.write_text("1 PINHOLE " + "1 " * 10_000_000)
     assert "damaged" in refused(lambda: load_capture(home))
+    write_synthetic_capture(home, "colmap-txt", 5, 32, 24, n_points=20)
+    cameras.write_text(cameras.read_text().replace("PINHOLE", "x" * 100_000))
+    assert "lens distortion" in refused(lambda: load_capture(home))
 
 
 def test_colmap_of_countless_images(tmp_path, refused, capture):
