@@ -151,9 +151,10 @@ def _pinhole(folder: Path, camera: ColmapCamera) -> tuple[float, float, float, f
     focal_lengths = _FOCAL_LENGTHS.get(camera.model)
     if focal_lengths is None or any(camera.params[focal_lengths + 2 :]):
         raise UserError(
-            f"{folder}: its cameras have lens distortion (model {camera.model[:40]}), and Gaussians are "
-            "drawn without; undistort the images first: put them into NEW/input and the model into "
-            "NEW/distorted/sparse/0, run snowsplat capture -s NEW --skip-matching, then use NEW"
+            f"{folder}: its cameras have lens distortion (model {camera.model[:40]}), and "
+            "Gaussians are drawn without; undistort the images first: put them into NEW/input and "
+            "the model into NEW/distorted/sparse/0, run snowsplat capture -s NEW --skip-matching, "
+            "then use NEW"
         )
     f, (cx, cy) = camera.params[:focal_lengths], camera.params[focal_lengths : focal_lengths + 2]
     if not all(map(math.isfinite, (*f, cx, cy))) or min(f) <= 0 or max(*f, abs(cx), abs(cy)) > 1e9:
