@@ -1,7 +1,7 @@
 # make demo     takes photos of a small scene and makes it anew from them, with `snowsplat make`
 # make test     all that must hold: format, lint, types, layers, tests on every instruction set, and
 #               the kernels of a GPU, on the CPU
-# make dev      the environment to work in; then, quickly: make check, make format, make native
+# make dev      the environment to work in; then, quickly: make test, make format, make native
 #
 # Each works by itself on a fresh clone and needs Python >= 3.10 and a C++ compiler. Everything goes
 # into .venv, made by BOOTSTRAP (python3); PYTHON=path/to/python uses a ready environment instead.
@@ -29,16 +29,14 @@ LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock
 SANITIZED := emulated-float32
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo test dev check format native compiler lint types layers pytest pytest-others pytest-ops sanitized clean
+.PHONY: demo test dev format native compiler lint types layers pytest pytest-others pytest-ops sanitized clean
 
 demo: native
 	$(PYTHON) examples/demo.py out/demo
 
-test: check
+test: lint types layers pytest
 
 dev: native
-
-check: lint types layers pytest
 
 # The environment. Editable without a build of its own: `make native` puts the libraries into src/.
 .venv/.installed: pyproject.toml | compiler
@@ -59,7 +57,7 @@ compiler:
 # and the viewer's page, into _viewer; only what changed is compiled.
 native: $(ENVIRONMENT) | compiler
 	@mkdir -p $(BUILD)
-	@$(LOCK) sh -ec ' \
+	@$(LOCK) env -u MAKEFLAGS sh -ec ' \
 	    cmake -G Ninja -S . -B $(BUILD) --log-level=NOTICE \
 	        -DPython3_EXECUTABLE="$(abspath $(shell command -v $(PYTHON)))" >/dev/null; \
 	    cmake --build $(BUILD) -- --quiet; \
