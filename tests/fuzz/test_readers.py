@@ -5,6 +5,7 @@ SNOWSPLAT_FUZZ=2000 tries so many others a reader; without it they are few and t
 
 import logging
 import os
+import warnings
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -37,6 +38,7 @@ change = st.tuples(
 def quiet():
     """Warnings about what was left out are not the subject."""
     logging.disable(logging.WARNING)
+    warnings.filterwarnings("ignore", module=r"PIL\.")  # as the command line does
     yield
     logging.disable(logging.NOTSET)
 

@@ -299,7 +299,8 @@ def check_adam(variant: Variant, leaf: Scene, ids: Tensor, cotangent: Tensor) ->
         too_large = int(large.nonzero()[:, 0].unique().numel())
         assert held[i] <= too_large, f"{held[i]} rows of {name} held, {too_large} have a reason"
         error = (m[name] - 0.1 * grad).abs() - variant.backward * _of_rows(grad)
-        assert (error[~large] <= 0).all(), f"the moment of {name}"
+        # Kernels take numbers for zero that are too small to have all of their digits.
+        assert (error[~large] <= torch.finfo(variant.dtype).tiny).all(), f"the moment of {name}"
 
 
 def check_rasterize(variant: Variant, extreme: Extreme) -> None:
