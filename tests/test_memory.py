@@ -93,5 +93,14 @@ def test_too_little_says_how_much_it_takes() -> None:
         plan_memory(capture_of(9, 2000, 1000), recipe("default"), DEVICE, 10**10, 50_000_000)
 
 
+def test_what_is_there_already_has_to_fit() -> None:
+    capture, config = capture_of(9, 100, 100), recipe("default", max_gaussians=50_000)
+    whole = plan_memory(capture, config, DEVICE, 10**10)
+    plan = plan_memory(capture, config, DEVICE, 10**10, whole.total, present=50_000)
+    assert plan.given_up == ()
+    with pytest.raises(UserError, match=r"go on with 50,000 Gaussians, which take \d+ MB .*more$"):
+        plan_memory(capture, config, DEVICE, 10**10, whole.total - 1_000_000, present=50_000)
+
+
 def test_a_gpu_takes_less_than_a_gigabyte_for_a_million() -> None:
     assert GPU.of(1_000_000, 0, 3) < 1_000_000_000

@@ -93,6 +93,7 @@ def plan_memory(
     device: torch.device,
     available: int,
     budget: int | None = None,
+    present: int = 0,
 ) -> MemoryPlan:
     """What a training of ``capture`` takes; with a ``budget``, made to take no more.
 
@@ -101,9 +102,10 @@ def plan_memory(
     Args:
         available: bytes that the device has left, which photos may have half of.
         budget: bytes; None: as much as it takes.
+        present: Gaussians of a training that goes on: none of them is taken away.
 
     Raises:
-        UserError: too little for photos of this size.
+        UserError: too little for photos of this size, or for what is present.
     """
     cost = GPU if device.type == "cuda" else CPU
     sizes = [view.camera.width * view.camera.height for view in capture.train]
@@ -120,7 +122,12 @@ def plan_memory(
     photos = min(all_photos, config.image_memory or available // 2)
     given_up = []
     if budget is not None:
-        least = images + fewest + each * _FEWEST_GAUSSIANS
+        least = images + fewest + each * max(_FEWEST_GAUSSIANS, present)
+        if budget < least and present > _FEWEST_GAUSSIANS:
+            raise UserError(
+                f"--memory {in_words(budget)} is too little to go on with {present:,} Gaussians, "
+                f"which take {in_words(least)} with photos of this size; give more"
+            )
         if budget < least:
             raise UserError(
                 f"--memory {in_words(budget)} is too little for photos of this size, which take "

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from snowsplat import checkpoint
+from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.cli.train import _KNOBS, Train
 from snowsplat.formats import read_gaussians
 from snowsplat.recipes import RECIPES, recipe
@@ -204,6 +205,19 @@ def test_resume_where_nothing_is(refused, run, capture, tmp_path):
     assert result.code == 0
     assert "no checkpoint yet" in result.out
     assert "--overwrite" in refused("train", capture, "-o", out, "--resume")
+
+
+def test_resume_with_less_memory_than_its_gaussians_take(refused, run, tmp_path):
+    """They stay as many as they are: to say that there are fewer would not make it so."""
+    capture, out = tmp_path / "capture", tmp_path / "out"
+    write_synthetic_capture(capture, "blender", 3, 48, 36)
+    flags = ("--recipe", "paper", "--initial-points", 5000, "--checkpoint-every", 2)
+    assert run("train", capture, "-o", out, *flags, "--iterations", 2).code == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    more = ("train", "-o", out, "--resume", "--iterations", 4)
+    assert "to go on with 5,000 Gaussians" in refused(*more, "--memory", "70MB", "-q")
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert run(*more, "--memory", "80MB").code == 0
 
 
 # In a given time

@@ -37,8 +37,9 @@ class MemoryBudget:
         config: TrainConfig,
         device: torch.device,
         before: int,
+        present: int = 0,
     ) -> MemoryBudget:
-        """``asked``: the flag.
+        """``asked``: the flag; ``present``: Gaussians of a training that goes on.
 
         Raises:
             UserError: no number of bytes, or too few.
@@ -47,7 +48,8 @@ class MemoryBudget:
         from snowsplat.memory import parse_bytes, plan_memory
 
         budget = None if asked is None else parse_bytes(asked)
-        plan = plan_memory(capture, config, device, available_memory(device), budget)
+        available = available_memory(device)
+        plan = plan_memory(capture, config, device, available, budget, present)
         return cls(device, plan, before)
 
     def __str__(self) -> str:

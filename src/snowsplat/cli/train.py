@@ -68,6 +68,11 @@ def read_meta(start: Checkpoint) -> Noted:
     return noted
 
 
+def _gaussians_in(start: Checkpoint) -> int:
+    means = start.tensors.get("gaussians.means")  # what stands there is checked when it is loaded
+    return 0 if means is None else means.numel() // 3
+
+
 @dataclass
 class Train:
     """Train a scene from photos whose cameras are known (COLMAP, or transforms.json).
@@ -251,7 +256,8 @@ class Train:
             if plan.resolution is not None:
                 settings = replace(settings, resolution=plan.resolution)
                 capture = settings.load()
-        memory = MemoryBudget.of(self.memory, capture, config, device, before)
+        present = 0 if start is None else _gaussians_in(start)
+        memory = MemoryBudget.of(self.memory, capture, config, device, before, present)
         config = memory.plan.config
         trainer = Trainer(capture, config, schedule, device)
         if start is None:
