@@ -18,10 +18,10 @@ from snowsplat.recipes import recipe
 DEVICE = torch.device("cpu")
 
 
-def capture_of(photos: int, width: int, height: int) -> Capture:
+def capture_of(photos: int, width: int, height: int, stored: int = 0) -> Capture:
     pose = torch.eye(4, dtype=torch.float64)[:3]
     camera = Camera(width, height, width, width, width / 2, height / 2, pose)
-    source = ImageSource(Path("photo.jpg"), width, height)
+    source = ImageSource(Path("photo.jpg"), width, height, stored=stored)
     return Capture([View(str(i), camera, source) for i in range(photos)], [], None, 1.0)
 
 
@@ -86,6 +86,15 @@ def test_photos_go_first_then_gaussians() -> None:
     assert 1000 <= least.config.density.max_gaussians < 200_000
     for plan, budget in ((wide, 2e9), (narrow, 9e8), (least, 5e8)):
         assert plan.total <= budget
+
+
+def test_files_are_decoded_whole_whatever_size_is_wanted() -> None:
+    config, large = recipe("default"), 24_000_000
+    wanted = plan_memory(capture_of(9, 400, 300), config, DEVICE, 10**10)
+    plan = plan_memory(capture_of(9, 400, 300, large), config, DEVICE, 10**10)
+    assert plan.images - wanted.images == DECODERS * 18 * (large - 400 * 300)
+    with pytest.raises(UserError, match=r"give more, or make the files smaller$"):
+        plan_memory(capture_of(9, 400, 300, large), config, DEVICE, 10**10, 300_000_000)
 
 
 def test_too_little_says_how_much_it_takes() -> None:

@@ -47,7 +47,7 @@ class Cost:
 # some seven tiles. On a GPU reckoned from what is allocated.
 CPU = Cost(fixed=66_000_000, pixel=170, gaussian=1150)
 GPU = Cost(fixed=50_000_000, pixel=70, gaussian=240)
-# A photo that is being decoded, bytes a pixel; on the CPU, and so many at a time.
+# A photo that is being decoded, bytes a pixel of its file; on the CPU, and so many at a time.
 _DECODING = 18
 
 # Photos at hand at least: the one in use, and those that are decoded ahead.
@@ -114,8 +114,9 @@ def plan_memory(
     masked = (size for view, size in zip(capture.train, sizes, strict=True) if view.mask)
     all_photos = 3 * sum(sizes) + sum(masked)
     images = cost.of(0, largest, config.sh_degree)
+    stored = max(largest, *(view.image.stored for view in capture.train))
     if cost is CPU:
-        images += DECODERS * _DECODING * largest
+        images += DECODERS * _DECODING * stored
     each = cost.of(1, 0, config.sh_degree) - cost.fixed
     config = config.capped(sorted(sizes)[len(sizes) // 2])
     cap = config.density.max_gaussians or None
@@ -129,9 +130,11 @@ def plan_memory(
                 f"which take {in_words(least)} with photos of this size; give more"
             )
         if budget < least:
+            # -r leaves the files as they are, and each is decoded whole.
+            smaller = "the files smaller" if stored > largest else "them smaller with -r"
             raise UserError(
                 f"--memory {in_words(budget)} is too little for photos of this size, which take "
-                f"{in_words(least)}; give more, or make them smaller with -r"
+                f"{in_words(least)}; give more, or make {smaller}"
             )
         room = (budget - images - min(photos, fewest)) // each
         if cap is None or cap > room:

@@ -64,6 +64,7 @@ def test_resolution_at_decode(pristine, resolution, size):
     with ImageLoader([view]) as loader:
         assert loader.get(view).rgb.shape == (size[1], size[0], 3)
     assert (view.camera.width, view.camera.height) == size
+    assert view.image.stored == 32 * 24
     assert view.camera.fx == pytest.approx(full.camera.fx * size[0] / 32)
     assert view.camera.cy == pytest.approx(full.camera.cy * size[1] / 24)
 

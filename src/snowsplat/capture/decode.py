@@ -42,12 +42,14 @@ class ImageSource:
 
     ``turn``: apply the orientation that the camera noted in the file. Off unless the sizes prove
     that the pose was made for the turned picture: COLMAP poses are made for the pixels as stored.
+    ``stored``: how many pixels are decoded for it; 0: not known, as many as are wanted.
     """
 
     path: Path
     width: int
     height: int
     turn: bool = False
+    stored: int = 0
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,7 @@ def _view(
     if image.mask is not None:
         mask = ImageSource(image.mask, width, height, turn)
         _check_mask(image, header, read_header(image.mask))
-    source = ImageSource(image.path, width, height, turn)
+    source = ImageSource(image.path, width, height, turn, header.width * header.height)
     return View(image.name, image.camera.scaled(width, height), source, mask)
 
 
