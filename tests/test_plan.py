@@ -3,9 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from snowsplat import plan as planning
 from snowsplat.camera import Camera
 from snowsplat.capture import load_capture
 from snowsplat.capture.capture import Capture, Points, View
@@ -14,6 +17,7 @@ from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.config import changed
 from snowsplat.plan import Plan, make_plan, measure_slowness
 from snowsplat.recipes import recipe
+from snowsplat.trainer import Trainer
 
 POSE = torch.eye(4, dtype=torch.float64)[:3]
 
@@ -110,3 +114,29 @@ def test_the_speed_of_this_machine(tmp_path):
         assert 0.0 < measure_slowness(small, recipe("default")) < float("inf")
         assert len(small.train) == 7
         assert (small.points is None) if points is None else (len(small.points) == points)
+
+
+def test_the_speed_is_measured_on_photos_no_larger_than_are_chosen(tmp_path, monkeypatch):
+    """Steps on the photos as they are may take many times the memory of the training."""
+    random = np.random.default_rng(0)
+    views = []
+    for name in ("0.png", "1.png"):
+        Image.fromarray(random.integers(0, 255, (64, 4000, 3), np.uint8)).save(tmp_path / name)
+        Image.fromarray(np.full((64, 4000), 255, np.uint8)).save(tmp_path / f"mask {name}")
+        camera = Camera(4000, 64, 2000.0, 2000.0, 2000.0, 32.0, POSE)
+        image, mask = (ImageSource(tmp_path / f, 4000, 64) for f in (name, f"mask {name}"))
+        views.append(View(name, camera, image, mask))
+    wide = Capture(views, [], Points(torch.rand(50, 3), torch.zeros(50, 3, dtype=torch.uint8)), 1.0)
+    measured = []
+
+    class Watched(Trainer):
+        def __init__(self, capture: Capture, *rest: object, **more: object) -> None:
+            measured.extend((view.camera.width, view.camera.height) for view in capture.train)
+            super().__init__(capture, *rest, **more)
+
+    monkeypatch.setattr(planning, "Trainer", Watched)
+    for resize, size in ((True, (1600, 26)), (False, (4000, 64))):
+        measured.clear()
+        assert measure_slowness(wide, recipe("default"), resize=resize) > 0.0
+        assert measured == [size] * 2
+    assert views[0].camera.width == views[0].image.width == 4000

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from snowsplat.capture.capture import Capture, Points
+from snowsplat.capture.capture import Capture, Points, View
 from snowsplat.config import TrainConfig, changed
 from snowsplat.pace import Work
 from snowsplat.schedule import Schedule
@@ -115,20 +115,30 @@ def make_plan(
 
 
 def measure_slowness(
-    capture: Capture, config: TrainConfig, device: torch.device | None = None
+    capture: Capture,
+    config: TrainConfig,
+    device: torch.device | None = None,
+    *,
+    resize: bool = True,
 ) -> float:
     """How many times as long as reckoned a step takes on this machine, by a few real ones.
 
-    ``device``: to train on; default: the CPU.
+    Args:
+        device: to train on; default: the CPU.
+        resize: as of `make_plan`, which then takes photos no larger than some size. Steps on larger
+            ones would take time and memory that the training does not.
     """
-    camera = capture.train[0].camera
+    views = capture.train[:_PHOTOS]
+    if resize:
+        views = [_no_larger(view) for view in views]
+    camera = views[0].camera
     downscale = 1 if camera.width * camera.height < 500_000 else 2
     points = capture.points
     if points is not None and len(points) > _POINTS:
         every = math.ceil(len(points) / _POINTS)
         points = Points(points.xyz[::every], points.rgb[::every])
     trainer = Trainer(
-        replace(capture, train=capture.train[:_PHOTOS], test=[], points=points),
+        replace(capture, train=views, test=[], points=points),
         replace(
             config,
             initial_points=min(config.initial_points, _POINTS),
@@ -148,6 +158,21 @@ def measure_slowness(
         reckoned = work.seconds(downscale, len(trainer.gaussians))
         ratios.append((time.monotonic() - start) / reckoned)
     return _TRAINED * statistics.median(ratios[1:])  # the first one waits for its photo
+
+
+def _no_larger(view: View) -> View:
+    """The view at the largest size that is chosen, or as it is."""
+    camera, mask = view.camera, view.mask
+    scale = _LARGEST / max(camera.width, camera.height)
+    if scale >= 1.0:
+        return view
+    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+    return replace(
+        view,
+        camera=camera.scaled(width, height),
+        image=replace(view.image, width=width, height=height),
+        mask=mask and replace(mask, width=width, height=height),
+    )
 
 
 def _capped(config: TrainConfig, pixels: int, rise: float) -> TrainConfig:

@@ -69,7 +69,7 @@ class TimeBudget:
         """What to train. ``capture`` is at full resolution; ``may``: see `make_plan`."""
         from snowsplat.plan import make_plan, measure_slowness
 
-        slowness = measure_slowness(capture, config, device)
+        slowness = measure_slowness(capture, config, device, resize=may.get("resize", True))
         return make_plan(capture, config, self.left, slowness, **may)
 
     def described(self, plan: Plan) -> str:
