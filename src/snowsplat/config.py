@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -10,6 +11,8 @@ from snowsplat.errors import UserError
 from snowsplat.optim import LearningRates
 from snowsplat.schedule import Schedule, When
 from snowsplat.untrusted import from_json
+
+_MOST_SEED = 2**61  # generators are seeded with four times as much
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,25 @@ class TrainConfig:
             raise UserError(f"--iterations is {self.iterations}; it must be at least 1")
         if self.sh_degree not in (0, 1, 2, 3):
             raise UserError(f"--sh-degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
+        if not -_MOST_SEED <= self.seed < _MOST_SEED:
+            raise UserError(f"--seed is {self.seed}; take one nearer to 0")
+        rates, density = self.learning_rates, self.density
+        for name, count in (
+            ("--initial-points", self.initial_points),
+            ("--densify-interval", density.densify_interval),
+        ):
+            if count < 1:
+                raise UserError(f"{name} is {count}; it must be at least 1")
+        for name, rate in (("--lr-means", rates.means), ("--lr-means-final", rates.means_final)):
+            if rate <= 0.0:  # from one to the other it goes by equal factors
+                raise UserError(f"{name} is {rate:g}; it must be more than 0, like 1e-12")
+        for name, when in (
+            ("--densify-from", density.densify_from),
+            ("--densify-until", density.densify_until),
+            ("--lr-means-steps", rates.means_steps),
+        ):
+            if not math.isfinite(when):
+                raise UserError(f"{name} is {when}; it must be a step, or a share of all like 0.5")
 
     def capped(self, pixels: int) -> TrainConfig:
         """This configuration with the cap that ``gaussians_per_pixel`` means for such photos."""

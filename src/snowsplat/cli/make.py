@@ -71,7 +71,7 @@ class Make:
         """Gives the exit code: 0, or 130 after Ctrl-C."""
         started = time.monotonic()
         name, out = self._where()
-        if self.minutes is not None and not 0.0 < self.minutes < float("inf"):
+        if self.minutes is not None and not 0.0 < 60.0 * self.minutes < float("inf"):
             raise UserError(f"--minutes is {self.minutes:g}; it must be more than 0")
         check_threads(self.threads)
         if self.device is not None:  # before hours of work

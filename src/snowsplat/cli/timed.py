@@ -49,7 +49,7 @@ class TimeBudget:
             UserError: no time at all.
         """
         if minutes is not None:
-            if not 0.0 < minutes < float("inf"):
+            if not 0.0 < 60.0 * minutes < float("inf"):
                 raise UserError(f"--minutes is {minutes:g}; it must be more than 0")
             return cls(60.0 * minutes, 0.0, started)
         return None if before is None else cls(before["seconds"], before["spent"], started)
