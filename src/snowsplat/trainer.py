@@ -53,7 +53,8 @@ class Trainer:
         trainer.gaussians
 
     Between two steps everything is in `state_tensors`: a trainer that loads them goes on bitwise as
-    this one would have. Between two steps ``schedule`` may be stretched, too.
+    this one would have. Between two steps ``schedule`` may be stretched, too. ``within_step``: an
+    error or a second Ctrl-C has ended a step in its middle, and the state is not to be kept.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Trainer:
         self.config = config = config.capped(sizes[len(sizes) // 2])
         self.schedule = schedule or Schedule(config.iterations)
         self.step = 0
+        self.within_step = False
         # One generator for each kind of choice, so that one kind does not disturb another.
         self._generators = {
             name: torch.Generator().manual_seed(4 * config.seed + i)
@@ -120,7 +122,8 @@ class Trainer:
         """Step on to step ``until`` (default: the last one), with a report after each.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C, after the step that it fell into: the state is whole.
+            KeyboardInterrupt: Ctrl-C, after the step that it fell into: the state is whole. The
+                second one comes at once: see ``within_step``.
             Diverged: loss, gradients or parameters are no longer finite; the step is named.
         """
         last = math.inf if until is None else until
@@ -142,6 +145,7 @@ class Trainer:
         Raises:
             Diverged: the loss is not finite, or the update of the step before was not.
         """
+        self.within_step = True
         with single_threaded():
             # The refinement that ends an iteration of the paper waits for the next one to begin, so
             # that nothing evaluates or saves a scene that was cloned or reset a moment ago.
@@ -167,6 +171,7 @@ class Trainer:
             health.check_updates(self.step, held, self.gaussians)  # a GPU tells it a step later
             health.check_loss(step, loss, self.gaussians, view, photo)
             self.step = step
+            self.within_step = False
             return loss
 
     def _queue_step(
@@ -246,5 +251,6 @@ class Trainer:
         for name, random in self._generators.items():
             random.set_state(tensors[f"random.{name}"])
         self.step = int(tensors["step"])
+        self.within_step = False
         self._order = tensors["order"].tolist()
         self._prefetch(self._downscale(self.step + 1))

@@ -1,6 +1,7 @@
 """`snowsplat train`, from flags to files: what is written, what is refused, what a stop leaves."""
 
 import json
+import os
 import re
 import shutil
 import signal
@@ -15,6 +16,7 @@ from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.cli.train import _KNOBS, Train
 from snowsplat.formats import read_gaussians
 from snowsplat.recipes import RECIPES, recipe
+from snowsplat.trainer import Trainer
 
 QUICK = ("--iterations", 30, "--threads", 1)
 
@@ -183,6 +185,31 @@ def test_ctrl_c_saves_and_resumes(run, start, capture, tmp_path):
     assert run("train", "-o", stopped, "--resume", "--iterations", more).code == 0
     assert len(scene(stopped, more)) > 1000
     assert not whole.exists()
+
+
+def test_a_second_ctrl_c_saves_no_half_step(run, capture, tmp_path, monkeypatch):
+    """What it leaves is as after a kill, and goes on to the same scene."""
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    flags = ("--recipe", "mcmc", *QUICK, "--checkpoint-every", 10)
+    assert run("train", capture, "-o", whole, *flags).code == 0
+    queue_step = Trainer._queue_step
+
+    def press_twice(trainer: Trainer, step: int, *rest: object) -> None:
+        queue_step(trainer, step, *rest)
+        if step == 25:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as pressing:
+        pressing.setattr(Trainer, "_queue_step", press_twice)
+        result = run("train", capture, "-o", stopped, *flags)
+    assert (result.code, result.err) == (130, "snowsplat: stopped by Ctrl-C\n")
+    newest = stopped / "checkpoints/step_000020.safetensors"
+    assert f"not saved; the last good checkpoint is {newest}," in result.out
+    assert checkpoint.files(stopped / "checkpoints")[0] == (20, newest)
+    assert not (stopped / "point_cloud").exists()
+    assert run("train", "-o", stopped, "--resume").code == 0
+    assert scene(stopped) == scene(whole)
 
 
 def test_resume_refuses_another_training(refused, run, capture, tmp_path):

@@ -73,7 +73,9 @@ class TrainingRun:
                 self.history.step_begins()
                 self.trainer.run(self._record)
         except KeyboardInterrupt:
-            if self.trainer.step == 0:
+            if self.trainer.step == 0 or self.trainer.within_step:  # there is nothing whole to save
+                if self.trainer.step > 0:
+                    print(f"stopped within a step, which is not saved; {self._kept()}")
                 self.out.discard()
                 raise
             stopped = True
