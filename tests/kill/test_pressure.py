@@ -151,6 +151,18 @@ def test_a_disk_that_becomes_full_during_a_training(zygote, place, capture):
         assert digest(scene) == whole
 
 
+def test_a_disk_too_full_for_the_first_scene(zygote, place, capture):
+    """Nothing has come of that training, so nothing stays, and the same command begins anew."""
+    out = place / "out"
+    command = ["train", capture, "-o", out, "--iterations", 20, "--save-iterations", 10, *CPU]
+    with full(place, 90):
+        refused(zygote.run(command), rf"{out}/point_cloud/\S+: No space left on device")
+        assert not out.exists()
+        subprocess.run(["mount", "-o", "remount,size=10m", place], check=True)
+        again = zygote.run(command)
+        assert again.code == 0, again.text
+
+
 def test_a_disk_that_becomes_full_during_a_capture(zygote, place, photos):
     """Finished stages stay; with room again the same command goes on."""
     out = place / "garden"

@@ -21,6 +21,7 @@ import argparse
 import ast
 import re
 import shutil
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -145,9 +146,7 @@ class OutputFolder:
         from snowsplat.config import config_to_json
 
         remove_temporaries(self.path, _FILES)
-        for folder in (self.path / "point_cloud").glob("iteration_*"):
-            if not (folder / "point_cloud.ply").exists():
-                shutil.rmtree(folder, ignore_errors=True)
+        self._remove_unwritten_scenes()
         whole = {
             "snowsplat": __version__,
             "capture": asdict(settings),
@@ -166,12 +165,21 @@ class OutputFolder:
         )
         write_text(self.path / "cfg_args", repr(namespace))
 
+    def _remove_unwritten_scenes(self) -> None:
+        """Folders of scenes that a kill or a full disk prevented."""
+        for folder in (self.path / "point_cloud").glob("iteration_*"):
+            if not (folder / "point_cloud.ply").exists():
+                shutil.rmtree(folder, ignore_errors=True)
+
     def discard(self) -> None:
         """Take back what `begin` wrote, if nothing has come of it."""
         if self.scenes() or self.checkpoints.exists():
             return
         for name in _FILES:
             (self.path / name).unlink(missing_ok=True)
+        self._remove_unwritten_scenes()
+        with suppress(OSError):  # it is not there, or something else is in it
+            (self.path / "point_cloud").rmdir()
         if self.path.is_dir() and not any(self.path.iterdir()):
             self.path.rmdir()
 
