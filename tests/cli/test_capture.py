@@ -109,6 +109,11 @@ def test_photos_in_place(captured, photos, run, refused, tmp_path):
     assert result.code == 0, result.err
     assert times(place / "input") == before
     assert load_capture(place).train
+    # They are not ours to replace, not even by some of them.
+    for inputs in (sorted((place / "input").iterdir())[:5], [photos]):
+        line = refused("capture", *inputs, "-o", place, "--overwrite", *QUICK)
+        assert f"{place / 'input'}: holds the photos that were given" in line
+    assert times(place / "input") == before
 
     # A model that is there already is undistorted as it is.
     given = tmp_path / "given"

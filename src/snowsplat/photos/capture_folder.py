@@ -235,6 +235,11 @@ def _check_free(
     record = folder / RECORD
     if record.is_file():
         before = Stages(record, STAGES).about.get("inputs")
+        if not in_place and _were_in_place(before, folder):
+            raise UserError(
+                f"{folder / 'input'}: holds the photos that were given for the capture here, not "
+                "copies that could be replaced; name another folder"
+            )
         if before != [str(path.absolute()) for path in inputs] and not overwrite:
             what = ", ".join(map(str, before)) if isinstance(before, list) else "something else"
             raise UserError(
@@ -250,6 +255,13 @@ def _check_free(
             f"{folder}: holds other files ({', '.join(others[:3])}"
             f"{', …' if len(others) > 3 else ''}); name a new or an empty folder"
         )
+
+
+def _were_in_place(inputs: Any, folder: Path) -> bool:
+    """``inputs``: those of a capture in ``folder``, as they are written down."""
+    names = inputs if isinstance(inputs, list) else []
+    there = (folder / "input").resolve()
+    return any(isinstance(name, str) and Path(name).resolve() == there for name in names)
 
 
 @contextmanager
