@@ -14,7 +14,10 @@ from pathlib import Path
 import pytest
 
 from snowsplat.cli import making
+from snowsplat.cli.make import RECORD
+from snowsplat.cli.making import STAGES
 from snowsplat.cli.presets import PRESETS, quality_within
+from snowsplat.photos.stages import Stages
 from snowsplat.photos.synthetic import write_synthetic_photos
 
 QUICK = replace(PRESETS["draft"], iterations=120)
@@ -202,6 +205,19 @@ def test_two_photos_leave_nothing(refused, capture, tmp_path):
 
 
 # Times
+
+
+def test_a_stop_before_the_cameras_leaves_the_folder_ours(refused, capture, tmp_path):
+    """Somebody removed the capture in it, to have the cameras found anew."""
+    out, two = tmp_path / "out", tmp_path / "two"
+    (out / "scene").mkdir(parents=True)
+    Stages(out / RECORD, STAGES).save()
+    two.mkdir()
+    for name in ("view_00.png", "view_01.png"):
+        shutil.copy(capture / "images" / name, two)
+    for _ in range(2):  # and the same command comes as far again
+        assert "only 2 usable pictures" in refused("make", two, "-o", out)
+        assert files(out) == {RECORD}
 
 
 def test_the_effort_that_a_time_allows():

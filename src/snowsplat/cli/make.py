@@ -12,7 +12,7 @@ import tyro
 
 from snowsplat.cli.computing import check_threads, compute_with
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.making import CAPTURE, STAGES, Making, TrainingStopped
+from snowsplat.cli.making import STAGES, Making, TrainingStopped
 from snowsplat.cli.presets import Quality, quality_within
 from snowsplat.cli.viewing import PageFlags
 from snowsplat.errors import UserError
@@ -106,9 +106,9 @@ class Make:
             print(f"stopped; go on with: {self._command()}")
             return 130
         finally:
-            if not (out / CAPTURE).exists():
-                (out / RECORD).unlink(missing_ok=True)
-                if not existed and not any(out.iterdir()):
+            if out.is_dir() and {entry.name for entry in out.iterdir()} <= {RECORD}:
+                (out / RECORD).unlink(missing_ok=True)  # nothing has come of it
+                if not existed:
                     out.rmdir()
 
     def _where(self) -> tuple[str, Path]:
