@@ -219,6 +219,12 @@ def test_resume_refuses_another_training(refused, run, capture, tmp_path):
     assert "recipe" in refused("train", "-o", out, "--resume", "--recipe", "paper")
     assert "beyond" in refused("train", "-o", out, "--resume", "--iterations", 10)
     assert "exclude" in refused("train", capture, "-o", out, "--resume", "--overwrite")
+    # Nor on other photos than before, or to test on those that it was trained on.
+    (tmp_path / "tests.txt").write_text("view_04\n")
+    for flags in (["-r", 2], ["--eval"], ["--test-list", tmp_path / "tests.txt"], ["-i", "more"]):
+        assert "other settings" in refused("train", "-o", out, "--resume", *flags)
+    moved = shutil.copytree(capture, tmp_path / "moved")
+    assert run("train", moved, "-o", out, "--resume", "-r", 1).code == 0
     before = scene(out)
     assert run("train", "-o", out, "--resume").code == 0  # all is done: the same again
     assert scene(out) == before

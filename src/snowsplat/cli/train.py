@@ -68,6 +68,13 @@ def read_meta(start: Checkpoint) -> Noted:
     return noted
 
 
+def _other_settings(start: Checkpoint) -> UserError:
+    return UserError(
+        f"{start.path}: was made with other settings; resume without flags that change the "
+        "training (--iterations, --test-iterations, --checkpoint-every may change)"
+    )
+
+
 def _gaussians_in(start: Checkpoint) -> int:
     means = start.tensors.get("gaussians.means")  # what stands there is checked when it is loaded
     return 0 if means is None else means.numel() // 3
@@ -242,7 +249,7 @@ class Train:
             settings, config = self._capture_settings(None), self._config()
             recipe = self.recipe or "default"
         else:
-            settings = self._capture_settings(noted.capture)
+            settings = self._resumed_settings(start, noted)
             config, recipe = self._resumed_config(start, noted), noted.recipe
         capture = settings.load()
         if budget is not None and start is None:
@@ -323,6 +330,19 @@ class Train:
         }
         return replace(settings, **{k: v for k, v in changes.items() if v is not None})
 
+    def _resumed_settings(self, start: Checkpoint, noted: Noted) -> CaptureSettings:
+        """The checkpoint's own; where the capture and the list of tests are may have changed."""
+
+        def matters(settings: CaptureSettings) -> tuple[Any, ...]:
+            resolution = max(1, settings.resolution)  # -1 is as they are, too
+            tests = settings.test_list and Path(settings.test_list).name
+            return settings.images, resolution, settings.hold_out, tests
+
+        settings = self._capture_settings(noted.capture)
+        if matters(settings) != matters(noted.capture):
+            raise _other_settings(start)
+        return settings
+
     def _knobs(self) -> dict[str, Any]:
         knobs = {name: getattr(self, name) for name in _KNOBS}
         if self.white_background:
@@ -371,10 +391,7 @@ class Train:
         resumed = changed(config, **self._knobs())
         same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
         if same != config:
-            raise UserError(
-                f"{start.path}: was made with other settings; resume without flags that change the "
-                "training (--iterations, --test-iterations, --checkpoint-every may change)"
-            )
+            raise _other_settings(start)
         # A training with a time may have gone beyond what was planned at first.
         if self.iterations is not None and resumed.iterations < start.step:
             raise UserError(
