@@ -1,6 +1,7 @@
 """The frame of the command line: help, mistakes, exit codes, and how soon it answers."""
 
 import logging
+import os
 import subprocess
 import sys
 import warnings
@@ -8,6 +9,8 @@ import warnings
 import pytest
 
 from snowsplat.cli import main as module
+
+from .conftest import ENVIRONMENT
 
 
 def test_help_of_the_command_and_of_each_verb_teaches(run):
@@ -104,6 +107,23 @@ def test_no_memory_is_one_line_that_says_what_helps(monkeypatch, refused):
     monkeypatch.setattr(module.VERBS["info"], "run", another)
     with pytest.raises(RuntimeError, match="a defect"):
         module.main(["info", "x"])
+
+
+def test_a_training_whose_reader_has_gone_is_not_done(capture, tmp_path):
+    """As of `| head -1`: silent, but no success."""
+    read, write = os.pipe()
+    os.close(read)
+    words = ["train", capture, "-o", tmp_path / "out", "--iterations", 9, "--device", "cpu"]
+    done = subprocess.run(
+        [sys.executable, "-m", "snowsplat", *map(str, words)],
+        env=ENVIRONMENT,
+        stdout=write,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
+    assert not (tmp_path / "out/point_cloud").exists()
 
 
 def test_python_m(start):

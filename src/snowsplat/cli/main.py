@@ -1,8 +1,8 @@
 """The command `snowsplat`: finds the verb, runs it, turns errors into a line and an exit code.
 
 Exit codes: 0 done; 2 a mistake in the flags or the input, told in one line on stderr; 130 stopped
-by Ctrl-C, all that was reached is saved. Anything else is a defect of the program, with its
-traceback.
+by Ctrl-C, all that was reached is saved; 141 the reader of our output has gone. Anything else is a
+defect of the program, with its traceback.
 """
 
 import inspect
@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail("stopped by Ctrl-C", 130)
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return 141  # as of all that end by it: a training has not come to its end
     except MemoryError:
         return _fail(_OUT_OF_MEMORY, 2)
     except RuntimeError as error:
