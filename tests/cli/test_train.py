@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import time
+import weakref
 from dataclasses import fields
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from snowsplat import checkpoint
 from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.cli.train import _KNOBS, Train
+from snowsplat.cli.training_run import TrainingRun
 from snowsplat.formats import read_gaussians
 from snowsplat.recipes import RECIPES, recipe
 from snowsplat.trainer import Trainer
@@ -251,6 +253,27 @@ def test_resume_with_less_memory_than_its_gaussians_take(refused, run, tmp_path)
     assert "to go on with 5,000 Gaussians" in refused(*more, "--memory", "70MB", "-q")
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert run(*more, "--memory", "80MB").code == 0
+
+
+def test_resume_keeps_no_second_copy_of_the_state(run, capture, tmp_path, monkeypatch):
+    """That of the checkpoint is no part of what it says that it takes."""
+    out, read = tmp_path / "out", []
+    assert run("train", capture, "-o", out, *QUICK, "--checkpoint-every", 20).code == 0
+    load, train = checkpoint.latest, TrainingRun.run
+
+    def latest(folder: Path) -> checkpoint.Checkpoint:
+        start = load(folder)
+        read.extend(weakref.ref(tensor) for tensor in start.tensors.values())
+        return start
+
+    def looking(training: TrainingRun) -> int:
+        assert read
+        assert not [tensor for tensor in read if tensor() is not None]
+        return train(training)
+
+    monkeypatch.setattr(checkpoint, "latest", latest)
+    monkeypatch.setattr(TrainingRun, "run", looking)
+    assert run("train", "-o", out, "--resume").code == 0
 
 
 # In a given time

@@ -271,6 +271,7 @@ class Train:
             out.begin(capture, settings, config)
         else:
             trainer.load_state(start.tensors)
+            start.tensors.clear()  # it has copied them, and they are no part of what it takes
             out.write_config(settings, config)
         self._describe(capture, trainer, start)
         if budget is not None and start is None:
