@@ -282,7 +282,8 @@ def capture(tmp_path):
 
 
 def outside(tmp_path: Path) -> list[str]:
-    return ["../secret.png", str(tmp_path / "secret.png"), "images/../../secret.png"]
+    secret = tmp_path / "secret.png"
+    return ["../secret.png", str(secret), "images/../../secret.png", f"./{secret}"]
 
 
 @pytest.mark.parametrize("number", range(3))
@@ -295,7 +296,7 @@ def test_colmap_that_names_an_image_elsewhere(tmp_path, refused, capture, format
     assert "which is not in" in refused(lambda: load_capture(home))
 
 
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", range(4))
 @pytest.mark.parametrize("key", ["file_path", "mask_path"])
 def test_transforms_that_name_a_file_elsewhere(tmp_path, refused, capture, key, number):
     home = capture("blender")
@@ -303,6 +304,9 @@ def test_transforms_that_name_a_file_elsewhere(tmp_path, refused, capture, key, 
     scene = json.loads(path.read_text())
     scene["frames"][1][key] = outside(tmp_path)[number]
     path.write_text(json.dumps(scene))
+    if (key, number) == ("mask_path", 3):  # taken as a name in the folder, where there is none
+        assert "which is absent" in refused(lambda: load_capture(home))
+        return
     assert "which is not in the folder" in refused(lambda: load_capture(home))
 
 

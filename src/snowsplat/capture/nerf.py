@@ -166,8 +166,8 @@ def _at_home(where: str, root: Path, name: str) -> Path:
 
 def _find_file(where: str, root: Path, name: str, images: str) -> str | None:
     """The image that a frame names, as a path from ``root``; None if it is absent."""
-    _at_home(where, root, name)
     name = name.replace("\\", "/").removeprefix("./")
+    _at_home(where, root, name)  # what is left of ".//x" is no longer relative
     if images != "images" and name.startswith("images/"):
         name = f"{images}/{name.removeprefix('images/')}"
     for suffix in ("", *IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES)):
