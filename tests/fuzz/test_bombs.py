@@ -461,6 +461,7 @@ def test_json_of_any_kind(tmp_path, refused, text):
         "Namespace(a=" + "[" * 200_000,
         "Namespace(" + "a." * 200_000 + "b=1)",
         "Namespace(a='" + "\\'" * 200_000,
+        "Namespace(" + " " * 1_000_000,
         "__import__('os').system('touch ran')",
         "Namespace(source_path=__import__('os').system('touch ran'))",
     ],

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from snowsplat.gaussians import Gaussians
 
 # A text, a name or number, or a sign; and those of which the value is taken.
-_WORD = re.compile(r"""\s*('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S)""", re.DOTALL)
+# Spaces are no part of it: looking beyond each of a million is a million times a million steps.
+_WORD = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S""", re.DOTALL)
 _LITERAL = re.compile(r"""['"].*['"]|True|False|None|-?[\d.]+(?:e[+-]?\d+)?""", re.DOTALL)
 _NAMESPACE_LIMIT = 1 << 20  # characters
 _PART = 4  # words of a part that are kept: one more than are wanted
@@ -270,7 +271,7 @@ def _namespace(path: Path) -> dict[str, Any]:
     nesting may end the program.
     """
     with open(path, encoding="utf-8") as file:
-        words = (match[0].strip() for match in _WORD.finditer(file.read(_NAMESPACE_LIMIT)))
+        words = (match[0] for match in _WORD.finditer(file.read(_NAMESPACE_LIMIT)))
         if [next(words, ""), next(words, "")] != ["Namespace", "("]:
             raise ValueError("not a Namespace")
         values, depth, part = {}, 1, list[str]()
