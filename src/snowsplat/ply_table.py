@@ -77,7 +77,7 @@ class PlyTable:
         dtype = np.dtype([(name, order + code) for name, code in self.columns.items()])
         with open(self.path, "rb") as file:
             file.seek(self._data_start)
-            chunk = max(1, _CHUNK_BYTES // dtype.itemsize)
+            chunk = max(1, _CHUNK_BYTES // max(1, dtype.itemsize))  # there may be no columns
             if self.format != "ascii":
                 file.seek(sum(e.count * e.row_bytes for e in self._before), os.SEEK_CUR)
                 read = self._read_binary

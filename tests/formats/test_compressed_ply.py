@@ -63,6 +63,13 @@ def test_colours_between_the_bounds_of_their_chunk(tmp_path):
     assert read.sh_degree == 0
 
 
+def test_an_sh_element_without_properties_is_degree_0(tmp_path, make_scene):
+    path = tmp_path / "a.compressed.ply"
+    write_gaussians(path, make_scene(30, 0))
+    path.write_bytes(path.read_bytes().replace(b"end_header", b"element sh 30\nend_header"))
+    assert read_gaussians(path).sh_degree == 0
+
+
 def test_the_bytes_that_are_written(tmp_path):
     scene = Gaussians(
         torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 4.0]]),
