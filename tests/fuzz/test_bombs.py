@@ -190,6 +190,18 @@ def test_sog_whose_member_is_larger_than_it_says(tmp_path, refused, members):
     assert "damaged meta.json" in refused(lambda: read_gaussians(path))
 
 
+def test_sog_whose_member_lies_beyond_any_file(tmp_path, refused, members):
+    path = tmp_path / "a.sog"
+    data = bundle(path, {"meta.json": members["meta.json"]})
+    entry, end = data.find(b"PK\1\2"), data.find(b"PK\5\6")
+    place = struct.pack("<HHQ", 1, 8, 2**64 - 1)  # in 64 bits, beside the entry
+    struct.pack_into("<H", data, entry + 30, len(place))
+    struct.pack_into("<I", data, entry + 42, 0xFFFFFFFF)
+    struct.pack_into("<I", data, end + 12, end - entry + len(place))
+    path.write_bytes(data[:end] + place + data[end:])
+    assert "damaged meta.json" in refused(lambda: read_gaussians(path))
+
+
 def test_sog_of_countless_members(tmp_path, refused):
     path, entries = tmp_path / "a.sog", 300_000
     entry = b"PK\1\2" + struct.pack("<6H3I5H2I", *[20, 20], *[0] * 7, 1, *[0] * 6) + b"a"

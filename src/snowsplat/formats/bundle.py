@@ -104,6 +104,7 @@ class Bundle:
             OSError,
             ValueError,
             RuntimeError,
+            OverflowError,  # a place that no file reaches
             EOFError,
             struct.error,
             zipfile.BadZipFile,
