@@ -91,13 +91,13 @@ def tiff_of_one_tile(side: int) -> bytes:
     return tiff([*sizes, *tile, (324, 4, 1, start), (325, 4, 1, 100)], zlib.compress(bytes(99999)))
 
 
-def jpeg_of_scans(side: int, scans: int) -> bytes:
+def jpeg_of_scans(side: int, scans: int, between: bytes = b"") -> bytes:
     """Progressive, its last scan again and again: few bytes, but all pixels are gone through."""
     packed = io.BytesIO()
     Image.new("RGB", (side, side), (90, 99, 128)).save(packed, "JPEG", progressive=True, quality=50)
     data = packed.getvalue()
     last = data.rfind(b"\xff\xda")
-    return data[:-2] + data[last:-2] * scans + b"\xff\xd9"
+    return data[:-2] + between + data[last:-2] * scans + b"\xff\xd9"
 
 
 @pytest.mark.parametrize(
@@ -111,6 +111,8 @@ def jpeg_of_scans(side: int, scans: int) -> bytes:
         ("text.ppm", lambda: b"P3 2000 2000 255\n" + b"0 " * 12_000_000, "slow to read"),
         ("tile.tif", lambda: tiff_of_one_tile(46_000), "tiles larger than the image"),
         ("scans.jpg", lambda: jpeg_of_scans(4000, 2000), "scans of all its pixels"),
+        # A marker without a length, after which the next one looks like one.
+        ("tem.jpg", lambda: jpeg_of_scans(4000, 2000, b"\xff\x01"), "scans of all its pixels"),
     ],
 )
 @pytest.mark.filterwarnings("ignore")

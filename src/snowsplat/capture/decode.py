@@ -28,8 +28,9 @@ MOST_PIXELS, LONGEST_SIDE = 178_956_970, 65_535
 # bytes. Both are far above what any program writes for an image of that size.
 _MOST_TILE_PIXELS, _MOST_SCANNED_PIXELS = 1 << 22, 3_000_000_000
 _MOST_SEGMENTS = 100_000  # of a JPEG
-# What begins a segment of a JPEG; in the data of a scan are only those that this leaves out.
-_MARKER, _SCAN, _END = re.compile(rb"\xff[^\x00\xd0-\xd8\xff]"), b"\xff\xda", b"\xff\xd9"
+# What begins a segment of a JPEG; those that this leaves out have no length, and are in the data of
+# a scan, or (TEM, 01) passed over by decoders.
+_MARKER, _SCAN, _END = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]"), b"\xff\xda", b"\xff\xd9"
 _BAND_PIXELS = 1 << 20  # what is held at a time while pixels are rearranged
 #: The endings that are tried where a capture names its images without one.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
