@@ -54,7 +54,7 @@ def test_a_dataclass_comes_back():
 @pytest.mark.parametrize(
     "changed",
     [
-        *({"count": value} for value in (1.0, True, "1", None, [1])),
+        *({"count": value} for value in (1.0, True, "1", None, [1], 10**400, -(2**64))),
         *({"share": value} for value in ("1", None, True, float("nan"), float("inf"), 10**400)),
         *({"kind": value} for value in ("c", 1, None, ["a"])),
         *({"place": value} for value in ([1], [1, 2, 3], "ab", {"a": 1})),
@@ -89,6 +89,7 @@ def test_json_with_and_without_a_mark():
         b"{",
         b"\xff",
         b"[" * 10**6,
+        b"[" * 500 + b"]" * 500,
         b'{"a":' * 10**5,
         b"9" * 5000,
         b"[" + b"[]," * 10**7 + b"0]",
@@ -97,6 +98,10 @@ def test_json_with_and_without_a_mark():
 def test_json_that_is_none(data):
     with pytest.raises(ValueError):  # noqa: PT011
         parse_json(data)
+
+
+def test_json_may_be_a_single_value():
+    assert [parse_json(data) for data in (b"3", b'"a"', b"null", b"[]")] == [3, "a", None, []]
 
 
 def test_json_as_programs_write_it_may_be_large():

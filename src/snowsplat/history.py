@@ -11,6 +11,7 @@ from snowsplat.untrusted import from_json, read_json
 
 #: Most points of a curve; when there are more, neighbours become one.
 MOST_POINTS = 400
+_ABSURD = 1e30
 
 
 @dataclass(frozen=True)
@@ -101,12 +102,16 @@ class History:
         try:
             values = read_json(path)
             stretches = [from_json(Stretch, stretch) for stretch in values["stretches"]]
-            measured = [from_json(Measured, figures) for figures in values["measured"]]
+            measured = [from_json(Measured, measure) for measure in values["measured"]]
             if any(stretch.steps < 1 for stretch in stretches):
                 raise ValueError("of no steps")
+            figures = [f for s in stretches for f in (s.loss, s.seconds)]
+            figures += [f for m in measured for f in (m.psnr, m.ssim)]
+            if any(abs(figure) > _ABSURD for figure in figures):
+                raise ValueError("sums of them are not finite")
             return cls(
                 [stretch for stretch in stretches if stretch.step <= last_step],
-                [figures for figures in measured if figures.step <= last_step],
+                [measure for measure in measured if measure.step <= last_step],
                 max(1, int(values["stride"])),
             )
         except (OSError, ValueError, TypeError, KeyError, OverflowError):

@@ -19,6 +19,8 @@ _ALWAYS_ALLOWED = 48 << 20  # bytes of memory
 _RATIO = (
     2  # bytes of memory for each of a larger file; those that programs write need about as much
 )
+_DEEPEST = 100  # values within each other; what goes through them calls itself
+_WHOLE = 1 << 64  # whole numbers are smaller; of any size, they overflow what is reckoned with them
 
 
 def read_json(path: Path) -> Any:
@@ -46,9 +48,16 @@ def parse_json(data: bytes) -> Any:
     if needed > _ALWAYS_ALLOWED + _RATIO * len(data):
         raise ValueError("absurdly many values")
     try:
-        return json.loads(data.decode("utf-8-sig"))
+        value = json.loads(data.decode("utf-8-sig"))
     except RecursionError:
         raise ValueError("nested too deep") from None
+    level = [value] if isinstance(value, dict | list) else []
+    for _ in range(_DEEPEST):
+        inner = (each.values() if isinstance(each, dict) else each for each in level)
+        level = [value for values in inner for value in values if isinstance(value, dict | list)]
+        if not level:
+            return value
+    raise ValueError("nested too deep")
 
 
 def is_file(path: Path) -> bool:
@@ -113,6 +122,9 @@ def _as(hint: Any, value: Any) -> Any:
     elif hint is float:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if number and abs(value) <= sys.float_info.max:
+            return value
+    elif hint is int:
+        if type(value) is int and abs(value) < _WHOLE:
             return value
     elif isinstance(hint, type) and is_dataclass(hint):
         return from_json(hint, value)

@@ -511,7 +511,9 @@ def test_a_checkpoint_whose_header_is_not_what_was_written(tmp_path, refused):
 
 def test_history_of_things_that_are_no_numbers(tmp_path):
     stretch = {"step": 1, "steps": 1, "loss": 0.5, "seconds": 0.1, "gaussians": 5}
-    for changed in ({"loss": "a"}, {"seconds": None}, {"steps": 0}, {"step": True}, {"more": 1}):
+    wrong = ({"loss": "a"}, {"seconds": None}, {"steps": 0}, {"step": True}, {"more": 1})
+    absurd = ({"gaussians": 10**400}, {"loss": 1e308}, {"seconds": -1e308})
+    for changed in (*wrong, *absurd):
         whole = {"stretches": [stretch | changed], "measured": [], "stride": 1}
         (tmp_path / "history.json").write_text(json.dumps(whole))
         assert History.read(tmp_path / "history.json", 9).stretches == []
