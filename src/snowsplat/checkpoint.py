@@ -25,7 +25,7 @@ from torch import Tensor
 from snowsplat.errors import UserError
 from snowsplat.files import atomic_path
 from snowsplat.health import check_finite
-from snowsplat.untrusted import parse_json
+from snowsplat.untrusted import check_header, parse_json
 
 #: One more whenever the meaning of the tensors changes, so that an old file is refused.
 VERSION = 1
@@ -139,6 +139,7 @@ def files(folder: Path | str) -> list[tuple[int, Path]]:
 def _read(path: Path) -> Checkpoint:
     """Raises: OSError: it cannot be read. UserError: what can be read is no whole checkpoint."""
     try:
+        check_header(path)
         with safetensors.safe_open(path, framework="pt", device="cpu") as file:
             metadata = file.metadata() or {}
             text = metadata[_HEADER].encode("utf-8", "replace")
@@ -153,7 +154,12 @@ def _read(path: Path) -> Checkpoint:
         # Not in older files, where a damaged header may go unseen.
         whole = whole and header.get("layout", _layout(tensors)) == _layout(tensors)
         whole = whole and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
-        checkpoint = Checkpoint(path, int(header["step"]), tensors, dict(header["meta"]))
+        if not isinstance(header["meta"], dict):
+            raise ValueError("no names")
+        # Floats of a byte, which nothing here writes and torch hardly reckons with.
+        if any(t.is_floating_point() and t.itemsize < 2 for t in tensors.values()):
+            raise ValueError("tensors of another program")
+        checkpoint = Checkpoint(path, int(header["step"]), tensors, header["meta"])
     except RuntimeError as error:  # as torch says what the system said
         number = re.search(r"\((\d+)\)$", str(error))
         if number is None:

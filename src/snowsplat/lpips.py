@@ -29,13 +29,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from snowsplat.errors import UserError
+from snowsplat.untrusted import check_header
 
 # The mean and deviation of ImageNet's colours, as [-1, 1] has them: ((0.485, …) − 0.5) · 2 and
 # 0.229 · 2.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _MIN_SIDE = 32  # of an image, in pixels: the backbones halve it several times
-_BACKBONE = re.compile(r"(?:.*\.)?(?:features|net\.slice\d)\.(\d+)\.(weight|bias)")
+_BACKBONE = re.compile(r"(?:.*\.)?(?:features|net\.slice\d)\.(\d{1,3})\.(weight|bias)")
 _HEAD = re.compile(r"lin(\d)\.model\.1\.weight")
 
 
@@ -174,8 +175,7 @@ def _unit(features: Tensor) -> Tensor:
 
 def _read_state(path: Path) -> dict[str, Tensor]:
     try:
-        if path.exists() and not path.is_file():
-            raise UserError(f"{path}: is no file")
+        check_header(path)
         return safetensors.torch.load_file(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None

@@ -19,6 +19,7 @@ _ALWAYS_ALLOWED = 48 << 20  # bytes of memory
 _RATIO = (
     2  # bytes of memory for each of a larger file; those that programs write need about as much
 )
+_LARGEST_HEADER = 1 << 20  # bytes
 _DEEPEST = 100  # values within each other; what goes through them calls itself
 _WHOLE = 1 << 64  # whole numbers are smaller; of any size, they overflow what is reckoned with them
 
@@ -58,6 +59,21 @@ def parse_json(data: bytes) -> Any:
         if not level:
             return value
     raise ValueError("nested too deep")
+
+
+def check_header(path: Path) -> None:
+    """Whether a safetensors file may be opened: each tensor takes ten times its part of the header.
+
+    Raises:
+        OSError: absent, or not to be read.
+        ValueError: a header that is absurdly large, or no file at all.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError("not a file")
+    with open(path, "rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+    if size > _LARGEST_HEADER:
+        raise ValueError("absurdly many tensors")
 
 
 def is_file(path: Path) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import save_file
 
 from snowsplat import checkpoint
 from snowsplat.camera_list import read_cameras
@@ -507,6 +508,37 @@ def test_a_checkpoint_whose_header_is_not_what_was_written(tmp_path, refused):
         assert "damaged" in refused(lambda: checkpoint.load(path))
     path.write_bytes(whole)
     assert checkpoint.load(path).meta == {"rate": 0.125}
+
+
+@pytest.mark.parametrize(
+    ("tensor", "meta"),
+    [
+        (torch.ones(4).to(torch.float8_e4m3fn), {}),  # of which torch has no sum
+        (torch.ones(4), [[1, 2]]),  # of which Python makes a dict
+    ],
+)
+def test_a_checkpoint_of_another_program(tmp_path, refused, monkeypatch, tensor, meta):
+    monkeypatch.setattr(checkpoint, "check_finite", lambda *_: None)
+    monkeypatch.setattr(checkpoint, "dict", lambda given: given, raising=False)
+    path = checkpoint.save(tmp_path, 5, {"a": tensor}, meta)
+    monkeypatch.undo()
+    assert "not a checkpoint" in refused(lambda: checkpoint.load(path))
+
+
+def test_safetensors_of_countless_tensors(tmp_path, refused):
+    """Each takes a thousand bytes of memory, and fifty of the file."""
+    empty = {"dtype": "U8", "shape": [0], "data_offsets": [0, 0]}
+    head = json.dumps({f"{i:x}": empty for i in range(200_000)} | {"__metadata__": {}}).encode()
+    path = tmp_path / "step_000005.safetensors"
+    path.write_bytes(struct.pack("<Q", len(head)) + head)
+    assert "not a checkpoint" in refused(lambda: checkpoint.load(path))
+    assert "not a safetensors file" in refused(lambda: Lpips.load(path))
+
+
+def test_weights_of_a_layer_of_a_thousand_digits(tmp_path, refused):
+    path = tmp_path / "a.safetensors"
+    save_file({f"features.{'1' * 5000}.weight": torch.zeros(1)}, path)
+    assert "is missing" in refused(lambda: Lpips.load(path))
 
 
 def test_history_of_things_that_are_no_numbers(tmp_path):
