@@ -60,7 +60,7 @@ def check_state(own: Mapping[str, Tensor], given: Mapping[str, Tensor], views: i
     fits = fits and all(
         own[name].shape == given[name].shape for name in own if name.startswith("random.")
     )
-    if not fits or not set(given["order"].tolist()) <= set(range(views)):
+    if not fits or int(given["step"]) < 0 or not set(given["order"].tolist()) <= set(range(views)):
         raise UserError(
             "the checkpoint is of another capture or recipe; go on with those it was made with"
         )

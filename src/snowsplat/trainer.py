@@ -249,7 +249,10 @@ class Trainer:
         self._optimizer.load_state(part("optimizer."))
         self._density.load_state(part("density."))
         for name, random in self._generators.items():
-            random.set_state(tensors[f"random.{name}"])
+            try:
+                random.set_state(tensors[f"random.{name}"])
+            except RuntimeError:  # torch knows what can be one
+                raise UserError("the checkpoint is damaged; go on from an earlier one") from None
         self.step = int(tensors["step"])
         self.within_step = False
         self._order = tensors["order"].tolist()
