@@ -8,6 +8,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+import torch
 
 from snowsplat import checkpoint
 from snowsplat.cli.output import OutputFolder
@@ -84,6 +85,15 @@ def test_the_newest_is_shown_as_it_comes(trained, tmp_path):
     assert newest() is later  # replaced at this moment
     assert NewestScene(folder, None)().gaussians is None
     assert "--checkpoint-every" in " ".join(NewestScene(folder, None)().about)
+
+
+def test_a_checkpoint_of_something_else(trained, tmp_path):
+    out = OutputFolder(tmp_path / "out")
+    shutil.copytree(trained, out.path)
+    for tensors in ({"a": torch.zeros(3)}, {"gaussians.means": torch.zeros(3)}):
+        checkpoint.save(out.checkpoints, 5000, tensors, {})
+        with pytest.raises(UserError, match="not the checkpoint of a training"):
+            NewestScene(out, None)()
 
 
 def test_watch_refuses(refused, trained, tmp_path):

@@ -120,6 +120,8 @@ class NewestScene:
             return read_gaussians(path)
         tensors = checkpoint.load(path).tensors
         part = "gaussians."
-        return Gaussians(
-            **{name[len(part) :]: t for name, t in tensors.items() if name.startswith(part)}
-        )
+        own = {name[len(part) :]: t for name, t in tensors.items() if name.startswith(part)}
+        try:
+            return Gaussians(**own)
+        except (TypeError, ValueError):
+            raise UserError(f"{path}: not the checkpoint of a training") from None
