@@ -13,6 +13,8 @@ from html import escape
 
 from PIL import Image
 
+from snowsplat.untrusted import printable
+
 _STYLE = """
 :root { color-scheme: light dark; --bg: #fbfaf7; --card: #fff; --ink: #20252c; --soft: #667080;
   --line: #e3e0d8; --accent: #b8650a; --bad: #b3261e; }
@@ -104,9 +106,3 @@ def duration(seconds: float) -> str:
 def text(value: object) -> str:
     """Anything as text of the page, also within quotes."""
     return escape(printable(str(value)))
-
-
-def printable(text: str) -> str:
-    """File names may hold bytes that are no text, and control characters that XML refuses."""
-    text = text.encode("utf-8", "replace").decode("utf-8")
-    return "".join(c if c in "\n\t" or c.isprintable() else "\ufffd" for c in text)

@@ -96,6 +96,16 @@ def inside(folder: Path, name: str) -> Path | None:
     return folder / name if Path(there).is_relative_to(home) else None
 
 
+def printable(text: str) -> str:
+    """A text for pages and terminals.
+
+    Names may hold bytes that are no text, and control characters: XML refuses these, and terminals
+    obey them.
+    """
+    text = text.encode("utf-8", "replace").decode("utf-8")
+    return "".join(c if c in "\n\t" or c.isprintable() else "\ufffd" for c in text)
+
+
 def from_json(kind: type[_Kind], values: Any) -> _Kind:
     """A dataclass from JSON values, which have to be what its fields are declared as.
 

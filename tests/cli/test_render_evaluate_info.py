@@ -10,6 +10,7 @@ import safetensors.torch
 import torch
 from PIL import Image
 
+from snowsplat import checkpoint
 from snowsplat.cli.main import main
 from snowsplat.formats import read_gaussians, write_gaussians
 
@@ -166,6 +167,17 @@ def test_info(run, refused, trained, capture, tmp_path):
     assert "no camera poses" in refused("info", tmp_path)
     (tmp_path / "scene.obj").write_text("v 0 0 0")
     assert "not a scene file I know" in refused("info", tmp_path / "scene.obj")
+
+
+def test_info_says_nothing_that_a_terminal_obeys(run, refused, tmp_path):
+    meta = {"a\x1b[2J": "\ud800 \x1b]0;title\x07", "b": {"\x9b2J": [1]}}
+    path = checkpoint.save(tmp_path, 5, {"a": torch.zeros(3)}, meta)
+    result = run("info", path)
+    assert result.code == 0
+    assert result.out.replace("\n", "").isprintable()
+    head = "ply\nformat ascii 1.0\nelement vertex 0\n" + 2 * "property float \x1b[2J\n"
+    (tmp_path / "a.ply").write_text(f"{head}end_header\n")
+    assert refused("info", tmp_path / "a.ply").strip().isprintable()
 
 
 def test_info_of_a_checkpoint(run, capture, tmp_path):

@@ -12,7 +12,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.output import OutputFolder
 from snowsplat.errors import UserError
-from snowsplat.untrusted import read_json
+from snowsplat.untrusted import printable, read_json
 
 if TYPE_CHECKING:
     from snowsplat.formats import Format
@@ -210,12 +210,13 @@ def _print(facts: dict[str, Any], indent: str = "") -> None:
     for name, value in facts.items():
         label = f"{indent}{name.replace('_', ' '):{width}}"
         if isinstance(value, dict) and any(isinstance(v, dict | list) for v in value.values()):
-            print(label.rstrip())
+            print(printable(label.rstrip()))
             _print(value, indent + "  ")
         elif isinstance(value, dict):
-            print(label, ", ".join(f"{k} {_text(v)}" for k, v in value.items()))
+            inner = ", ".join(f"{k} {_text(v)}" for k, v in value.items())
+            print(printable(f"{label} {inner}"))
         else:
-            print(label, _text(value))
+            print(printable(f"{label} {_text(value)}"))
 
 
 def _text(value: Any) -> str:

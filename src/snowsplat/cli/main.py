@@ -25,6 +25,7 @@ from snowsplat.cli.train import Train
 from snowsplat.cli.view import View
 from snowsplat.cli.watch import Watch
 from snowsplat.errors import UserError
+from snowsplat.untrusted import printable
 
 VERBS: dict[str, Any] = {
     "make": Make,
@@ -115,7 +116,7 @@ def _fail(message: str, code: int) -> int:
 
 
 def _tell(message: str) -> None:
-    print("snowsplat:", " ".join(message.split()), file=sys.stderr)
+    print("snowsplat:", printable(" ".join(message.split())), file=sys.stderr)
 
 
 class _Notes(logging.Handler):

@@ -15,8 +15,9 @@ from PIL import Image
 from snowsplat.capture.colmap import posed_camera
 from snowsplat.capture.colmap_files import read_model, read_points
 from snowsplat.files import write_text
-from snowsplat.page import bar, cards, duration, page, picture, printable, table, text
+from snowsplat.page import bar, cards, duration, page, picture, table, text
 from snowsplat.photos.scene_map import PlacedPhoto, draw_scene
+from snowsplat.untrusted import printable
 
 _FILE = "capture_report.html"
 _THUMBNAILS = 24  # at most, evenly chosen
