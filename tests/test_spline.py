@@ -63,6 +63,17 @@ def test_waves_longer_than_the_smoothing_stay_and_shorter_ones_go():
         assert share == pytest.approx(kept, abs=0.05)
 
 
+def test_many_samples_take_no_more_time_each():
+    """A film may be asked for through all cameras of a long video, or a list that anybody wrote."""
+    times = torch.arange(20_000.0, dtype=torch.float64)
+    values = torch.stack([torch.sin(times / 100), torch.cos(times / 100)], 1)
+    assert torch.allclose(
+        Spline(times, values)(times[:-1] + 0.5)[5:-5, 0],
+        torch.sin((times[:-1] + 0.5) / 100)[5:-5],
+        atol=1e-6,
+    )
+
+
 def test_refused():
     for times in ([0.0], [0.0, 0.0], [1.0, 0.0]):
         with pytest.raises(ValueError, match="times that increase"):

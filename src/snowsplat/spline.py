@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,16 +31,23 @@ class Spline:
         count = len(times)
         bend = torch.zeros_like(values)  # second derivatives at the knots
         if count > 2:
-            inner = torch.arange(count - 2)
             # Second divided differences are Qᵀ y, and R takes the bend at the inner knots to them.
-            q = torch.zeros(count, count - 2, dtype=torch.float64)
-            q[inner, inner] = 1 / steps[:-1]
-            q[inner + 1, inner] = -1 / steps[:-1] - 1 / steps[1:]
-            q[inner + 2, inner] = 1 / steps[1:]
-            r = torch.diag((steps[:-1] + steps[1:]) / 3)
-            r = r + torch.diag(steps[1:-1] / 6, 1) + torch.diag(steps[1:-1] / 6, -1)
-            bend[1:-1] = torch.linalg.solve(r + smoothing * q.T @ q, q.T @ values)
-            values = values - smoothing * q @ bend[1:-1]
+            # Q has three entries a column, so R + smoothing · Qᵀ Q has five diagonals.
+            first, last = 1 / steps[:-1], 1 / steps[1:]
+            middle = -first - last
+            diagonal = (steps[:-1] + steps[1:]) / 3
+            diagonal = diagonal + smoothing * (first**2 + middle**2 + last**2)
+            beside = middle[:-1] * first[1:] + last[:-1] * middle[1:]
+            beside = steps[1:-1] / 6 + smoothing * beside
+            beyond = smoothing * last[:-2] * first[2:]
+            first, middle, last = first[:, None], middle[:, None], last[:, None]
+            differences = first * values[:-2] + middle * values[1:-1] + last * values[2:]
+            inner = _solve(diagonal, beside, beyond, differences)
+            bend[1:-1] = inner
+            values = values.clone()
+            values[:-2] -= smoothing * first * inner
+            values[1:-1] -= smoothing * middle * inner
+            values[2:] -= smoothing * last * inner
         self._times, self._values, self._bend = times, values, bend
 
     def __call__(self, times: Tensor) -> Tensor:
@@ -52,3 +60,30 @@ class Spline:
         line = a * self._values[i] + b * self._values[i + 1]
         cubic = (a**3 - a) * self._bend[i] + (b**3 - b) * self._bend[i + 1]
         return line + cubic * step**2 / 6
+
+
+def _solve(diagonal: Tensor, beside: Tensor, beyond: Tensor, right: Tensor) -> Tensor:
+    """(M, D): x of A x = right, A symmetric and positive, given by three of its five diagonals.
+
+    By A = L D Lᵀ, a row at a time: time and memory grow with M, not with its square.
+    """
+    rows = right.numpy().copy()
+    near, far = [*beside.tolist(), 0.0], [*beyond.tolist(), 0.0, 0.0]
+    pivots = diagonal.tolist()
+    for i in range(len(pivots)):
+        # What row i takes from the two below it.
+        a, b = near[i] / pivots[i], far[i] / pivots[i]
+        if i + 1 < len(pivots):
+            pivots[i + 1] -= a * near[i]
+            near[i + 1] -= a * far[i]
+            rows[i + 1] -= a * rows[i]
+        if i + 2 < len(pivots):
+            pivots[i + 2] -= b * far[i]
+            rows[i + 2] -= b * rows[i]
+        near[i], far[i] = a, b
+    rows /= np.array(pivots)[:, None]
+    for i in reversed(range(len(pivots) - 1)):
+        rows[i] -= near[i] * rows[i + 1]
+        if i + 2 < len(pivots):
+            rows[i] -= far[i] * rows[i + 2]
+    return torch.from_numpy(rows)
