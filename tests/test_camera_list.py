@@ -46,6 +46,8 @@ def test_refused(tmp_path):
         {"width": 10**9},
         {"fx": -1.0},
         {"fy": float("inf")},
+        {"fx": 1e-300, "fy": 1e300},
+        {"position": [1e300, 0, 0]},
         {"position": [1, 2]},
         {"position": [1, 2, float("nan")]},
         {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]},

@@ -6,7 +6,6 @@ pixels. The principal point is not in it: it is taken as the middle of the pictu
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ from snowsplat.geometry import quat_from_rotation, rotation_from_quat
 from snowsplat.untrusted import read_json
 
 _LARGEST = 100_000  # pixels along a side
+# What single precision can still reckon with: focal lengths in pixels, world units.
+_LEAST_FOCAL, _MOST_FOCAL, _FARTHEST = 1e-3, 1e9, 1e15
 
 
 def write_cameras(path: Path, cameras: Iterable[tuple[str, Camera]]) -> None:
@@ -81,8 +82,10 @@ def _camera(entry: dict[str, Any]) -> Camera:
     error = rotation @ rotation.T - torch.eye(3, dtype=torch.float64)
     is_one = float(error.abs().max()) < 1e-3 and float(torch.linalg.det(rotation)) > 0
     fx, fy = float(entry["fx"]), float(entry["fy"])
-    if not (is_one and bool(position.isfinite().all()) and math.isfinite(fx + fy)):
-        raise ValueError("not a rotation, or not finite")
+    if not (is_one and float(position.abs().max()) < _FARTHEST):
+        raise ValueError("not a rotation, or absurdly far")
+    if not (min(fx, fy) >= _LEAST_FOCAL and max(fx, fy) <= _MOST_FOCAL):
+        raise ValueError("no focal lengths")
     if max(width, height) > _LARGEST:
         raise ValueError("too large")
     rotation = rotation_from_quat(quat_from_rotation(rotation))  # exactly one, from rounded numbers

@@ -109,6 +109,7 @@ def test_sizes_are_even():
     assert FilmSize.parse("33x21").of(camera) == (32, 20)
     large = camera.scaled(4000, 3000)
     assert FilmSize.parse(None).of(large) == (1920, 1440)
+    assert FilmSize.parse("8192").of(camera.scaled(1, 100_000)) == (8192, 8192)
 
 
 def test_number_of_frames():

@@ -63,7 +63,8 @@ class FilmSize:
         else:
             scale = self.width / width
         wanted = (self.width or width * scale, self.height or height * scale)
-        width, height = (max(_SMALLEST, 2 * int(side / 2 + 0.25)) for side in wanted)
+        # Cameras are taken from files too: a narrow one, made wide, is as high as a tower.
+        width, height = (min(_LARGEST, max(_SMALLEST, 2 * int(side / 2 + 0.25))) for side in wanted)
         return width, height
 
 
