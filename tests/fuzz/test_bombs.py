@@ -444,6 +444,19 @@ def test_a_video_of_huge_frames(tmp_path, refused):
     assert "larger than 67" in refused(lambda: read_clip(path.with_suffix(".avi")))
 
 
+@pytest.mark.parametrize("count", [3_000_000, 4_000_000_000])
+def test_a_video_of_countless_frames(tmp_path, refused, count):
+    """All of one size, so that none of them has to be told by itself."""
+    path = write_video(tmp_path / "a.mp4", pan(4))
+    assert is_video(path)
+    data = bytearray(path.read_bytes())
+    struct.pack_into(">II", data, data.find(b"stsz") + 8, 1, count)
+    struct.pack_into(">I", data, data.find(b"stsc") + 16, count)  # all of them in one piece
+    path.write_bytes(data)
+    assert "promises more frames" in refused(lambda: read_clip(path))
+    assert not guarded(lambda: is_video(path), tmp_path, path.stat().st_size)
+
+
 # Records
 
 

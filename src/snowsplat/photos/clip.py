@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
+import re
+import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,6 +23,12 @@ _FORMATS = ",".join(
     ]
 )
 _MOST_PIXELS = 1 << 26  # of a frame: 8192×8192
+# Of the boxes that an mp4 file is made of: a head, kinds, those of frames and of nothing, and what
+# is counted: frames, of parts of a film too, and edits, each of which may repeat all frames.
+_BOX, _KIND = 8, re.compile(rb"[ -~\xa9]{4}")
+_NO_COUNTS = (b"mdat", b"free", b"skip", b"wide")
+_COUNTS = re.compile(rb"stsz|stz2|trun|elst|cmov")
+_FEW_EDITS, _ALWAYS_ALLOWED = 16, 1 << 16
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -38,6 +47,41 @@ class Clip:
     width: int  # pixels, upright
     height: int
     aspect: float = 1.0  # width over height of a stored pixel; some camcorders' are not square
+
+
+def _check_boxes(path: Path) -> None:
+    """Whether an mp4 file has the frames that it promises.
+
+    FFmpeg makes an entry of each before it looks for any: a few bytes can promise millions. Counts
+    stand in boxes within boxes, of any depth; frames in boxes of their own, which are passed over.
+
+    Raises:
+        ValueError: more frames than bytes.
+    """
+    size = path.stat().st_size
+    if size < _BOX:
+        return
+    frames = edits = 0
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        start = 0
+        while start + _BOX <= size:
+            length, kind = struct.unpack_from(">I4s", data, start)
+            if length == 1 and start + 2 * _BOX <= size:
+                (length,) = struct.unpack_from(">Q", data, start + _BOX)
+            end = min(size, start + length) if length else size
+            if end < start + _BOX or not _KIND.fullmatch(kind):
+                return  # another kind of file, or its end
+            for tag in () if kind in _NO_COUNTS else _COUNTS.finditer(data, start, end):
+                at = tag.end() + (8 if tag[0] in (b"stsz", b"stz2") else 4)
+                if tag[0] == b"cmov":
+                    raise ValueError("a header that is packed")
+                if at + 4 <= end:
+                    (count,) = struct.unpack_from(">I", data, at)
+                    frames += 0 if tag[0] == b"elst" else count
+                    edits += count if tag[0] == b"elst" else 0
+                if frames * max(1, edits // _FEW_EDITS) > max(size, _ALWAYS_ALLOWED):
+                    raise ValueError("promises more frames than it has bytes")
+            start = end
 
 
 def is_video(path: Path) -> bool:
@@ -133,6 +177,7 @@ def open_video(path: Path) -> InputContainer:
         "protocol_whitelist": "file",
         "max_pixels": str(_MOST_PIXELS),
     }
+    _check_boxes(path)
     # A name may look like an address. Some tags of cameras are no UTF-8; they do not matter here.
     container = av.open(f"file:{path.absolute()}", options=options, metadata_errors="replace")
     for stream in container.streams.video:
