@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.cli.output import CaptureSettings, OutputFolder
+from snowsplat.cli.output import CAPTURE, SCENE, CaptureSettings, OutputFolder
 from snowsplat.cli.presets import PRESETS, Preset, Quality
 from snowsplat.cli.progress import duration
 from snowsplat.files import atomic_path
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from snowsplat.cli.viewing import PageFlags
     from snowsplat.photos.stages import Outcome, Stages
 
-CAPTURE, SCENE = "capture", "scene"
 STAGES = ("scene", "pictures")  # the capture keeps its own record
 HOLD_OUT = 8
 # What of a preset is about the training.

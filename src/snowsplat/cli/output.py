@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from snowsplat.evaluate import Evaluation
     from snowsplat.gaussians import Gaussians
 
+#: What `make` has in its folder: the capture, and the output folder of its training.
+CAPTURE, SCENE = "capture", "scene"
 # A text, a name or number, or a sign; and those of which the value is taken.
 # Spaces are no part of it: looking beyond each of a million is a million times a million steps.
 _WORD = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S""", re.DOTALL)

@@ -11,8 +11,7 @@ import tyro
 
 from snowsplat.cli.computing import compute_with
 from snowsplat.cli.flags import flag
-from snowsplat.cli.making import SCENE
-from snowsplat.cli.output import OutputFolder
+from snowsplat.cli.output import SCENE, OutputFolder
 from snowsplat.errors import UserError
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from snowsplat.cli.flags import flag
-from snowsplat.cli.making import SCENE
-from snowsplat.cli.output import OutputFolder
+from snowsplat.cli.output import SCENE, OutputFolder
 from snowsplat.cli.scene import SceneFlags
 from snowsplat.cli.viewing import PageFlags
 from snowsplat.errors import UserError
