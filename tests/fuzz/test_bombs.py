@@ -101,6 +101,19 @@ def jpeg_of_scans(side: int, scans: int, between: bytes = b"") -> bytes:
     return data[:-2] + between + data[last:-2] * scans + b"\xff\xd9"
 
 
+def png_of_chunks(count: int) -> bytes:
+    """With empty ones before its pixels, each of which takes microseconds to skip."""
+    data = png(64, 64)
+    empty = struct.pack(">I", 0) + b"juNk" + struct.pack(">I", zlib.crc32(b"juNk"))
+    return data[:33] + empty * count + data[33:]
+
+
+def jpeg_after(junk: bytes) -> bytes:
+    packed = io.BytesIO()
+    Image.new("RGB", (64, 64)).save(packed, "JPEG")
+    return packed.getvalue()[:2] + junk + packed.getvalue()[2:]
+
+
 @pytest.mark.parametrize(
     ("name", "data", "line"),
     [
@@ -114,6 +127,13 @@ def jpeg_of_scans(side: int, scans: int, between: bytes = b"") -> bytes:
         ("scans.jpg", lambda: jpeg_of_scans(4000, 2000), "scans of all its pixels"),
         # A marker without a length, after which the next one looks like one.
         ("tem.jpg", lambda: jpeg_of_scans(4000, 2000, b"\xff\x01"), "scans of all its pixels"),
+        ("chunks.png", lambda: png_of_chunks(5_000_000), "absurdly many chunks"),
+        (
+            "segments.jpg",
+            lambda: jpeg_after(b"\xff\xe5\0\x02" * 15_000_000),
+            "absurdly many segments",
+        ),
+        ("padded.jpg", lambda: jpeg_after(b"\xff" * 60_000_000), "absurdly much before its pixels"),
     ],
 )
 @pytest.mark.filterwarnings("ignore")

@@ -5,7 +5,6 @@ Everything here is a pure function of the file, so it may run in any thread and 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,22 +14,13 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
+from snowsplat.capture.image_file import open_image, reason_of
 from snowsplat.errors import UserError
 from snowsplat.untrusted import is_file
 
 # What photographs come as (a phone's MPO counts as JPEG). Pillow also knows formats that start
 # other programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
-#: The largest image that is read; its size is known before it is decoded. Pillow's own limit, which
-#: is enough for the backs of the largest cameras (151 million) and the sides of any JPEG.
-MOST_PIXELS, LONGEST_SIDE = 178_956_970, 65_535
-# A tile of a TIFF may be larger than the image; a scan of a JPEG costs time for each pixel, and few
-# bytes. Both are far above what any program writes for an image of that size.
-_MOST_TILE_PIXELS, _MOST_SCANNED_PIXELS = 1 << 22, 3_000_000_000
-_MOST_SEGMENTS = 100_000  # of a JPEG
-# What begins a segment of a JPEG; those that this leaves out have no length, and are in the data of
-# a scan, or (TEM, 01) passed over by decoders.
-_MARKER, _SCAN, _END = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]"), b"\xff\xda", b"\xff\xd9"
 _BAND_PIXELS = 1 << 20  # what is held at a time while pixels are rearranged
 #: The endings that are tried where a capture names its images without one.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
@@ -94,72 +84,6 @@ class Header:
     width: int  # pixels, as stored
     height: int
     sideways: bool  # its EXIF orientation exchanges width and height
-
-
-def open_image(path: Path, formats: Sequence[str], *, header_only: bool = False) -> Image.Image:
-    """An image file whose pixels are not yet read; with ``header_only`` they must not be.
-
-    Raises:
-        ValueError: larger than `MOST_PIXELS` or `LONGEST_SIDE`, or made to do harm. And whatever
-            Pillow raises on damaged files.
-    """
-    image = Image.open(path, formats=list(formats))
-    try:
-        _check(image)
-        if not header_only and image.format in ("JPEG", "MPO"):
-            _check_scans(image, path)
-    except BaseException:
-        image.close()
-        raise
-    return image
-
-
-def _check(image: Image.Image) -> None:
-    width, height = image.size
-    if width * height > MOST_PIXELS or max(width, height) > LONGEST_SIDE:
-        raise ValueError(TOO_LARGE)
-    # Decoders in Python take a second for a million pixels; one of them trusts any skip it reads.
-    if any(tile[0] in Image.DECODERS for tile in getattr(image, "tile", ())):
-        raise ValueError(f"a {image.format} of a kind that is slow to read; save it as PNG")
-    if image.format == "TIFF":
-        tags = getattr(image, "tag_v2", {})
-        sides = [tags.get(tag, 1) for tag in (322, 323)]
-        if not all(isinstance(side, int) for side in sides) or (
-            sides[0] * sides[1] > max(_MOST_TILE_PIXELS, width * height)
-        ):
-            raise ValueError("has tiles larger than the image")
-
-
-def _check_scans(image: Image.Image, path: Path) -> None:
-    data = path.read_bytes()
-    scans, at = 0, 2
-    for _ in range(_MOST_SEGMENTS):
-        marker = _MARKER.search(data, at)
-        if marker is None or marker[0] == _END:
-            break
-        at = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
-        scans += marker[0] == _SCAN
-    else:
-        raise ValueError("absurdly many segments")
-    if scans * image.width * image.height > _MOST_SCANNED_PIXELS:
-        raise ValueError(f"{scans} scans of all its pixels")
-
-
-def reason_of(error: Exception) -> str:
-    """Why an image cannot be read, in a few words, from what Pillow or `open_image` raised."""
-    if isinstance(error, Image.UnidentifiedImageError):
-        return "not an image of a known format"
-    if isinstance(error, Image.DecompressionBombError):
-        return TOO_LARGE
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return " ".join(str(error).split())[:120] or type(error).__name__
-
-
-TOO_LARGE = (
-    f"more than {MOST_PIXELS // 1_000_000} million pixels, or {LONGEST_SIDE:,} a side; make it "
-    "smaller"
-)
 
 
 def read_header(path: Path) -> Header:

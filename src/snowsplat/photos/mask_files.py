@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from snowsplat.capture.decode import reason_of
+from snowsplat.capture.image_file import reason_of
 from snowsplat.errors import UserError
 from snowsplat.files import shown
 from snowsplat.photos.photo_files import Header, open_image, turned

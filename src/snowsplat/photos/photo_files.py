@@ -16,8 +16,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image, ImageOps
 
-from snowsplat.capture import decode as capture_decode
-from snowsplat.capture.decode import reason_of
+from snowsplat.capture import image_file
+from snowsplat.capture.image_file import reason_of
 from snowsplat.photos.exif import ORIENTATION, Notes, notes_for_copy, read_notes
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
@@ -133,11 +133,11 @@ def _bits(path: Path, image: Image.Image) -> int:
 
 
 def open_image(path: Path, *, header_only: bool = False) -> Image.Image:
-    """A lazily read image of a format that photos have; raises as `capture.decode.open_image`."""
+    """A lazily read image of a format that photos have; raises as `image_file.open_image`."""
     from pillow_heif import register_heif_opener
 
     register_heif_opener()
-    return capture_decode.open_image(path, _FORMATS, header_only=header_only)
+    return image_file.open_image(path, _FORMATS, header_only=header_only)
 
 
 def decode(path: Path, header: Header, longest: int | None) -> Image.Image:

@@ -23,7 +23,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.capture.decode import open_image, reason_of, resize_area
+from snowsplat.capture.decode import resize_area
+from snowsplat.capture.image_file import open_image, reason_of
 from snowsplat.capture.images import available_memory
 from snowsplat.errors import UserError
 from snowsplat.files import atomic_path
