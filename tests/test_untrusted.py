@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import pytest
 
-from snowsplat.untrusted import from_json, inside, is_file, parse_json, read_json
+from snowsplat.untrusted import from_json, inside, is_file, parse_json, quoted, read_json
 
 
 @dataclass(frozen=True)
@@ -139,3 +139,10 @@ def test_what_is_a_file(tmp_path):
     names = ("a", "pipe", "absent", ".", "a\0", "x" * 5000)
     assert [is_file(tmp_path / name) for name in names] == [True] + [False] * 5
     assert not is_file(Path("/dev/zero"))
+
+
+def test_what_is_quoted_is_short_and_no_command():
+    assert quoted("a'b") == '"a\'b"'
+    assert quoted("\x1b[2J\udcd8") == "'\ufffd[2J?'"
+    assert len(quoted("\udcd8\x00" * 1000)) <= 82
+    assert quoted(7) == "'7'"

@@ -106,6 +106,11 @@ def printable(text: str) -> str:
     return "".join(c if c in "\n\t" or c.isprintable() else "\ufffd" for c in text)
 
 
+def quoted(value: object) -> str:
+    """What a file says there, for a message of one line: its beginning, in quotes."""
+    return repr(printable(str(value))[:80])
+
+
 def from_json(kind: type[_Kind], values: Any) -> _Kind:
     """A dataclass from JSON values, which have to be what its fields are declared as.
 
@@ -120,7 +125,7 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
     hints = get_type_hints(kind)
     known = {field.name for field in fields(kind) if field.init}  # type: ignore[arg-type]
     if not values.keys() <= known:
-        raise ValueError(f"no {kind.__name__}: {sorted(values.keys() - known)[0][:40]!r}")
+        raise ValueError(f"no {kind.__name__}: {quoted(sorted(values.keys() - known)[0])}")
     try:
         return kind(**{name: _as(hints[name], value) for name, value in values.items()})
     except TypeError as error:  # one is missing
@@ -156,4 +161,4 @@ def _as(hint: Any, value: Any) -> Any:
         return from_json(hint, value)
     elif isinstance(hint, type) and type(value) is hint:
         return value
-    raise ValueError(f"{str(value)[:40]!r} is no {getattr(hint, '__name__', hint)}")
+    raise ValueError(f"{quoted(value)} is no {getattr(hint, '__name__', hint)}")

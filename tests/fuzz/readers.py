@@ -23,6 +23,7 @@ import numpy as np
 import safetensors.torch
 import torch
 from PIL import Image
+from pillow_heif import register_heif_opener
 
 from snowsplat import checkpoint
 from snowsplat.camera_list import read_cameras, write_cameras
@@ -257,6 +258,7 @@ _PLACE = {1: "N", 2: (1.0, 2.0, 3.0), 3: "W", 4: (1.0, 2.0, 3.0), 5: 0, 6: 7.0}
 
 
 def _save_image(path: Path, kind: str) -> None:
+    register_heif_opener()
     image = photo(width=80, height=60)
     options: dict[str, Any] = {}
     if kind in ("jpg", "progressive", "webp", "heic", "tif", "png"):

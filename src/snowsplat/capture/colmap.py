@@ -27,7 +27,7 @@ from snowsplat.capture.colmap_files import (
 from snowsplat.capture.points_ply import read_points as read_points_ply
 from snowsplat.errors import UserError
 from snowsplat.geometry import rotation_from_quat
-from snowsplat.untrusted import inside, is_file
+from snowsplat.untrusted import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ def read_colmap(
     for image in model.images:
         if inside(image_folder, image.name) is None:
             raise UserError(
-                f"{folder}: names the image {image.name[:80]!r}, which is not in {image_folder}; "
+                f"{folder}: names the image {quoted(image.name)}, which is not in {image_folder}; "
                 "run COLMAP again, with the images in one folder"
             )
         if not is_file(image_folder / image.name):
@@ -106,7 +106,7 @@ def read_colmap(
     if not posed:
         raise UserError(
             f"{image_folder}: none of the {len(missing)} images of the model is here (the first is "
-            f"{missing[0][:80]!r}); name the right folder with --images"
+            f"{quoted(missing[0])}); name the right folder with --images"
         )
     if missing:
         logger.warning(

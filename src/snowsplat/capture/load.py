@@ -13,7 +13,7 @@ from snowsplat.capture.colmap import find_models, read_colmap
 from snowsplat.capture.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
 from snowsplat.capture.nerf import find_transforms, read_nerf
 from snowsplat.errors import UserError
-from snowsplat.untrusted import is_file
+from snowsplat.untrusted import is_file, quoted
 
 logger = logging.getLogger(__name__)
 
@@ -261,6 +261,6 @@ def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]
             problem = (
                 "is the name of several images" if matches else "is not an image of the capture"
             )
-            raise UserError(f"the list of test images: {line[:80]!r} {problem}")
+            raise UserError(f"the list of test images: {quoted(line)} {problem}")
         tested |= matches
     return tested

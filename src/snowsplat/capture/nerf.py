@@ -30,7 +30,7 @@ from snowsplat.capture.decode import IMAGE_SUFFIXES, read_header
 from snowsplat.capture.points_ply import read_points as read_points_ply
 from snowsplat.errors import UserError
 from snowsplat.geometry import invert_rigid, transform_points
-from snowsplat.untrusted import inside, is_file, read_json
+from snowsplat.untrusted import inside, is_file, quoted, read_json
 
 logger = logging.getLogger(__name__)
 
@@ -158,7 +158,7 @@ def _at_home(where: str, root: Path, name: str) -> Path:
     path = inside(root, name.replace("\\", "/"))
     if path is None:
         raise UserError(
-            f"{where} names {name[:80]!r}, which is not in the folder of the file; copy it there "
+            f"{where} names {quoted(name)}, which is not in the folder of the file; copy it there "
             "and name it from there"
         )
     return path
@@ -193,7 +193,7 @@ def _number(where: str, values: Mapping[str, Any], key: str) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise UserError(f"{where}: {key} should be a number, not {str(value)[:40]!r}")
+        raise UserError(f"{where}: {key} should be a number, not {quoted(value)}")
     if not abs(value) < 1e9:  # not a number, or a damaged one
         raise UserError(f"{where}: {key} is {str(value)[:40]}, which makes no sense")
     return float(value)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from snowsplat.untrusted import is_file, parse_json
+from snowsplat.untrusted import is_file, parse_json, quoted
 
 _MOST_MEMBERS = 1000
 _INFLATION, _INFLATION_FREE = 4, 1 << 20  # WebP does not deflate by much
@@ -83,7 +83,7 @@ class Bundle:
 
     def _beside(self, name: str) -> Path:
         if not name or Path(name).name != name:  # nothing outside the folder
-            raise Damaged(f"names a picture outside its folder ({name[:60]!r})")
+            raise Damaged(f"names a picture outside its folder ({quoted(name)})")
         return self._path.parent / name
 
     def _member(self, name: str) -> bytes:
@@ -115,7 +115,7 @@ class Bundle:
     def _file(self, path: Path) -> bytes:
         try:
             if not is_file(path):  # a pipe never ends
-                raise Damaged(f"{path.name[:60]!r} is absent, or no file")
+                raise Damaged(f"{quoted(path.name)} is absent, or no file")
             return path.read_bytes()
         except OSError as error:
             raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None

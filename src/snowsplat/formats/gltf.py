@@ -25,6 +25,7 @@ from snowsplat.formats.frames import UP_BACK, flip_axes
 from snowsplat.formats.glb import Damaged
 from snowsplat.gaussians import SH_C0, SH_REST_COUNTS, Gaussians
 from snowsplat.geometry import Similarity
+from snowsplat.untrusted import quoted
 
 logger = logging.getLogger(__name__)
 
@@ -100,7 +101,7 @@ def _check(path: Path, primitive: dict[str, Any], extension: dict[str, Any]) -> 
     if primitive.get("mode", 4) != _POINTS:
         raise Damaged("has splats that are no points")
     if extension.get("kernel", "ellipse") != "ellipse":
-        raise Damaged(f"has splats of the kind {str(extension['kernel'])[:40]!r}, not ellipses")
+        raise Damaged(f"has splats of the kind {quoted(extension['kernel'])}, not ellipses")
     if not any(name.startswith(f"{EXTENSION}:") for name in primitive["attributes"]):
         packed = ", ".join(map(str, extension.get("extensions", {}))) or "an unknown way"
         raise Damaged(f"has its splats packed by {packed[:60]}, which I do not read")

@@ -11,7 +11,7 @@ from snowsplat.errors import UserError
 from snowsplat.photos.photo import Photo
 from snowsplat.photos.sfm.check_model import can_be_read
 from snowsplat.photos.sfm.options import SfmResult
-from snowsplat.untrusted import inside
+from snowsplat.untrusted import inside, quoted
 
 
 def result_of(
@@ -82,7 +82,7 @@ def describe_model(capture: Path, photos: Sequence[Photo]) -> SfmResult:
         # Images are written under the names of the photos.
         if inside(capture / "input", name) is None:
             raise UserError(
-                f"{numbered[0]}: names the photo {name[:80]!r}, which is not in "
+                f"{numbered[0]}: names the photo {quoted(name)}, which is not in "
                 f"{capture / 'input'}; leave out --skip-matching"
             )
     if not names & {photo.name for photo in photos}:
