@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from snowsplat.camera import Camera
-from snowsplat.capture import Capture, View
+from snowsplat.capture import Capture, Points, View
 from snowsplat.capture.decode import ImageSource
 from snowsplat.capture.images import DECODERS
 from snowsplat.errors import UserError
@@ -22,7 +23,8 @@ def capture_of(photos: int, width: int, height: int, stored: int = 0) -> Capture
     pose = torch.eye(4, dtype=torch.float64)[:3]
     camera = Camera(width, height, width, width, width / 2, height / 2, pose)
     source = ImageSource(Path("photo.jpg"), width, height, stored=stored)
-    return Capture([View(str(i), camera, source) for i in range(photos)], [], None, 1.0)
+    points = Points(torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8))
+    return Capture([View(str(i), camera, source) for i in range(photos)], [], points, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -113,3 +115,22 @@ def test_what_is_there_already_has_to_fit() -> None:
 
 def test_a_gpu_takes_less_than_a_gigabyte_for_a_million() -> None:
     assert GPU.of(1_000_000, 0, 3) < 1_000_000_000
+
+
+@pytest.mark.parametrize("random", [20_000, 200_000])
+def test_random_gaussians_begin_wide(random: int) -> None:
+    """As many as are there at the start take three times the tiles; the later ones do not."""
+    with_points = capture_of(9, 1000, 500)
+    config = recipe("default", max_gaussians=140_000, initial_points=random)
+    budget = 450_000_000
+    plans = [
+        plan_memory(capture, config, DEVICE, 10**10, budget)
+        for capture in (with_points, replace(with_points, points=None))
+    ]
+    assert plans[0].limit == 140_000
+    assert plans[1].limit is not None
+    assert plans[1].limit < 140_000
+    assert plans[1].total <= budget
+    later = CPU.of(plans[1].limit, 0, 3) - CPU.fixed
+    assert plans[1].scene == later + 2 * CPU.gaussian * min(random, plans[1].limit)
+    assert plan_memory(replace(with_points, points=None), config, DEVICE, 10**10, budget, 140_000)

@@ -47,6 +47,8 @@ class Cost:
 # some seven tiles. On a GPU reckoned from what is allocated.
 CPU = Cost(fixed=66_000_000, pixel=170, gaussian=1150)
 GPU = Cost(fixed=50_000_000, pixel=70, gaussian=240)
+# Random ones begin so wide that each of them touches about three times as many tiles.
+_WIDE = 2
 # A photo that is being decoded, bytes a pixel of its file; on the CPU, and so many at a time.
 _DECODING = 18
 
@@ -118,12 +120,18 @@ def plan_memory(
     if cost is CPU:
         images += DECODERS * _DECODING * stored
     each = cost.of(1, 0, config.sh_degree) - cost.fixed
+    random = config.initial_points if capture.points is None and not present else 0
+    wide = _WIDE * cost.gaussian
+
+    def scene(count: int) -> int:
+        return each * count + wide * min(count, random)
+
     config = config.capped(sorted(sizes)[len(sizes) // 2])
     cap = config.density.max_gaussians or None
     photos = min(all_photos, config.image_memory or available // 2)
     given_up = []
     if budget is not None:
-        least = images + fewest + each * max(_FEWEST_GAUSSIANS, present)
+        least = images + fewest + scene(max(_FEWEST_GAUSSIANS, present))
         if budget < least and present > _FEWEST_GAUSSIANS:
             raise UserError(
                 f"--memory {in_words(budget)} is too little to go on with {present:,} Gaussians, "
@@ -136,20 +144,21 @@ def plan_memory(
                 f"--memory {in_words(budget)} is too little for photos of this size, which take "
                 f"{in_words(least)}; give more, or make {smaller}"
             )
-        room = (budget - images - min(photos, fewest)) // each
+        left = budget - images - min(photos, fewest)
+        room = max(min(random, left // (each + wide)), (left - wide * random) // each)
         if cap is None or cap > room:
             more = "no limit of them" if cap is None else f"{cap:,}"
             given_up.append(f"at most {room:,} Gaussians instead of {more}")
             cap = room
             config = changed(config, max_gaussians=room)
-        left = max(fewest, budget - images - each * cap)
+        left = max(fewest, budget - images - scene(cap))
         if photos > left:
             share = 100 * left // all_photos
             given_up.append(f"{share}% of the photos stay decoded, the others are read again")
             photos = left
         config = replace(config, image_memory=photos)
     count = 1_000_000 if cap is None else cap
-    return MemoryPlan(config, each * count, images, photos, tuple(given_up), cap)
+    return MemoryPlan(config, scene(count), images, photos, tuple(given_up), cap)
 
 
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
