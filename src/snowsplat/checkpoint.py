@@ -51,7 +51,7 @@ def save(
     *,
     keep: int = 2,
 ) -> Path:
-    """Write ``folder/step_000500.safetensors`` atomically, then remove all but the ``keep`` newest.
+    """Write ``folder/step_000500.safetensors`` atomically, then `remove_old`.
 
     Args:
         tensors: any shapes and dtypes, 0-dimensional and empty ones too.
@@ -65,8 +65,6 @@ def save(
     check_finite(f"the state of step {step}", tensors, "older checkpoints are as they were")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    for leftover in folder.glob(".*tmp*"):  # of a save that was killed
-        leftover.unlink(missing_ok=True)
     path = folder / f"step_{step:06d}.safetensors"
     whole = {name: _owned(tensor) for name, tensor in tensors.items()}
     header = {
@@ -86,9 +84,20 @@ def save(
             if number is None:
                 raise OSError(f"{path}: cannot be written ({error})") from None
             raise OSError(int(number[1]), os.strerror(int(number[1]))) from None
-    for _, old in files(folder)[keep:]:
-        old.unlink(missing_ok=True)
+    remove_old(folder, step, keep=keep)
     return path
+
+
+def remove_old(folder: Path | str, step: int, *, keep: int = 2) -> None:
+    """Remove the checkpoints before the ``keep`` newest up to ``step``, and what killed saves left.
+
+    Newer ones stay: a training goes on from ``step`` where it found those damaged.
+    """
+    folder = Path(folder)
+    for leftover in folder.glob(".*tmp*"):
+        leftover.unlink(missing_ok=True)
+    for _, old in [file for file in files(folder) if file[0] <= step][keep:]:
+        old.unlink(missing_ok=True)
 
 
 def load(path: Path | str) -> Checkpoint:

@@ -76,6 +76,22 @@ def test_a_scene_that_a_kill_prevented(zygote, capture, tmp_path):
     assert digest(early) == whole
 
 
+def test_an_old_checkpoint_that_a_kill_left(zygote, capture, tmp_path):
+    """Killed between the last checkpoint and the removal of the one before the one before it."""
+    out = tmp_path / "out"
+    command = ["train", capture, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
+    command += ["--device", "cpu", "--threads", 1]
+    assert zygote.run(command).code == 0
+    kept = names_in(out / "checkpoints")
+    assert kept == {"step_000020.safetensors", "step_000030.safetensors"}
+    shutil.copy(
+        out / "checkpoints/step_000020.safetensors", out / "checkpoints/step_000010.safetensors"
+    )
+    done = zygote.run([*command, "--resume"])
+    assert done.code == 0, done.text
+    assert names_in(out / "checkpoints") == kept
+
+
 def test_damaged_checkpoints_are_not_begun_over(zygote, capture, tmp_path):
     out = tmp_path / "out"
     command = ["train", capture, "-o", out, "--iterations", 20, "--checkpoint-every", 10]

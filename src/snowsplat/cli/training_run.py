@@ -69,7 +69,7 @@ class TrainingRun:
         stopped = False
         try:
             with nullcontext() if self.quiet else self.progress:
-                self._save_what_a_kill_prevented()
+                self._do_what_a_kill_prevented()
                 self.history.step_begins()
                 self.trainer.run(self._record)
         except KeyboardInterrupt:
@@ -123,9 +123,12 @@ class TrainingRun:
             return step % every == 0
         return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
 
-    def _save_what_a_kill_prevented(self) -> None:
-        """Between a checkpoint and the scene of the same step."""
+    def _do_what_a_kill_prevented(self) -> None:
+        """Between a checkpoint and the removal of an old one, or the scene of the same step."""
+        from snowsplat import checkpoint
+
         step = self.first_step
+        checkpoint.remove_old(self.out.checkpoints, step)
         if step in self.save_iterations and step not in self.out.scenes():
             self._save_scene()
 
