@@ -78,6 +78,10 @@ def test_from_photos_to_files_and_what_is_done_again(
     for part in (scene.name, "capture_report.html", "renders", f"PSNR {metrics['psnr']:.2f} dB"):
         assert part in summary
 
+    facts = json.loads(run("info", out, "--json").out)
+    assert facts["kind"] == "output folder"
+    assert facts["scenes"] == [120]
+
     # The same again: nothing is done.
     before = state(out)
     again = run(*command)

@@ -11,6 +11,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.output import OutputFolder
+from snowsplat.cli.scene import training_folder
 from snowsplat.errors import UserError
 from snowsplat.untrusted import printable, read_json
 
@@ -27,13 +28,14 @@ class Info:
 
     Examples:
       snowsplat info out/garden
+      snowsplat info walk_scene
       snowsplat info garden.spz
       snowsplat info out/garden/point_cloud/iteration_3000/point_cloud.ply
       snowsplat info garden
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT|CAPTURE")] = None
-    """A scene of any format, a checkpoint, the output folder of a training, or a capture."""
+    """A scene of any format, a checkpoint, the output folder of `train` or `make`, or a capture."""
     json: Annotated[bool, switch()] = False
     """Print JSON, for programs."""
 
@@ -69,7 +71,7 @@ def describe(path: Path) -> dict[str, Any]:
                 raise UserError(f"{error}, checkpoints and captures") from None
         else:
             return _scene(path, format)
-    folder = OutputFolder(path)
+    folder = training_folder(path)
     if folder.is_one() or folder.scenes():
         return _output(folder)
     return _capture(path)
