@@ -4,7 +4,7 @@
     python benchmarks/formats.py SCENE --capture CAPTURE
 
 SCENE is a trained one, of any format that is read. Times are of a scene of `--gaussians` made of
-it, a copy beside the other; bytes a Gaussian are those of SCENE itself. With the capture that it
+it, a copy beside the other; bytes a Gaussian are those of SCENE itself. With the dataset that it
 was trained on: PSNR of the renderings of what was read back against those of SCENE, and against
 the photos, mean over every 8th photo's camera.
 """
@@ -21,11 +21,11 @@ from pathlib import Path
 
 import torch
 
-from snowsplat import Gaussians, View, load_capture, read_gaussians
-from snowsplat.evaluate import evaluate_views, psnr
+from snowsplat import Gaussians, View, load_dataset, read_gaussians
+from snowsplat.evaluation.metrics import evaluate_views, psnr
 from snowsplat.formats import FORMATS
 from snowsplat.formats.spz import read_spz, write_spz
-from snowsplat.render import render
+from snowsplat.scene.render import render
 
 Read = Callable[[Path], Gaussians]
 Write = Callable[[Path, Gaussians], None]
@@ -76,9 +76,9 @@ def main() -> None:
     scene = read_gaussians(arguments.scene)
     large = enlarged(scene, arguments.gaussians)
     views: list[View] = []
-    if arguments.capture:
-        capture = load_capture(arguments.capture, hold_out=8, resolution=arguments.resolution)
-        views = capture.test
+    if arguments.dataset:
+        dataset = load_dataset(arguments.dataset, hold_out=8, resolution=arguments.resolution)
+        views = dataset.test
     expected = [render(scene, view.camera).image for view in views]
     print(
         f"{len(scene):,} Gaussians of SH degree {scene.sh_degree}; times of {len(large):,}; "

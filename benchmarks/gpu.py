@@ -54,7 +54,7 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
     garden = flags.captures / "garden_points.npz"
     if garden.is_file():
         environment["SNOWSPLAT_GARDEN"] = str(garden)
-    captures = [str(flags.captures / name) for name in CAPTURES]
+    datasets = [str(flags.captures / name) for name in CAPTURES]
     folder = ["--folder", str(scratch)]
 
     def job(
@@ -72,7 +72,7 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
     found = {group: [] for group in (*GROUPS, "beside")}
     found["device"] = [job("device", ["device"], 45, alone=True)]
     if "train" in flags.only:
-        part = ["train", *captures, "--device", "cpu", "--seeds", *map(str, flags.seeds)]
+        part = ["train", *datasets, "--device", "cpu", "--seeds", *map(str, flags.seeds)]
         found["beside"].append(job("train on the CPU", part, 200, SNOWSPLAT_THREADS=most))
     if "peer" in flags.only:
         found["beside"].append(job("build the peer", ["peer-build"], 240))
@@ -91,13 +91,13 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         found["peer"] = [
             job(f"peer {size}", ["peer", size, *folder], 50, alone=True) for size in ("1m", "200k")
         ]
-    part = ["train", *captures, "--seeds", *map(str, flags.seeds)]
+    part = ["train", *datasets, "--seeds", *map(str, flags.seeds)]
     found["train"] = [job("train on the GPU", part, 100, alone=True)]
     late = []
     if "sanitizer" in flags.only:
         late.append(job("initcheck", ["sanitize", "initcheck"], 60, alone=True, **few))
     if "train" in flags.only:
-        part = ["train", *captures, "--iterations", "7000"]
+        part = ["train", *datasets, "--iterations", "7000"]
         late.append(job("train on the GPU, 7000 steps", part, 90, alone=True))
     wanted = {group: found[group] if group in flags.only else [] for group in GROUPS}
     # The sanitizers take longest, the tests are many.

@@ -16,8 +16,8 @@ from torch import Tensor
 from workloads import Workload
 
 from snowsplat import ops
-from snowsplat.camera import Camera
-from snowsplat.gaussians import Gaussians
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
 
 #: Gaussians, width, height. From one of each to a few thousand, none a multiple of anything.
 SIZES = ((0, 1, 1), (1, 5, 3), (33, 17, 31), (999, 95, 53), (4099, 161, 99))

@@ -22,7 +22,7 @@ from typing import Any
 from gpu_jobs import finding
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Captures whose pictures are transparent.
+#: Datasets whose pictures are transparent.
 BACKGROUNDS = {"lego400": "white"}
 
 
@@ -444,25 +444,25 @@ def stages(size: str, folder: Path, repeats: int) -> None:
 
 
 def train(
-    captures: Iterable[Path], seeds: Iterable[int], device: str, iterations: int | None
+    datasets: Iterable[Path], seeds: Iterable[int], device: str, iterations: int | None
 ) -> None:
-    """Held-out PSNR, time, memory of the default recipe; a seed of all captures, then the next."""
+    """Held-out PSNR, time, memory of the default recipe; a seed of all datasets, then the next."""
     for seed in seeds:
-        for path in captures:
+        for path in datasets:
             if path.is_dir():
                 _train(path, seed, device, iterations)
             elif seed == 0:
-                finding("absent", capture=path.name)
+                finding("absent", dataset=path.name)
 
 
 def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
     import torch
 
-    from snowsplat import Trainer, evaluate_views, load_capture, recipe
+    from snowsplat import Trainer, evaluate_views, load_dataset, recipe
 
     device = torch.device(name)
     on_gpu = device.type == "cuda"
-    capture = load_capture(path)
+    dataset = load_dataset(path)
     background: Any = BACKGROUNDS.get(path.name, "black")
     config = recipe(
         "default",
@@ -476,7 +476,7 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     begin = time.perf_counter()
-    trainer = Trainer(capture, config, device=device)
+    trainer = Trainer(dataset, config, device=device)
     trainer.run()
     if on_gpu:
         torch.cuda.synchronize()
@@ -489,10 +489,10 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
     same = None
     if on_gpu:  # the scene as the CPU sees it
         white = (1.0 if background == "white" else 0.0,) * 3
-        same = evaluate_views(trainer.gaussians.to("cpu"), capture.test, background=white).psnr
+        same = evaluate_views(trainer.gaussians.to("cpu"), dataset.test, background=white).psnr
     finding(
         "training",
-        capture=path.name,
+        dataset=path.name,
         device=device.type,
         seed=seed,
         iterations=config.iterations,
@@ -532,7 +532,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     part.add_argument("--folder", type=Path, required=True)
     part.add_argument("--repeats", type=int, default=20)
     part = parts.add_parser("train")
-    part.add_argument("captures", nargs="+", type=Path)
+    part.add_argument("datasets", metavar="dataset", nargs="+", type=Path)
     part.add_argument("--seeds", nargs="+", type=int, default=[0])
     part.add_argument("--device", default="cuda")
     part.add_argument("--iterations", type=int)
@@ -557,7 +557,7 @@ def main() -> None:
         case "stages":
             stages(flags.size, flags.folder, flags.repeats)
         case "train":
-            train(flags.captures, flags.seeds, flags.device, flags.iterations)
+            train(flags.datasets, flags.seeds, flags.device, flags.iterations)
         case "peer-build":
             import gpu_peer
 

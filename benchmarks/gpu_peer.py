@@ -19,7 +19,7 @@ from torch import Tensor
 from workloads import Workload
 
 from snowsplat import ops
-from snowsplat.evaluate import psnr
+from snowsplat.evaluation.metrics import psnr
 
 
 def build() -> None:
@@ -139,7 +139,7 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
 
 @torch.no_grad()
 def _our_image(step: Step) -> Tensor:
-    from snowsplat.render import project
+    from snowsplat.scene.render import project
 
     camera = step.camera
     splats = project(step.trainer.gaussians, camera)

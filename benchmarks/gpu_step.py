@@ -20,16 +20,16 @@ from torch import Tensor
 from workloads import Workload
 
 from snowsplat import ops
-from snowsplat.capture import Capture, Points, View
-from snowsplat.capture.decode import ImageSource, LoadedImage
-from snowsplat.config import TrainConfig
-from snowsplat.density import AdaptiveDensity
+from snowsplat.data import Dataset, Points, View
+from snowsplat.data.decode import ImageSource, LoadedImage
 from snowsplat.ops.cuda.kernels import Argument, Kernel
 from snowsplat.ops.cuda.launches import launch_by
 from snowsplat.ops.native import LAUNCHERS
-from snowsplat.optim import Adam, LearningRates
-from snowsplat.render import project, render
-from snowsplat.trainer import Trainer
+from snowsplat.scene.render import project, render
+from snowsplat.training.config import TrainConfig
+from snowsplat.training.density import AdaptiveDensity
+from snowsplat.training.optim import Adam, LearningRates
+from snowsplat.training.trainer import Trainer
 
 GPU = torch.device("cuda")
 EXTENT = 4.0
@@ -67,7 +67,7 @@ class Step:
         points = Points(torch.rand(8, 3), torch.zeros(8, 3, dtype=torch.uint8))
         view = View("not read", camera, source)
         self.trainer = trainer = Trainer(
-            Capture([view], [], points, extent=EXTENT), CONFIG, device=device
+            Dataset([view], [], points, extent=EXTENT), CONFIG, device=device
         )
         gaussians = scene.gaussians.to(device)
         trainer.gaussians = gaussians

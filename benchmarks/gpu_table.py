@@ -155,13 +155,13 @@ def _training(findings: Findings, name: str) -> str:
     for found in findings.of("training"):
         runs[tuple(found[k] for k in key)][found["device"]] = found
     differences: dict[str, list[float]] = {}
-    for (capture, iterations, seed), by_device in sorted(runs.items()):
+    for (dataset, iterations, seed), by_device in sorted(runs.items()):
         cpu, gpu = by_device.get("cpu"), by_device.get("cuda")
         difference = "—"
         if cpu and gpu:
-            differences.setdefault(capture, []).append(gpu["psnr"] - cpu["psnr"])
-            difference = f"{differences[capture][-1]:+.2f}"
-        cells = [f"{capture}", f"{iterations}", f"{seed}"]
+            differences.setdefault(dataset, []).append(gpu["psnr"] - cpu["psnr"])
+            difference = f"{differences[dataset][-1]:+.2f}"
+        cells = [f"{dataset}", f"{iterations}", f"{seed}"]
         cells += [f"{cpu['psnr']:.2f}" if cpu else "—", f"{gpu['psnr']:.2f}" if gpu else "—"]
         cells += [difference, f"{cpu['seconds']:.1f}" if cpu else "—"]
         if gpu:
@@ -178,10 +178,10 @@ def _training(findings: Findings, name: str) -> str:
     if rows:
         head = "capture,steps,seed,CPU,GPU,difference,CPU s,GPU s,steps/s,Gaussians,peak MB"
         lines += _table([*head.split(","), "seen by the CPU"], rows)
-    for capture, found in differences.items():
+    for dataset, found in differences.items():
         mean = sum(found) / len(found)
         verdict = "within" if abs(mean) <= PSNR_GOAL else "NOT within"
-        lines += ["", f"{capture}: mean difference {mean:+.3f} dB, {verdict} {PSNR_GOAL} dB."]
+        lines += ["", f"{dataset}: mean difference {mean:+.3f} dB, {verdict} {PSNR_GOAL} dB."]
     if absent:
         lines += ["", f"Not here, so not trained: {', '.join(absent)}."]
     return "\n".join(lines)

@@ -21,7 +21,7 @@ from snowsplat import ops
 from snowsplat.ops import native, reference
 from snowsplat.ops.adam import PARAMETERS
 from snowsplat.ops.scratch import take_rows
-from snowsplat.process import single_threaded
+from snowsplat.util.process import single_threaded
 
 #: Native functions by the stage that they are. One that is not here appears under its own name.
 STAGES = {

@@ -25,8 +25,8 @@ from floor import OPERATIONS, OPERATIONS_A_CLOCK, floor_ns, system_ghz
 from iteration import REST, STAGES, TOTAL
 from workloads import SIZES
 
-from snowsplat.errors import UserError
 from snowsplat.ops import native
+from snowsplat.util.errors import UserError
 
 Measured = dict[str, Any]
 BLEND = ("blend forward", "blend backward")

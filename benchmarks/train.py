@@ -1,4 +1,4 @@
-"""Held-out PSNR against training time, of a capture and one or more recipes.
+"""Held-out PSNR against training time, of a dataset and one or more recipes.
 
     python benchmarks/train.py ../shared/captures/fox_small -o out/benchmark
     python benchmarks/train.py CAPTURE -o OUT --recipe default paper --iterations 7000
@@ -23,8 +23,8 @@ from typing import Any
 
 from plot import line_chart
 
-from snowsplat import Capture, TrainConfig, Trainer, UserError, load_capture, ops, recipe
-from snowsplat.recipes import RECIPES
+from snowsplat import Dataset, TrainConfig, Trainer, UserError, load_dataset, ops, recipe
+from snowsplat.training.recipes import RECIPES
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ def milestones(iterations: int, count: int) -> list[int]:
     return sorted(steps)
 
 
-def train(capture: Capture, name: str, config: TrainConfig, count: int) -> list[Milestone]:
+def train(dataset: Dataset, name: str, config: TrainConfig, count: int) -> list[Milestone]:
     """Train, and print a row at each milestone."""
     clock = _Clock()
     with clock:
-        trainer = Trainer(capture, config)
+        trainer = Trainer(dataset, config)
     rows = []
     for step in milestones(config.iterations, count):
         with clock:
@@ -103,12 +103,12 @@ def main() -> None:
     if flags.threads:
         ops.set_num_threads(flags.threads)
     start = _peak_mb()
-    capture = load_capture(flags.capture, resolution=flags.resolution)
-    if not capture.test:
-        raise UserError(f"{flags.capture}: too few photos to hold one out")
-    camera = capture.train[0].camera
+    dataset = load_dataset(flags.dataset, resolution=flags.resolution)
+    if not dataset.test:
+        raise UserError(f"{flags.dataset}: too few photos to hold one out")
+    camera = dataset.train[0].camera
     print(
-        f"{flags.capture.name}: {len(capture.train)} photos to train on, {len(capture.test)} held "
+        f"{flags.dataset.name}: {len(dataset.train)} photos to train on, {len(dataset.test)} held "
         f"out, {camera.width}x{camera.height}; {ops.get_num_threads()} threads; "
         f"{start:.0f} MB are Python and PyTorch"
     )
@@ -121,13 +121,13 @@ def main() -> None:
         config = recipe(
             name, iterations=flags.iterations, seed=flags.seed, test_iterations=(), **knobs
         )
-        rows += train(capture, name, config, flags.milestones)
+        rows += train(dataset, name, config, flags.milestones)
     _write(flags, rows, knobs)
 
 
 def _write(flags: argparse.Namespace, rows: list[Milestone], knobs: dict[str, Any]) -> None:
     flags.output.mkdir(parents=True, exist_ok=True)
-    name = flags.capture.resolve().name
+    name = flags.dataset.resolve().name
     stem = flags.output / name
     with stem.with_name(f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Milestone)])
@@ -165,7 +165,7 @@ def _flags() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("capture", type=Path)
+    parser.add_argument("dataset", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/benchmark"))
     parser.add_argument("--recipe", nargs="+", default=["default"], choices=RECIPES)
     parser.add_argument("--iterations", type=int, help="the recipe's by default")

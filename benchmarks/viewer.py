@@ -27,16 +27,16 @@ from PIL import Image
 from websockets.sync.client import connect
 from workloads import SIZES, workload
 
-from snowsplat import Trainer, load_capture, ops, recipe
-from snowsplat.capture import Capture, Points, View
-from snowsplat.capture.decode import ImageSource
-from snowsplat.geometry import quat_from_rotation
-from snowsplat.process import single_threaded
-from snowsplat.viewer.network.gauge import Gauge
-from snowsplat.viewer.network.look import Look
-from snowsplat.viewer.network.pictures import draw
-from snowsplat.viewer.network.training import TrainingViewer
-from snowsplat.viewer.network.viewer import NetworkViewer
+from snowsplat import Trainer, load_dataset, ops, recipe
+from snowsplat.data import Dataset, Points, View
+from snowsplat.data.decode import ImageSource
+from snowsplat.scene.geometry import quat_from_rotation
+from snowsplat.util.process import single_threaded
+from snowsplat.viewer.live.gauge import Gauge
+from snowsplat.viewer.live.look import Look
+from snowsplat.viewer.live.pictures import draw
+from snowsplat.viewer.live.training import TrainingViewer
+from snowsplat.viewer.live.viewer import NetworkViewer
 
 MODES = ("color", "depth", "alpha", "normals", "points", "ellipsoids", "cost")
 
@@ -110,8 +110,8 @@ def answers(name: str, repeats: int) -> None:
     camera = scene.camera
     nowhere = ImageSource(Path("nowhere.jpg"), camera.width, camera.height)
     points = Points(scene.gaussians.means, torch.zeros(len(scene.gaussians), 3, dtype=torch.uint8))
-    capture = Capture([View("view", camera, nowhere)], [], points, 1.0)
-    viewer = NetworkViewer(capture)
+    dataset = Dataset([View("view", camera, nowhere)], [], points, 1.0)
+    viewer = NetworkViewer(dataset)
     stop = threading.Event()
     times: dict[str, list[float]] = {"answer": [], "full": []}
     sizes: list[int] = []
@@ -146,14 +146,14 @@ def answers(name: str, repeats: int) -> None:
 
 def training(path: Path, seconds: float, rounds: int) -> None:
     """Steps a second of one training, in turns: without a viewer, watched by nobody, …"""
-    capture = load_capture(path)
+    dataset = load_dataset(path)
     # Beyond its first steps a training of this length is the same all the time.
     config = recipe("default", iterations=1_000_000, coarse_to_fine=(1, 2), densify_until=900)
-    trainer = Trainer(capture, config)
+    trainer = Trainer(dataset, config)
     trainer.run(until=1000)
-    viewer = NetworkViewer(capture)
-    hook = TrainingViewer(viewer, Gauge(capture.train, viewer.background))
-    camera = capture.train[0].camera
+    viewer = NetworkViewer(dataset)
+    hook = TrainingViewer(viewer, Gauge(dataset.train, viewer.background))
+    camera = dataset.train[0].camera
     found: dict[str, list[float]] = {}
 
     def measure(name: str, call: bool) -> None:
@@ -209,8 +209,8 @@ def main() -> None:
         ops.set_num_threads(arguments.threads)
     pictures(arguments.size, arguments.repeats)
     answers(arguments.size, arguments.repeats)
-    if arguments.capture:
-        training(arguments.capture, arguments.seconds, arguments.rounds)
+    if arguments.dataset:
+        training(arguments.dataset, arguments.seconds, arguments.rounds)
 
 
 if __name__ == "__main__":

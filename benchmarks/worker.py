@@ -17,9 +17,9 @@ from pairs import LANES, count_pairs, count_steps, frame_of
 from torch import Tensor
 from workloads import workload
 
-from snowsplat.errors import UserError
 from snowsplat.ops import Splats2D, native
-from snowsplat.process import single_threaded
+from snowsplat.util.errors import UserError
+from snowsplat.util.process import single_threaded
 
 
 def counts(iteration: Iteration, with_pairs: bool) -> dict[str, int]:

@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.camera import Camera
-from snowsplat.gaussians import SH_C0, Gaussians
-from snowsplat.geometry import look_at, morton_order, quat_from_rotation
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import SH_C0, Gaussians
+from snowsplat.scene.geometry import look_at, morton_order, quat_from_rotation
 
 GARDEN = Path(__file__).resolve().parents[2] / "shared" / "captures" / "garden_points.npz"
 

@@ -12,10 +12,10 @@ import sys
 import time
 from pathlib import Path
 
-from snowsplat.capture.colmap import posed_camera
-from snowsplat.capture.colmap_files import read_model
-from snowsplat.photos.compare import compare_poses
-from snowsplat.photos.synthetic import Truth, write_synthetic_photos
+from snowsplat.data.colmap import posed_camera
+from snowsplat.data.colmap_files import read_model
+from snowsplat.synthetic import Truth, write_synthetic_photos
+from snowsplat.synthetic.compare_poses import compare_poses
 
 _MINUTES = 2.2  # for all that `snowsplat make` does
 _DEGREES, _SHARE = 0.1, 0.002  # what is demanded of each photo
@@ -42,9 +42,9 @@ def snowsplat(*arguments: str | Path) -> None:
     subprocess.run([sys.executable, "-m", "snowsplat", *map(str, arguments)], check=True)
 
 
-def compare(capture: Path, truth: Truth) -> bool:
-    """Print how near the poses of a capture are to the true ones; whether that is near enough."""
-    model = read_model(capture / "sparse" / "0")
+def compare(dataset: Path, truth: Truth) -> bool:
+    """Print how near the poses of a dataset are to the true ones; whether that is near enough."""
+    model = read_model(dataset / "sparse" / "0")
     found = {image.name: posed_camera(model, image).cam_from_world for image in model.images}
     errors = compare_poses(found, truth.poses)
     degrees, shares = errors.rotations, errors.centres

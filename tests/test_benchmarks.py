@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat import Gaussians, load_capture, ops, write_gaussians
-from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat import Gaussians, load_dataset, ops, write_gaussians
 from snowsplat.ops import native, reference
 from snowsplat.ops.cuda.launches import KERNELS, launch_by
 from snowsplat.ops.native import LAUNCHERS
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 BENCHMARKS = ROOT / "benchmarks"
@@ -122,11 +122,11 @@ def test_pairs_are_those_of_the_twin(monkeypatch):
 
 
 def test_psnr_against_time(tmp_path):
-    capture = tmp_path / "balls"
+    dataset = tmp_path / "balls"
     with torch.random.fork_rng():
-        write_synthetic_capture(capture, n_views=9, width=48, height=36, n_points=200)
+        write_toy_dataset(dataset, n_views=9, width=48, height=36, n_points=200)
     text = benchmark(
-        *("train.py", capture, "-o", tmp_path, "--iterations", 40, "--milestones", 3),
+        *("train.py", dataset, "-o", tmp_path, "--iterations", 40, "--milestones", 3),
         *("--recipe", "default", "paper", "--set", "max_gaussians=300"),
     )
     first, *_, last = (line.split() for line in text.splitlines() if line.startswith("default"))
@@ -141,7 +141,7 @@ def test_psnr_against_time(tmp_path):
     assert [len(line.attrib["points"].split()) for line in lines] == [3, 3]
 
 
-def test_a_wrong_capture_is_one_line(tmp_path):
+def test_a_wrong_dataset_is_one_line(tmp_path):
     run = subprocess.run(
         [sys.executable, str(BENCHMARKS / "train.py"), str(tmp_path / "none")],
         env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
@@ -154,8 +154,8 @@ def test_a_wrong_capture_is_one_line(tmp_path):
 
 
 def test_formats(tmp_path):
-    write_synthetic_capture(tmp_path / "capture", "colmap-bin", 9, 32, 24, n_points=60)
-    points = load_capture(tmp_path / "capture").points
+    write_toy_dataset(tmp_path / "capture", "colmap-bin", 9, 32, 24, n_points=60)
+    points = load_dataset(tmp_path / "capture").points
     assert points is not None
     write_gaussians(tmp_path / "a.ply", Gaussians.from_points(points))
     text = benchmark(
@@ -461,7 +461,7 @@ all ops ran
 def test_training_as_on_a_machine_with_little_installed(gpu_modules, tmp_path):
     """The child that trains on the CPU, where nothing can be imported that is not there."""
     with torch.random.fork_rng():
-        write_synthetic_capture(tmp_path / "lego400", n_views=9, width=48, height=36, n_points=200)
+        write_toy_dataset(tmp_path / "lego400", n_views=9, width=48, height=36, n_points=200)
     blocked = tmp_path / "site"
     blocked.mkdir()
     (blocked / "sitecustomize.py").write_text(
@@ -529,7 +529,7 @@ def test_the_page_of_a_gpu(gpu_modules):
     add(
         "g", "training", device="cuda", psnr=32.25, seconds=6.0, peak=2e8, psnr_on_cpu=32.251, **key
     )
-    add("g", "absent", capture="lego400")
+    add("g", "absent", dataset="lego400")
     for size, count, peak in (("3m", 3_000_000, 2.5e9), ("1m", 1_000_000, 1e9)):
         counts = {"gaussians": count, "seen": count // 2, "instances": 4 * count}
         add(size, "frame", size=size, pairs=10**8, width=1920, height=1080, **counts)
@@ -581,7 +581,7 @@ def test_the_plan_of_a_run(gpu_modules, tmp_path):
 
     (tmp_path / "garden_points.npz").touch()
     flags = argparse.Namespace(
-        captures=tmp_path, only=list(gpu.GROUPS), seeds=[0, 1], peer=None, arch="9.0"
+        datasets=tmp_path, only=list(gpu.GROUPS), seeds=[0, 1], peer=None, arch="9.0"
     )
     planned = gpu.jobs(flags, tmp_path)
     names = [job.name for job in planned]
@@ -589,7 +589,7 @@ def test_the_plan_of_a_run(gpu_modules, tmp_path):
     assert names[0] == "device"
     assert {"stages 200k", "stages 1m", "stages 3m", "memcheck", "racecheck"} <= set(names)
     assert "tests/ops/test_rasterize.py" in names
-    assert "tests/test_trainer_gpu.py" in names
+    assert "tests/training/test_trainer_gpu.py" in names
     first_alone = next(i for i, job in enumerate(planned) if job.alone and i > 0)
     assert all(job.alone for job in planned[first_alone:])
     for job in planned:

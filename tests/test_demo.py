@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.capture.colmap_files import ColmapCamera, ColmapImage, write_model
-from snowsplat.geometry import quat_from_rotation
-from snowsplat.photos.synthetic import Truth
-from snowsplat.photos.synthetic.lens import Lens
-from snowsplat.photos.synthetic.photographer import walk
+from snowsplat.data.colmap_files import ColmapCamera, ColmapImage, write_model
+from snowsplat.scene.geometry import quat_from_rotation
+from snowsplat.synthetic import Truth
+from snowsplat.synthetic.lens import Lens
+from snowsplat.synthetic.photographer import walk
 
 DEMO = Path(__file__).resolve().parents[1] / "examples" / "demo.py"
 TRUTH = Truth(

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.cli import main as cli
 from snowsplat.formats import read_gaussians
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -18,7 +18,7 @@ def test_python_example_runs(tmp_path, monkeypatch, capsys):
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(example.split("\n\n")[1].splitlines()) == 5  # "in five lines"
     monkeypatch.chdir(tmp_path)
-    write_synthetic_capture(tmp_path / "garden", n_views=9, width=48, height=36, n_points=300)
+    write_toy_dataset(tmp_path / "garden", n_views=9, width=48, height=36, n_points=300)
     quick, changes = re.subn("iterations=[0-9]+", "iterations=40", example)
     assert changes == 1
     (tmp_path / "example.py").write_text(quick)
@@ -31,7 +31,7 @@ def test_python_example_runs(tmp_path, monkeypatch, capsys):
 def commands() -> list[str]:
     shown = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
     lines = [line for block in shown for line in block.splitlines()]
-    lines += re.findall(r"`(snowsplat (?:capture|make|train|render|evaluate) [^`]+)`", README)
+    lines += re.findall(r"`(snowsplat (?:dataset|make|train|render|evaluate) [^`]+)`", README)
     return lines
 
 

@@ -2,59 +2,61 @@
 
     import snowsplat
 
-    capture = snowsplat.load_capture("path/to/capture")
-    trainer = snowsplat.Trainer(capture, snowsplat.recipe("default", iterations=1000))
+    dataset = snowsplat.load_dataset("path/to/dataset")
+    trainer = snowsplat.Trainer(dataset, snowsplat.recipe("default", iterations=1000))
     trainer.run()
     snowsplat.write_gaussians("scene.ply", trainer.gaussians)
 
 The public names are below; each is imported when it is first used, so that `snowsplat --help` does
-not wait for torch. `render` is in `snowsplat.render`, the numerical operations are in
+not wait for torch. `render` is in `snowsplat.scene.render`, the numerical operations are in
 `snowsplat.ops`.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from snowsplat.camera import Camera
-    from snowsplat.capture import Capture, Points, View, load_capture
-    from snowsplat.config import TrainConfig
-    from snowsplat.errors import UserError
-    from snowsplat.evaluate import evaluate_views
-    from snowsplat.formats import read_gaussians, write_gaussians
-    from snowsplat.gaussians import Gaussians
-    from snowsplat.recipes import recipe
-    from snowsplat.trainer import Trainer
+from snowsplat._version import __version__
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from snowsplat.data import Dataset, Points, View, load_dataset
+    from snowsplat.evaluation.metrics import evaluate_views
+    from snowsplat.formats import read_gaussians, write_gaussians
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.training.config import TrainConfig
+    from snowsplat.training.recipes import recipe
+    from snowsplat.training.trainer import Trainer
+    from snowsplat.util.errors import UserError
+
 
 _MODULES = {
-    "Camera": "camera",
-    "Capture": "capture",
-    "Gaussians": "gaussians",
-    "Points": "capture",
-    "TrainConfig": "config",
-    "Trainer": "trainer",
-    "UserError": "errors",
-    "View": "capture",
-    "evaluate_views": "evaluate",
-    "load_capture": "capture",
+    "Camera": "scene.camera",
+    "Dataset": "data",
+    "Gaussians": "scene.gaussians",
+    "Points": "data",
+    "TrainConfig": "training.config",
+    "Trainer": "training.trainer",
+    "UserError": "util.errors",
+    "View": "data",
+    "evaluate_views": "evaluation.metrics",
+    "load_dataset": "data",
     "read_gaussians": "formats",
-    "recipe": "recipes",
-    "write_gaussians": "formats",
+    "recipe": "training.recipes",
+    "write_gaussians": "pipeline.convert",
 }
 
 __all__ = [
     "Camera",
-    "Capture",
+    "Dataset",
     "Gaussians",
     "Points",
     "TrainConfig",
     "Trainer",
     "UserError",
     "View",
+    "__version__",
     "evaluate_views",
-    "load_capture",
+    "load_dataset",
     "read_gaussians",
     "recipe",
     "write_gaussians",

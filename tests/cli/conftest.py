@@ -1,4 +1,4 @@
-"""A small capture, and the command line called in this process or as a process of its own."""
+"""A small dataset, and the command line called in this process or as a process of its own."""
 
 import os
 import subprocess
@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import snowsplat
-from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.cli.main import main
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
 
@@ -24,10 +24,10 @@ class Result:
 
 
 @pytest.fixture(scope="session")
-def capture(tmp_path_factory) -> Path:
+def dataset(tmp_path_factory) -> Path:
     """9 views, 48×36; not to be changed."""
     root = tmp_path_factory.mktemp("cli")
-    return write_synthetic_capture(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
+    return write_toy_dataset(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 @pytest.fixture

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat import edit
-from snowsplat.camera import Camera
-from snowsplat.camera_list import write_cameras
 from snowsplat.cli.convert import _keep
-from snowsplat.errors import UserError
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.geometry import look_at
+from snowsplat.scene import edit
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera_json import write_cameras
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.geometry import look_at
+from snowsplat.util.errors import UserError
 
 WRITTEN = [f.suffixes[0] for f in FORMATS if f.write]
 READ_BACK = [f for f in FORMATS if f.write and f.read]

@@ -7,21 +7,21 @@ import av
 import numpy as np
 import pytest
 
-from snowsplat.cli.films import FilmSize, frames_in
 from snowsplat.cli.main import main
-from snowsplat.errors import UserError
+from snowsplat.pipeline.films import FilmSize, frames_in
+from snowsplat.util.errors import UserError
 
-from ..paths.rigs import camera_at
+from ..trajectory.rigs import camera_at
 
 SHORT = ("--seconds", 1, "--fps", 10)
 
 
 @pytest.fixture(scope="module")
-def trained(capture, tmp_path_factory) -> Path:
-    """An output folder whose capture is not needed any more; not to be changed but for films."""
+def trained(dataset, tmp_path_factory) -> Path:
+    """An output folder whose dataset is not needed any more; not to be changed but for films."""
     out = tmp_path_factory.mktemp("films") / "out"
     flags = ["--iterations", "60", "--eval", "--quiet", "--background", "white"]
-    assert main(["train", str(capture), "-o", str(out), *flags]) == 0
+    assert main(["train", str(dataset), "-o", str(out), *flags]) == 0
     return out
 
 

@@ -59,7 +59,7 @@ def test_completion_is_printed(run):
 def test_errors_of_the_system_and_warnings_are_one_line(monkeypatch, refused, run):
     def full_disk(self):
         warnings.warn("something\nodd", stacklevel=1)
-        logging.getLogger("snowsplat.capture").info("took the\nlarger one")
+        logging.getLogger("snowsplat.data").info("took the\nlarger one")
         raise OSError(28, "No space left on device", "out/scene.ply")
 
     monkeypatch.setattr(module.VERBS["info"], "run", full_disk)
@@ -109,11 +109,11 @@ def test_no_memory_is_one_line_that_says_what_helps(monkeypatch, refused):
         module.main(["info", "x"])
 
 
-def test_a_training_whose_reader_has_gone_is_not_done(capture, tmp_path):
+def test_a_training_whose_reader_has_gone_is_not_done(dataset, tmp_path):
     """As of `| head -1`: silent, but no success."""
     read, write = os.pipe()
     os.close(read)
-    words = ["train", capture, "-o", tmp_path / "out", "--iterations", 9, "--device", "cpu"]
+    words = ["train", dataset, "-o", tmp_path / "out", "--iterations", 9, "--device", "cpu"]
     done = subprocess.run(
         [sys.executable, "-m", "snowsplat", *map(str, words)],
         env=ENVIRONMENT,

@@ -13,19 +13,19 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.cli import making
 from snowsplat.cli.make import RECORD
-from snowsplat.cli.making import STAGES
-from snowsplat.cli.presets import PRESETS, quality_within
-from snowsplat.photos.stages import Stages
-from snowsplat.photos.synthetic import write_synthetic_photos
+from snowsplat.pipeline import make as making
+from snowsplat.pipeline.make import STAGES
+from snowsplat.pipeline.presets import PRESETS, quality_within
+from snowsplat.synthetic import write_synthetic_photos
+from snowsplat.util.stages import Stages
 
 QUICK = replace(PRESETS["draft"], iterations=120)
 #: The command with as short a training, and a checkpoint every moment, in a process of its own.
 PROGRAM = """
 import sys
 from dataclasses import replace
-from snowsplat.cli import making
+from snowsplat.pipeline import make as making
 from snowsplat.cli.main import main
 making._CHECKPOINT_SECONDS = 0.2
 making.PRESETS["draft"] = replace(making.PRESETS["draft"], iterations=120)
@@ -175,12 +175,12 @@ def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
 # Refused
 
 
-def test_places_that_are_taken(refused, capture, tmp_path):
+def test_places_that_are_taken(refused, dataset, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("mine")
-    assert "holds other files" in refused("make", capture / "images", "-o", out)
-    assert "is a file" in refused("make", capture / "images", "-o", out / "thesis.txt")
+    assert "holds other files" in refused("make", dataset / "images", "-o", out)
+    assert "is a file" in refused("make", dataset / "images", "-o", out / "thesis.txt")
     assert files(out) == {"thesis.txt"}
 
 
@@ -193,17 +193,17 @@ def test_places_that_are_taken(refused, capture, tmp_path):
         (["PHOTOS", "--threads", 0], "--threads is 0"),
     ],
 )
-def test_mistakes_write_nothing(refused, capture, tmp_path, flags, expected):
-    words = [capture / "images" if word == "PHOTOS" else word for word in flags]
+def test_mistakes_write_nothing(refused, dataset, tmp_path, flags, expected):
+    words = [dataset / "images" if word == "PHOTOS" else word for word in flags]
     assert expected in refused("make", *words, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_two_photos_leave_nothing(refused, capture, tmp_path):
+def test_two_photos_leave_nothing(refused, dataset, tmp_path):
     two = tmp_path / "two"
     two.mkdir()
     for name in ("view_00.png", "view_01.png"):
-        shutil.copy(capture / "images" / name, two)
+        shutil.copy(dataset / "images" / name, two)
     refused("make", two, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -211,14 +211,14 @@ def test_two_photos_leave_nothing(refused, capture, tmp_path):
 # Times
 
 
-def test_a_stop_before_the_cameras_leaves_the_folder_ours(refused, capture, tmp_path):
-    """Somebody removed the capture in it, to have the cameras found anew."""
+def test_a_stop_before_the_cameras_leaves_the_folder_ours(refused, dataset, tmp_path):
+    """Somebody removed the dataset in it, to have the cameras found anew."""
     out, two = tmp_path / "out", tmp_path / "two"
     (out / "scene").mkdir(parents=True)
     Stages(out / RECORD, STAGES).save()
     two.mkdir()
     for name in ("view_00.png", "view_01.png"):
-        shutil.copy(capture / "images" / name, two)
+        shutil.copy(dataset / "images" / name, two)
     for _ in range(2):  # and the same command comes as far again
         assert "only 2 usable pictures" in refused("make", two, "-o", out)
         assert files(out) == {RECORD}

@@ -1,4 +1,4 @@
-"""`--memory`: a capture ten times as large as the memory that it may take."""
+"""`--memory`: a dataset ten times as large as the memory that it may take."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def snowsplat_cli(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Few photos under very many names."""
     folder: Path = tmp_path_factory.mktemp("large")
     random = np.random.default_rng(0)
@@ -48,9 +48,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_capture_of_ten_times_the_memory_trains(capture: Path, tmp_path: Path) -> None:
+def test_a_dataset_of_ten_times_the_memory_trains(dataset: Path, tmp_path: Path) -> None:
     words = ("-o", str(tmp_path / "out"), "--memory", f"{BUDGET // 10**6}MB", "--iterations", "100")
-    run = snowsplat_cli("train", str(capture), *words, "--densify-from-iter", "20")
+    run = snowsplat_cli("train", str(dataset), *words, "--densify-from-iter", "20")
     assert run.returncode == 0, run.stderr
     assert re.search(r"^memory: \d+ MB at most \(.*photos \d+ MB\)$", run.stdout, re.MULTILINE)
     assert re.search(r"^for lack of memory: at most [\d,]+ Gaussians", run.stdout, re.MULTILINE)
@@ -60,13 +60,13 @@ def test_a_capture_of_ten_times_the_memory_trains(capture: Path, tmp_path: Path)
     assert int(taken[1]) - int(taken[2]) <= BUDGET / 1e6
 
 
-def test_too_little_is_said_before_anything_is_made(capture: Path, tmp_path: Path) -> None:
+def test_too_little_is_said_before_anything_is_made(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for words, line in (
         (("--memory", "40MB"), r"snowsplat: --memory 40 MB is too little for photos .* -r\n"),
         (("--memory", "lots"), r"snowsplat: --memory is 'lots'; it must be like 4GB or 800MB\n"),
     ):
-        run = snowsplat_cli("train", str(capture), "-o", str(out), *words)
+        run = snowsplat_cli("train", str(dataset), "-o", str(out), *words)
         assert run.returncode == 2
         assert re.fullmatch(line, run.stderr), run.stderr
         assert not out.exists()

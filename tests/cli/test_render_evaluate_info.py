@@ -10,17 +10,17 @@ import safetensors.torch
 import torch
 from PIL import Image
 
-from snowsplat import checkpoint
 from snowsplat.cli.main import main
 from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.training import checkpoint
 
 
 @pytest.fixture(scope="module")
-def trained(capture, tmp_path_factory) -> Path:
+def trained(dataset, tmp_path_factory) -> Path:
     """An output folder with two scenes; renders and metrics come and go."""
     out = tmp_path_factory.mktemp("trained") / "out"
     flags = ["--iterations", "60", "--save-iterations", "30", "--eval", "--quiet"]
-    assert main(["train", str(capture), "-o", str(out), *flags]) == 0
+    assert main(["train", str(dataset), "-o", str(out), *flags]) == 0
     return out
 
 
@@ -28,7 +28,7 @@ def picture(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path)).astype(np.float64)
 
 
-def test_render_beside_the_photos(run, trained, capture):
+def test_render_beside_the_photos(run, trained, dataset):
     result = run("render", trained)
     assert result.code == 0, result.err
     for split, names in (("test", [0, 8]), ("train", [1, 2, 3, 4, 5, 6, 7])):
@@ -37,7 +37,7 @@ def test_render_beside_the_photos(run, trained, capture):
         for kind in ("renders", "gt"):
             assert sorted(p.name for p in (folder / kind).iterdir()) == expected
         for i, name in enumerate(names):
-            photo = picture(capture / f"images/view_{name:02d}.png")
+            photo = picture(dataset / f"images/view_{name:02d}.png")
             np.testing.assert_array_equal(picture(folder / f"gt/{i:05d}.png"), photo)
     # The pictures are what was measured, but for rounding to 8 bits.
     metrics = json.loads((trained / "metrics.json").read_text())
@@ -91,12 +91,12 @@ def test_evaluate_with_lpips(run, refused, trained, tmp_path):
     assert run("evaluate", trained).code == 0
 
 
-def test_a_folder_that_the_reference_made(run, trained, capture, tmp_path):
+def test_a_folder_that_the_reference_made(run, trained, dataset, tmp_path):
     """It has cfg_args and no config.json; nothing in it is executed."""
     theirs = tmp_path / "theirs"
     shutil.copytree(trained / "point_cloud", theirs / "point_cloud")
     (theirs / "cfg_args").write_text(
-        f"Namespace(sh_degree=3, source_path='{capture}', model_path='x', images='images', "
+        f"Namespace(sh_degree=3, source_path='{dataset}', model_path='x', images='images', "
         "resolution=-1, white_background=False, data_device='cuda', eval=True)"
     )
     assert run("evaluate", theirs).code == 0
@@ -108,14 +108,14 @@ def test_a_folder_that_the_reference_made(run, trained, capture, tmp_path):
     assert "executed" not in result.out
 
 
-def test_a_capture_that_has_moved(run, refused, trained, capture, tmp_path):
+def test_a_dataset_that_has_moved(run, refused, trained, dataset, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(trained, moved)
     config = json.loads((moved / "config.json").read_text())
     config["capture"]["path"] = "/nowhere"
     (moved / "config.json").write_text(json.dumps(config))
     assert "/nowhere" in refused("evaluate", moved)
-    assert run("evaluate", moved, "-s", capture).code == 0
+    assert run("evaluate", moved, "-s", dataset).code == 0
 
 
 def test_refused(refused, trained, tmp_path):
@@ -137,7 +137,7 @@ def test_refused(refused, trained, tmp_path):
     assert "holds no scene" in refused("evaluate", damaged)
 
 
-def test_info(run, refused, trained, capture, tmp_path):
+def test_info(run, refused, trained, dataset, tmp_path):
     def facts(path: Path) -> dict:
         assert run("info", path).code == 0  # for people
         result = run("info", path, "--json")
@@ -152,10 +152,10 @@ def test_info(run, refused, trained, capture, tmp_path):
     assert facts(trained / "input.ply")["points"] == 300
     out = facts(trained)
     assert out["scenes"] == [30, 60]
-    assert out["capture"] == str(capture)
+    assert out["capture"] == str(dataset)
     assert out["metrics"]["psnr"] > 10
     assert out["last_scene"]["gaussians"] == len(gaussians)
-    photos = facts(capture)
+    photos = facts(dataset)
     assert (photos["photos"], photos["held_out_with_eval"], photos["points"]) == (9, 2, 300)
     assert photos["sizes"] == {"48x36": 9}
     gaussians.means[3, 1] = float("nan")
@@ -180,9 +180,9 @@ def test_info_says_nothing_that_a_terminal_obeys(run, refused, tmp_path):
     assert refused("info", tmp_path / "a.ply").strip().isprintable()
 
 
-def test_info_of_a_checkpoint(run, capture, tmp_path):
+def test_info_of_a_checkpoint(run, dataset, tmp_path):
     flags = ("--iterations", 4, "--checkpoint-every", 4, "-q")
-    assert run("train", capture, "-o", tmp_path / "out", *flags).code == 0
+    assert run("train", dataset, "-o", tmp_path / "out", *flags).code == 0
     result = run("info", tmp_path / "out/checkpoints/step_000004.safetensors", "--json")
     values = json.loads(result.out)
     assert (values["kind"], values["step"]) == ("checkpoint", 4)

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat import checkpoint
-from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.cli.train import _KNOBS, Train
-from snowsplat.cli.training_run import TrainingRun
 from snowsplat.formats import read_gaussians
-from snowsplat.recipes import RECIPES, recipe
-from snowsplat.trainer import Trainer
+from snowsplat.pipeline.train import TrainingRun
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training import checkpoint
+from snowsplat.training.recipes import RECIPES, recipe
+from snowsplat.training.trainer import Trainer
 
 QUICK = ("--iterations", 30, "--threads", 1)
 
@@ -31,9 +31,9 @@ def files(folder: Path) -> set[str]:
     return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
 
 
-def test_the_output_folder(run, capture, tmp_path):
+def test_the_output_folder(run, dataset, tmp_path):
     out = tmp_path / "new" / "out"
-    result = run("train", capture, "-o", out, *QUICK, "--eval", "--save-iterations", 10, 20)
+    result = run("train", dataset, "-o", out, *QUICK, "--eval", "--save-iterations", 10, 20)
     assert result.code == 0, result.err
     assert result.err == ""
     assert files(out) == {
@@ -60,10 +60,10 @@ def test_the_output_folder(run, capture, tmp_path):
     assert lines[-1].startswith("step 30: 2 views  PSNR")
 
 
-def test_the_reference_spelling_of_flags(run, capture, tmp_path):
+def test_the_reference_spelling_of_flags(run, dataset, tmp_path):
     out = tmp_path / "out"
     result = run(
-        *("train", "-s", capture, "-m", out, "-i", "images", "-r", 2, "--eval", "-w", "--quiet"),
+        *("train", "-s", dataset, "-m", out, "-i", "images", "-r", 2, "--eval", "-w", "--quiet"),
         *("--iterations", 20, "--sh_degree", 1, "--densify_grad_threshold", 0.0004),
         *("--densification_interval", 7, "--densify_from_iter", 3, "--densify_until_iter", 15),
         *("--opacity_reset_interval", 9, "--percent_dense", 0.02, "--lambda_dssim", 0.3),
@@ -74,7 +74,7 @@ def test_the_reference_spelling_of_flags(run, capture, tmp_path):
     assert result.code == 0, result.err
     config = json.loads((out / "config.json").read_text())
     assert config["capture"] == {
-        "path": str(capture),
+        "path": str(dataset),
         "images": "images",
         "resolution": 2,
         "hold_out": 8,
@@ -116,9 +116,9 @@ def test_every_knob_is_a_flag_and_a_knob_of_some_recipe():
     assert set(RECIPES) == {"default", "paper", "mcmc"}
 
 
-def test_a_knob_that_the_recipe_does_not_have(refused, capture, tmp_path):
+def test_a_knob_that_the_recipe_does_not_have(refused, dataset, tmp_path):
     line = refused(
-        "train", capture, "-o", tmp_path / "out", "--recipe", "mcmc", "--percent-dense", 0.1
+        "train", dataset, "-o", tmp_path / "out", "--recipe", "mcmc", "--percent-dense", 0.1
     )
     assert "--percent-dense" in line
     assert not (tmp_path / "out").exists()
@@ -127,12 +127,12 @@ def test_a_knob_that_the_recipe_does_not_have(refused, capture, tmp_path):
 # Repeatable, resumable
 
 
-def test_seed_threads_checkpoints_and_quiet_do_not_matter(run, capture, tmp_path):
+def test_seed_threads_checkpoints_and_quiet_do_not_matter(run, dataset, tmp_path):
     a, b, c = (tmp_path / name for name in "abc")
-    assert run("train", capture, "-o", a, *QUICK).code == 0
+    assert run("train", dataset, "-o", a, *QUICK).code == 0
     flags = ("--threads", 2, "--checkpoint-every", 7, "--quiet")
-    assert run("train", capture, "-o", b, "--iterations", 30, *flags).code == 0
-    assert run("train", capture, "-o", c, *QUICK, "--seed", 1).code == 0
+    assert run("train", dataset, "-o", b, "--iterations", 30, *flags).code == 0
+    assert run("train", dataset, "-o", c, *QUICK, "--seed", 1).code == 0
     assert scene(a) == scene(b) != scene(c)
     assert {p.name for p in (b / "checkpoints").iterdir()} == {
         "step_000021.safetensors",
@@ -148,11 +148,11 @@ def wait_for(path: Path, process) -> None:
         time.sleep(0.002)
 
 
-def test_kill_9_and_resume_give_the_same_scene(run, start, capture, tmp_path):
+def test_kill_9_and_resume_give_the_same_scene(run, start, dataset, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     flags = ("--iterations", 120, "--threads", 1, "--checkpoint-every", 20, "--eval", "-q")
-    assert run("train", capture, "-o", whole, *flags).code == 0
-    process = start("train", capture, "-o", killed, *flags)
+    assert run("train", dataset, "-o", whole, *flags).code == 0
+    process = start("train", dataset, "-o", killed, *flags)
     wait_for(killed / "checkpoints/step_000060.safetensors", process)
     process.send_signal(signal.SIGKILL)
     process.communicate()
@@ -168,9 +168,9 @@ def test_kill_9_and_resume_give_the_same_scene(run, start, capture, tmp_path):
     assert (killed / "metrics.json").read_bytes() == (whole / "metrics.json").read_bytes()
 
 
-def test_ctrl_c_saves_and_resumes(run, start, capture, tmp_path):
+def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path):
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    process = start("train", capture, "-o", stopped, "--iterations", 100_000, "--threads", 1)
+    process = start("train", dataset, "-o", stopped, "--iterations", 100_000, "--threads", 1)
     deadline = time.monotonic() + 60
     while "step" not in (process.stdout.readline() if process.poll() is None else "step"):
         assert time.monotonic() < deadline
@@ -189,11 +189,11 @@ def test_ctrl_c_saves_and_resumes(run, start, capture, tmp_path):
     assert not whole.exists()
 
 
-def test_a_second_ctrl_c_saves_no_half_step(run, capture, tmp_path, monkeypatch):
+def test_a_second_ctrl_c_saves_no_half_step(run, dataset, tmp_path, monkeypatch):
     """What it leaves is as after a kill, and goes on to the same scene."""
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     flags = ("--recipe", "mcmc", *QUICK, "--checkpoint-every", 10)
-    assert run("train", capture, "-o", whole, *flags).code == 0
+    assert run("train", dataset, "-o", whole, *flags).code == 0
     queue_step = Trainer._queue_step
 
     def press_twice(trainer: Trainer, step: int, *rest: object) -> None:
@@ -204,7 +204,7 @@ def test_a_second_ctrl_c_saves_no_half_step(run, capture, tmp_path, monkeypatch)
 
     with monkeypatch.context() as pressing:
         pressing.setattr(Trainer, "_queue_step", press_twice)
-        result = run("train", capture, "-o", stopped, *flags)
+        result = run("train", dataset, "-o", stopped, *flags)
     assert (result.code, result.err) == (130, "snowsplat: stopped by Ctrl-C\n")
     newest = stopped / "checkpoints/step_000020.safetensors"
     assert f"not saved; the last good checkpoint is {newest}," in result.out
@@ -214,40 +214,40 @@ def test_a_second_ctrl_c_saves_no_half_step(run, capture, tmp_path, monkeypatch)
     assert scene(stopped) == scene(whole)
 
 
-def test_resume_refuses_another_training(refused, run, capture, tmp_path):
+def test_resume_refuses_another_training(refused, run, dataset, tmp_path):
     out = tmp_path / "out"
-    assert run("train", capture, "-o", out, *QUICK, "--checkpoint-every", 30).code == 0
+    assert run("train", dataset, "-o", out, *QUICK, "--checkpoint-every", 30).code == 0
     assert "other settings" in refused("train", "-o", out, "--resume", "--seed", 5)
     assert "recipe" in refused("train", "-o", out, "--resume", "--recipe", "paper")
     assert "beyond" in refused("train", "-o", out, "--resume", "--iterations", 10)
-    assert "exclude" in refused("train", capture, "-o", out, "--resume", "--overwrite")
+    assert "exclude" in refused("train", dataset, "-o", out, "--resume", "--overwrite")
     # Nor on other photos than before, or to test on those that it was trained on.
     (tmp_path / "tests.txt").write_text("view_04\n")
     for flags in (["-r", 2], ["--eval"], ["--test-list", tmp_path / "tests.txt"], ["-i", "more"]):
         assert "other settings" in refused("train", "-o", out, "--resume", *flags)
-    moved = shutil.copytree(capture, tmp_path / "moved")
+    moved = shutil.copytree(dataset, tmp_path / "moved")
     assert run("train", moved, "-o", out, "--resume", "-r", 1).code == 0
     before = scene(out)
     assert run("train", "-o", out, "--resume").code == 0  # all is done: the same again
     assert scene(out) == before
 
 
-def test_resume_where_nothing_is(refused, run, capture, tmp_path):
+def test_resume_where_nothing_is(refused, run, dataset, tmp_path):
     out = tmp_path / "out"
     assert "no whole checkpoint" in refused("train", "-o", out, "--resume")
     assert not out.exists()
-    result = run("train", capture, "-o", out, "--resume", *QUICK)
+    result = run("train", dataset, "-o", out, "--resume", *QUICK)
     assert result.code == 0
     assert "no checkpoint yet" in result.out
-    assert "--overwrite" in refused("train", capture, "-o", out, "--resume")
+    assert "--overwrite" in refused("train", dataset, "-o", out, "--resume")
 
 
 def test_resume_with_less_memory_than_its_gaussians_take(refused, run, tmp_path):
     """They stay as many as they are: to say that there are fewer would not make it so."""
-    capture, out = tmp_path / "capture", tmp_path / "out"
-    write_synthetic_capture(capture, "blender", 3, 48, 36)
+    dataset, out = tmp_path / "capture", tmp_path / "out"
+    write_toy_dataset(dataset, "blender", 3, 48, 36)
     flags = ("--recipe", "paper", "--initial-points", 5000, "--checkpoint-every", 2)
-    assert run("train", capture, "-o", out, *flags, "--iterations", 2).code == 0
+    assert run("train", dataset, "-o", out, *flags, "--iterations", 2).code == 0
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     more = ("train", "-o", out, "--resume", "--iterations", 4)
     assert "to go on with 5,000 Gaussians" in refused(*more, "--memory", "70MB", "-q")
@@ -255,10 +255,10 @@ def test_resume_with_less_memory_than_its_gaussians_take(refused, run, tmp_path)
     assert run(*more, "--memory", "80MB").code == 0
 
 
-def test_resume_keeps_no_second_copy_of_the_state(run, capture, tmp_path, monkeypatch):
+def test_resume_keeps_no_second_copy_of_the_state(run, dataset, tmp_path, monkeypatch):
     """That of the checkpoint is no part of what it says that it takes."""
     out, read = tmp_path / "out", []
-    assert run("train", capture, "-o", out, *QUICK, "--checkpoint-every", 20).code == 0
+    assert run("train", dataset, "-o", out, *QUICK, "--checkpoint-every", 20).code == 0
     load, train = checkpoint.latest, TrainingRun.run
 
     def latest(folder: Path) -> checkpoint.Checkpoint:
@@ -279,10 +279,10 @@ def test_resume_keeps_no_second_copy_of_the_state(run, capture, tmp_path, monkey
 # In a given time
 
 
-def test_minutes(run, capture, tmp_path):
+def test_minutes(run, dataset, tmp_path):
     out = tmp_path / "out"
     flags = ("--minutes", 0.05, "--eval", "--checkpoint-every", 40)
-    result = run("train", capture, "-o", out, *flags)
+    result = run("train", dataset, "-o", out, *flags)
     assert result.code == 0, result.err
     lines = result.out.splitlines()
     assert re.fullmatch(r"3.0 s on this machine: 48x36, at most 864 Gaussians, .*steps", lines[1])
@@ -298,10 +298,10 @@ def test_minutes(run, capture, tmp_path):
     assert len(scene(out, step + 50)) > 1000
 
 
-def test_a_stopped_training_keeps_to_its_time(start, run, capture, tmp_path):
+def test_a_stopped_training_keeps_to_its_time(start, run, dataset, tmp_path):
     """What was spent is known, and so is the schedule as it was stretched."""
     out = tmp_path / "out"
-    process = start("train", capture, "-o", out, "--minutes", 2, "--checkpoint-every", 50)
+    process = start("train", dataset, "-o", out, "--minutes", 2, "--checkpoint-every", 50)
     wait_for(out / "checkpoints/step_000200.safetensors", process)
     process.send_signal(signal.SIGKILL)
     process.communicate()
@@ -318,23 +318,23 @@ def test_a_stopped_training_keeps_to_its_time(start, run, capture, tmp_path):
 # Refused
 
 
-def test_places_that_are_taken(refused, run, capture, tmp_path):
+def test_places_that_are_taken(refused, run, dataset, tmp_path):
     out = tmp_path / "out"
     out.write_text("a file")
-    assert "is a file" in refused("train", capture, "-o", out, *QUICK)
+    assert "is a file" in refused("train", dataset, "-o", out, *QUICK)
     out.unlink()
     out.mkdir()
     (out / "thesis.txt").write_text("mine")
-    assert "holds other files" in refused("train", capture, "-o", out, *QUICK)
-    assert "holds other files" in refused("train", capture, "-o", out, *QUICK, "--overwrite")
+    assert "holds other files" in refused("train", dataset, "-o", out, *QUICK)
+    assert "holds other files" in refused("train", dataset, "-o", out, *QUICK, "--overwrite")
     assert files(out) == {"thesis.txt"}
     (out / "thesis.txt").unlink()
-    assert run("train", capture, "-o", out, *QUICK, "--checkpoint-every", 10).code == 0
+    assert run("train", dataset, "-o", out, *QUICK, "--checkpoint-every", 10).code == 0
     before = scene(out)
-    assert "--resume" in refused("train", capture, "-o", out, *QUICK)
+    assert "--resume" in refused("train", dataset, "-o", out, *QUICK)
     assert scene(out) == before
     (out / "notes.txt").write_text("mine")
-    assert run("train", capture, "-o", out, "--iterations", 20, "--overwrite").code == 0
+    assert run("train", dataset, "-o", out, "--iterations", 20, "--overwrite").code == 0
     assert not (out / "checkpoints").exists()
     assert [p.name for p in (out / "point_cloud").iterdir()] == ["iteration_20"]
     assert (out / "notes.txt").read_text() == "mine"
@@ -365,39 +365,39 @@ def test_places_that_are_taken(refused, run, capture, tmp_path):
         (["--test-list", "absent.txt"], "absent.txt"),
     ],
 )
-def test_flags_that_make_no_sense(refused, capture, tmp_path, flags, expected):
-    assert expected in refused("train", capture, "-o", tmp_path / "out", *flags)
+def test_flags_that_make_no_sense(refused, dataset, tmp_path, flags, expected):
+    assert expected in refused("train", dataset, "-o", tmp_path / "out", *flags)
     assert not (tmp_path / "out").exists()
 
 
-def test_bad_captures_write_nothing(refused, capture, tmp_path):
+def test_bad_datasets_write_nothing(refused, dataset, tmp_path):
     out = tmp_path / "out"
     assert "no such folder" in refused("train", tmp_path / "absent", "-o", out)
     (tmp_path / "empty").mkdir()
     refused("train", tmp_path / "empty", "-o", out)
     damaged = tmp_path / "damaged"
-    shutil.copytree(capture, damaged)
+    shutil.copytree(dataset, damaged)
     (damaged / "images/view_03.png").write_bytes(b"not an image")
     assert "view_03.png" in refused("train", damaged, "-o", out)
     # A whole header, then nothing: found out only when the photo's turn comes.
-    photo = (capture / "images/view_03.png").read_bytes()
+    photo = (dataset / "images/view_03.png").read_bytes()
     (damaged / "images/view_03.png").write_bytes(photo[: len(photo) // 2])
     assert "view_03.png" in refused("train", damaged, "-o", out, *QUICK, "-q")
     assert not out.exists()
     model = damaged / "sparse/0/images.bin"
     model.write_bytes(model.read_bytes()[:100])
     refused("train", damaged, "-o", out)
-    assert "needs a capture" in refused("train", "-o", out)
-    assert "add -o" in refused("train", capture)
+    assert "needs a dataset" in refused("train", "-o", out)
+    assert "add -o" in refused("train", dataset)
     assert not out.exists()
 
 
-def test_divergence_names_the_last_good_checkpoint(refused, run, capture, tmp_path):
+def test_divergence_names_the_last_good_checkpoint(refused, run, dataset, tmp_path):
     """And it makes a scene; nothing that diverged is on disk."""
     out = tmp_path / "out"
     # The rate grows 60-fold a step, until single precision has no number for it.
     rates = ["--lr-means-final", 1e40, "--lr-means-steps", 25]
-    line = refused("train", capture, "-o", out, *QUICK, *rates, "--checkpoint-every", 3, "-q")
+    line = refused("train", dataset, "-o", out, *QUICK, *rates, "--checkpoint-every", 3, "-q")
     diverged = int(re.search(r"not finite at step (\d+), .* means \(", line)[1])
     step = diverged // 3 * 3
     path = out / "checkpoints" / f"step_{step:06d}.safetensors"
@@ -407,8 +407,8 @@ def test_divergence_names_the_last_good_checkpoint(refused, run, capture, tmp_pa
     assert read_gaussians(out / f"point_cloud/iteration_{step}/point_cloud.ply").finite_rows().all()
 
 
-def test_divergence_without_a_checkpoint(refused, capture, tmp_path):
+def test_divergence_without_a_checkpoint(refused, dataset, tmp_path):
     out = tmp_path / "out"
-    line = refused("train", capture, "-o", out, "--iterations", 40, "--lr-sh-dc", "inf", "-q")
+    line = refused("train", dataset, "-o", out, "--iterations", 40, "--lr-sh-dc", "inf", "-q")
     assert line.endswith("there is no checkpoint yet")
     assert not out.exists()

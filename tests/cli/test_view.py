@@ -19,10 +19,10 @@ from ..browser import Browser, needs_chromium
 
 
 @pytest.fixture(scope="module")
-def out(capture, tmp_path_factory) -> Path:
+def out(dataset, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("view") / "out"
     flags = ["--iterations", "60", "--save-iterations", "30", "--quiet"]
-    assert main(["train", str(capture), "-o", str(folder), *flags]) == 0
+    assert main(["train", str(dataset), "-o", str(folder), *flags]) == 0
     return folder
 
 
@@ -62,7 +62,7 @@ def test_a_real_browser_at_the_printed_address(start, out):
 @pytest.fixture
 def served(run, monkeypatch):
     """Run the verb up to where it waits: its result, the addresses opened, the site's arguments."""
-    from snowsplat.viewer import static_scene
+    from snowsplat.viewer.web import scene as static_scene
 
     def served(*arguments: object, environment: Sequence[str] = ()):
         for name in ("SSH_CONNECTION", "SSH_TTY", "DISPLAY", "WAYLAND_DISPLAY"):

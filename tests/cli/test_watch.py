@@ -10,21 +10,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat import checkpoint
-from snowsplat.cli.output import OutputFolder
 from snowsplat.cli.watch import NewestScene, Watch
-from snowsplat.errors import UserError
-from snowsplat.viewer.network.server import free_port
+from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.training import checkpoint
+from snowsplat.util.errors import UserError
+from snowsplat.viewer.live.server import free_port
 
 
 @pytest.fixture(scope="module")
-def trained(capture, tmp_path_factory) -> Path:
+def trained(dataset, tmp_path_factory) -> Path:
     """Checkpoints of step 20 and 40, scenes of 20 and 50."""
     from snowsplat.cli.main import main
 
     out = tmp_path_factory.mktemp("watch") / "out"
     flags = ["--iterations", "50", "--checkpoint-every", "20", "--save-iterations", "20", "-q"]
-    assert main(["train", str(capture), "-o", str(out), *flags]) == 0
+    assert main(["train", str(dataset), "-o", str(out), *flags]) == 0
     return out
 
 
@@ -106,30 +106,30 @@ def test_watch_refuses(refused, trained, tmp_path):
     assert "--host 192.0.2.1" in refused("watch", trained, "--host", "192.0.2.1")
 
 
-def test_a_port_that_is_taken(refused, trained, capture, tmp_path):
+def test_a_port_that_is_taken(refused, trained, dataset, tmp_path):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()
         port = listener.getsockname()[1]
         assert f"port {port} is taken" in refused("watch", trained, "--port", port)
         out = tmp_path / "out"
-        line = refused("train", capture, "-o", out, "--view", "--port", port)
+        line = refused("train", dataset, "-o", out, "--view", "--port", port)
         assert f"port {port} is taken" in line
-        line = refused("make", capture / "images", "-o", out, "--view", "--port", port)
+        line = refused("make", dataset / "images", "-o", out, "--view", "--port", port)
         assert f"port {port} is taken" in line
         assert not out.exists()
 
 
-def test_a_place_without_a_page(refused, capture, tmp_path):
+def test_a_place_without_a_page(refused, dataset, tmp_path):
     for flags in (["--port", 9000], ["--host", "0.0.0.0"]):
-        assert "add --view" in refused("train", capture, "-o", tmp_path / "out", *flags)
-        assert "add --view" in refused("make", capture / "images", "-o", tmp_path / "out", *flags)
+        assert "add --view" in refused("train", dataset, "-o", tmp_path / "out", *flags)
+        assert "add --view" in refused("make", dataset / "images", "-o", tmp_path / "out", *flags)
 
 
-def test_the_page_of_a_training_stays_until_ctrl_c(start, run, capture, tmp_path):
+def test_the_page_of_a_training_stays_until_ctrl_c(start, run, dataset, tmp_path):
     viewed, plain = tmp_path / "viewed", tmp_path / "plain"
     port = free_port("127.0.0.1", None)
-    process = start("train", capture, "-o", viewed, "--iterations", 30, "--view", "--port", port)
+    process = start("train", dataset, "-o", viewed, "--iterations", 30, "--view", "--port", port)
     url = url_of(process)
     while not (line := process.stdout.readline()).startswith("the scene stays at"):
         assert line
@@ -137,7 +137,7 @@ def test_the_page_of_a_training_stays_until_ctrl_c(start, run, capture, tmp_path
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
-    assert run("train", capture, "-o", plain, "--iterations", 30).code == 0
+    assert run("train", dataset, "-o", plain, "--iterations", 30).code == 0
     name = "point_cloud/iteration_30/point_cloud.ply"
     assert (viewed / name).read_bytes() == (plain / name).read_bytes()
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat.camera import Camera
-from snowsplat.errors import UserError
 from snowsplat.formats import format_for_reading, read_gaussians
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.geometry import look_at
-from snowsplat.render import render
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.geometry import look_at
+from snowsplat.scene.render import render
+from snowsplat.util.errors import UserError
 
 Make = Callable[..., Gaussians]
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from snowsplat.formats import format_for_reading, read_gaussians, write_gaussians
-from snowsplat.gaussians import SH_C0, Gaussians
-from snowsplat.geometry import morton_order
+from snowsplat.scene.gaussians import SH_C0, Gaussians
+from snowsplat.scene.geometry import morton_order
 
 BOUNDS = [f"{e}_{k}{a}" for k in ("", "scale_") for e in ("min", "max") for a in "xyz"]
 COLORS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]

@@ -13,11 +13,11 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from snowsplat.errors import UserError
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import Header, pack, unpack
-from snowsplat.gaussians import Gaussians
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.errors import UserError
 
 EXAMPLES = int(os.environ.get("SNOWSPLAT_FUZZ", "0"))
 QUIET = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]

@@ -5,11 +5,11 @@ import itertools
 import pytest
 import torch
 
-from snowsplat.camera import Camera
 from snowsplat.formats.frames import UP_BACK, flip_axes
-from snowsplat.gaussians import Gaussians
-from snowsplat.geometry import look_at
-from snowsplat.render import render
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import look_at
+from snowsplat.scene.render import render
 
 
 def flipped(scene: Gaussians, signs: tuple[int, int, int]) -> Gaussians:

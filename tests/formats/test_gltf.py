@@ -10,9 +10,9 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 
-from snowsplat import edit
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.geometry import Similarity, rotation_from_quat
+from snowsplat.scene import edit
+from snowsplat.scene.geometry import Similarity, rotation_from_quat
 
 from . import json_damage
 

@@ -9,9 +9,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from snowsplat.errors import UserError
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.gaussians import Gaussians
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.errors import UserError
 
 BLOCK, SPAN = 5.0, 32767
 LOW, HIGH = -0.75, 0.5

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.errors import UserError
 from snowsplat.formats import ply, read_gaussians, write_gaussians
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.util.errors import UserError
 
 REFERENCE = Path(__file__).parents[2].parent / "shared/splats/reference_layout_sh3.ply"
 

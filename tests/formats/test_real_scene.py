@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from snowsplat.camera import Camera
-from snowsplat.evaluate import psnr
+from snowsplat.evaluation.metrics import psnr
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
-from snowsplat.geometry import look_at
-from snowsplat.render import render
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import look_at
+from snowsplat.scene.render import render
 
 #: What the picture must keep, in dB; .splat has no colour that depends on the direction.
 LEAST = {"splat": 25.0}

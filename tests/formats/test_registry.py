@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat.errors import UserError
 from snowsplat.formats import (
     FORMATS,
     format_for_reading,
@@ -13,7 +12,8 @@ from snowsplat.formats import (
     read_gaussians,
     write_gaussians,
 )
-from snowsplat.gaussians import Gaussians
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.errors import UserError
 
 
 def one() -> Gaussians:

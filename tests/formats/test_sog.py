@@ -15,7 +15,7 @@ from PIL import Image
 
 from snowsplat.formats import read_gaussians, sog, write_gaussians
 from snowsplat.formats.codebooks import palette_for
-from snowsplat.geometry import morton_order
+from snowsplat.scene.geometry import morton_order
 
 from . import json_damage
 

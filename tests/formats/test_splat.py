@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.gaussians import SH_C0, Gaussians
+from snowsplat.scene.gaussians import SH_C0, Gaussians
 
 
 def importance(g: Gaussians) -> torch.Tensor:

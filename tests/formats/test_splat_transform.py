@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from snowsplat.edit import transform
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.frames import UP_BACK, flip_axes
 from snowsplat.formats.spz import write_spz
-from snowsplat.gaussians import Gaussians
-from snowsplat.geometry import Similarity, rotation_from_quat
+from snowsplat.scene.edit import transform
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import Similarity, rotation_from_quat
 
 
 def assert_same(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:

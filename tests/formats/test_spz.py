@@ -10,7 +10,7 @@ import zstandard
 
 from snowsplat.formats import format_for_reading, read_gaussians, write_gaussians
 from snowsplat.formats.spz import write_spz
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 
 
 def head(version: int, count: int, degree: int, bits: int = 12, flags: int = 0, streams: int = 0):

@@ -11,7 +11,7 @@ import torch
 
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.spz import write_spz
-from snowsplat.gaussians import Gaussians
+from snowsplat.scene.gaussians import Gaussians
 
 NODE = Path(__file__).parents[1] / "node"
 

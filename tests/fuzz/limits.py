@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 SECONDS = 10.0
 MEMORY, RATIO = 64 << 20, 4  # bytes, and for each byte of the file and of what is read from it

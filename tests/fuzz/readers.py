@@ -25,31 +25,32 @@ import torch
 from PIL import Image
 from pillow_heif import register_heif_opener
 
-from snowsplat import checkpoint
-from snowsplat.camera_list import read_cameras, write_cameras
-from snowsplat.capture import load_capture
-from snowsplat.capture.decode import ImageSource, load_image, load_mask
-from snowsplat.capture.decode import read_header as read_image_header
-from snowsplat.capture.points_ply import read_points, write_points
-from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.cli.info import describe
-from snowsplat.cli.output import CaptureSettings, OutputFolder
-from snowsplat.config import TrainConfig
-from snowsplat.errors import UserError
+from snowsplat.data import load_dataset
+from snowsplat.data.decode import ImageSource, load_image, load_mask
+from snowsplat.data.decode import read_header as read_image_header
+from snowsplat.data.points_ply import read_points, write_points
+from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import unpack
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.history import History
-from snowsplat.lpips import Lpips
-from snowsplat.photos import capture_folder, clip, mask_files, photo_files, video
-from snowsplat.photos.inputs import Gathered
-from snowsplat.photos.photo import Photo
-from snowsplat.photos.progress import silent
-from snowsplat.photos.stages import Stages
+from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
+from snowsplat.scene.camera_json import read_cameras, write_cameras
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.sfm import pipeline as capture_folder
+from snowsplat.sfm.ingest import clip, mask_files, photo_files, video
+from snowsplat.sfm.ingest.inputs import Gathered
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.progress import silent
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training import checkpoint
+from snowsplat.training.config import TrainConfig
+from snowsplat.training.history import History
+from snowsplat.util.errors import UserError
+from snowsplat.util.stages import Stages
 
 from ..formats.test_ksplat import ksplat, section
-from ..photos.pictures import exif, pan, photo, write_video
+from ..sfm.pictures import exif, pan, photo, write_video
 
 _IMAGE_BYTES = 16  # of memory for each pixel, while an image is decoded
 _FRAME_BYTES = 96  # of a video: frames that follow each other are decoded at once
@@ -217,21 +218,21 @@ def _reads(file: str) -> Callable[[Path], Any]:
     return lambda folder: read_gaussians(folder / file)
 
 
-# Captures
+# Datasets
 
 
-def _capture(format: str, file: str, **more: Any) -> Reader:
+def _dataset(format: str, file: str, **more: Any) -> Reader:
     def make(folder: Path) -> None:
-        write_synthetic_capture(folder, format, 5, 32, 24, n_points=20)  # type: ignore[arg-type]
+        write_toy_dataset(folder, format, 5, 32, 24, n_points=20)  # type: ignore[arg-type]
 
     def read(folder: Path) -> Any:
-        return load_capture(folder)
+        return load_dataset(folder)
 
     return Reader(f"capture {format}, its {Path(file).name}", file, make, read, **more)
 
 
 def _test_list(folder: Path) -> None:
-    write_synthetic_capture(folder, "colmap-bin", 5, 32, 24, n_points=20)
+    write_toy_dataset(folder, "colmap-bin", 5, 32, 24, n_points=20)
     names = sorted(path.name for path in (folder / "images").iterdir())
     (folder / "test.txt").write_text("\n".join(names[:2]))
 
@@ -376,10 +377,10 @@ def _video(name: str, file: str, **options: Any) -> Reader:
 
 
 def _output(folder: Path) -> OutputFolder:
-    write_synthetic_capture(folder / "capture", "colmap-bin", 5, 32, 24, n_points=20)
-    capture = load_capture(folder / "capture")
+    write_toy_dataset(folder / "capture", "colmap-bin", 5, 32, 24, n_points=20)
+    dataset = load_dataset(folder / "capture")
     out = OutputFolder(folder / "out")
-    out.begin(capture, CaptureSettings(str(folder / "capture")), TrainConfig())
+    out.begin(dataset, DatasetSettings(str(folder / "capture")), TrainConfig())
     out.write_scene(7, make_scene(5, 0))
     figures = {"iteration": 7, "split": "test", "psnr": 20.5, "ssim": 0.9, "views": {"a": 1.0}}
     (out.path / "metrics.json").write_text(json.dumps(figures))
@@ -402,11 +403,11 @@ def _make_cfg_args(folder: Path) -> None:
 
 
 def _make_checkpoint(folder: Path) -> None:
-    from snowsplat.config import config_to_json
+    from snowsplat.training.config import config_to_json
 
     tensors = {"means": torch.rand(7, 3), "order": torch.arange(5), "none": torch.zeros(0, 3)}
     meta = {
-        "capture": asdict(CaptureSettings("x")),
+        "capture": asdict(DatasetSettings("x")),
         "recipe": "default",
         "training": config_to_json(TrainConfig()),
         "time": {"seconds": 60.0, "spent": 3.0},
@@ -457,8 +458,8 @@ def _make_lpips(folder: Path) -> None:
 
 
 def _make_cameras(folder: Path) -> None:
-    write_synthetic_capture(folder / "c", "colmap-bin", 3, 32, 24, n_points=20)
-    views = load_capture(folder / "c", hold_out=None).train
+    write_toy_dataset(folder / "c", "colmap-bin", 3, 32, 24, n_points=20)
+    views = load_dataset(folder / "c", hold_out=None).train
     write_cameras(folder / "cameras.json", [(view.name, view.camera) for view in views])
 
 
@@ -481,12 +482,12 @@ READERS: tuple[Reader, ...] = (
     _scene("a.glb"),
     Reader("scene glb, its JSON", "a.glb", _make_glb_json, _reads("a.glb"), True, _glb_json),
     Reader("points a.ply", "a.ply", _make_points, lambda folder: read_points(folder / "a.ply")),
-    *(_capture("colmap-bin", f"sparse/0/{part}.bin") for part in ("cameras", "images", "points3D")),
-    *(_capture("colmap-txt", f"sparse/0/{part}.txt") for part in ("cameras", "images", "points3D")),
-    _capture("blender", "transforms_train.json", json=True),
+    *(_dataset("colmap-bin", f"sparse/0/{part}.bin") for part in ("cameras", "images", "points3D")),
+    *(_dataset("colmap-txt", f"sparse/0/{part}.txt") for part in ("cameras", "images", "points3D")),
+    _dataset("blender", "transforms_train.json", json=True),
     Reader(
         *("list of test images", "test.txt", _test_list),
-        lambda folder: load_capture(folder, test_list=folder / "test.txt"),
+        lambda folder: load_dataset(folder, test_list=folder / "test.txt"),
     ),
     *(_image(kind, ending, "image", _read_image) for kind, ending in IMAGES.items()),
     *(_image(kind, end, "photo", _read_photo) for kind, end in (IMAGES | {"heic": "heic"}).items()),

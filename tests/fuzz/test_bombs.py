@@ -19,24 +19,25 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from snowsplat import checkpoint
-from snowsplat.camera_list import read_cameras
-from snowsplat.capture import load_capture
-from snowsplat.capture.decode import ImageSource, load_image, read_header
-from snowsplat.capture.synthetic import write_synthetic_capture
-from snowsplat.cli.output import OutputFolder
-from snowsplat.errors import UserError
+from snowsplat.data import load_dataset
+from snowsplat.data.decode import ImageSource, load_image, read_header
+from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.spz_container import Header, pack
-from snowsplat.history import History
-from snowsplat.lpips import Lpips
-from snowsplat.photos import capture_folder, photo_files
-from snowsplat.photos.clip import is_video, read_clip
-from snowsplat.photos.sfm.result import describe_model
-from snowsplat.photos.stages import Stages
+from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.scene.camera_json import read_cameras
+from snowsplat.sfm import pipeline as capture_folder
+from snowsplat.sfm.colmap.result import describe_model
+from snowsplat.sfm.ingest import photo_files
+from snowsplat.sfm.ingest.clip import is_video, read_clip
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training import checkpoint
+from snowsplat.training.history import History
+from snowsplat.util.errors import UserError
+from snowsplat.util.stages import Stages
 
-from ..photos.conftest import make_model
-from ..photos.pictures import pan, write_video
+from ..sfm.conftest import make_model
+from ..sfm.pictures import pan, write_video
 from .limits import guarded
 from .readers import make_scene
 
@@ -300,16 +301,16 @@ def test_ply_of_one_endless_line(tmp_path, refused):
     assert "far too long" in refused(lambda: read_gaussians(path))
 
 
-# Captures
+# Datasets
 
 
 @pytest.fixture
-def capture(tmp_path):
-    """A function that makes a capture in ``home``; a picture lies outside of it."""
+def dataset(tmp_path):
+    """A function that makes a dataset in ``home``; a picture lies outside of it."""
 
     def make(format: str) -> Path:
         home = tmp_path / "home"
-        write_synthetic_capture(home, format, 5, 32, 24, n_points=20)
+        write_toy_dataset(home, format, 5, 32, 24, n_points=20)
         (tmp_path / "secret.png").write_bytes(next(home.rglob("*.png")).read_bytes())
         return home
 
@@ -323,76 +324,76 @@ def outside(tmp_path: Path) -> list[str]:
 
 @pytest.mark.parametrize("number", range(3))
 @pytest.mark.parametrize("format", ["colmap-bin", "colmap-txt"])
-def test_colmap_that_names_an_image_elsewhere(tmp_path, refused, capture, format, number):
-    home = capture(format)
+def test_colmap_that_names_an_image_elsewhere(tmp_path, refused, dataset, format, number):
+    home = dataset(format)
     name = ["../../secret.png", str(tmp_path / "secret.png"), "a/../../../secret.png"][number]
     model = home / "sparse/0" / f"images.{format[-3:]}"
     model.write_bytes(model.read_bytes().replace(b"view_02.png", name.encode()))
-    assert "which is not in" in refused(lambda: load_capture(home))
+    assert "which is not in" in refused(lambda: load_dataset(home))
 
 
 @pytest.mark.parametrize("number", range(4))
 @pytest.mark.parametrize("key", ["file_path", "mask_path"])
-def test_transforms_that_name_a_file_elsewhere(tmp_path, refused, capture, key, number):
-    home = capture("blender")
+def test_transforms_that_name_a_file_elsewhere(tmp_path, refused, dataset, key, number):
+    home = dataset("blender")
     path = home / "transforms_train.json"
     scene = json.loads(path.read_text())
     scene["frames"][1][key] = outside(tmp_path)[number]
     path.write_text(json.dumps(scene))
     if (key, number) == ("mask_path", 3):  # taken as a name in the folder, where there is none
-        assert "which is absent" in refused(lambda: load_capture(home))
+        assert "which is absent" in refused(lambda: load_dataset(home))
         return
-    assert "which is not in the folder" in refused(lambda: load_capture(home))
+    assert "which is not in the folder" in refused(lambda: load_dataset(home))
 
 
-def test_transforms_that_name_points_elsewhere(tmp_path, refused, capture):
-    home = capture("blender")
+def test_transforms_that_name_points_elsewhere(tmp_path, refused, dataset):
+    home = dataset("blender")
     path = home / "transforms_train.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "../a.ply"}))
-    assert "which is not in the folder" in refused(lambda: load_capture(home))
+    assert "which is not in the folder" in refused(lambda: load_dataset(home))
 
 
-def test_an_absolute_path_that_stays_inside_is_one_of_the_capture(capture):
-    home = capture("blender")
+def test_an_absolute_path_that_stays_inside_is_one_of_the_dataset(dataset):
+    home = dataset("blender")
     path = home / "transforms_train.json"
     scene = json.loads(path.read_text())
     for frame in scene["frames"]:
         frame["file_path"] = str((home / frame["file_path"]).absolute())
     path.write_text(json.dumps(scene))
-    assert len(load_capture(home, hold_out=None).train) == 5
+    assert len(load_dataset(home, hold_out=None).train) == 5
 
 
-def test_colmap_text_of_one_endless_line(tmp_path, refused, capture):
-    home = capture("colmap-txt")
+def test_colmap_text_of_one_endless_line(tmp_path, refused, dataset):
+    home = dataset("colmap-txt")
     images = home / "sparse/0/images.txt"
     images.write_text("1 1 0 0 0 0 0 0 1 a.png\n" + "1 " * 10_000_000 + "\n")
-    assert "should be its observations" in refused(lambda: load_capture(home))
+    assert "should be its observations" in refused(lambda: load_dataset(home))
     cameras = home / "sparse/0/cameras.txt"
     cameras.write_text("1 PINHOLE " + "1 " * 10_000_000)
-    assert "damaged" in refused(lambda: load_capture(home))
-    write_synthetic_capture(home, "colmap-txt", 5, 32, 24, n_points=20)
+    assert "damaged" in refused(lambda: load_dataset(home))
+    write_toy_dataset(home, "colmap-txt", 5, 32, 24, n_points=20)
     cameras.write_text(cameras.read_text().replace("PINHOLE", "x" * 100_000))
-    assert "lens distortion" in refused(lambda: load_capture(home))
+    assert "lens distortion" in refused(lambda: load_dataset(home))
 
 
-def test_colmap_of_countless_images(tmp_path, refused, capture):
-    home = capture("colmap-txt")
+def test_colmap_of_countless_images(tmp_path, refused, dataset):
+    home = dataset("colmap-txt")
     (home / "sparse/0/images.txt").write_text("1 1 0 0 0 0 0 0 1 a\n\n" * 600_000)
-    assert "more than 200,000 images" in refused(lambda: load_capture(home))
+    assert "more than 200,000 images" in refused(lambda: load_dataset(home))
 
 
-def test_colmap_points_of_many_lines_take_little_memory(tmp_path, capture):
-    home = capture("colmap-txt")
+def test_colmap_points_of_many_lines_take_little_memory(tmp_path, dataset):
+    home = dataset("colmap-txt")
     points = home / "sparse/0/points3D.txt"
     points.write_text("1 0 1 0 9 9 9 0\n" * 1_500_000)
-    found = guarded(lambda: load_capture(home), tmp_path, points.stat().st_size)
+    found = guarded(lambda: load_dataset(home), tmp_path, points.stat().st_size)
     assert len(found.points) == 1_500_000
 
 
-def test_a_list_of_test_images_that_is_a_pipe(tmp_path, refused, capture):
-    home = capture("colmap-bin")
+def test_a_list_of_test_images_that_is_a_pipe(tmp_path, refused, dataset):
+    home = dataset("colmap-bin")
     os.mkfifo(home / "test.txt")
-    assert "no file" in refused(lambda: load_capture(home, test_list=home / "test.txt"))
+    assert "no file" in refused(lambda: load_dataset(home, test_list=home / "test.txt"))
 
 
 # Photos and videos
@@ -493,7 +494,7 @@ def test_json_of_any_kind(tmp_path, refused, text):
     (out / "config.json").write_text(text)
     refused(lambda: read_cameras(path))
     refused(lambda: Stages(path, capture_folder.STAGES))
-    refused(lambda: load_capture(path))
+    refused(lambda: load_dataset(path))
     refused(lambda: OutputFolder(out).settings())
     empty = guarded(lambda: History.read(path, 9), tmp_path, path.stat().st_size)
     assert empty.stretches == []
@@ -517,7 +518,7 @@ def test_json_of_any_kind(tmp_path, refused, text):
 def test_cfg_args_that_is_a_program(tmp_path, refused, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cfg_args").write_text(text)
-    assert "does not name the capture" in refused(lambda: OutputFolder(tmp_path).settings())
+    assert "does not name the dataset" in refused(lambda: OutputFolder(tmp_path).settings())
     assert not (tmp_path / "ran").exists()
 
 
@@ -602,12 +603,12 @@ def test_a_record_of_stages_that_was_edited(tmp_path, caplog):
         run()
 
 
-def test_an_image_list_does_not_grow_with_what_is_logged(tmp_path, caplog, capture):
+def test_an_image_list_does_not_grow_with_what_is_logged(tmp_path, caplog, dataset):
     """Names of images stand in warnings and errors, but not megabytes of them."""
-    home = capture("colmap-txt")
+    home = dataset("colmap-txt")
     images = home / "sparse/0/images.txt"
     images.write_text(images.read_text() + "9 1 0 0 0 0 0 0 1 " + "x" * 100_000 + "\n\n")
     with caplog.at_level(logging.WARNING):
-        assert len(load_capture(home, hold_out=None).train) == 5
+        assert len(load_dataset(home, hold_out=None).train) == 5
     assert max(len(record.getMessage()) for record in caplog.records) < 1000
-    assert np.isfinite(load_capture(home).extent)
+    assert np.isfinite(load_dataset(home).extent)

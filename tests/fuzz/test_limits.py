@@ -7,7 +7,7 @@ import time
 import pytest
 import torch
 
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 from .limits import MEMORY, Broken, guarded
 

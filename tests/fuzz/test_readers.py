@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 from .damage import KINDS, damaged, damaged_json
 from .limits import guarded

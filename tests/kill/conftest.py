@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from snowsplat.capture.synthetic import write_synthetic_capture
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
-from ..photos.sfm import scenes
+from ..sfm.colmap import scenes
 from .harness import Zygote
 
 if sys.platform != "linux":
@@ -17,10 +17,10 @@ if sys.platform != "linux":
 
 
 @pytest.fixture(scope="session")
-def capture(tmp_path_factory) -> Path:
+def dataset(tmp_path_factory) -> Path:
     """9 views, 48×36; not to be changed."""
     root = tmp_path_factory.mktemp("kill")
-    return write_synthetic_capture(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
+    return write_toy_dataset(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 @pytest.fixture(scope="session")

@@ -29,12 +29,12 @@ import torch
 from PIL import Image
 
 import snowsplat
-from snowsplat import checkpoint
-from snowsplat.capture.colmap_files import ColmapImage, read_model, read_points
+from snowsplat.data.colmap_files import ColmapImage, read_model, read_points
 from snowsplat.formats import read_gaussians
-from snowsplat.gaussians import Gaussians
-from snowsplat.geometry import rotation_from_quat
-from snowsplat.ply_table import open_table
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.training import checkpoint
+from snowsplat.util.ply import open_table
 
 _MOST_DEFECTS = 20
 _SOURCE = str(Path(snowsplat.__file__).parents[1])
@@ -439,7 +439,7 @@ _PLAIN = (
 )
 
 
-def train_jobs(capture: Path) -> list[Job]:
+def train_jobs(dataset: Path) -> list[Job]:
     """With checkpoints, then --resume; with --memory; with --minutes; over an older training."""
 
     def check_same(output: Path, whole: Path) -> None:
@@ -468,20 +468,20 @@ def train_jobs(capture: Path) -> list[Job]:
 
     def plain(*more: object) -> Callable[[Path, bool], list[object]]:
         def command(output: Path, again: bool) -> list[object]:
-            return ["train", capture, "-o", output, *_PLAIN, *more, *(["--resume"] * again)]
+            return ["train", dataset, "-o", output, *_PLAIN, *more, *(["--resume"] * again)]
 
         return command
 
     def timed(output: Path, again: bool) -> list[object]:
-        words = ["train", capture, "-o", output, "--minutes", 0.05, "--eval", "--device", "cpu"]
+        words = ["train", dataset, "-o", output, "--minutes", 0.05, "--eval", "--device", "cpu"]
         return [*words, "--checkpoint-every", 5, "--threads", 1, *(["--resume"] * again)]
 
     def replacing(output: Path, _: bool) -> list[object]:
-        return ["train", capture, "-o", output, *_PLAIN, "--overwrite"]
+        return ["train", dataset, "-o", output, *_PLAIN, "--overwrite"]
 
     def older(output: Path) -> None:
         """What a training of other settings leaves."""
-        shutil.copytree(_older_training(output.parents[1], capture), output)
+        shutil.copytree(_older_training(output.parents[1], dataset), output)
 
     return [
         Job("train", "train", "out", plain(), check_same),
@@ -491,10 +491,10 @@ def train_jobs(capture: Path) -> list[Job]:
     ]
 
 
-def _older_training(folder: Path, capture: Path) -> Path:
+def _older_training(folder: Path, dataset: Path) -> Path:
     out = folder / "older"
     if not out.exists():
-        words = ["train", capture, "-o", out, "--iterations", 25, "--checkpoint-every", 5]
+        words = ["train", dataset, "-o", out, "--iterations", 25, "--checkpoint-every", 5]
         subprocess.run(
             [sys.executable, "-m", "snowsplat", *map(str, words), "--device", "cpu", "--quiet"],
             env={**os.environ, "PYTHONPATH": _SOURCE},
@@ -504,13 +504,13 @@ def _older_training(folder: Path, capture: Path) -> Path:
     return out
 
 
-def capture_jobs(photos: Path) -> list[Job]:
+def sfm_jobs(photos: Path) -> list[Job]:
     """From photos, with smaller copies."""
 
     def command(output: Path, _: bool) -> list[object]:
         return ["capture", photos, "-o", output, "--quality", "draft", "--threads", 1, "--resize"]
 
-    return [Job("capture", "capture", "garden", command, _check_capture)]
+    return [Job("capture", "capture", "garden", command, _check_dataset)]
 
 
 def make_jobs(photos: Path) -> list[Job]:
@@ -523,7 +523,7 @@ def make_jobs(photos: Path) -> list[Job]:
     def check_done(output: Path, whole: Path) -> None:
         if names_in(output) != names_in(whole):
             raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
-        _check_capture(output / "capture", whole / "capture")
+        _check_dataset(output / "capture", whole / "capture")
         record = json.loads((output / "make.json").read_text())
         if list(record["stages"]) != ["scene", "pictures"]:
             raise Defect("stages are not finished")
@@ -535,7 +535,7 @@ def make_jobs(photos: Path) -> list[Job]:
     return [Job("make", "make", "made", command, check_done)]
 
 
-def _check_capture(output: Path, whole: Path) -> None:
+def _check_dataset(output: Path, whole: Path) -> None:
     """The same files, and the same cameras but for rounding."""
     if names_in(output) != names_in(whole):
         raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")

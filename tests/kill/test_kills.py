@@ -8,16 +8,16 @@ import signal
 
 import pytest
 
-from snowsplat import checkpoint
 from snowsplat.formats import write_gaussians
+from snowsplat.training import checkpoint
 
 from .harness import (
     Killer,
-    capture_jobs,
     convert_jobs,
     digest,
     make_jobs,
     names_in,
+    sfm_jobs,
     some_gaussians,
     train_jobs,
 )
@@ -35,13 +35,13 @@ def test_convert(killer, tmp_path):
 
 
 @pytest.mark.slow
-def test_train(killer, capture):
-    assert not killer.kill(train_jobs(capture), 4)
+def test_train(killer, dataset):
+    assert not killer.kill(train_jobs(dataset), 4)
 
 
 @pytest.mark.slow
-def test_capture(killer, photos):
-    assert not killer.kill(capture_jobs(photos), 3)
+def test_dataset(killer, photos):
+    assert not killer.kill(sfm_jobs(photos), 3)
 
 
 @pytest.mark.slow
@@ -49,10 +49,10 @@ def test_make(killer, photos):
     assert not killer.kill(make_jobs(photos), 3)
 
 
-def test_train_at_its_very_beginning(zygote, capture):
+def test_train_at_its_very_beginning(zygote, dataset):
     """Before each of the first changes of files: the folder is ours from the first one on."""
     out = zygote.folder / "begun"
-    command = ["train", capture, "-o", out, "--iterations", 3, "--device", "cpu", "--threads", 1]
+    command = ["train", dataset, "-o", out, "--iterations", 3, "--device", "cpu", "--threads", 1]
     for at in range(1, 8):
         ended = zygote.run([*command, "--resume"], at=at)
         assert ended.killed, ended.text
@@ -61,10 +61,10 @@ def test_train_at_its_very_beginning(zygote, capture):
     assert not list(out.rglob("*.tmp"))
 
 
-def test_a_scene_that_a_kill_prevented(zygote, capture, tmp_path):
+def test_a_scene_that_a_kill_prevented(zygote, dataset, tmp_path):
     """Killed between the checkpoint of step 20 and the scene of step 20."""
     out = tmp_path / "out"
-    command = ["train", capture, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
+    command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
     command += ["--save-iterations", 20, "--device", "cpu", "--threads", 1]
     assert zygote.run(command).code == 0
     early = out / "point_cloud/iteration_20/point_cloud.ply"
@@ -76,10 +76,10 @@ def test_a_scene_that_a_kill_prevented(zygote, capture, tmp_path):
     assert digest(early) == whole
 
 
-def test_an_old_checkpoint_that_a_kill_left(zygote, capture, tmp_path):
+def test_an_old_checkpoint_that_a_kill_left(zygote, dataset, tmp_path):
     """Killed between the last checkpoint and the removal of the one before the one before it."""
     out = tmp_path / "out"
-    command = ["train", capture, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
+    command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
     command += ["--device", "cpu", "--threads", 1]
     assert zygote.run(command).code == 0
     kept = names_in(out / "checkpoints")
@@ -92,9 +92,9 @@ def test_an_old_checkpoint_that_a_kill_left(zygote, capture, tmp_path):
     assert names_in(out / "checkpoints") == kept
 
 
-def test_damaged_checkpoints_are_not_begun_over(zygote, capture, tmp_path):
+def test_damaged_checkpoints_are_not_begun_over(zygote, dataset, tmp_path):
     out = tmp_path / "out"
-    command = ["train", capture, "-o", out, "--iterations", 20, "--checkpoint-every", 10]
+    command = ["train", dataset, "-o", out, "--iterations", 20, "--checkpoint-every", 10]
     command += ["--device", "cpu", "--threads", 1]
     assert zygote.run(command).code == 0
     shutil.rmtree(out / "point_cloud")
@@ -107,10 +107,10 @@ def test_damaged_checkpoints_are_not_begun_over(zygote, capture, tmp_path):
     assert {name: (out / name).read_bytes() for name in names_in(out)} == before
 
 
-def test_a_training_with_a_time_that_took_more_steps_than_planned(zygote, capture, tmp_path):
+def test_a_training_with_a_time_that_took_more_steps_than_planned(zygote, dataset, tmp_path):
     """The checkpoint at its end is beyond the plan that is written in it."""
     out = tmp_path / "out"
-    command = ["train", capture, "-o", out, "--minutes", 0.02, "--checkpoint-every", 5]
+    command = ["train", dataset, "-o", out, "--minutes", 0.02, "--checkpoint-every", 5]
     command += ["--device", "cpu", "--threads", 1]
     assert zygote.run(command).code == 0
     newest = checkpoint.latest(out / "checkpoints")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat import checkpoint
+from snowsplat.training import checkpoint
 
 from .harness import Ended, Zygote, check_whole, digest, leftovers, names_in
 
@@ -20,11 +20,11 @@ CPU = ("--device", "cpu", "--threads", 1)
 
 
 @pytest.fixture(scope="module")
-def trained(zygote, capture) -> Path:
+def trained(zygote, dataset) -> Path:
     """With checkpoints of steps 20 and 30; not to be changed."""
     out = zygote.folder / "trained"
     ended = zygote.run(
-        ["train", capture, "-o", out, "--iterations", 30, "--checkpoint-every", 10, "--eval", *CPU]
+        ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10, "--eval", *CPU]
     )
     assert ended.code == 0, ended.text
     return out
@@ -81,12 +81,12 @@ def refused(ended: Ended, pattern: str) -> None:
     assert re.search(pattern, lines[0]), lines[0]
 
 
-def commands(place: Path, trained: Path, capture: Path, photos: Path) -> dict[str, list[object]]:
+def commands(place: Path, trained: Path, dataset: Path, photos: Path) -> dict[str, list[object]]:
     """One a verb, which writes below ``place``; ``place``/trained is a training."""
     output = place / "trained"
     return {
         "convert": ["convert", trained, place / "a.html"],
-        "train": ["train", capture, "-o", place / "t", "--iterations", 9, *CPU],
+        "train": ["train", dataset, "-o", place / "t", "--iterations", 9, *CPU],
         "resume": ["train", "-o", output, "--resume", "--iterations", 60, *CPU],
         "render": ["render", output, *CPU],
         "film": ["render", output, "--path", "ellipse", "--seconds", 0.2, *CPU],
@@ -103,24 +103,24 @@ VERBS = ["convert", "train", "resume", "render", "film", "evaluate", "capture", 
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_read_only_folder(verb, zygote, place, trained, capture, photos):
+def test_a_read_only_folder(verb, zygote, place, trained, dataset, photos):
     shutil.copytree(trained, place / "trained")
     before = {name: digest(place / name) for name in names_in(place)}
     with read_only(place):
-        ended = zygote.run(commands(place, trained, capture, photos)[verb])
+        ended = zygote.run(commands(place, trained, dataset, photos)[verb])
     refused(ended, rf"{place}\S*: Read-only file system")
     assert {name: digest(place / name) for name in names_in(place)} == before
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_full_disk(verb, zygote, place, trained, capture, photos):
+def test_a_full_disk(verb, zygote, place, trained, dataset, photos):
     # What is there fits, and hardly more.
     used = sum((trained / name).stat().st_size // 4096 + 1 for name in names_in(trained)) * 4
     with full(place, used + 60 + 4 * len(names_in(trained))):
         shutil.copytree(trained, place / "trained")
         fill(place)
         before = {name: digest(place / name) for name in names_in(place)}
-        ended = zygote.run(commands(place, trained, capture, photos)[verb])
+        ended = zygote.run(commands(place, trained, dataset, photos)[verb])
         refused(ended, r"No space left on device|the disk is full|the disk has 0")
         assert not leftovers(place)
         after = {name: digest(place / name) for name in names_in(place)}
@@ -128,10 +128,10 @@ def test_a_full_disk(verb, zygote, place, trained, capture, photos):
         assert not changed, f"{verb} changed {changed}"
 
 
-def test_a_disk_that_becomes_full_during_a_training(zygote, place, capture):
+def test_a_disk_that_becomes_full_during_a_training(zygote, place, dataset):
     """The checkpoint before it stays whole; with room again it goes on to the same scene."""
     out = place / "out"
-    command = ["train", capture, "-o", out, "--iterations", 60, "--checkpoint-every", 10, *CPU]
+    command = ["train", dataset, "-o", out, "--iterations", 60, "--checkpoint-every", 10, *CPU]
     assert zygote.run(command).code == 0
     scene = out / "point_cloud/iteration_60/point_cloud.ply"
     whole = digest(scene)
@@ -151,10 +151,10 @@ def test_a_disk_that_becomes_full_during_a_training(zygote, place, capture):
         assert digest(scene) == whole
 
 
-def test_a_disk_too_full_for_the_first_scene(zygote, place, capture):
+def test_a_disk_too_full_for_the_first_scene(zygote, place, dataset):
     """Nothing has come of that training, so nothing stays, and the same command begins anew."""
     out = place / "out"
-    command = ["train", capture, "-o", out, "--iterations", 20, "--save-iterations", 10, *CPU]
+    command = ["train", dataset, "-o", out, "--iterations", 20, "--save-iterations", 10, *CPU]
     with full(place, 90):
         refused(zygote.run(command), rf"{out}/point_cloud/\S+: No space left on device")
         assert not out.exists()
@@ -163,7 +163,7 @@ def test_a_disk_too_full_for_the_first_scene(zygote, place, capture):
         assert again.code == 0, again.text
 
 
-def test_a_disk_that_becomes_full_during_a_capture(zygote, place, photos):
+def test_a_disk_that_becomes_full_during_a_dataset(zygote, place, photos):
     """Finished stages stay; with room again the same command goes on."""
     out = place / "garden"
     command = ["capture", photos, "-o", out, "--quality", "draft", "--threads", 1]
@@ -197,10 +197,10 @@ def has_checkpoint(out: Path) -> Callable[[], bool]:
     return lambda: any(out.glob("checkpoints/step_*"))
 
 
-def test_a_training_whose_folder_is_moved_goes_on(zygote, place, capture):
+def test_a_training_whose_folder_is_moved_goes_on(zygote, place, dataset):
     """In a new one: hours of work are worth more than order."""
     out, elsewhere = place / "out", place / "elsewhere"
-    command = ["train", capture, "-o", out, "--iterations", 400, "--checkpoint-every", 10, "--eval"]
+    command = ["train", dataset, "-o", out, "--iterations", 400, "--checkpoint-every", 10, "--eval"]
     ended = zygote.run(
         [*command, *CPU],
         while_it_runs=when(has_checkpoint(out), lambda: out.rename(elsewhere)),
@@ -215,10 +215,10 @@ def test_a_training_whose_folder_is_moved_goes_on(zygote, place, capture):
     assert zygote.run(["evaluate", out, *CPU]).code == 0
 
 
-def test_a_training_whose_photos_vanish(zygote, place, capture):
+def test_a_training_whose_photos_vanish(zygote, place, dataset):
     """At its beginning, and before it goes on: what is saved stays."""
     mine, out = place / "capture", place / "out"
-    shutil.copytree(capture, mine)
+    shutil.copytree(dataset, mine)
     command = ["train", mine, "-o", out, "--iterations", 40, "--checkpoint-every", 10, *CPU]
     assert zygote.run(command).code == 0
     before = {name: digest(out / name) for name in names_in(out)}
@@ -239,7 +239,7 @@ def test_a_training_whose_photos_vanish(zygote, place, capture):
 
 
 @pytest.mark.parametrize("verb", ["capture", "make"])
-def test_photos_or_the_folder_vanish_under_a_capture(verb, zygote, place, photos):
+def test_photos_or_the_folder_vanish_under_a_dataset(verb, zygote, place, photos):
     mine, out = place / "photos", place / "out"
     shutil.copytree(photos, mine)
     command = [verb, mine, "-o", out, "--quality", "draft", "--threads", 1]
@@ -258,12 +258,12 @@ def test_photos_or_the_folder_vanish_under_a_capture(verb, zygote, place, photos
 
 
 @pytest.mark.parametrize("verb", ["convert", "train", "resume", "render", "film", "capture"])
-def test_a_limit_of_the_size_of_files(verb, zygote, place, trained, capture, photos):
+def test_a_limit_of_the_size_of_files(verb, zygote, place, trained, dataset, photos):
     shutil.copytree(trained, place / "trained")
     before = {name: digest(place / name) for name in names_in(place)}
     limit = {"capture": 50_000, "resume": 5000}.get(verb, 500)
     ended = zygote.run(
-        commands(place, trained, capture, photos)[verb], limits={"RLIMIT_FSIZE": limit}
+        commands(place, trained, dataset, photos)[verb], limits={"RLIMIT_FSIZE": limit}
     )
     refused(ended, r"File too large")
     assert not leftovers(place)
@@ -273,11 +273,11 @@ def test_a_limit_of_the_size_of_files(verb, zygote, place, trained, capture, pho
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_limit_of_open_files(verb, zygote, place, trained, capture, photos):
+def test_a_limit_of_open_files(verb, zygote, place, trained, dataset, photos):
     """So low that hardly one can be opened."""
     shutil.copytree(trained, place / "trained")
     before = names_in(place)
-    ended = zygote.run(commands(place, trained, capture, photos)[verb], limits={"RLIMIT_NOFILE": 1})
+    ended = zygote.run(commands(place, trained, dataset, photos)[verb], limits={"RLIMIT_NOFILE": 1})
     refused(ended, r"Too many open files")
     assert not leftovers(place)
     assert names_in(place) >= before
@@ -305,10 +305,10 @@ def bars(text: str) -> list[str]:
     return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", bar) for bar in found]
 
 
-def test_a_narrow_terminal(zygote, place, trained, capture, photos):
-    all_of_them = commands(place, trained, capture, photos)
+def test_a_narrow_terminal(zygote, place, trained, dataset, photos):
+    all_of_them = commands(place, trained, dataset, photos)
     shutil.copytree(trained, place / "trained")
-    longer = ["train", capture, "-o", place / "t", "--iterations", 500, *CPU]
+    longer = ["train", dataset, "-o", place / "t", "--iterations", 500, *CPU]
     for command in (longer, all_of_them["capture"], all_of_them["film"], all_of_them["evaluate"]):
         ended = zygote.run(command, columns=24)
         assert ended.code == 0, ended.text
@@ -320,7 +320,7 @@ def test_a_narrow_terminal(zygote, place, trained, capture, photos):
             assert steps, ended.text
             assert all(steps), bars(ended.text)  # not half a number
             assert ended.text.count("\x1b[?25l") == ended.text.count("\x1b[?25h") == 1  # cursor
-    ended = zygote.run(["train", capture, "-o", place / "t", *CPU], columns=24)
+    ended = zygote.run(["train", dataset, "-o", place / "t", *CPU], columns=24)
     assert ended.code == 2
     assert len(shown(ended.text.strip())) == 1
 
@@ -338,7 +338,7 @@ def test_zygote_runs_what_the_command_runs(zygote, trained, tmp_path):
     for folder in (zygote.folder / "by zygote", tmp_path):
         folder.mkdir(exist_ok=True)
     assert zygote.run(["convert", trained, zygote.folder / "by zygote" / "a.spz"]).code == 0
-    source = Path(checkpoint.__file__).parents[1]
+    source = Path(checkpoint.__file__).parents[2]
     subprocess.run(
         ["python", "-m", "snowsplat", "convert", trained, tmp_path / "a.spz"],
         env={**os.environ, "PYTHONPATH": str(source)},

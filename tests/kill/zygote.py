@@ -29,24 +29,24 @@ _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
 def _import_all() -> None:
-    import snowsplat.checkpoint
-    import snowsplat.cli.films
     import snowsplat.cli.main
-    import snowsplat.cli.making
-    import snowsplat.cli.memory_budget
-    import snowsplat.edit
-    import snowsplat.evaluate
+    import snowsplat.evaluation.metrics
     import snowsplat.formats
-    import snowsplat.photos.capture_folder
-    import snowsplat.photos.orient
-    import snowsplat.photos.report
-    import snowsplat.photos.undistort
-    import snowsplat.plan
-    import snowsplat.recipes
-    import snowsplat.trainer
-    import snowsplat.training_report
-    import snowsplat.viewer.static_scene
-    import snowsplat.viewer.static_server
+    import snowsplat.pipeline.films
+    import snowsplat.pipeline.make
+    import snowsplat.pipeline.memory
+    import snowsplat.scene.edit
+    import snowsplat.sfm.orient
+    import snowsplat.sfm.pipeline
+    import snowsplat.sfm.report
+    import snowsplat.sfm.undistort
+    import snowsplat.training.checkpoint
+    import snowsplat.training.recipes
+    import snowsplat.training.report
+    import snowsplat.training.time_budget.plan
+    import snowsplat.training.trainer
+    import snowsplat.viewer.web.scene
+    import snowsplat.viewer.web.server
 
     # After zlib: its own would take the place of Python's.
     importlib.import_module("pycolmap")
@@ -107,8 +107,8 @@ def _child(run: dict) -> None:
     sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
     sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
     sys.argv = ["snowsplat", *run["argv"]]
-    from snowsplat.cli import making
     from snowsplat.cli.main import main
+    from snowsplat.pipeline import make as making
 
     # `make` with a training of a moment, and checkpoints all the time.
     making._CHECKPOINT_SECONDS = 0.1

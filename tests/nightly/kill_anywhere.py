@@ -24,15 +24,15 @@ from kill.harness import (
     Job,
     Killer,
     Zygote,
-    capture_jobs,
     convert_jobs,
     make_jobs,
+    sfm_jobs,
     some_gaussians,
     train_jobs,
 )
-from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.formats import write_gaussians
-from snowsplat.photos.synthetic import write_synthetic_photos
+from snowsplat.synthetic import write_synthetic_photos
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 VERBS = ("capture", "train", "make", "convert")
 # Of all kills: those of a verb that takes long are fewer.
@@ -47,11 +47,11 @@ def jobs(folder: Path, verbs: list[str]) -> list[Job]:
         write_gaussians(folder / "other.ply", some_gaussians(100, 2))
         found += convert_jobs(folder / "in.ply", folder / "other.ply")
     if "train" in verbs:
-        write_synthetic_capture(folder / "capture", "colmap-bin", 9, 48, 36, n_points=300)
+        write_toy_dataset(folder / "capture", "colmap-bin", 9, 48, 36, n_points=300)
         found += train_jobs(folder / "capture")
     if "capture" in verbs or "make" in verbs:
         write_synthetic_photos(folder / "photos", n_views=16, width=320, height=240)
-        found += capture_jobs(folder / "photos") if "capture" in verbs else []
+        found += sfm_jobs(folder / "photos") if "capture" in verbs else []
         found += make_jobs(folder / "photos") if "make" in verbs else []
     return found
 

@@ -254,7 +254,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("capture", type=Path, help="a capture to train on")
+    parser.add_argument("dataset", type=Path, help="a dataset to train on")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--width", type=int, default=160, help="of the photos, pixels")
     parser.add_argument("--gaussians", type=int, default=3000)
@@ -263,12 +263,12 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         out, small = Path(folder, "out"), Path(folder, "small")
         flags = ["-r", arguments.width, "--max-gaussians", arguments.gaussians, "--threads", 1]
-        short = ["train", arguments.capture, "-o", small, "--iterations", 50, *flags, "-q"]
+        short = ["train", arguments.dataset, "-o", small, "--iterations", 50, *flags, "-q"]
         subprocess.run(
             [sys.executable, "-m", "snowsplat", *map(str, short)], env=ENVIRONMENT, check=True
         )
         training = Server.start(
-            *("training", "train", arguments.capture, "-o", out, "--iterations", 50_000_000),
+            *("training", "train", arguments.dataset, "-o", out, "--iterations", 50_000_000),
             *(*flags, "--view"),
         )
         stack.callback(training.process.kill)

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from snowsplat import ops
-from snowsplat.errors import UserError
 from snowsplat.ops.cuda import availability
+from snowsplat.util.errors import UserError
 
 TOO_OLD = "A card (compute capability 6.1) is too old; it takes 7.5, which came in 2018, or newer"
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 import snowsplat
-from snowsplat.errors import UserError
 from snowsplat.ops import native
 from snowsplat.ops.cuda import cubins, driver, nvrtc
 from snowsplat.ops.cuda.kernels import Kernel
+from snowsplat.util.errors import UserError
 
 KERNEL = Kernel("statistic", threads=128, items=64)
 BUILT = (75, 80, 86, 89, 90, 100, 120)  # as in CMakeLists.txt

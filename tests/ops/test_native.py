@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import snowsplat
-from snowsplat.errors import UserError
 from snowsplat.ops import native
+from snowsplat.util.errors import UserError
 
 SOURCES = Path(snowsplat.__file__).parents[1]
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.camera import Camera
-from snowsplat.camera_list import read_cameras
-from snowsplat.capture.synthetic import write_synthetic_capture
 from snowsplat.cli.main import main
 from snowsplat.formats import read_gaussians
-from snowsplat.gaussians import Gaussians
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera_json import read_cameras
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 
 @dataclass
@@ -25,9 +25,9 @@ class Trained:
 def trained(tmp_path_factory) -> Trained:
     """Balls in a sphere, world z up, seen from a distance of 3; an output folder of 200 steps."""
     root = tmp_path_factory.mktemp("trained")
-    capture = write_synthetic_capture(root / "capture", "colmap-bin", 12, 96, 72, n_points=2000)
+    dataset = write_toy_dataset(root / "capture", "colmap-bin", 12, 96, 72, n_points=2000)
     flags = ["--iterations", "200", "--quiet"]
-    assert main(["train", str(capture), "-o", str(root / "out"), *flags]) == 0
+    assert main(["train", str(dataset), "-o", str(root / "out"), *flags]) == 0
     scene = root / "out/point_cloud/iteration_200/point_cloud.ply"
     _, cameras = read_cameras(root / "out/cameras.json")
     return Trained(root / "out", scene, read_gaussians(scene), cameras)

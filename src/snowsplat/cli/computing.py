@@ -6,7 +6,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
     import torch

@@ -12,12 +12,12 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.scene import cameras_of, folder_around, scene_file
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from snowsplat.camera import Camera
-    from snowsplat.gaussians import Gaussians
-    from snowsplat.geometry import Similarity
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.scene.geometry import Similarity
 
 Vector = tuple[float, float, float]
 Box = tuple[float, float, float, float, float, float]
@@ -70,8 +70,8 @@ class Convert:
             raise UserError("convert needs a scene and the name of a file to write")
         *sources, target = self.paths
         self._check(target)
-        from snowsplat import edit
-        from snowsplat.formats import format_for_writing, read_gaussians, write_gaussians
+        from snowsplat.pipeline.convert import format_for_writing, read_gaussians, write_gaussians
+        from snowsplat.scene import edit
 
         format = format_for_writing(target)
         movement = self._movement()
@@ -106,7 +106,7 @@ class Convert:
     def _changed(self, scene: Gaussians, movement: Similarity | None) -> Gaussians:
         import torch
 
-        from snowsplat import edit
+        from snowsplat.scene import edit
 
         if self.crop:
             before = len(scene)
@@ -127,7 +127,7 @@ class Convert:
             return None
         import torch
 
-        from snowsplat.geometry import Similarity, rotation_from_quat
+        from snowsplat.scene.geometry import Similarity, rotation_from_quat
 
         rotation = torch.eye(3, dtype=torch.float64)
         for axis, degrees in enumerate(self.rotate):
@@ -140,8 +140,8 @@ class Convert:
 
 def _write_page(target: Path, scene: Gaussians, cameras: list[Camera]) -> None:
     """A page that starts where a photo was taken, if it is known where."""
-    from snowsplat.formats.html import write_html
-    from snowsplat.viewer.static_scene import ready
+    from snowsplat.viewer.web.html import write_html
+    from snowsplat.viewer.web.scene import ready
 
     write_html(target, *ready(scene, cameras))
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from snowsplat.cli.flags import flag
 from snowsplat.cli.scene import SceneFlags
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from snowsplat.evaluate import ViewMetrics
+    from snowsplat.evaluation.metrics import ViewMetrics
 
 
 @dataclass
@@ -37,15 +37,15 @@ class Evaluate(SceneFlags):
 
     def run(self) -> int:
         """Gives the exit code, 0."""
-        iteration, gaussians, capture, background = self.load()
-        views = capture.test if self.split == "test" else capture.train
+        iteration, gaussians, dataset, background = self.load()
+        views = dataset.test if self.split == "test" else dataset.train
         if not views:
             raise UserError(
                 "no photos were held out for testing; train with --eval, or use --split train"
             )
-        from snowsplat.evaluate import evaluate_views
-        from snowsplat.lpips import Lpips
-        from snowsplat.process import single_threaded
+        from snowsplat.evaluation.lpips import Lpips
+        from snowsplat.evaluation.metrics import evaluate_views
+        from snowsplat.util.process import single_threaded
 
         network = None if self.lpips is None else Lpips.load(self.lpips)
         width = max(4, *(len(view.name) for view in views))

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.output import OutputFolder
 from snowsplat.cli.scene import training_folder
-from snowsplat.errors import UserError
-from snowsplat.untrusted import printable, read_json
+from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import printable, read_json
 
 if TYPE_CHECKING:
     from snowsplat.formats import Format
-    from snowsplat.gaussians import Gaussians
+    from snowsplat.scene.gaussians import Gaussians
 
 _PERCENTILES = (1, 50, 99)
 
 
 @dataclass
 class Info:
-    """Tell what a scene, a point cloud, a capture, a checkpoint or an output folder holds.
+    """Tell what a scene, a point cloud, a dataset, a checkpoint or an output folder holds.
 
     Examples:
       snowsplat info out/garden
@@ -34,8 +34,8 @@ class Info:
       snowsplat info garden
     """
 
-    path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT|CAPTURE")] = None
-    """A scene of any format, a checkpoint, the output folder of `train` or `make`, or a capture."""
+    path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT|DATASET")] = None
+    """A scene of any format, a checkpoint, the output folder of `train` or `make`, or a dataset."""
     json: Annotated[bool, switch()] = False
     """Print JSON, for programs."""
 
@@ -67,26 +67,26 @@ def describe(path: Path) -> dict[str, Any]:
         try:
             format = format_for_reading(path)
         except UserError as error:
-            if path.suffix != ".json":  # which a capture may be
-                raise UserError(f"{error}, checkpoints and captures") from None
+            if path.suffix != ".json":  # which a dataset may be
+                raise UserError(f"{error}, checkpoints and datasets") from None
         else:
             return _scene(path, format)
     folder = training_folder(path)
     if folder.is_one() or folder.scenes():
         return _output(folder)
-    return _capture(path)
+    return _dataset(path)
 
 
 def _scene(path: Path, format: Format) -> dict[str, Any]:
     from snowsplat.formats import ply, read_gaussians
-    from snowsplat.ply_table import open_table
+    from snowsplat.util.ply import open_table
 
     facts: dict[str, Any] = {"file": str(path), "bytes": path.stat().st_size}
     if format.name == "PLY":
         table = open_table(path)
         facts["encoding"] = table.format
         if not ply.is_scene(table):
-            from snowsplat.capture.points_ply import read_points
+            from snowsplat.data.points_ply import read_points
 
             xyz, _ = read_points(path)
             return {"kind": "point cloud", **facts, "points": len(xyz), **_bounds(xyz)}
@@ -149,7 +149,7 @@ def _short(values: Any) -> list[float]:
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:
-    from snowsplat import checkpoint
+    from snowsplat.training import checkpoint
 
     loaded = checkpoint.load(path)
     return {
@@ -183,27 +183,27 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
     return facts
 
 
-def _capture(path: Path) -> dict[str, Any]:
+def _dataset(path: Path) -> dict[str, Any]:
     from collections import Counter
 
-    from snowsplat.capture import load_capture
+    from snowsplat.data import load_dataset
 
-    capture = load_capture(path)
-    views = [*capture.train, *capture.test]
+    dataset = load_dataset(path)
+    views = [*dataset.train, *dataset.test]
     sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in views)
     focal = sorted(view.camera.fx for view in views)
     return {
         "kind": "capture",
         "path": str(path),
-        "description": capture.description,
+        "description": dataset.description,
         "photos": len(views),
-        "held_out_with_eval": len(capture.test),
+        "held_out_with_eval": len(dataset.test),
         "sizes": dict(sizes),
         "focal_length_pixels": _short([focal[0], focal[-1]]),
         "masks": sum(view.mask is not None for view in views),
-        "points": 0 if capture.points is None else len(capture.points),
-        "extent": float(f"{capture.extent:.5g}"),
-        "bounds": [_short(corner) for corner in capture.bounds.tolist()],
+        "points": 0 if dataset.points is None else len(dataset.points),
+        "extent": float(f"{dataset.extent:.5g}"),
+        "bounds": [_short(corner) for corner in dataset.bounds.tolist()],
     }
 
 

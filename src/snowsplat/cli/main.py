@@ -15,21 +15,21 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from snowsplat.cli.capture import Capture
 from snowsplat.cli.convert import Convert
 from snowsplat.cli.evaluate import Evaluate
 from snowsplat.cli.info import Info
 from snowsplat.cli.make import Make
 from snowsplat.cli.render import Render
+from snowsplat.cli.sfm import Sfm
 from snowsplat.cli.train import Train
 from snowsplat.cli.view import View
 from snowsplat.cli.watch import Watch
-from snowsplat.errors import UserError
-from snowsplat.untrusted import printable
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import printable
 
 VERBS: dict[str, Any] = {
     "make": Make,
-    "capture": Capture,
+    "sfm": Sfm,
     "train": Train,
     "evaluate": Evaluate,
     "render": Render,
@@ -39,17 +39,20 @@ VERBS: dict[str, Any] = {
     "info": Info,
 }
 
+# Former names of subcommands, still accepted but not listed.
+_FORMER_NAMES = {"capture": "sfm"}
+
 DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, shown in real time.
 
   snowsplat make PHOTOS                     photos or a video -> a scene: all of what follows
-  snowsplat capture PHOTOS -o CAPTURE       photos or a video -> photos with known cameras
-  snowsplat train CAPTURE -o OUT --eval     photos with known cameras -> a scene in OUT
+  snowsplat sfm PHOTOS -o DATASET           photos or a video -> photos with known cameras
+  snowsplat train DATASET -o OUT --eval     photos with known cameras -> a scene in OUT
   snowsplat evaluate OUT                    PSNR, SSIM of the photos held out
   snowsplat render OUT                      pictures of the scene beside the photos
   snowsplat view FILE|OUT                   fly through a scene in the browser
   snowsplat watch OUT                       a scene with its photos, also while it is trained
   snowsplat convert SCENE [MORE …] FILE     another format; cut, thinned out, turned, merged
-  snowsplat info ANYTHING                   what is in a scene, a capture, an output folder
+  snowsplat info ANYTHING                   what is in a scene, a dataset, an output folder
 
 Each has its own help: snowsplat train --help
 
@@ -88,6 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parse(arguments: list[str]) -> Any:
     """The verb's dataclass. Leaves the process, as argparse does, after help or with a mistake."""
+    arguments = [_FORMER_NAMES.get(arguments[0], arguments[0]), *arguments[1:]]
     choices = []
     for name, verb in VERBS.items():
         # The list of verbs shows what each does, its own help also how to use it.

@@ -12,14 +12,14 @@ import tyro
 
 from snowsplat.cli.computing import check_threads, compute_with
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.making import STAGES, Making, TrainingStopped
-from snowsplat.cli.presets import Quality, quality_within
 from snowsplat.cli.viewing import PageFlags
-from snowsplat.errors import UserError
-from snowsplat.files import remove_temporaries
+from snowsplat.pipeline.make import STAGES, Making, TrainingStopped
+from snowsplat.pipeline.presets import Quality, quality_within
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import remove_temporaries
 
 if TYPE_CHECKING:
-    from snowsplat.photos.stages import Stages
+    from snowsplat.util.stages import Stages
 
 RECORD = "make.json"
 
@@ -80,8 +80,8 @@ class Make:
         page = PageFlags(self.port, self.host)
         page.check(self.view)
 
-        from snowsplat.photos.sources import find_sources
-        from snowsplat.photos.stages import Stages
+        from snowsplat.sfm.ingest.sources import find_sources
+        from snowsplat.util.stages import Stages
 
         kinds = [source.kind for source in find_sources(self.inputs).sources]
         existed = out.exists()

@@ -13,8 +13,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
 if TYPE_CHECKING:
-    from snowsplat import trainer
-    from snowsplat.evaluate import Evaluation
+    from snowsplat.evaluation.metrics import Evaluation
+    from snowsplat.training import trainer
 
 _LINE_SECONDS = 5.0
 _RATE_SECONDS = 3.0  # the rate shown is the mean of about this long

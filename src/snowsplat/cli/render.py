@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.scene import SceneFlags
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from snowsplat.camera import Camera
-    from snowsplat.capture import View
-    from snowsplat.gaussians import Gaussians
+    from snowsplat.data import View
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
 
 
 @dataclass
@@ -75,10 +75,10 @@ class Render(SceneFlags):
             if getattr(self, name):
                 flag_name = name.replace("_", "-")
                 raise UserError(f"--{flag_name} is for films; say which by --path, as ellipse")
-        iteration, gaussians, capture, background = self.load()
+        iteration, gaussians, dataset, background = self.load()
         chosen = {
-            "test": [] if self.split == "train" or self.skip_test else capture.test,
-            "train": [] if self.split == "test" or self.skip_train else capture.train,
+            "test": [] if self.split == "train" or self.skip_test else dataset.test,
+            "train": [] if self.split == "test" or self.skip_train else dataset.train,
         }
         if not any(chosen.values()):
             raise UserError(
@@ -92,7 +92,7 @@ class Render(SceneFlags):
         return 0
 
     def _film(self, way: str) -> None:
-        from snowsplat.cli.films import Film, FilmSize, cameras_along, frames_in
+        from snowsplat.pipeline.films import Film, FilmSize, cameras_along, frames_in
 
         if self.depth == "16bit":
             raise UserError("--depth 16bit is for pictures; a film takes --depth color")
@@ -126,9 +126,9 @@ class Render(SceneFlags):
 
         The photos themselves are not needed.
         """
-        from snowsplat.camera_list import read_cameras
         from snowsplat.cli.scene import folder_around
         from snowsplat.formats import read_gaussians
+        from snowsplat.scene.camera_json import read_cameras
 
         suffix = "_side_by_side" if self.side_by_side else ""
         scene = self.output or self.model_path
@@ -153,10 +153,10 @@ class Render(SceneFlags):
     ) -> None:
         import torch
 
-        from snowsplat.capture import ImageLoader
-        from snowsplat.cli import pictures
-        from snowsplat.files import write_json
-        from snowsplat.render import render
+        from snowsplat.data import ImageLoader
+        from snowsplat.pipeline import pictures
+        from snowsplat.scene.render import render
+        from snowsplat.util.files import write_json
 
         device = gaussians.means.device
         color = torch.tensor(background, device=device)
@@ -211,7 +211,7 @@ class PngQueue:
 
     def write(self, path: Path, pixels: np.ndarray) -> None:
         """Raises: OSError: an earlier picture could not be written."""
-        from snowsplat.cli.pictures import write_png
+        from snowsplat.pipeline.pictures import write_png
 
         self._under_way.append(self._pool.submit(write_png, path, pixels))
         if len(self._under_way) > 8:

@@ -11,15 +11,15 @@ import tyro
 
 from snowsplat.cli.computing import compute_with
 from snowsplat.cli.flags import flag
-from snowsplat.cli.output import SCENE, OutputFolder
-from snowsplat.errors import UserError
+from snowsplat.pipeline.output_folder import SCENE, OutputFolder
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
     import torch
 
-    from snowsplat.camera import Camera
-    from snowsplat.capture import Capture
-    from snowsplat.gaussians import Gaussians
+    from snowsplat.data import Dataset
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
 
 
 @dataclass
@@ -32,8 +32,8 @@ class SceneFlags:
     """The reference's way to name it."""
     iteration: Annotated[int | None, flag("N", default="the last")] = None
     """Which of the scenes in OUT."""
-    capture: Annotated[
-        Path | None, flag("CAPTURE", "-s", "--source-path", default="as trained")
+    dataset: Annotated[
+        Path | None, flag("DATASET", "-s", "--source-path", "--capture", default="as trained")
     ] = None
     """The photos and their cameras, if they are no longer where they were."""
     resolution: Annotated[int | None, flag("N", "-r", default="as trained")] = None
@@ -52,25 +52,25 @@ class SceneFlags:
             raise UserError(f"{path}: no such folder; give the output folder of a training")
         return training_folder(path)
 
-    def load(self) -> tuple[int, Gaussians, Capture, tuple[float, float, float]]:
-        """Iteration, scene, capture and background colour.
+    def load(self) -> tuple[int, Gaussians, Dataset, tuple[float, float, float]]:
+        """Iteration, scene, dataset and background colour.
 
         Raises:
             UserError: one of them is absent or damaged.
         """
-        capture, background = self.load_capture()
+        dataset, background = self.load_dataset()
         iteration, gaussians = self.folder().read_scene(self.iteration)
-        return iteration, gaussians.to(self.computing()), capture, background
+        return iteration, gaussians.to(self.computing()), dataset, background
 
-    def load_capture(self) -> tuple[Capture, tuple[float, float, float]]:
+    def load_dataset(self) -> tuple[Dataset, tuple[float, float, float]]:
         """Capture and background colour.
 
         Raises:
             UserError: there is none, or it is damaged.
         """
         settings, background = self.folder().settings()
-        if self.capture is not None:
-            settings = replace(settings, path=str(self.capture))
+        if self.dataset is not None:
+            settings = replace(settings, path=str(self.dataset))
         if self.resolution is not None:
             settings = replace(settings, resolution=self.resolution)
         return settings.load(), background
@@ -126,7 +126,7 @@ def cameras_of(folder: OutputFolder) -> list[Camera]:
     Raises:
         UserError: the list is damaged.
     """
-    from snowsplat.camera_list import read_cameras
+    from snowsplat.scene.camera_json import read_cameras
 
     file = folder.path / "cameras.json"
     return read_cameras(file)[1] if file.is_file() else []

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from snowsplat.cli.progress import duration
 
 if TYPE_CHECKING:
-    from snowsplat.photos.progress import Report
+    from snowsplat.sfm.progress import Report
 
 _LINE_SECONDS = 5.0
 _WIDTH = 10  # of the names of stages

@@ -1,4 +1,4 @@
-"""`snowsplat train`: a posed capture becomes a scene."""
+"""`snowsplat train`: a posed dataset becomes a scene."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import tyro
 
 from snowsplat.cli.computing import ask_for_the_same_bits, compute_with
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.memory_budget import MemoryBudget
-from snowsplat.cli.output import CaptureSettings, OutputFolder
 from snowsplat.cli.progress import resident_bytes
-from snowsplat.cli.timed import TimeBudget
-from snowsplat.cli.training_run import TrainingRun
 from snowsplat.cli.viewing import PageFlags
-from snowsplat.errors import UserError
-from snowsplat.schedule import Schedule
-from snowsplat.untrusted import from_json
+from snowsplat.pipeline.memory import MemoryBudget
+from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.timed import TimeBudget
+from snowsplat.pipeline.train import TrainingRun
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import from_json
 
 if TYPE_CHECKING:
-    from snowsplat.capture import Capture
-    from snowsplat.checkpoint import Checkpoint
-    from snowsplat.config import TrainConfig
-    from snowsplat.trainer import Trainer
+    from snowsplat.data import Dataset
+    from snowsplat.training.checkpoint import Checkpoint
+    from snowsplat.training.config import TrainConfig
+    from snowsplat.training.trainer import Trainer
 
 # Flags that are knobs of the configuration, under the same name.
 _KNOBS = (
@@ -46,7 +46,7 @@ RECIPE = "the recipe's"
 class Noted:
     """What a checkpoint says of its training, beside the numbers."""
 
-    capture: CaptureSettings
+    capture: DatasetSettings  # the key in the file
     recipe: Literal["default", "paper", "mcmc"]
     training: dict[str, Any]  # see `config_from_json`
     time: dict[str, float] | None = None  # see `TimeBudget`
@@ -97,7 +97,7 @@ class Train:
     flags of the reference implementation are understood (-s -m -i -r -w --eval --iterations …).
     """
 
-    capture: Annotated[Path | None, tyro.conf.Positional, flag("CAPTURE")] = None
+    dataset: Annotated[Path | None, tyro.conf.Positional, flag("DATASET")] = None
     """Folder of photos and cameras: images/ and sparse/0/ of COLMAP, or transforms.json."""
     output: Annotated[Path | None, flag("OUT", "-o", "-m", "--model-path")] = None
     """Folder for the result; made if it is not there."""
@@ -114,11 +114,11 @@ class Train:
     """End after this time, measuring and saving included: picks steps, size of photos and number of
     Gaussians to fit, but for those that are named. With --resume: the time for what is left."""
     eval: Annotated[bool, switch()] = False
-    """Hold out every 8th photo (or the capture's own test split) and measure on it at the end."""
+    """Hold out every 8th photo (or the dataset's own test split) and measure on it at the end."""
     test_list: Annotated[Path | None, flag("FILE")] = None
     """Text file naming the photos to hold out instead, one a line. Means --eval."""
     images: Annotated[str | None, flag("NAME", "-i", default="images")] = None
-    """Name of the folder of photos in the capture."""
+    """Name of the folder of photos in the dataset."""
     resolution: Annotated[int | None, flag("N", "-r", default="as they are")] = None
     """1, 2, 4 or 8 divide the size of the photos; any other number is the width to be had."""
     background: Annotated[
@@ -166,7 +166,7 @@ class Train:
     ssim_weight: Annotated[float | None, flag("F", "--lambda-dssim", default=RECIPE)] = None
     """Share of 1 - SSIM in the loss; the rest is the mean absolute difference."""
     initial_points: Annotated[int | None, flag("N", default=RECIPE)] = None
-    """Random Gaussians to begin with where the capture has no points."""
+    """Random Gaussians to begin with where the dataset has no points."""
     grad_threshold: Annotated[
         float | None, flag("F", "--densify-grad-threshold", default=RECIPE)
     ] = None
@@ -207,8 +207,8 @@ class Train:
     """Learning rate of the colours' change with direction."""
     feature_lr: Annotated[float | None, flag("F", default=RECIPE)] = None
     """Both of them: --lr-sh-dc F --lr-sh-rest F/20, as in the reference."""
-    source_path: Annotated[Path | None, flag("CAPTURE", "-s")] = None
-    """The reference's way to name the capture."""
+    source_path: Annotated[Path | None, flag("DATASET", "-s")] = None
+    """The reference's way to name the dataset."""
     quiet: Annotated[bool, switch("-q")] = False
     """No progress, only the result."""
     checkpoint_seconds: Annotated[float | None, tyro.conf.Suppress] = None
@@ -230,12 +230,12 @@ class Train:
         PageFlags(self.port, self.host).check(self.view)
         out = OutputFolder(self.output)
         out.check_free(resume=self.resume, overwrite=self.overwrite)
-        if not self.resume and self._capture_path() is None:
+        if not self.resume and self._dataset_path() is None:
             raise UserError(
-                "train needs a capture; name the folder of the photos and their cameras"
+                "train needs a dataset; name the folder of the photos and their cameras"
             )
 
-        from snowsplat.trainer import Trainer
+        from snowsplat.training.trainer import Trainer
 
         device = compute_with(self.threads, self.device)
         before = resident_bytes()
@@ -246,15 +246,15 @@ class Train:
         budget, schedule = self._length(noted, started)
         slowness = 1.0
         if start is None or noted is None:
-            settings, config = self._capture_settings(None), self._config()
+            settings, config = self._dataset_settings(None), self._config()
             recipe = self.recipe or "default"
         else:
             settings = self._resumed_settings(start, noted)
             config, recipe = self._resumed_config(start, noted), noted.recipe
-        capture = settings.load()
+        dataset = settings.load()
         if budget is not None and start is None:
             plan = budget.plan(
-                *(capture, config, device),
+                *(dataset, config, device),
                 resize=self.resolution is None,
                 more_gaussians=self.max_gaussians is None,
                 more_often=self.densify_interval is None and self.densify_from is None,
@@ -262,18 +262,18 @@ class Train:
             config, slowness = plan.config, plan.slowness
             if plan.resolution is not None:
                 settings = replace(settings, resolution=plan.resolution)
-                capture = settings.load()
+                dataset = settings.load()
         present = 0 if start is None else _gaussians_in(start)
-        memory = MemoryBudget.of(self.memory, capture, config, device, before, present)
+        memory = MemoryBudget.of(self.memory, dataset, config, device, before, present)
         config = memory.plan.config
-        trainer = Trainer(capture, config, schedule, device)
+        trainer = Trainer(dataset, config, schedule, device)
         if start is None:
-            out.begin(capture, settings, config)
+            out.begin(dataset, settings, config)
         else:
             trainer.load_state(start.tensors)
             start.tensors.clear()  # it has copied them, and they are no part of what it takes
             out.write_config(settings, config)
-        self._describe(capture, trainer, start)
+        self._describe(dataset, trainer, start)
         if budget is not None and start is None:
             self._say(budget.described(plan))
         self._say(str(memory))
@@ -313,15 +313,15 @@ class Train:
             return TimeBudget.of(self.minutes, None, started), None
         return TimeBudget.of(self.minutes, noted.time, started), noted.schedule
 
-    def _capture_path(self) -> Path | None:
-        if self.capture is not None and self.source_path is not None:
-            raise UserError("the capture is named twice; leave out -s or the other")
-        return self.capture or self.source_path
+    def _dataset_path(self) -> Path | None:
+        if self.dataset is not None and self.source_path is not None:
+            raise UserError("the dataset is named twice; leave out -s or the other")
+        return self.dataset or self.source_path
 
-    def _capture_settings(self, before: CaptureSettings | None) -> CaptureSettings:
+    def _dataset_settings(self, before: DatasetSettings | None) -> DatasetSettings:
         """From the flags; what they leave open is as it was ``before``."""
-        path = self._capture_path()
-        settings = before or CaptureSettings(path="")
+        path = self._dataset_path()
+        settings = before or DatasetSettings(path="")
         changes: dict[str, Any] = {
             "path": None if path is None else str(path.absolute()),
             "images": self.images,
@@ -331,15 +331,15 @@ class Train:
         }
         return replace(settings, **{k: v for k, v in changes.items() if v is not None})
 
-    def _resumed_settings(self, start: Checkpoint, noted: Noted) -> CaptureSettings:
-        """The checkpoint's own; where the capture and the list of tests are may have changed."""
+    def _resumed_settings(self, start: Checkpoint, noted: Noted) -> DatasetSettings:
+        """The checkpoint's own; where the dataset and the list of tests are may have changed."""
 
-        def matters(settings: CaptureSettings) -> tuple[Any, ...]:
+        def matters(settings: DatasetSettings) -> tuple[Any, ...]:
             resolution = max(1, settings.resolution)  # -1 is as they are, too
             tests = settings.test_list and Path(settings.test_list).name
             return settings.images, resolution, settings.hold_out, tests
 
-        settings = self._capture_settings(noted.capture)
+        settings = self._dataset_settings(noted.capture)
         if matters(settings) != matters(noted.capture):
             raise _other_settings(start)
         return settings
@@ -359,19 +359,19 @@ class Train:
         return {name: value for name, value in knobs.items() if value is not None}
 
     def _config(self) -> TrainConfig:
-        from snowsplat.recipes import recipe
+        from snowsplat.training.recipes import recipe
 
         return recipe(self.recipe or "default", **self._knobs())
 
     def _checkpoint(self, out: OutputFolder) -> Checkpoint | None:
-        from snowsplat import checkpoint
+        from snowsplat.training import checkpoint
 
         newest = checkpoint.latest(out.checkpoints)
         if newest is not None:
             return newest
-        if self._capture_path() is None:
+        if self._dataset_path() is None:
             raise UserError(
-                f"{out.path}: holds no whole checkpoint to resume; name the capture to begin anew"
+                f"{out.path}: holds no whole checkpoint to resume; name the dataset to begin anew"
             )
         if out.scenes() or checkpoint.exists(out.checkpoints):
             what = "a scene" if out.scenes() else "checkpoints"
@@ -384,7 +384,7 @@ class Train:
 
     def _resumed_config(self, start: Checkpoint, noted: Noted) -> TrainConfig:
         """The checkpoint's own; flags may change only what leaves the steps so far as they were."""
-        from snowsplat.config import changed, config_from_json
+        from snowsplat.training.config import changed, config_from_json
 
         config = config_from_json(noted.training)
         if self.recipe not in (None, noted.recipe):
@@ -403,11 +403,11 @@ class Train:
 
     # Words
 
-    def _describe(self, capture: Capture, trainer: Trainer, start: Checkpoint | None) -> None:
-        camera = capture.train[0].camera
-        points = "no points" if capture.points is None else f"{len(capture.points):,} points"
+    def _describe(self, dataset: Dataset, trainer: Trainer, start: Checkpoint | None) -> None:
+        camera = dataset.train[0].camera
+        points = "no points" if dataset.points is None else f"{len(dataset.points):,} points"
         self._say(
-            f"{capture.description}: {len(capture.train)} photos to train on, {len(capture.test)} "
+            f"{dataset.description}: {len(dataset.train)} photos to train on, {len(dataset.test)} "
             f"held out, {camera.width}x{camera.height}, {points}"
         )
         if start is not None:

@@ -15,11 +15,11 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.scene import cameras_of, folder_around, training_folder
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from snowsplat.camera import Camera
-    from snowsplat.gaussians import Gaussians
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
 
 
 @dataclass
@@ -49,8 +49,8 @@ class View:
     def run(self) -> int:
         """Gives the exit code: 0, after Ctrl-C too, which is how one leaves."""
         from snowsplat.viewer.hosts import ANY_HOST
-        from snowsplat.viewer.static_scene import site
-        from snowsplat.viewer.static_server import StaticServer
+        from snowsplat.viewer.web.scene import site
+        from snowsplat.viewer.web.server import StaticServer
 
         if self.path is None:
             raise UserError("view needs a scene; name a file or the output folder of a training")

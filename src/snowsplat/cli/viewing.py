@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from snowsplat.errors import UserError
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from snowsplat.capture import Capture
-    from snowsplat.trainer import Trainer
-    from snowsplat.viewer.network.training import TrainingViewer
-    from snowsplat.viewer.network.viewer import NetworkViewer
+    from snowsplat.data import Dataset
+    from snowsplat.training.trainer import Trainer
+    from snowsplat.viewer.live.training import TrainingViewer
+    from snowsplat.viewer.live.viewer import NetworkViewer
 
 LOCAL = "127.0.0.1"
 
@@ -30,7 +30,7 @@ class PageFlags:
             UserError: a place for a page that nobody wants, or one that cannot be had.
         """
         if view:
-            from snowsplat.viewer.network.server import free_port
+            from snowsplat.viewer.live.server import free_port
 
             free_port(self.host or LOCAL, self.port)
             return
@@ -39,17 +39,17 @@ class PageFlags:
                 raise UserError(f"{name} says where a page is to be; add --view to have one")
 
     def open(
-        self, capture: Capture, background: tuple[float, float, float], label: str
+        self, dataset: Dataset, background: tuple[float, float, float], label: str
     ) -> NetworkViewer:
         """Open the page, and say where it is.
 
         Raises:
             UserError: the port is taken, or the host is not this machine.
         """
-        from snowsplat.viewer.network.viewer import NetworkViewer
+        from snowsplat.viewer.live.viewer import NetworkViewer
 
         host = self.host or LOCAL
-        viewer = NetworkViewer(capture, background, host=host, port=self.port, label=label)
+        viewer = NetworkViewer(dataset, background, host=host, port=self.port, label=label)
         print(f"watch it in a browser: {viewer.url}", flush=True)
         if viewer.others is not None:
             print(f"from other computers: {viewer.others}", flush=True)
@@ -60,11 +60,11 @@ class PageFlags:
 
     def open_for(self, trainer: Trainer, label: str) -> TrainingViewer:
         """The page of a training."""
-        from snowsplat.viewer.network.gauge import Gauge
-        from snowsplat.viewer.network.training import TrainingViewer
+        from snowsplat.viewer.live.gauge import Gauge
+        from snowsplat.viewer.live.training import TrainingViewer
 
         white = trainer.config.background == "white"
         background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
-        viewer = self.open(trainer.capture, background, label)
-        views = trainer.capture.test or trainer.capture.train
+        viewer = self.open(trainer.dataset, background, label)
+        views = trainer.dataset.test or trainer.dataset.train
         return TrainingViewer(viewer, Gauge(views, viewer.background))

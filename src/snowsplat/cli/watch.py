@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from snowsplat.cli.flags import flag
-from snowsplat.cli.output import SCENE, OutputFolder
 from snowsplat.cli.scene import SceneFlags
 from snowsplat.cli.viewing import PageFlags
-from snowsplat.errors import UserError
+from snowsplat.pipeline.output_folder import SCENE, OutputFolder
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
     import torch
 
-    from snowsplat.gaussians import Gaussians
-    from snowsplat.viewer.network.viewer import Scene
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.viewer.live.viewer import Scene
 
 _NOTHING = [
     "Nothing is saved yet.",
@@ -49,11 +49,11 @@ class Watch(SceneFlags):
     def run(self) -> int:
         """Gives the exit code: 0, after Ctrl-C."""
         folder = self.folder()
-        capture, background = self.load_capture()
+        dataset, background = self.load_dataset()
         newest = NewestScene(folder, self.iteration, self.computing())
         newest()  # what cannot be shown is refused before a page opens
         label = folder.path.absolute().name
-        viewer = PageFlags(self.port, self.host).open(capture, background, label)
+        viewer = PageFlags(self.port, self.host).open(dataset, background, label)
         try:
             print("Ctrl-C ends it", flush=True)
             viewer.hold(newest)
@@ -81,7 +81,7 @@ class NewestScene:
         Raises:
             UserError: the first one cannot be read.
         """
-        from snowsplat.viewer.network.viewer import Scene
+        from snowsplat.viewer.live.viewer import Scene
 
         try:
             step, path = self._newest()
@@ -99,7 +99,7 @@ class NewestScene:
         return self._scene
 
     def _newest(self) -> tuple[int, Path | None]:
-        from snowsplat import checkpoint
+        from snowsplat.training import checkpoint
 
         if self._iteration is not None:
             there = self._folder.scenes()
@@ -111,9 +111,9 @@ class NewestScene:
         return max(found, key=lambda each: each[0], default=(0, None))
 
     def _gaussians(self, path: Path) -> Gaussians:
-        from snowsplat import checkpoint
         from snowsplat.formats import read_gaussians
-        from snowsplat.gaussians import Gaussians
+        from snowsplat.scene.gaussians import Gaussians
+        from snowsplat.training import checkpoint
 
         if path.parent != self._folder.checkpoints:
             return read_gaussians(path)

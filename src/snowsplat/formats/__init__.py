@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.errors import UserError
 from snowsplat.formats import ply
 from snowsplat.formats.compressed_ply import (
     is_compressed_ply,
@@ -16,12 +15,12 @@ from snowsplat.formats.compressed_ply import (
     write_compressed_ply,
 )
 from snowsplat.formats.gltf import is_glb, read_glb, write_glb
-from snowsplat.formats.html import write_html
 from snowsplat.formats.ksplat import read_ksplat
 from snowsplat.formats.sog import is_sog, read_sog, write_sog
 from snowsplat.formats.splat import read_splat, write_splat
 from snowsplat.formats.spz import is_spz, read_spz, write_spz
-from snowsplat.gaussians import Gaussians
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.errors import UserError
 
 __all__ = [
     "FORMATS",
@@ -29,6 +28,7 @@ __all__ = [
     "format_for_reading",
     "format_for_writing",
     "read_gaussians",
+    "register_format",
     "write_gaussians",
 ]
 
@@ -54,7 +54,7 @@ class Format:
 
 
 #: In the order in which `recognises` is asked: a special kind before the general one.
-FORMATS: tuple[Format, ...] = (
+FORMATS: list[Format] = [
     Format(
         "compressed PLY",
         (".compressed.ply",),
@@ -111,15 +111,18 @@ FORMATS: tuple[Format, ...] = (
         None,
         "positions and all else have 16 or 32 bits, SH 8 to 32",
     ),
-    Format(
-        "HTML",
-        (".html",),
-        None,
-        None,
-        write_html,
-        "what compressed PLY loses",
-    ),
-)
+]
+
+
+def register_format(format: Format) -> None:
+    """Add a format that a package above this one writes, such as an HTML page.
+
+    Raises:
+        ValueError: a format of that name is registered.
+    """
+    if any(known.name == format.name for known in FORMATS):
+        raise ValueError(f"format {format.name} is already registered")
+    FORMATS.append(format)
 
 
 def read_gaussians(path: Path | str) -> Gaussians:

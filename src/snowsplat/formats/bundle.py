@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from snowsplat.untrusted import is_file, parse_json, quoted
+from snowsplat.util.safe_json import is_file, parse_json, quoted
 
 _MOST_MEMBERS = 1000
 _INFLATION, _INFLATION_FREE = 4, 1 << 20  # WebP does not deflate by much

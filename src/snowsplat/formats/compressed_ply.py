@@ -22,12 +22,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from snowsplat.errors import UserError
-from snowsplat.files import atomic_path
 from snowsplat.formats import packing
-from snowsplat.gaussians import SH_C0, SH_REST_COUNTS, Gaussians
-from snowsplat.geometry import morton_order
-from snowsplat.ply_table import PlyTable, header_of, open_table
+from snowsplat.scene.gaussians import SH_C0, SH_REST_COUNTS, Gaussians
+from snowsplat.scene.geometry import morton_order
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
+from snowsplat.util.ply import PlyTable, header_of, open_table
 
 _CHUNK = 256
 _AXES = ("x", "y", "z")

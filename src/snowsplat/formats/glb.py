@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from snowsplat.geometry import rotation_from_quat
-from snowsplat.untrusted import parse_json
+from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.util.safe_json import parse_json
 
 MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942

@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from snowsplat.edit import merge, transform
-from snowsplat.errors import UserError
-from snowsplat.files import atomic_path
 from snowsplat.formats import glb, packing
 from snowsplat.formats.frames import UP_BACK, flip_axes
 from snowsplat.formats.glb import Damaged
-from snowsplat.gaussians import SH_C0, SH_REST_COUNTS, Gaussians
-from snowsplat.geometry import Similarity
-from snowsplat.untrusted import quoted
+from snowsplat.scene.edit import merge, transform
+from snowsplat.scene.gaussians import SH_C0, SH_REST_COUNTS, Gaussians
+from snowsplat.scene.geometry import Similarity
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
+from snowsplat.util.safe_json import quoted
 
 logger = logging.getLogger(__name__)
 

@@ -25,9 +25,9 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.errors import UserError
 from snowsplat.formats import packing
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.util.errors import UserError
 
 _HEADER_BYTES = 4096
 _SECTION_HEADER_BYTES = 1024

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from snowsplat.errors import UserError
-from snowsplat.gaussians import SH_C0, Gaussians
+from snowsplat.scene.gaussians import SH_C0, Gaussians
+from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from snowsplat.errors import UserError
-from snowsplat.files import atomic_path
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.ply_table import PlyTable, header, open_table
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
+from snowsplat.util.ply import PlyTable, header, open_table
 
 _WRITE_ROWS = 1 << 14
 

@@ -28,13 +28,13 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.errors import UserError
-from snowsplat.files import atomic_path
 from snowsplat.formats import packing
 from snowsplat.formats.bundle import Bundle, Damaged
 from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.geometry import morton_order
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.geometry import morton_order
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
 
 _PALETTE_LIMIT = 1 << 16  # labels have 16 bits
 _PALETTE_COLUMNS = 64

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.errors import UserError
-from snowsplat.files import atomic_path
 from snowsplat.formats import packing
-from snowsplat.gaussians import Gaussians
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _LOG_LIMIT = 87.0  # e to more is not a float

@@ -24,12 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.errors import UserError
-from snowsplat.files import atomic_path
 from snowsplat.formats import packing
 from snowsplat.formats.frames import UP_BACK, flip_axes
 from snowsplat.formats.spz_container import ANTIALIASED, Header, is_spz, pack, unpack
-from snowsplat.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
 
 __all__ = ["is_spz", "read_spz", "write_spz"]
 

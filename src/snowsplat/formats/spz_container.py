@@ -15,8 +15,8 @@ from pathlib import Path
 
 import zstandard
 
-from snowsplat.errors import UserError
 from snowsplat.formats.packing import check_count
+from snowsplat.util.errors import UserError
 
 #: Bits of `Header.flags`.
 ANTIALIASED = 1

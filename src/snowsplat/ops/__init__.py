@@ -4,13 +4,13 @@
 """
 
 from snowsplat.ops.adam import adam_step
+from snowsplat.ops.capacity import Room
 from snowsplat.ops.devices import default_device, resolve_device
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.neighbours import neighbours
 from snowsplat.ops.photometric import photometric_loss, ssim
 from snowsplat.ops.project import project
 from snowsplat.ops.rasterize import count_blended, rasterize
-from snowsplat.ops.room import Room
 from snowsplat.ops.splats import Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
 

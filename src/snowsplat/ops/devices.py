@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import torch
 
-from snowsplat.errors import UserError
 from snowsplat.ops.cuda import availability
+from snowsplat.util.errors import UserError
 
 
 def default_device(note: Callable[[str], None] | None = None) -> torch.device:

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import torch
 
-from snowsplat.errors import UserError
 from snowsplat.ops import cuda
 from snowsplat.ops.cuda.kernels import Argument
+from snowsplat.util.errors import UserError
 
 # Worst to best. The position of a name is the number that native/cpu/isa.cpp knows it by.
 ISAS = ("baseline", "avx2", "avx512")

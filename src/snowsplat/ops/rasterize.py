@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from snowsplat.ops import scratch
+from snowsplat.ops.capacity import Room
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.room import Room
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
 from snowsplat.ops.sums import sum_of_rows
 

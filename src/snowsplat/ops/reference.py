@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from snowsplat.ops.room import Room
+from snowsplat.ops.capacity import Room
 from snowsplat.ops.splats import Splats2D
 
 LOW_PASS = 0.3  # pixels²: every splat is blurred by it, so that none slips between pixel centres

@@ -13,9 +13,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from snowsplat.errors import UserError
-from snowsplat.files import atomic_path
 from snowsplat.ops.cuda import nvrtc
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
 
 Capability = tuple[int, int]
 

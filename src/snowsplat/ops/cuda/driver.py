@@ -16,10 +16,10 @@ from typing import Any
 
 import torch
 
-from snowsplat.errors import UserError
 from snowsplat.ops.cuda import cubins
 from snowsplat.ops.cuda.availability import why_unusable
 from snowsplat.ops.cuda.kernels import Argument, Kernel
+from snowsplat.util.errors import UserError
 
 # Of the driver. What is no code for this card may be followed by what is.
 _OUT_OF_MEMORY = 2

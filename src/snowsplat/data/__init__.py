@@ -1,0 +1,17 @@
+"""Photos with known cameras, from whatever describes them, as one `Dataset`."""
+
+from snowsplat.data.dataset import Dataset, Points, View, scene_extent
+from snowsplat.data.decode import ImageSource, LoadedImage
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.load import load_dataset
+
+__all__ = [
+    "Dataset",
+    "ImageLoader",
+    "ImageSource",
+    "LoadedImage",
+    "Points",
+    "View",
+    "load_dataset",
+    "scene_extent",
+]

@@ -1,0 +1,266 @@
+"""A folder -> Dataset: which reader, which file of each image, at which size, in which split."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from snowsplat.data.colmap import find_models, read_colmap
+from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
+from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
+from snowsplat.data.transforms_json import find_transforms, read_nerf
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import is_file, quoted
+
+logger = logging.getLogger(__name__)
+
+_DIVISORS = (1, 2, 4, 8)
+_SMALLEST_SIDE = 16  # pixels; below it is a mistake in -r
+_LARGEST_FACTOR = 16
+
+
+def load_dataset(
+    path: Path | str,
+    *,
+    images: str = "images",
+    resolution: int | None = None,
+    hold_out: int | None = 8,
+    test_list: Path | str | Sequence[str] | None = None,
+) -> Dataset:
+    """Read a posed dataset; images stay on disk, but the headers of all are checked.
+
+    ``path`` is a folder with a COLMAP model (``sparse/0`` …, binary or text) and images, a folder
+    with ``transforms.json`` or ``transforms_train.json``, or such a file.
+
+    Args:
+        images: name of the folder of images.
+        resolution: 1, 2, 4 or 8 divide the size of the images (``images_2`` … are used where they
+            are whole); any other number is the width in pixels to bring wider images to; None
+            or −1 takes them as they are.
+        hold_out: every so many-th image, in the order of names, beginning with the first, is held
+            out for testing; splits that the dataset itself brings come first. None trains on all.
+        test_list: the names of the images to hold out instead, or a text file of one a line.
+
+    Raises:
+        UserError: no dataset there; files that are damaged; cameras with lens distortion; images
+            that are absent, damaged, or of another size than their cameras.
+    """
+    root = Path(path)
+    posed, points, description = _read(root, images)
+    posed = _with_smaller_copies(posed, resolution)
+    headers = [read_header(image.path) for image in posed]
+    sizes = _file_sizes(posed, headers)
+    views = sorted(
+        (_view(*found, resolution) for found in zip(posed, headers, sizes, strict=True)),
+        key=lambda view: view.name,
+    )
+    if len({view.name for view in views}) < len(views):
+        twice = next(name for name, n in Counter(view.name for view in views).items() if n > 1)
+        raise UserError(f"{root}: has two images named {twice}; remove one")
+    tested = _test_names(posed, hold_out, test_list)
+    train = [view for view in views if view.name not in tested]
+    if not train:
+        raise UserError(
+            f"{root}: all {len(views)} images are held out for testing, and none is left to train "
+            "on; hold out fewer or none"
+        )
+    return Dataset(
+        train=train,
+        test=[view for view in views if view.name in tested],
+        points=points,
+        extent=scene_extent([view.camera for view in train]),
+        description=description,
+    )
+
+
+def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str]:
+    if not root.exists():
+        raise UserError(f"{root}: no such folder")
+    transforms = find_transforms(root)
+    models = find_models(root / "sparse") or ([] if transforms else find_models(root))
+    models = models or ([] if transforms else find_models(root / "colmap" / "sparse"))
+    if models:
+        return read_colmap(root, models, images)
+    if transforms:
+        return read_nerf(transforms, images)
+    if root.is_file():
+        raise UserError(f"{root}: not a dataset; give its folder, or a transforms.json")
+    raise UserError(
+        f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); photos "
+        "alone need their poses computed first, e.g. by COLMAP"
+    )
+
+
+def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> list[PosedImage]:
+    """The same images from ``images_2`` … if such folders are asked for and hold every image."""
+    if resolution not in _DIVISORS[1:]:
+        return posed
+    smaller = []
+    for image in posed:
+        if not image.folder.name:
+            return posed
+        folder = image.folder.with_name(f"{image.folder.name}_{resolution}")
+        stem = str(Path(image.file).with_suffix(""))
+        names = (image.file, *(stem + s for s in IMAGE_SUFFIXES), stem + ".JPG", stem + ".PNG")
+        found = next((name for name in names if is_file(folder / name)), None)
+        if found is None or not _is_divided(image.path, folder / found, resolution):
+            if folder.is_dir():
+                logger.warning(
+                    "%s: %s there is %s; scaling the large images instead",
+                    folder,
+                    image.file,
+                    "absent" if found is None else f"not 1/{resolution} of the large one",
+                )
+            return posed
+        smaller.append(dataclasses.replace(image, folder=folder, file=found, divided=resolution))
+    return smaller
+
+
+def _is_divided(large: Path, small: Path, factor: int) -> bool:
+    a, b = read_header(large), read_header(small)
+    return _is_close(a.width, b.width, factor) and _is_close(a.height, b.height, factor)
+
+
+def _is_close(large: int, small: int, factor: int) -> bool:
+    # Sizes that do not divide are rounded up or down, as the tool that made the copy pleased.
+    return abs(small - large / factor) < 1
+
+
+def _file_sizes(posed: list[PosedImage], headers: list[Header]) -> list[tuple[int, int, bool]]:
+    """Width and height of each file, and whether it has to be turned, checked against its camera.
+
+    A folder of images may be a smaller copy of those the poses were made from (``images_4``, or
+    datasets that are passed around without the large ones): then the intrinsics are scaled. It
+    has to be a whole number of times smaller, and the same for all images of a folder.
+    """
+    found = [_shrunk_by(image, header) for image, header in zip(posed, headers, strict=True)]
+    usual: dict[Path, int] = {}
+    for folder in {image.folder for image in posed}:
+        factors = [f for i, (f, _) in zip(posed, found, strict=True) if i.folder == folder and f]
+        if factors:
+            usual[folder] = Counter(sorted(factors)).most_common(1)[0][0]
+    sizes = []
+    for image, header, (factor, turn) in zip(posed, headers, found, strict=True):
+        if factor is None or factor != usual[image.folder]:
+            camera = image.camera
+            raise UserError(
+                f"{image.path}: is {header.width}x{header.height}, but its camera is "
+                f"{camera.width}x{camera.height}; use the images that the poses were made from, or "
+                "all of them scaled by 1/2, 1/4 or 1/8"
+            )
+        size = (header.height, header.width) if turn else (header.width, header.height)
+        sizes.append((*size, turn))
+    for folder, factor in usual.items():
+        if factor > 1 and not folder.name.endswith(f"_{factor}"):
+            logger.warning(
+                "%s: images are 1/%d of their cameras' size; scaled to it", folder, factor
+            )
+    return sizes
+
+
+def _shrunk_by(image: PosedImage, header: Header) -> tuple[int | None, bool]:
+    """How many times smaller than its camera a file is, None if it is no such thing; and its turn.
+
+    Pixels are taken as stored, which is what COLMAP does, unless they fit the camera only when
+    turned as the file's EXIF orientation says.
+    """
+    camera = image.camera
+    turns = (False, True) if header.sideways else (False,)
+    for turn in turns:
+        width, height = (header.height, header.width) if turn else (header.width, header.height)
+        factor = max(1, round(camera.width / width))
+        exact = factor == 1 and (width, height) == (camera.width, camera.height)
+        close = _is_close(camera.width, width, factor) and _is_close(camera.height, height, factor)
+        if exact or (1 < factor <= _LARGEST_FACTOR and close):
+            return factor, turn
+    return None, False
+
+
+def _view(
+    image: PosedImage, header: Header, size: tuple[int, int, bool], resolution: int | None
+) -> View:
+    width, height, turn = size
+    width, height = _final_size(image, width, height, resolution)
+    mask = None
+    if image.mask is not None:
+        mask = ImageSource(image.mask, width, height, turn)
+        _check_mask(image, header, read_header(image.mask))
+    source = ImageSource(image.path, width, height, turn, header.width * header.height)
+    return View(image.name, image.camera.scaled(width, height), source, mask)
+
+
+def _final_size(
+    image: PosedImage, width: int, height: int, resolution: int | None
+) -> tuple[int, int]:
+    if resolution is None or resolution == -1:
+        return width, height
+    if resolution < 1:
+        raise UserError(f"a resolution of {resolution} makes no sense; use 1, 2, 4, 8 or a width")
+    if resolution in _DIVISORS:
+        divisor = resolution / image.divided
+    else:
+        divisor = max(1.0, width / resolution)
+    new_width, new_height = max(1, round(width / divisor)), max(1, round(height / divisor))
+    if divisor > 1 and min(new_width, new_height) < _SMALLEST_SIDE:
+        raise UserError(
+            f"a resolution of {resolution} makes images of {new_width}x{new_height} pixels; use 1, "
+            "2, 4 or 8 to divide their size, or a larger width"
+        )
+    return new_width, new_height
+
+
+def _check_mask(image: PosedImage, header: Header, mask: Header) -> None:
+    fits = (header.width, header.height), (image.camera.width, image.camera.height)
+    if (mask.width, mask.height) not in fits:
+        raise UserError(
+            f"{image.mask}: the mask is {mask.width}x{mask.height}, but its image is "
+            f"{header.width}x{header.height}; make it as large"
+        )
+
+
+def _test_names(
+    posed: list[PosedImage], hold_out: int | None, test_list: Path | str | Sequence[str] | None
+) -> set[str]:
+    names = sorted(image.name for image in posed)
+    if test_list is not None:
+        return _listed(names, test_list)
+    if hold_out is None:
+        return set()
+    if hold_out < 1:
+        raise UserError(f"holding out every {hold_out}th image makes no sense; use 2 or more")
+    if any(image.split == "test" for image in posed):
+        return {image.name for image in posed if image.split == "test"}
+    return set(names[::hold_out])
+
+
+def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]:
+    """Names may be whole, without their folder, or without their ending, as long as it is clear."""
+    if isinstance(test_list, str | Path):
+        try:
+            if Path(test_list).exists() and not is_file(Path(test_list)):
+                raise ValueError("no file")
+            lines = Path(test_list).read_text(encoding="utf-8").splitlines()
+        except (OSError, ValueError) as error:
+            raise UserError(
+                f"{test_list}: the list of test images cannot be read ({error})"
+            ) from None
+    else:
+        lines = list(test_list)
+    known: dict[str, set[str]] = {}
+    for name in names:
+        file = name.rpartition("/")[2]
+        for short in {name, name.rpartition(".")[0], file, file.rpartition(".")[0]}:
+            known.setdefault(short, set()).add(name)
+    tested = set()
+    for line in filter(None, (line.strip() for line in lines)):
+        matches = {line} if line in names else known.get(line, set())
+        if len(matches) != 1:
+            problem = (
+                "is the name of several images" if matches else "is not an image of the dataset"
+            )
+            raise UserError(f"the list of test images: {quoted(line)} {problem}")
+        tested |= matches
+    return tested

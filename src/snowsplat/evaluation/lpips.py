@@ -1,0 +1,185 @@
+"""LPIPS, a learned perceptual distance of images (Zhang, Isola, Efros, Shechtman, Wang, CVPR 2018).
+
+It needs the weights of a network trained on photographs and of its five linear heads, which are not
+ours to carry: the user names a file that holds both. Such a file is made, wherever the `lpips`
+package is installed, with
+
+    weights = {name: w.clone() for name, w in lpips.LPIPS(net="vgg").state_dict().items()}
+    safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
+
+Not what `torch.save` writes: that is a program (a pickle), and even where torch holds it to a few
+harmless functions, a hundred bytes of it can ask for any amount of memory. Names in the file:
+
+    features.N.weight, features.N.bias    backbone, N as in torchvision's AlexNet or VGG16
+    (or net.sliceM.N.weight, …)           the same, as the `lpips` package spells it
+    linK.model.1.weight                   (1, C, 1, 1), K = 0..4, the heads
+
+Which of the two backbones it is shows in the shape of its first layer.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors.torch
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import check_header
+
+# The mean and deviation of ImageNet's colours, as [-1, 1] has them: ((0.485, …) − 0.5) · 2 and
+# 0.229 · 2.
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
+_MIN_SIDE = 32  # of an image, in pixels: the backbones halve it several times
+_BACKBONE = re.compile(r"(?:.*\.)?(?:features|net\.slice\d)\.(\d{1,3})\.(weight|bias)")
+_HEAD = re.compile(r"lin(\d)\.model\.1\.weight")
+
+
+@dataclass(frozen=True)
+class _Conv:
+    """A convolution and its ReLU. ``tap``: its output is one of the five that are compared."""
+
+    index: int  # N of the weights' names
+    inputs: int
+    outputs: int
+    size: int = 3
+    stride: int = 1
+    padding: int = 1
+    tap: bool = False
+    pool: int = 0  # side of the max pooling (stride 2) before it; 0 is none
+
+
+_ALEX = (
+    _Conv(0, 3, 64, size=11, stride=4, padding=2, tap=True),
+    _Conv(3, 64, 192, size=5, padding=2, tap=True, pool=3),
+    _Conv(6, 192, 384, tap=True, pool=3),
+    _Conv(8, 384, 256, tap=True),
+    _Conv(10, 256, 256, tap=True),
+)
+_VGG16 = (
+    _Conv(0, 3, 64),
+    _Conv(2, 64, 64, tap=True),
+    _Conv(5, 64, 128, pool=2),
+    _Conv(7, 128, 128, tap=True),
+    _Conv(10, 128, 256, pool=2),
+    _Conv(12, 256, 256),
+    _Conv(14, 256, 256, tap=True),
+    _Conv(17, 256, 512, pool=2),
+    _Conv(19, 512, 512),
+    _Conv(21, 512, 512, tap=True),
+    _Conv(24, 512, 512, pool=2),
+    _Conv(26, 512, 512),
+    _Conv(28, 512, 512, tap=True),
+)
+
+
+@dataclass(frozen=True)
+class Lpips:
+    """A backbone and its heads; call it with two images.
+
+    ``name`` is "alex" or "vgg": figures of different backbones do not compare.
+    """
+
+    name: str
+    layers: tuple[_Conv, ...]
+    weights: dict[int, tuple[Tensor, Tensor]]  # by layer index: weight, bias
+    heads: tuple[Tensor, ...]  # five of (C,)
+
+    @staticmethod
+    def load(path: Path | str) -> Lpips:
+        """Read a weights file, see the head of this module.
+
+        Raises:
+            UserError: absent, not a weights file, or with layers that are missing or of another
+            shape.
+        """
+        state = _read_state(Path(path))
+        backbone: dict[tuple[int, str], Tensor] = {}
+        heads: dict[int, Tensor] = {}
+        for name, value in state.items():
+            if match := _BACKBONE.fullmatch(name):
+                backbone[int(match[1]), match[2]] = value
+            elif match := _HEAD.fullmatch(name):
+                heads[int(match[1])] = value
+        first = backbone.get((0, "weight"))
+        alex = first is not None and tuple(first.shape) == (64, 3, 11, 11)
+        layers = _ALEX if alex else _VGG16
+
+        def checked(value: Tensor | None, shape: tuple[int, ...], name: str) -> Tensor:
+            if value is None or tuple(value.shape) != shape:
+                found = "missing" if value is None else f"of shape {tuple(value.shape)}"
+                raise UserError(
+                    f"{path}: not LPIPS weights: {name} is {found}; the file should hold the state "
+                    "of lpips.LPIPS(net='alex') or net='vgg'"
+                )
+            return value.to(torch.float32).contiguous()
+
+        weights = {}
+        for layer in layers:
+            kernel = (layer.outputs, layer.inputs, layer.size, layer.size)
+            name = f"features.{layer.index}"
+            weights[layer.index] = (
+                checked(backbone.get((layer.index, "weight")), kernel, f"{name}.weight"),
+                checked(backbone.get((layer.index, "bias")), kernel[:1], f"{name}.bias"),
+            )
+        channels = [layer.outputs for layer in layers if layer.tap]
+        linear = tuple(
+            checked(heads.get(k), (1, c, 1, 1), f"lin{k}.model.1.weight").reshape(c)
+            for k, c in enumerate(channels)
+        )
+        return Lpips("alex" if alex else "vgg", layers, weights, linear)
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor, target: Tensor) -> float:
+        """The distance of two images (H, W, 3) in 0..1: 0 for the same image, larger is further.
+
+        d = Σ_k mean over pixels of Σ_c w_kc (f̂_kc(image) − f̂_kc(target))², f̂ the features of tap
+        k with unit length over the channels.
+
+        Raises:
+            UserError: images smaller than 32 pixels.
+        """
+        if min(image.shape[:2]) < _MIN_SIDE:
+            raise UserError(f"LPIPS needs images of at least {_MIN_SIDE} pixels a side")
+        distance = 0.0
+        pairs = zip(self._features(image), self._features(target), strict=True)
+        for head, (a, b) in zip(self.heads, pairs, strict=True):
+            difference = (_unit(a) - _unit(b)).square()
+            distance += float(torch.einsum("c,chw->hw", head, difference).mean())
+        return distance
+
+    def _features(self, image: Tensor) -> list[Tensor]:
+        """The five taps, each (C, h, w)."""
+        x = image.to(torch.float32).permute(2, 0, 1)[None] * 2.0 - 1.0
+        shift, scale = (torch.tensor(values).reshape(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
+        x = (x - shift) / scale
+        taps = []
+        for layer in self.layers:
+            if layer.pool:
+                x = F.max_pool2d(x, layer.pool, stride=2)
+            weight, bias = self.weights[layer.index]
+            x = F.conv2d(x, weight, bias, layer.stride, layer.padding).relu_()
+            if layer.tap:
+                taps.append(x[0])
+        return taps
+
+
+def _unit(features: Tensor) -> Tensor:
+    return features / (features.square().sum(0, keepdim=True).sqrt() + 1e-10)
+
+
+def _read_state(path: Path) -> dict[str, Tensor]:
+    try:
+        check_header(path)
+        return safetensors.torch.load_file(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (safetensors.SafetensorError, ValueError, KeyError):
+        raise UserError(
+            f"{path}: not a safetensors file; see snowsplat evaluate --help for how one is made"
+        ) from None

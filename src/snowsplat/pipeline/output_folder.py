@@ -1,0 +1,292 @@
+"""The output folder of a training, laid out as the reference implementation does, for its tools.
+
+    OUT/cfg_args                                   its settings, in the reference's spelling
+    OUT/cameras.json                               all cameras
+    OUT/input.ply                                  the points that training began with
+    OUT/point_cloud/iteration_N/point_cloud.ply    the scene after N steps
+    OUT/config.json                                ours: every setting, exactly
+    OUT/checkpoints/step_N.safetensors             ours: see snowsplat.training.checkpoint
+    OUT/metrics.json                               figures of the last evaluation
+    OUT/history.json                               ours: the curves of the training
+    OUT/report.html                                ours: how the training went, to look at
+    OUT/test/ours_N/renders, gt                    what `snowsplat render` makes; train/ alike
+    OUT/films/                                     ours: and its films
+
+Folders that the reference itself made are read as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import shutil
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from snowsplat._version import __version__
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import is_temporary, remove_temporaries, write_json, write_text
+from snowsplat.util.safe_json import from_json, read_json
+
+if TYPE_CHECKING:
+    from snowsplat.data import Dataset
+    from snowsplat.evaluation.metrics import Evaluation
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.training.config import TrainConfig
+
+#: What `make` has in its folder: the dataset, and the output folder of its training.
+CAPTURE, SCENE = "capture", "scene"
+# A text, a name or number, or a sign; and those of which the value is taken.
+# Spaces are no part of it: looking beyond each of a million is a million times a million steps.
+_WORD = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S""", re.DOTALL)
+_LITERAL = re.compile(r"""['"].*['"]|True|False|None|-?[\d.]+(?:e[+-]?\d+)?""", re.DOTALL)
+_NAMESPACE_LIMIT = 1 << 20  # characters
+_PART = 4  # words of a part that are kept: one more than are wanted
+_SCENE = re.compile(r"iteration_(\d+)")
+_RESULTS = ("point_cloud", "checkpoints", "train", "test", "films")
+_REPORTS = ("metrics.json", "history.json", "report.html")
+_FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
+
+
+@dataclass(frozen=True)
+class DatasetSettings:
+    """How the dataset of a training was read: the arguments of `load_dataset`."""
+
+    path: str
+    images: str = "images"
+    resolution: int = -1
+    hold_out: int | None = None
+    test_list: str | None = None
+
+    def load(self) -> Dataset:
+        """Read the dataset.
+
+        Raises:
+            UserError: see `snowsplat.data.load_dataset`.
+        """
+        from snowsplat.data import load_dataset
+
+        return load_dataset(
+            self.path,
+            images=self.images,
+            resolution=self.resolution,
+            hold_out=self.hold_out,
+            test_list=self.test_list,
+        )
+
+
+@dataclass(frozen=True)
+class OutputFolder:
+    """An output folder, existing or to come."""
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def history(self) -> Path:
+        return self.path / "history.json"
+
+    @property
+    def report(self) -> Path:
+        return self.path / "report.html"
+
+    def is_one(self) -> bool:
+        """Whether a training, ours or the reference's, has written here."""
+        return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))
+
+    # Before a training
+
+    def check_free(self, *, resume: bool, overwrite: bool) -> None:
+        """Refuse a place that is taken; writes nothing.
+
+        Raises:
+            UserError: a file, a folder of something else, or a training that is not to be touched.
+        """
+        if not self.path.exists():
+            return
+        if not self.path.is_dir():
+            raise UserError(f"{self.path}: is a file; name a folder for the output")
+        others = (entry for entry in self.path.iterdir() if not is_temporary(entry, _FILES))
+        if any(others) and not self.is_one():
+            raise UserError(f"{self.path}: holds other files; name a new or an empty folder")
+        if self.is_one() and not resume and not overwrite:
+            raise UserError(
+                f"{self.path}: holds a training already; add --resume to go on with it, "
+                "--overwrite to replace it, or name another folder"
+            )
+
+    def begin(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
+        """Make the folder, without old results, and `describe` the training."""
+        for name in _RESULTS:
+            shutil.rmtree(self.path / name, ignore_errors=True)
+        for name in _REPORTS:
+            (self.path / name).unlink(missing_ok=True)
+        self.describe(dataset, settings, config)
+
+    def describe(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
+        """Write what is known before the first step."""
+        from snowsplat.scene.camera_json import write_cameras
+
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.write_config(settings, config)  # from here on the folder is known to be ours
+        if dataset.points is not None:
+            from snowsplat.data.points_ply import write_points
+
+            points = dataset.points
+            write_points(self.path / "input.ply", points.xyz.numpy(), points.rgb.numpy())
+        views = [*dataset.train, *dataset.test]
+        cameras = ((Path(view.name).stem, view.camera) for view in views)
+        write_cameras(self.path / "cameras.json", cameras)
+
+    def write_config(self, settings: DatasetSettings, config: TrainConfig) -> None:
+        """`config.json` and `cfg_args`; what a kill has left of earlier ones goes."""
+        from snowsplat.training.config import config_to_json
+
+        remove_temporaries(self.path, _FILES)
+        self._remove_unwritten_scenes()
+        whole = {
+            "snowsplat": __version__,
+            "capture": asdict(settings),
+            "training": config_to_json(config),
+        }
+        write_json(self.path / "config.json", whole)
+        namespace = argparse.Namespace(
+            data_device="cpu",
+            eval=settings.hold_out is not None,
+            images=settings.images,
+            model_path=str(self.path.absolute()),
+            resolution=settings.resolution,
+            sh_degree=config.sh_degree,
+            source_path=settings.path,
+            white_background=config.background == "white",
+        )
+        write_text(self.path / "cfg_args", repr(namespace))
+
+    def _remove_unwritten_scenes(self) -> None:
+        """Folders of scenes that a kill or a full disk prevented."""
+        for folder in (self.path / "point_cloud").glob("iteration_*"):
+            if not (folder / "point_cloud.ply").exists():
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def discard(self) -> None:
+        """Take back what `begin` wrote, if nothing has come of it."""
+        if self.scenes() or self.checkpoints.exists():
+            return
+        for name in _FILES:
+            (self.path / name).unlink(missing_ok=True)
+        self._remove_unwritten_scenes()
+        with suppress(OSError):  # it is not there, or something else is in it
+            (self.path / "point_cloud").rmdir()
+        if self.path.is_dir() and not any(self.path.iterdir()):
+            self.path.rmdir()
+
+    # Scenes
+
+    def scenes(self) -> list[int]:
+        """The iterations whose scene is there, ascending."""
+        folder = self.path / "point_cloud"
+        if not folder.is_dir():
+            return []
+        found = [_SCENE.fullmatch(entry.name) for entry in folder.iterdir()]
+        steps = sorted(int(match[1]) for match in found if match)
+        return [step for step in steps if self.scene_path(step).is_file()]
+
+    def scene_path(self, iteration: int) -> Path:
+        return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+    def write_scene(self, iteration: int, gaussians: Gaussians) -> Path:
+        """Save the scene; gives its file."""
+        from snowsplat.formats import write_gaussians
+
+        path = self.scene_path(iteration)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_gaussians(path, gaussians)
+        return path
+
+    def read_scene(self, iteration: int | None) -> tuple[int, Gaussians]:
+        """The scene of an iteration, the last one by default.
+
+        Raises:
+            UserError: no such folder or scene, or a damaged one.
+        """
+        from snowsplat.formats import read_gaussians
+
+        if not self.path.is_dir():
+            raise UserError(f"{self.path}: no such folder; give the output folder of a training")
+        scenes = self.scenes()
+        if not scenes:
+            raise UserError(f"{self.path}: holds no scene (no point_cloud/iteration_N in it)")
+        chosen = scenes[-1] if iteration is None else iteration
+        if chosen not in scenes:
+            there = ", ".join(map(str, scenes))
+            raise UserError(f"{self.path}: holds no scene of iteration {chosen}; there are {there}")
+        return chosen, read_gaussians(self.scene_path(chosen))
+
+    def write_metrics(self, iteration: int, split: str, evaluation: Evaluation) -> None:
+        """`metrics.json`: which scene, which views, the mean figures, and those of each view."""
+        head = {"iteration": iteration, "split": split}
+        write_json(self.path / "metrics.json", head | evaluation.as_json())
+
+    # Settings
+
+    def settings(self) -> tuple[DatasetSettings, tuple[float, float, float]]:
+        """How the dataset was read, and the background colour.
+
+        Raises:
+            UserError: no settings here, or damaged ones.
+        """
+        ours, theirs = self.path / "config.json", self.path / "cfg_args"
+        try:
+            if ours.is_file():
+                whole = read_json(ours)
+                dataset = from_json(DatasetSettings, whole["capture"])
+                white = whole["training"]["background"] == "white"
+            elif theirs.is_file():
+                values = _namespace(theirs)
+                dataset = DatasetSettings(
+                    path=str(values["source_path"]),
+                    images=str(values.get("images", "images")),
+                    resolution=int(values.get("resolution", -1)),
+                    hold_out=8 if values.get("eval") else None,
+                )
+                white = bool(values.get("white_background"))
+            else:
+                raise UserError(
+                    f"{self.path}: not the output folder of a training (no config.json)"
+                )
+        except (KeyError, TypeError, ValueError, SyntaxError, OverflowError):
+            where = ours if ours.is_file() else theirs
+            raise UserError(f"{where}: damaged; it does not name the dataset") from None
+        return dataset, (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+
+
+def _namespace(path: Path) -> dict[str, Any]:
+    """Texts, numbers, True, False and None of ``Namespace(name=value, …)``; all else is left out.
+
+    Only single words are given to Python's own reader of literals: it runs nothing, but deep
+    nesting may end the program.
+    """
+    with open(path, encoding="utf-8") as file:
+        words = (match[0] for match in _WORD.finditer(file.read(_NAMESPACE_LIMIT)))
+        if [next(words, ""), next(words, "")] != ["Namespace", "("]:
+            raise ValueError("not a Namespace")
+        values, depth, part = {}, 1, list[str]()
+        for word in words:
+            if word in ("'", '"'):
+                raise ValueError("a text without an end")
+            depth += (word in "([{") - (word in ")]}")
+            if depth > 1 or (depth == 1 and word != ","):
+                part = [*part, word][:_PART]
+                continue
+            if len(part) == _PART - 1 and part[1] == "=" and _LITERAL.fullmatch(part[2]):
+                values[part[0]] = ast.literal_eval(part[2])
+            part = []
+            if depth < 1:
+                return values
+    raise ValueError("no end")

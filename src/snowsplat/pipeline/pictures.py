@@ -1,0 +1,69 @@
+"""Pictures as PNG files: colours in 8 bits, depth in 16 bits or in colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+from snowsplat.util.files import atomic_path
+
+# Anchors of a map from far (0) to near (1) whose lightness only grows: violet, blue, green, yellow.
+_DEPTH_COLORS = np.array(
+    [[68, 1, 84], [65, 68, 135], [42, 120, 142], [34, 168, 132], [122, 209, 81], [253, 231, 37]],
+    np.float32,
+)
+_OPAQUE_ENOUGH = 0.5  # below this alpha a pixel shows background, which has no depth
+
+
+def to_8bit(image: Tensor) -> np.ndarray:
+    """(H, W, 3) in 0..1 -> uint8, rounded to the nearest."""
+    return (image.clamp(0.0, 1.0) * 255.0 + 0.5).byte().contiguous().cpu().numpy()
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write (H, W, 3) uint8 or (H, W) uint16, atomically."""
+    with atomic_path(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3)
+
+
+def mean_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:
+    """(H, W) float32, world units: mean camera z of what a pixel shows, Σ T α z / Σ T α.
+
+    0 where it shows mostly background, which has no depth.
+    """
+    mean = depth / alpha.clamp_min(1e-6)
+    mean[alpha < _OPAQUE_ENOUGH] = 0.0
+    return mean.cpu().numpy()
+
+
+def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Near and far of some depth images, without the outermost 1% at each end."""
+    shown = np.concatenate([np.zeros(0, np.float32), *(depth[depth > 0] for depth in depths)])
+    if not shown.size:
+        return 1.0, 2.0
+    near, far = np.percentile(shown, [1, 99])
+    return float(near), max(float(far), 1.001 * float(near))
+
+
+def depth_in_16_bits(depth: np.ndarray) -> tuple[np.ndarray, float]:
+    """(H, W) uint16, and how many world units one step is."""
+    step = (float(depth.max()) or 1.0) / 65535.0
+    return np.clip(np.rint(depth / step), 0, 65535).astype(np.uint16), step
+
+
+def depth_in_color(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """(H, W, 3) uint8, from near (yellow) to far (violet); black where there is no depth.
+
+    Even steps of disparity, 1/z, which is how the eye tells distances.
+    """
+    with np.errstate(divide="ignore"):
+        t = (1.0 / depth - 1.0 / far) / (1.0 / near - 1.0 / far)
+    position = np.clip(np.nan_to_num(t), 0.0, 1.0) * (len(_DEPTH_COLORS) - 1)
+    low = np.minimum(position.astype(np.int64), len(_DEPTH_COLORS) - 2)
+    share = (position - low)[:, :, None]
+    color = _DEPTH_COLORS[low] * (1.0 - share) + _DEPTH_COLORS[low + 1] * share
+    return np.where(depth[:, :, None] > 0, np.rint(color), 0.0).astype(np.uint8)

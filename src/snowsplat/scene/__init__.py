@@ -1,0 +1,1 @@
+"""Cameras, Gaussians, and operations on a scene."""

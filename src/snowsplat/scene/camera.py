@@ -1,0 +1,87 @@
+"""The pinhole camera, in OpenCV axes: x right, y down, z forward."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat.scene.geometry import invert_rigid, transform_points
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera and its pose.
+
+    A point x_cam = R x_world + t in front of it (z > 0) falls on (fx·x/z + cx, fy·y/z + cy), in
+    pixels from the upper left corner of the picture: pixel (i, j) of column i and row j has its
+    centre at (i + 0.5, j + 0.5). This is COLMAP's convention too.
+
+    Raises:
+        ValueError: sizes or focal lengths that are not positive, a pose that is not (3, 4).
+    """
+
+    width: int  # pixels
+    height: int
+    fx: float  # pixels
+    fy: float
+    cx: float
+    cy: float
+    cam_from_world: Tensor  # (3, 4) float64, [R | t]; may require grad
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"a camera needs a positive size, not {self.width}x{self.height}")
+        if not (self.fx > 0 and self.fy > 0):
+            raise ValueError(f"a camera needs positive focal lengths, not {self.fx}, {self.fy}")
+        if self.cam_from_world.shape != (3, 4):
+            raise ValueError(f"cam_from_world is (3, 4), not {tuple(self.cam_from_world.shape)}")
+
+    def is_finite(self) -> bool:
+        """Whether all of it is, in the single precision of kernels."""
+        pose = self.cam_from_world.detach().reshape(-1).tolist()
+        return all(abs(n) < 1e38 for n in (self.fx, self.fy, self.cx, self.cy, *pose))
+
+    @property
+    def world_from_cam(self) -> Tensor:
+        """(3, 4), the inverse of ``cam_from_world``."""
+        return invert_rigid(self.cam_from_world)
+
+    @property
+    def position(self) -> Tensor:
+        """(3,) the camera's centre, world frame."""
+        return self.world_from_cam[:, 3]
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same view at another image size: intrinsics scaled by each axis' own ratio."""
+        sx, sy = width / self.width, height / self.height
+        return dataclasses.replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def to(self, device: torch.device) -> Camera:
+        """With its pose on a device, where rendering there finds it."""
+        return dataclasses.replace(self, cam_from_world=self.cam_from_world.to(device))
+
+    def downscaled(self, factor: int) -> Camera:
+        """The camera of the image that `ImageLoader.get` gives at ``downscale=factor``."""
+        return self.scaled(max(1, self.width // factor), max(1, self.height // factor))
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """World points (P, 3) -> pixel positions (P, 2) and depths (P,), the camera's z.
+
+        Positions mean nothing where the depth is not positive.
+        """
+        x_cam = transform_points(self.cam_from_world.to(points.dtype), points)
+        depth = x_cam[:, 2]
+        focal = torch.tensor([self.fx, self.fy], dtype=points.dtype)
+        centre = torch.tensor([self.cx, self.cy], dtype=points.dtype)
+        return x_cam[:, :2] / depth[:, None] * focal + centre, depth

@@ -1,0 +1,228 @@
+"""The scene: N Gaussians, their parameters as they are optimised, and their activations.
+
+This holds numbers only. It owns no optimiser and no density control: those take a `Gaussians` and
+give back another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.ops.scratch import take_rows
+
+#: The constant basis function of the spherical harmonics, Y_00 = 1 / (2 sqrt(pi)).
+SH_C0 = 0.28209479177387814
+#: Number of SH coefficients beyond the constant one, for degrees 0, 1, 2, 3.
+SH_REST_COUNTS = (0, 3, 8, 15)
+
+
+class ColoredPoints(Protocol):
+    """What `Gaussians.from_points` needs of a point cloud (`snowsplat.data.Points` is one)."""
+
+    xyz: Tensor  # (P, 3) float32, world
+    rgb: Tensor  # (P, 3) uint8
+
+
+@dataclass
+class Gaussians:
+    """N anisotropic Gaussians in the world frame, all tensors of one floating dtype on one device.
+
+    ==================  ===========  ======================================================
+    means               (N, 3)       centres, in world units
+    log_scales          (N, 3)       natural logarithm of the standard deviations
+    quats               (N, 4)       rotation, wxyz; need not be normalised
+    opacity_logits      (N,)         opacity = sigmoid(logit)
+    sh_dc               (N, 1, 3)    constant SH coefficient of each colour channel
+    sh_rest             (N, K, 3)    the others, K = (degree + 1)² − 1: 0, 3, 8 or 15
+    ==================  ===========  ======================================================
+
+    Raises:
+        ValueError: shapes, dtypes or devices that do not fit together.
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    quats: Tensor
+    opacity_logits: Tensor
+    sh_dc: Tensor
+    sh_rest: Tensor
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0] if self.means.ndim else 0
+        rest = self.sh_rest.shape[1] if self.sh_rest.ndim == 3 else 0
+        if rest not in SH_REST_COUNTS:
+            raise ValueError(
+                f"sh_rest holds {rest} coefficients a channel; 0, 3, 8 or 15 are possible"
+            )
+        expected = {
+            "means": (n, 3),
+            "log_scales": (n, 3),
+            "quats": (n, 4),
+            "opacity_logits": (n,),
+            "sh_dc": (n, 1, 3),
+            "sh_rest": (n, rest, 3),
+        }
+        for name, tensor in self.parameters().items():
+            if tuple(tensor.shape) != expected[name]:
+                raise ValueError(
+                    f"{name} has shape {tuple(tensor.shape)}, expected {expected[name]}"
+                )
+            if not tensor.is_floating_point() or tensor.dtype != self.means.dtype:
+                raise ValueError(f"{name} is {tensor.dtype}, means is {self.means.dtype}")
+            if tensor.device != self.means.device:
+                raise ValueError(f"{name} is on {tensor.device}, means on {self.means.device}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The six tensors by name, always in the order of the table above."""
+        return {
+            "means": self.means,
+            "log_scales": self.log_scales,
+            "quats": self.quats,
+            "opacity_logits": self.opacity_logits,
+            "sh_dc": self.sh_dc,
+            "sh_rest": self.sh_rest,
+        }
+
+    # Activations
+
+    @property
+    def scales(self) -> Tensor:
+        """(N, 3) standard deviations in world units, exp(log_scales)."""
+        return self.log_scales.exp()
+
+    @property
+    def rotations(self) -> Tensor:
+        """(N, 4) unit quaternions wxyz."""
+        return torch.nn.functional.normalize(self.quats, dim=1)
+
+    @property
+    def opacities(self) -> Tensor:
+        """(N,) in (0, 1), sigmoid(opacity_logits)."""
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def base_colors(self) -> Tensor:
+        """(N, 3) colour without its view-dependent part, 0.5 + C0 · sh_dc; not clamped."""
+        return 0.5 + SH_C0 * self.sh_dc[:, 0]
+
+    @property
+    def sh_degree(self) -> int:
+        """0 to 3: the degree that ``sh_rest`` has room for."""
+        return SH_REST_COUNTS.index(self.sh_rest.shape[1])
+
+    # Sets of Gaussians
+
+    def finite_rows(self) -> Tensor:
+        """(N,) bool: Gaussians all of whose parameters are finite."""
+        finite = torch.ones(len(self), dtype=torch.bool, device=self.means.device)
+        for parameter in self.parameters().values():
+            values = parameter if parameter.ndim > 1 else parameter[:, None]
+            finite &= values.isfinite().flatten(1).all(dim=1)
+        return finite
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """Apply one function to every parameter tensor."""
+        return Gaussians(*(function(tensor) for tensor in self.parameters().values()))
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The rows ``index``: (M,) integers in any order, or an (N,) bool mask."""
+        return self.map(lambda tensor: take_rows(tensor, index))
+
+    def select_(self, index: Tensor) -> None:
+        """`select` in place, a tensor at a time: memory never holds two of all."""
+        for name in tuple(self.parameters()):
+            setattr(self, name, take_rows(getattr(self, name), index))
+
+    def append(self, other: Gaussians) -> Gaussians:
+        """This set's rows, then the other's."""
+        return Gaussians.cat([self, other])
+
+    @staticmethod
+    def cat(parts: Sequence[Gaussians]) -> Gaussians:
+        """Rows of all ``parts`` (at least one, all of one SH degree) in order."""
+        columns = zip(*(part.parameters().values() for part in parts), strict=True)
+        return Gaussians(*(torch.cat(column) for column in columns))
+
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Gaussians:
+        """On another device or in another dtype; no copy where nothing changes."""
+        return self.map(lambda tensor: tensor.to(device=device, dtype=dtype))
+
+    def detach(self) -> Gaussians:
+        """The same storage, cut from the autograd graph."""
+        return self.map(Tensor.detach)
+
+    def clone(self) -> Gaussians:
+        return self.map(Tensor.clone)
+
+    # Where scenes begin
+
+    @staticmethod
+    def from_points(
+        points: ColoredPoints, sh_degree: int = 3, initial_opacity: float = 0.1
+    ) -> Gaussians:
+        """One round Gaussian a point, as in the paper (section 5.1).
+
+        The standard deviation is the mean distance to the three nearest other points, the colour is
+        the point's from every side, the rotation is the identity.
+
+        Raises:
+            ValueError: no points at all.
+        """
+        means = points.xyz.to(torch.float32).contiguous()
+        n = means.shape[0]
+        if n == 0:
+            raise ValueError("from_points needs at least one point")
+        sh_dc = (points.rgb.to(torch.float32) / 255.0 - 0.5) / SH_C0
+        logit = math.log(initial_opacity / (1.0 - initial_opacity))
+        return Gaussians(
+            means=means.clone(),
+            log_scales=_spacing(means).log()[:, None].repeat(1, 3),
+            quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            opacity_logits=means.new_full((n,), logit),
+            sh_dc=sh_dc[:, None, :].contiguous(),
+            sh_rest=means.new_zeros(n, SH_REST_COUNTS[sh_degree], 3),
+        )
+
+    @staticmethod
+    def random_in_bounds(
+        bounds: Tensor,
+        n: int,
+        generator: torch.Generator,
+        sh_degree: int = 3,
+        initial_opacity: float = 0.1,
+    ) -> Gaussians:
+        """Random colours and places in the box ``bounds`` (2, 3), its low and its high corner."""
+        low, high = bounds.to(torch.float32)
+        xyz = low + (high - low) * torch.rand(n, 3, generator=generator)
+        rgb = torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
+        return Gaussians.from_points(_RandomPoints(xyz, rgb), sh_degree, initial_opacity)
+
+
+@dataclass
+class _RandomPoints:
+    xyz: Tensor
+    rgb: Tensor
+
+
+def _spacing(points: Tensor) -> Tensor:
+    """(N,) mean distance of each point to its 3 nearest others (fewer where there are fewer)."""
+    k = min(3, points.shape[0] - 1)
+    if k == 0:
+        return points.new_ones(1)
+    spacing = ops.neighbours(points, k=k).mean(dim=1)
+    # Points that coincide would start as Gaussians of no size, whose logarithm is -inf. The floor
+    # is relative to the cloud, so that the unit of length of the dataset does not matter.
+    floor = 1e-3 * float(spacing.median())
+    return spacing.clamp_min(floor if floor > 0.0 else 1e-6)

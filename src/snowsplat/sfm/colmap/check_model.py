@@ -1,0 +1,56 @@
+"""Whether COLMAP can read a model that somebody else made: tried out in a child process first.
+
+    python -m snowsplat.sfm.colmap.check_model FOLDER BYTES
+
+COLMAP believes the counts in its files: one of a damaged file makes it take all memory there is, or
+run for hours. A child that takes BYTES more than it begins with, or too long, only ends itself.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from snowsplat.sfm.colmap.child import child_environment
+
+_SECONDS, _BYTES_A_SECOND = 10.0, 1_000_000
+_MEMORY, _RATIO = 1 << 30, 16  # bytes of address space, and for each byte of the files
+
+
+def can_be_read(folder: Path) -> bool:
+    """Whether COLMAP reads the model in a folder, in the time and memory that its size deserves."""
+    size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+    limit = _MEMORY + _RATIO * size
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", __name__, str(folder), str(limit)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=child_environment(1),
+            timeout=_SECONDS + size / _BYTES_A_SECOND,
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def _main(folder: str, limit: int) -> None:
+    import pycolmap
+
+    if sys.platform == "linux":
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        limit += pages * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    model = pycolmap.Reconstruction(folder)
+    model.update_point_3d_errors()
+    model.compute_mean_reprojection_error()
+    for number in model.reg_image_ids():
+        model.cameras[model.images[number].camera_id].calibration_matrix()
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1], int(sys.argv[2]))

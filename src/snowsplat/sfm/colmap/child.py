@@ -1,0 +1,203 @@
+"""The parent's side of the child process: starts it, listens, ends it, and tells how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import queue
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.progress import Report
+from snowsplat.util.errors import UserError
+
+# A database that grows may need so many bytes for its next step.
+_ROOM = 8_000_000
+_MODULE = "snowsplat.sfm.colmap.worker"
+_POLL_SECONDS = 0.5
+
+
+class Crashed(Exception):
+    """The child ended without an answer; ``code`` is its exit status, negative for a signal."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+    @property
+    def how(self) -> str:
+        """The end of it, in words."""
+        if self.code == -getattr(signal, "SIGKILL", 9):
+            return "it was killed, most likely because the memory was full"
+        if self.code < 0:
+            return f"it crashed ({signal.Signals(-self.code).name})"
+        return f"it ended with status {self.code}"
+
+
+def estimate_poses(
+    dataset: Path, photos: list[Photo], options: SfmOptions, report: Report
+) -> SfmResult:
+    """Find where each photo of ``capture/input`` was taken, and points of the scene.
+
+    Writes ``distorted/sparse/N`` (0 has most photos), in the photos' own cameras, at an arbitrary
+    scale and orientation, and ``distorted/database.db``; ``distorted/colmap.log`` is what COLMAP
+    said. Features and matches of an interrupted run are used again. The same photos and settings
+    give the same pairs and matches, and the same poses but for rounding; of more than 150 photos,
+    also but for the frame.
+
+    Raises:
+        UserError: fewer than 3 photos, no such camera model, no poses to be found (the message
+            says why), or COLMAP crashed twice.
+        OSError: the disk is full.
+    """
+    if len(photos) < 3:
+        raise UserError(
+            f"{len(photos)} photos are too few to see depth; take at least 3, better 30 or more"
+        )
+    if options.camera_model not in ("auto", *CAMERA_MODELS):
+        raise UserError(
+            f"{options.camera_model!r}: no such camera model; there are auto, "
+            + ", ".join(CAMERA_MODELS)
+        )
+    distorted = dataset.absolute() / "distorted"
+    distorted.mkdir(parents=True, exist_ok=True)
+    log = distorted / "colmap.log"
+    log.unlink(missing_ok=True)
+    job = {
+        "capture": str(dataset.absolute()),
+        "photos": [dataclasses.asdict(photo) for photo in photos],
+        "options": dataclasses.asdict(options),
+    }
+    threads = thread_count(options.threads)
+    try:
+        return _run({**job, "gentle": False}, log, threads, report)
+    except Crashed as crash:
+        first = crash
+        _check_disk(distorted)
+    try:
+        result = _run({**job, "gentle": True}, log, 1, report)
+    except Crashed as crash:
+        _check_disk(distorted)
+        advice = "report it"
+        if crash.code < 0:
+            advice = "use fewer or smaller photos, or a lower quality"
+        raise UserError(
+            f"finding the camera positions failed twice: {crash.how}; {advice} "
+            f"(its last words: {_last_line(log)})"
+        ) from None
+    note = f"as asked: {first.how}; what follows was done with smaller photos and one thread"
+    return dataclasses.replace(result, attempts=[note, *result.attempts])
+
+
+def _check_disk(folder: Path) -> None:
+    """Raises: OSError: files here cannot grow, which is why the child has ended."""
+    try:
+        largest = max(path.stat().st_size for path in folder.iterdir())
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.seek(largest)
+            file.write(bytes(_ROOM))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from None
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+    return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "none")
+
+
+def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmResult:
+    with (
+        open(log, "ab") as log_file,
+        subprocess.Popen(
+            [sys.executable, "-m", _MODULE],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log_file,
+            env=child_environment(threads),
+            text=True,
+            encoding="utf-8",
+        ) as child,
+    ):
+        try:
+            answer = _converse(child, job, report)
+            code = child.wait()
+        finally:
+            child.kill()
+    if "user_error" in answer:
+        raise UserError(answer["user_error"])
+    if "result" not in answer:
+        raise Crashed(code)
+    return SfmResult(**answer["result"])
+
+
+def _converse(child: subprocess.Popen[str], job: dict[str, Any], report: Report) -> dict[str, Any]:
+    """Send the job, report progress until the child ends, and give its last line.
+
+    All in this thread, so that Ctrl-C ends it and ``report`` needs no lock; another one listens.
+    """
+    lines: queue.Queue[str | None] = queue.Queue()
+
+    def listen() -> None:
+        assert child.stdout is not None
+        with child.stdout:
+            for line in child.stdout:
+                lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=listen, daemon=True).start()
+    assert child.stdin is not None
+    with contextlib.suppress(BrokenPipeError):  # its end shows below
+        child.stdin.write(json.dumps(job) + "\n")
+        child.stdin.flush()
+    answer: dict[str, Any] = {}
+    while True:
+        try:
+            line = lines.get(timeout=_POLL_SECONDS)
+        except queue.Empty:
+            if "watch" in answer:
+                _report_rows(report, *answer["watch"])
+            continue
+        if line is None or not line.endswith("\n"):  # it died in the middle of a word
+            break
+        answer = json.loads(line)
+        if "progress" in answer:
+            report(*answer["progress"])
+    # Open until here: at its end the child ends too.
+    with contextlib.suppress(BrokenPipeError):
+        child.stdin.close()
+    return answer
+
+
+def _report_rows(report: Report, database: str, table: str, total: int, what: str) -> None:
+    address = f"{Path(database).as_uri()}?mode=ro"
+    with (
+        contextlib.suppress(sqlite3.Error),  # it is being written: the next time
+        contextlib.closing(sqlite3.connect(address, uri=True)) as connection,
+    ):
+        (rows,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
+        report(min(rows, total), total, what)
+
+
+def child_environment(threads: int) -> dict[str, str]:
+    """For a child that runs our modules, COLMAP with so many threads."""
+    # The child finds the modules that this process finds, from a checkout or a wheel, and not
+    # what happens to lie in the current folder.
+    paths: Sequence[str] = [os.path.abspath(path) for path in sys.path if path]
+    return {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(paths),
+        "PYTHONSAFEPATH": "1",
+        "OMP_NUM_THREADS": str(threads),
+        "OPENBLAS_NUM_THREADS": str(threads),
+    }

@@ -1,0 +1,264 @@
+"""COLMAP's database of the features and matches of a dataset: made by us, kept after a kill.
+
+Photo number i of the list has image, frame id i + 1, whatever thread came first, so that the same
+photos always give the same database. A fingerprint of photos and settings lies in it: after an
+interrupted run what was computed is used again, unless the photos or the settings are others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snowsplat.sfm.ingest.photo import Photo
+
+# Fewer photos cannot fix the eight numbers of OPENCV.
+MIN_PHOTOS_FOR_OPENCV = 8
+# Without EXIF: about a 29 mm lens on 35 mm film, between a phone's photo and its cropped video.
+# The true focal length is found with the poses.
+GUESSED_FOCAL = 0.8
+
+_PLANE_OR_TURN = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two photos, by index into the list of photos, and what they have in common."""
+
+    first: int
+    second: int
+    inliers: int  # matches that fit one motion of the camera
+    flat: bool  # a plane, or a camera that only turned, explains them as well
+
+
+def open_database(path: Path, photos: list[Photo], camera_model: str, fingerprint: str) -> None:
+    """Make ``path`` a database that has ``photos``; keep its features and matches if they fit.
+
+    They do if the database is sound and carries the same ``fingerprint``. Names and cameras are
+    written anew in each case: a change of camera model does not touch features.
+    """
+    if not _is_sound(path, fingerprint):
+        remove_database(path)
+        with closing_database(path) as database:
+            _write_photos(database, photos, camera_model)
+        with closing(sqlite3.connect(path)) as connection, connection:
+            connection.execute("CREATE TABLE snowsplat (fingerprint TEXT)")
+            connection.execute("INSERT INTO snowsplat VALUES (?)", (fingerprint,))
+    else:
+        set_names(path, [photo.name for photo in photos])
+        with closing_database(path) as database:
+            for camera in _cameras(photos, camera_model):
+                database.update_camera(camera)
+
+
+def remove_database(path: Path) -> None:
+    """Remove the database, if there is one, and what SQLite keeps beside it."""
+    for suffix in ("", "-journal", "-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+def replace_database(path: Path, by: Path) -> None:
+    """Let the database ``by`` take the place of ``path``."""
+    with closing(sqlite3.connect(by)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    remove_database(path)
+    by.rename(path)
+    remove_database(by)
+
+
+@contextmanager
+def closing_database(path: Path) -> Iterator[pycolmap.Database]:
+    database = pycolmap.Database.open(path)
+    try:
+        yield database
+    finally:
+        database.close()
+
+
+def fingerprint_of(images: Path, photos: list[Photo], settings: object) -> str:
+    """A hash of all on which features and matches depend: the photos' files, the settings."""
+    files = [(images / photo.name).stat() for photo in photos]
+    facts = [
+        pycolmap.__version__,
+        repr(settings),
+        [
+            [p.name, p.width, p.height, p.group, p.focal, p.mask, s.st_size, s.st_mtime_ns]
+            for p, s in zip(photos, files, strict=True)
+        ],
+    ]
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+
+def _is_sound(path: Path, fingerprint: str) -> bool:
+    if not path.is_file():
+        return False
+    try:
+        with closing(sqlite3.connect(path)) as connection:
+            found = connection.execute("SELECT fingerprint FROM snowsplat").fetchall()
+            # COLMAP does not wait for the disk: after a power cut the file may be damaged.
+            return found == [(fingerprint,)] and connection.execute(
+                "PRAGMA quick_check"
+            ).fetchall() == [("ok",)]
+    except sqlite3.DatabaseError:
+        return False
+
+
+def _write_photos(database: pycolmap.Database, photos: list[Photo], camera_model: str) -> None:
+    cameras = {c.camera_id: c for c in _cameras(photos, camera_model)}
+    for camera in cameras.values():
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig()
+        rig.rig_id = camera.camera_id
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    camera_ids = _camera_ids(photos)
+    for image_id, photo in enumerate(photos, start=1):
+        camera_id = camera_ids[_camera_key(photo)]
+        image = pycolmap.Image(name=photo.name, camera_id=camera_id, image_id=image_id)
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame()
+        frame.frame_id = image_id
+        frame.rig_id = camera_id
+        frame.add_data_id(image.data_id)
+        frame.finalize_data_ids()
+        database.write_frame(frame, use_frame_id=True)
+
+
+def _camera_key(photo: Photo) -> tuple[str, int, int]:
+    # A group has one size; should it not, one camera cannot hold it.
+    return photo.group, photo.width, photo.height
+
+
+def _camera_ids(photos: list[Photo]) -> dict[tuple[str, int, int], int]:
+    keys = sorted({_camera_key(photo) for photo in photos})
+    return {key: number for number, key in enumerate(keys, start=1)}
+
+
+def _cameras(photos: list[Photo], camera_model: str) -> list[pycolmap.Camera]:
+    cameras = []
+    for key, camera_id in _camera_ids(photos).items():
+        members = [photo for photo in photos if _camera_key(photo) == key]
+        focals = [photo.focal for photo in members if photo.focal]
+        _, width, height = key
+        model = camera_model
+        if model == "auto":
+            model = "OPENCV" if len(members) >= MIN_PHOTOS_FOR_OPENCV else "SIMPLE_RADIAL"
+        focal = float(np.median(focals)) if focals else GUESSED_FOCAL * max(width, height)
+        camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal, width, height)
+        camera.has_prior_focal_length = bool(focals)
+        cameras.append(camera)
+    return cameras
+
+
+def set_names(path: Path, names: list[str]) -> None:
+    """Name the images of the database, in order of their ids."""
+    with closing(sqlite3.connect(path)) as connection, connection:
+        # Names are unique, so that swapping them takes two steps.
+        connection.execute("UPDATE images SET name = ':' || image_id")
+        connection.executemany(
+            "UPDATE images SET name = ? WHERE image_id = ?",
+            [(name, image_id) for image_id, name in enumerate(names, start=1)],
+        )
+
+
+def count_rows(path: Path, table: str) -> int:
+    """Rows of a table."""
+    with closing(sqlite3.connect(path)) as connection:
+        return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+
+
+def feature_counts(path: Path, photo_count: int) -> list[int]:
+    """Features of each photo, 0 where none were found or the photo could not be read."""
+    counts = [0] * photo_count
+    with closing(sqlite3.connect(path)) as connection:
+        for image_id, rows in connection.execute("SELECT image_id, rows FROM keypoints"):
+            counts[image_id - 1] = rows
+    return counts
+
+
+def verified_pairs(path: Path) -> list[Pair]:
+    """The pairs whose matches fit a motion of the camera, weak ones too."""
+    flat = {
+        int(config)
+        for name, config in pycolmap.TwoViewGeometryConfiguration.__members__.items()
+        if name in _PLANE_OR_TURN
+    }
+    query = "SELECT pair_id, rows, config FROM two_view_geometries WHERE rows > 0"
+    with closing(sqlite3.connect(path)) as connection:
+        rows = connection.execute(query).fetchall()
+    pairs = []
+    for pair_id, inliers, config in rows:
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        pairs.append(Pair(first - 1, second - 1, inliers, config in flat))
+    return pairs
+
+
+def trim_features(path: Path, limit: int) -> None:
+    """Keep the ``limit`` largest features of each photo; matching takes time by their square.
+
+    COLMAP's own limit is a rough one: it takes whole octaves, up to four times as many.
+    """
+    with closing(sqlite3.connect(path)) as connection:
+        query = "SELECT image_id FROM keypoints WHERE rows > ?"
+        for (image_id,) in connection.execute(query, (limit,)).fetchall():
+            keypoints = _read_rows(connection, "keypoints", image_id, np.dtype(np.float32))
+            descriptors = _read_rows(connection, "descriptors", image_id, np.dtype(np.uint8))
+            kept = np.sort(_largest(keypoints, limit))
+            with connection:
+                for table, rows in (("keypoints", keypoints), ("descriptors", descriptors)):
+                    connection.execute(
+                        f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?",
+                        (len(kept), rows[kept].tobytes(), image_id),
+                    )
+
+
+def _read_rows(
+    connection: sqlite3.Connection, table: str, image_id: int, dtype: np.dtype[Any]
+) -> NDArray[Any]:
+    query = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
+    rows, columns, data = connection.execute(query, (image_id,)).fetchone()
+    return np.frombuffer(data, dtype).reshape(rows, columns)
+
+
+def _largest(keypoints: NDArray[np.float32], count: int) -> NDArray[np.intp]:
+    # The columns after x, y are an affine shape, whose determinant is the squared scale.
+    scale = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+    return np.argsort(-scale, kind="stable")[:count]
+
+
+def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
+    """(≤ limit, 128) descriptors of a photo, those of the largest features."""
+    with closing_database(path) as database:
+        if not database.exists_descriptors(index + 1):
+            return np.zeros((0, 128), np.float32)
+        keypoints = database.read_keypoints(index + 1)
+        descriptors = np.asarray(database.read_descriptors(index + 1).data, np.float32)
+    if len(descriptors) == 0:
+        return np.zeros((0, 128), np.float32)
+    return descriptors[_largest(keypoints, limit)]
+
+
+def displacement_of(path: Path, pairs: Sequence[Pair]) -> float:
+    """How far apart matches lie in the two photos of a pair, in pixels: the median match.
+
+    Of the pairs, that of which 90% lie below: a slow walk has many pairs that hardly differ.
+    """
+    medians = []
+    with closing_database(path) as database:
+        for pair in pairs:
+            ids = pair.first + 1, pair.second + 1
+            matches = database.read_two_view_geometry(*ids).inlier_matches
+            first, second = (database.read_keypoints(i)[:, :2] for i in ids)
+            shift = first[matches[:, 0]] - second[matches[:, 1]]
+            medians.append(float(np.median(np.linalg.norm(shift, axis=1))))
+    return float(np.quantile(medians, 0.9))

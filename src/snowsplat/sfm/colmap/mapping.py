@@ -1,0 +1,183 @@
+"""From matches to cameras and points, and what is left when the badly fitting is taken away."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from snowsplat.sfm.colmap.database import count_rows
+from snowsplat.sfm.colmap.features import SEED
+from snowsplat.sfm.colmap.options import Mapper
+from snowsplat.sfm.progress import Report
+
+# A camera that sees fewer of the points is not held in its place by them.
+MIN_POINTS = 15
+MIN_PHOTOS = 3
+# Pixels at which features were looked for: an observation further off is left out at the end.
+_KEPT_ERROR = 3.0
+# COLMAP's threads race for the pair to begin with, and so for the frame and a little of everything.
+# With fewer photos than this they save nothing: one thread, and always the same poses.
+_MANY_PHOTOS = 150
+_MIN_ANGLE = 1.5  # degrees between the rays of a point
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """What is mapped, and with what means."""
+
+    database: Path
+    images: Path
+    scale: float  # pixels of a photo to one at which its features were looked for (1 or more)
+    threads: int
+    report: Report
+
+    def run(self, mapper: Mapper, relaxed: bool = False) -> list[pycolmap.Reconstruction]:
+        """Find cameras and points; the models found, the one with most photos first.
+
+        ``relaxed``: start and go on with weaker matches than is usual (incremental only).
+        """
+        if mapper == "global":
+            models = self._map_globally()
+        else:
+            models = self._map_incrementally(self._options(relaxed), start=None)
+        return _usable([self._refine(model) for model in models])
+
+    def extend(self, models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+        """Add photos to the first of ``models`` by weaker matches than is usual, where that helps.
+
+        Photos of the others are among them: what was apart may come together.
+        """
+        grown = self._map_incrementally(self._options(relaxed=True), start=models[0])
+        if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():
+            return models
+        refined = self._refine(grown[0])
+        if refined.num_reg_images() <= models[0].num_reg_images():
+            return models
+        return _usable([refined, *models[1:]])
+
+    def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
+        options = pycolmap.IncrementalPipelineOptions()
+        many = count_rows(self.database, "images") > _MANY_PHOTOS
+        options.num_threads = self.threads if many else 1
+        options.random_seed = SEED
+        options.min_model_size = MIN_PHOTOS
+        mapper, triangulation = options.mapper, options.triangulation
+        mapper.init_max_error *= self.scale
+        mapper.abs_pose_max_error *= self.scale
+        mapper.filter_max_reproj_error *= self.scale
+        triangulation.merge_max_reproj_error *= self.scale
+        triangulation.complete_max_reproj_error *= self.scale
+        if relaxed:
+            options.min_num_matches = 10
+            mapper.init_min_num_inliers = 40
+            mapper.init_min_tri_angle = 6.0
+            mapper.abs_pose_min_num_inliers = 15
+            mapper.abs_pose_min_inlier_ratio = 0.15
+            mapper.max_reg_trials = 6
+        return options
+
+    def _map_incrementally(
+        self,
+        options: pycolmap.IncrementalPipelineOptions,
+        start: pycolmap.Reconstruction | None,
+    ) -> list[pycolmap.Reconstruction]:
+        total = count_rows(self.database, "images")
+        placed = 0
+
+        def begin() -> None:
+            nonlocal placed
+            placed = 2 if start is None else start.num_reg_images()
+            self.report(placed, total, "photos placed")
+
+        def step() -> None:
+            nonlocal placed
+            placed += 1
+            self.report(min(placed, total), total, "photos placed")
+
+        with self._output() as output:
+            begun = ""
+            if start is not None:
+                begun = str(output / "start")
+                (output / "start").mkdir()
+                start.write(begun)
+            models = pycolmap.incremental_mapping(
+                self.database,
+                self.images,
+                output,
+                options,
+                input_path=begun,
+                initial_image_pair_callback=begin,
+                next_image_callback=step,
+            )
+        return list(models.values())
+
+    def _map_globally(self) -> list[pycolmap.Reconstruction]:
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads = self.threads
+        options.random_seed = SEED
+        options.min_model_size = MIN_PHOTOS
+        options.mapper.num_threads = self.threads
+        options.mapper.random_seed = SEED
+        options.mapper.max_normalized_reproj_error *= self.scale
+        self.report(0, 0, "photos placed")
+        with self._output() as output:
+            models = pycolmap.global_mapping(self.database, self.images, output, options)
+        return list(models.values())
+
+    @contextmanager
+    def _output(self) -> Iterator[Path]:
+        # COLMAP writes each model as it is found. We write them ourselves, all at once.
+        output = self.database.with_suffix(".models")
+        shutil.rmtree(output, ignore_errors=True)
+        output.mkdir()
+        try:
+            yield output
+        finally:
+            shutil.rmtree(output, ignore_errors=True)
+
+    def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """Leave out what fits badly, adjust all once more, and drop cameras that nothing holds."""
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary = False
+        options.ceres.solver_options.num_threads = self.threads
+        observations = pycolmap.ObservationManager(model)
+        for _ in range(2):
+            observations.filter_all_points3D(_KEPT_ERROR * self.scale, _MIN_ANGLE)
+            for image_id in list(model.reg_image_ids()):
+                image = model.image(image_id)
+                if image.num_points3D < MIN_POINTS:
+                    observations.deregister_frame(image.frame_id)
+            if model.num_reg_images() < MIN_PHOTOS:
+                break
+            pycolmap.bundle_adjustment(model, options)
+        model.update_point_3d_errors()
+        return model
+
+
+def _usable(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    # Largest first; one whose photos are all in larger ones says nothing new.
+    kept: list[pycolmap.Reconstruction] = []
+    placed: set[int] = set()
+    for model in sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D())):
+        photos = set(model.reg_image_ids())
+        if len(photos) >= MIN_PHOTOS and photos - placed:
+            kept.append(model)
+            placed |= photos
+    return kept
+
+
+def write_models(models: list[pycolmap.Reconstruction], sparse: Path) -> None:
+    """Write them as ``sparse/0``, ``sparse/1`` …: all or nothing."""
+    temporary = sparse.with_name(f".{sparse.name}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    for number, model in enumerate(models):
+        folder = temporary / str(number)
+        folder.mkdir(parents=True)
+        model.write(folder)
+    shutil.rmtree(sparse, ignore_errors=True)
+    temporary.rename(sparse)

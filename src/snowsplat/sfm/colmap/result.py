@@ -1,0 +1,95 @@
+"""What there is to say about models of a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pycolmap
+
+from snowsplat.sfm.colmap.check_model import can_be_read
+from snowsplat.sfm.colmap.options import SfmResult
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import inside, quoted
+
+
+def result_of(
+    models: Sequence[pycolmap.Reconstruction],
+    photos: Sequence[Photo],
+    unregistered: dict[str, str],
+    pairs: str,
+    attempts: list[str],
+) -> SfmResult:
+    """The figures of the first of ``models`` (at least one, the largest first)."""
+    model = models[0]
+    with_focal = {photo.name for photo in photos if photo.focal}
+    cameras = []
+    for camera_id, camera in sorted(model.cameras.items()):
+        of_it = {n for n in names_in(model) if model.find_image_with_name(n).camera_id == camera_id}
+        if of_it:
+            cameras.append(
+                {
+                    "model": camera.model_name,
+                    "width": camera.width,
+                    "height": camera.height,
+                    "params": [float(value) for value in camera.params],
+                    "focal_from": "exif" if of_it & with_focal else "guessed",
+                    "images": len(of_it),
+                }
+            )
+    return SfmResult(
+        registered=sorted(names_in(model)),
+        unregistered=unregistered,
+        points=model.num_points3D(),
+        observations=model.compute_num_observations(),
+        reprojection_error=model.compute_mean_reprojection_error(),
+        sub_models=[m.num_reg_images() for m in models],
+        cameras=cameras,
+        pairs=pairs,
+        attempts=attempts,
+    )
+
+
+def names_in(model: pycolmap.Reconstruction) -> set[str]:
+    """The names of the photos that have a pose in ``model``."""
+    return {model.image(image_id).name for image_id in model.reg_image_ids()}
+
+
+def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
+    """The figures of models that lie in ``distorted/sparse`` already, whoever made them.
+
+    Raises:
+        UserError: there is none, it is damaged, or it has none of the photos.
+    """
+    sparse = dataset / "distorted" / "sparse"
+    numbered = sorted(
+        (p for p in sparse.glob("*") if p.name.isdecimal()), key=lambda p: int(p.name)
+    )
+    if not numbered or numbered[0].name != "0":
+        raise UserError(f"{sparse / '0'}: no COLMAP model here; leave out --skip-matching")
+    models = []
+    for folder in numbered:
+        if not can_be_read(folder):
+            raise UserError(
+                f"{folder}: this COLMAP model is damaged, or COLMAP cannot read it; leave out "
+                "--skip-matching"
+            )
+        models.append(pycolmap.Reconstruction(folder))
+        models[-1].update_point_3d_errors()
+    names = names_in(models[0])
+    for name in names:
+        # Images are written under the names of the photos.
+        if inside(dataset / "input", name) is None:
+            raise UserError(
+                f"{numbered[0]}: names the photo {quoted(name)}, which is not in "
+                f"{dataset / 'input'}; leave out --skip-matching"
+            )
+    if not names & {photo.name for photo in photos}:
+        raise UserError(
+            f"{numbered[0]}: the COLMAP model has none of the photos in {dataset / 'input'}; "
+            "leave out --skip-matching"
+        )
+    missing = {p.name: "it is not in the model that was there" for p in photos}
+    unregistered = {name: why for name, why in missing.items() if name not in names}
+    return result_of(models, photos, unregistered, "not chosen: the model was there", [])

@@ -1,0 +1,84 @@
+"""Which photos look alike: a small description of each, from the features that it has already.
+
+VLAD (Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010),
+each word's part normalised (Arandjelović and Zisserman, "All about VLAD", CVPR 2013). The words
+are learnt from the photos themselves: nothing is downloaded, and a dataset is one scene. All of it
+is a fixed sequence of sums: the same features give the same neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+
+WORDS = 64
+FEATURES = 1000  # a photo; the largest, which a change of distance leaves
+_SAMPLE = 64 * WORDS * 4
+_ROUNDS = 12
+
+
+def similarity(descriptors: Sequence[Floats]) -> Floats:
+    """(N, N) how alike N photos look, from their descriptors (n, D); −1 … 1, 1 on the diagonal.
+
+    A photo without features looks like none: 0.
+    """
+    counts = [len(d) for d in descriptors]
+    if sum(counts) == 0:
+        return np.eye(len(descriptors), dtype=np.float32)
+    words = _learn_words(np.concatenate([_unit(d) for d in descriptors if len(d)]))
+    vectors = np.stack([_describe(_unit(d), words) for d in descriptors])
+    # What all photos of the scene have in common tells them not apart.
+    seen = np.array(counts) > 0
+    vectors[seen] = _unit(vectors[seen] - vectors[seen].mean(0))
+    alike = vectors @ vectors.T
+    np.fill_diagonal(alike, 1.0)
+    return alike
+
+
+def nearest(alike: Floats, count: int) -> set[tuple[int, int]]:
+    """Pairs (i < j) of each photo and the ``count`` that are most alike."""
+    pairs = set()
+    for i, row in enumerate(alike):
+        order = np.argsort(-row, kind="stable")
+        for j in [int(j) for j in order if j != i][:count]:
+            pairs.add((min(i, j), max(i, j)))
+    return pairs
+
+
+def _unit(rows: Floats) -> Floats:
+    rows = np.asarray(rows, np.float32)
+    norm = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.maximum(norm, 1e-12)
+
+
+def _learn_words(points: Floats) -> Floats:
+    # k-means on an even sample; words without points stay where they are.
+    sample = points[:: max(1, len(points) // _SAMPLE)]
+    words = sample[:: max(1, len(sample) // WORDS)][:WORDS].copy()
+    for _ in range(_ROUNDS):
+        nearest_word = _assign(sample, words)
+        for k in range(len(words)):
+            members = sample[nearest_word == k]
+            if len(members):
+                words[k] = members.mean(0)
+    return words
+
+
+def _assign(points: Floats, words: Floats) -> NDArray[np.intp]:
+    # |p − w|² = |p|² − 2 p·w + |w|², of which the first does not matter.
+    return np.argmin((words**2).sum(1) - 2 * points @ words.T, axis=1)
+
+
+def _describe(points: Floats, words: Floats) -> Floats:
+    vector = np.zeros_like(words)
+    if len(points):
+        word = _assign(points, words)
+        for k in np.unique(word):
+            vector[k] = (points[word == k] - words[k]).sum(0)
+    vector = _unit(vector)
+    return _unit(vector.reshape(1, -1))[0]

@@ -1,0 +1,1 @@
+"""Photos and videos as inputs: find, check, decode and select them."""

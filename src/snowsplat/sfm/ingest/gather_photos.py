@@ -1,0 +1,135 @@
+"""Photos -> ``input/``: planned by their headers, then checked and written on a few threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from snowsplat.sfm.ingest.mask_files import read_mask, write_mask
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.photo_files import (
+    Header,
+    Unusable,
+    decode,
+    decode_small,
+    link_or_copy,
+    read_header,
+    save,
+)
+from snowsplat.sfm.ingest.sharpness import PICTURE_SIDE, grey_copy, why_useless
+from snowsplat.sfm.ingest.sources import Source, free_names
+from snowsplat.sfm.progress import Report
+from snowsplat.util.files import shown
+
+
+@dataclass(frozen=True)
+class Planned:
+    source: Source
+    header: Header
+    name: str  # in input/
+
+
+def plan_photos(
+    sources: Sequence[Source], longest: int | None, skipped: list[tuple[str, str]]
+) -> list[Planned]:
+    """Each photo's name in ``input/``. Those that keep theirs come first to it."""
+    read = []
+    for source in sources:
+        try:
+            header = read_header(source.path)
+        except Unusable as error:
+            skipped.append((shown(source.path), str(error)))
+        else:
+            read.append((header.file_name(source.name, longest), source, header))
+    read.sort(key=lambda entry: (entry[0] != entry[1].name, entry[0]))
+    names = free_names([name for name, _, _ in read])
+    planned = [Planned(s, h, name) for name, (_, s, h) in zip(names, read, strict=True)]
+    return sorted(planned, key=lambda plan: plan.name)
+
+
+def write_photos(
+    planned: Sequence[Planned],
+    dataset: Path,
+    longest: int | None,
+    in_place: bool,
+    skipped: list[tuple[str, str]],
+    report: Report,
+) -> list[Photo]:
+    """On a few threads, each with one photo in memory; the order is that of ``planned``."""
+
+    def work(plan: Planned) -> Photo | str:
+        try:
+            return _write_photo(plan, dataset, longest, in_place)
+        except Unusable as error:
+            return str(error)
+
+    photos = []
+    pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="snowsplat-photos")
+    try:
+        for done, (plan, outcome) in enumerate(
+            zip(planned, pool.map(work, planned), strict=True), 1
+        ):
+            if isinstance(outcome, Photo):
+                photos.append(outcome)
+            else:
+                skipped.append((shown(plan.source.path), outcome))
+            report(done, len(planned), "photos")
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return photos
+
+
+def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bool) -> Photo:
+    source, header = plan.source, plan.header
+    target = dataset / "input" / plan.name
+    ready = header.is_ready(longest)
+    if ready and not header.transparent:
+        image = decode_small(source.path, PICTURE_SIDE)
+    else:
+        image = decode(source.path, header, longest)
+    counts = read_mask(source.mask, header, header.size(longest)) if source.mask else None
+    alpha = image.mode == "RGBA"
+    if alpha:
+        opaque = np.asarray(image.getchannel("A")) > 0
+        counts = opaque if counts is None else counts & opaque
+    _check_content(image, counts)
+    if not in_place:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if ready:
+            link_or_copy(source.path, target)
+        else:
+            save(image, target, source.path)
+    if counts is not None:
+        write_mask(dataset / "distorted" / "masks" / f"{plan.name}.png", counts)
+    width, height = header.size(longest)
+    notes = header.notes
+    scale = max(width, height) / max(header.width, header.height)
+    folder = str(PurePosixPath(plan.name).parent)
+    return Photo(
+        name=plan.name,
+        source=shown(source.path),
+        width=width,
+        height=height,
+        group=" ".join(filter(None, [f"{folder}/", notes.camera, f"{width}x{height}"])),
+        sequence=None,
+        focal=None if notes.focal is None else notes.focal * scale,
+        location=notes.location,
+        mask=counts is not None,
+        alpha=alpha,
+    )
+
+
+def _check_content(image: Image.Image, counts: np.ndarray | None) -> None:
+    """Raises Unusable: nothing to be seen, or nothing that counts."""
+    if counts is not None and not counts.any():
+        raise Unusable("is masked out all over")
+    grey = grey_copy(image.convert("RGB") if image.mode == "RGBA" else image, PICTURE_SIDE)
+    reason = why_useless(grey)
+    if reason:
+        raise Unusable(reason)

@@ -1,0 +1,233 @@
+"""Photos and videos -> ``input/``: the pictures as SfM will see them, and their masks.
+
+What stands in ``input/`` is upright, COLMAP can read it, and it has been decoded once. What is no
+picture of anything is left out and named; what is left has to be enough.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from snowsplat.sfm.ingest.clip import Clip, frames_wanted, read_clip
+from snowsplat.sfm.ingest.gather_photos import Planned, plan_photos, write_photos
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
+from snowsplat.sfm.ingest.sources import Source, find_sources
+from snowsplat.sfm.ingest.video import SAME_VIEW, extract_frames
+from snowsplat.sfm.progress import Report
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import shown
+
+logger = logging.getLogger(__name__)
+
+_FEWEST = 3  # pictures: two fix no scale between them and a third
+_SMALLEST_SIZE = 128  # pixels
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The pictures that can be used, in the order of names; and what was left out, and why."""
+
+    photos: list[Photo]
+    skipped: list[tuple[str, str]]  # source, reason
+
+
+@dataclass(frozen=True)
+class GatherOptions:
+    """What is asked of the pictures. Of ``fps`` and ``frames``, at most one."""
+
+    fps: float | None = None  # frames a second to take of videos
+    frames: int | None = None  # frames to take of each video, at most
+    size: int | None = None  # longest side in pixels to bring larger pictures to; None: as they are
+
+
+def find_inputs(inputs: Sequence[Path]) -> list[Path]:
+    """All files that `gather` would read, masks too. A quick check: only names are looked at.
+
+    Raises:
+        UserError: an input does not exist or is no photo or video; there is none in all of them.
+    """
+    sources = find_sources(inputs).sources
+    return [p for source in sources for p in (source.path, source.mask) if p is not None]
+
+
+def gather(
+    inputs: Sequence[Path], dataset: Path, options: GatherOptions, report: Report
+) -> Gathered:
+    """Fill ``capture/input`` and, where there are masks or alpha, ``capture/distorted/masks``.
+
+    An input that is ``capture/input`` itself is used in place: nothing in it is changed, so all
+    that is in it has to be upright already, in a format that COLMAP reads, and of the size asked.
+
+    Photos of one folder share a group, and so intrinsics, if they have the same size and the same
+    notes of camera and zoom. A portrait and a landscape photo of one phone do not: upright, their
+    width and height are exchanged, and a camera has one size. Each video is a group.
+
+    Raises:
+        UserError: fewer than three pictures that can be used, a mask that does not fit its photo,
+            not enough room on the disk, photos in place that would have to be changed.
+        OSError: ``capture`` cannot be written to.
+    """
+    _check(options)
+    found = find_sources(inputs)
+    folder = dataset / "input"
+    skipped = list(found.left_out)
+    in_place = any(path.resolve() == folder.resolve() for path in inputs)
+    planned = plan_photos([s for s in found.sources if s.kind == "photo"], options.size, skipped)
+    clips = [(s, read_clip(s.path)) for s in found.sources if s.kind == "video"]
+    if in_place:
+        _refuse_changes(planned, [s for s, _ in clips], options)
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_room(dataset, planned, clips, options)
+    try:
+        photos = write_photos(planned, dataset, options.size, in_place, skipped, report)
+        for source, clip in clips:
+            photos += _take_frames(source, clip, folder, options, skipped, report)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise UserError(
+                "the disk is full; make room, or take smaller pictures with --size 1600"
+            ) from None
+        raise
+    for mask in found.unused_masks:
+        logger.warning("%s: is the mask of no photo here; masks are named IMG.jpg.png", shown(mask))
+    if len(photos) < _FEWEST:
+        raise _too_few(len(photos), skipped)
+    return Gathered(sorted(photos, key=lambda photo: photo.name), skipped)
+
+
+def _check(options: GatherOptions) -> None:
+    if options.fps is not None and options.frames is not None:
+        raise UserError("both --fps and --frames are given; one of them says how many to take")
+    if options.fps is not None and not (options.fps > 0 and math.isfinite(options.fps)):
+        raise UserError(f"--fps {options.fps:g} makes no sense; use e.g. 2")
+    if options.frames is not None and options.frames < _FEWEST:
+        raise UserError(f"--frames {options.frames} is too few; use {_FEWEST} or more, e.g. 60")
+    if options.size is not None and options.size < _SMALLEST_SIZE:
+        raise UserError(
+            f"--size {options.size} is too small to find anything in; use {_SMALLEST_SIZE} or more"
+        )
+
+
+def _refuse_changes(
+    planned: Sequence[Planned], videos: Sequence[Source], options: GatherOptions
+) -> None:
+    """Raises UserError for what cannot be used in place."""
+    changed = [plan.source.path for plan in planned if not plan.header.is_ready(options.size)]
+    others = [source.path for source in videos]
+    others += [plan.source.path for plan in planned if plan.name != plan.source.name]
+    for path in [*changed, *others]:
+        raise UserError(
+            f"{shown(path)}: has to be converted, turned upright or scaled, and what stands in "
+            "input/ is never changed; use snowsplat sfm PHOTOS -o DATASET with a new folder"
+        )
+
+
+# Videos
+
+
+def _take_frames(
+    source: Source,
+    clip: Clip,
+    folder: Path,
+    options: GatherOptions,
+    skipped: list[tuple[str, str]],
+    report: Report,
+) -> list[Photo]:
+    below = folder / source.name
+    below.mkdir(parents=True, exist_ok=True)
+    windows = frames_wanted(clip, options.fps, options.frames)
+    frames = extract_frames(clip, below, windows, options.size, report)
+    label = source.path.name if not source.name else source.name
+    skipped += [(f"{label} at {seconds:.1f} s", reason) for seconds, reason in frames.skipped]
+    return [
+        Photo(
+            name=str(PurePosixPath(source.name) / frame.name),
+            source=f"{label} at {frame.seconds:.1f} s",
+            width=frame.width,
+            height=frame.height,
+            group=f"{label} {frame.width}x{frame.height}",
+            sequence=label,
+            focal=None,
+            location=None,
+            mask=False,
+            alpha=False,
+        )
+        for frame in frames.kept
+    ]
+
+
+# Refusals
+
+
+def _check_room(
+    dataset: Path,
+    planned: Sequence[Planned],
+    clips: Sequence[tuple[Source, Clip]],
+    options: GatherOptions,
+) -> None:
+    """Raises UserError if ``input/`` surely does not fit on the disk."""
+    device = (dataset / "input").stat().st_dev
+    needed = 0.0
+    for plan in planned:
+        width, height = plan.header.size(options.size)
+        if not plan.header.is_ready(options.size):
+            needed += width * height * (0.6 if plan.name.lower().endswith("g") else 1.5)
+        elif plan.source.path.stat().st_dev != device:
+            needed += plan.source.path.stat().st_size
+    for _, clip in clips:
+        scale = min(1.0, (options.size or math.inf) / max(clip.width, clip.height))
+        pixels = clip.width * clip.height * scale**2
+        needed += 0.3 * pixels * frames_wanted(clip, options.fps, options.frames)
+    free = shutil.disk_usage(dataset).free
+    if needed > free:
+        raise UserError(
+            f"the photos need about {needed / 1e6:,.0f} MB and the disk has {free / 1e6:,.0f} MB "
+            "left; make room, or take smaller pictures with --size 1600"
+        )
+
+
+def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
+    """The one line that helps most, by what most of the pictures suffer from."""
+    reasons = Counter(reason for _, reason in skipped)
+    reason, often = reasons.most_common(1)[0] if reasons else ("", 0)
+    everything = usable == 0 and often == len(skipped)
+    who = f"all {often} pictures" if everything else f"{often} of {usable + len(skipped)} pictures"
+    if often < 2 or often < len(skipped) / 2:
+        left_out = "".join(f"; {source} {why}" for source, why in skipped[:3])
+        left_out += f"; and {len(skipped) - 3} more" if len(skipped) > 3 else ""
+        return UserError(
+            f"{_count(usable)}, but poses need at least {_FEWEST}, better 20 or more "
+            f"from different places around the scene{left_out}"
+        )
+    if reason == SAME_VIEW:
+        video = skipped[0][0].partition(" at ")[0]
+        return UserError(
+            f"{video}: the camera does not move in it ({who} show the same view), and depth can "
+            "only be seen by moving; film while walking around the scene"
+        )
+    if reason in (BLACK, WHITE, FLAT):
+        what = {BLACK: "black", WHITE: "white", FLAT: "of one colour"}[reason]
+        return UserError(f"{who} are {what} all over; check the lens cap, the light and the files")
+    if reason == BLURRED:
+        return UserError(
+            f"{who} are blurred all over, so nothing can be recognised in them; hold the camera "
+            "still for each photo, in good light and in focus"
+        )
+    return UserError(
+        f"{_count(usable)}: {who}, {skipped[0][0]} first, {reason}; poses need at least "
+        f"{_FEWEST}, better 20 or more"
+    )
+
+
+def _count(usable: int) -> str:
+    return {0: "no usable picture", 1: "only 1 usable picture"}.get(
+        usable, f"only {usable} usable pictures"
+    )

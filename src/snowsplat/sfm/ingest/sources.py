@@ -1,0 +1,254 @@
+"""Which files are meant: photos and videos, the name each gets in ``input/``, its mask."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import shown
+
+PHOTO_SUFFIXES = {
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".webp", ".tif", ".tiff"),
+    *(".heic", ".heif", ".hif", ".bmp", ".ppm"),
+}
+VIDEO_SUFFIXES = {
+    *(".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts"),
+    *(".3gp", ".3g2", ".wmv", ".ogv", ".mjpeg", ".flv", ".insv", ".gif"),
+}
+_RAW_SUFFIXES = {
+    *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".orf", ".rw2"),
+    *(".raf", ".pef", ".srw", ".x3f", ".raw"),
+}
+MASKS = "masks"
+# What our own output folders hold: one that lies among the photos is none of them.
+_OUR_FILES = ("capture.json", "cfg_args")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that pictures come from."""
+
+    path: Path
+    kind: Literal["photo", "video"]
+    #: Relative, with "/": a photo's own; the folder of a video's frames, "" for none.
+    name: str
+    mask: Path | None = None  # of a photo
+
+
+@dataclass(frozen=True)
+class Found:
+    """All that the inputs hold, in the order of the inputs and of names within each."""
+
+    sources: list[Source]
+    left_out: list[tuple[str, str]]  # path, reason
+    unused_masks: list[Path]
+
+
+def find_sources(inputs: Sequence[Path]) -> Found:
+    """Photos and videos of files and folders; folders are searched with all that is in them.
+
+    Hidden files, ``masks`` folders and our own output folders are left out, and so are videos
+    beside photos: phones put a film of three seconds beside every photo. A single input gives its
+    own names; of several, each folder and video gets a folder, so equal names do not collide.
+
+    Raises:
+        UserError: an input does not exist or is no photo or video; there is none in all of them.
+    """
+    if not inputs:
+        raise UserError("no photos given; name a folder of photos, photos or a video")
+    found: list[Source] = []
+    left_out: list[tuple[str, str]] = []
+    unused: list[Path] = []
+    seen: dict[Path, Path] = {}
+    folders = {MASKS}  # names that are taken
+
+    def add(source: Source) -> None:
+        real = source.path.resolve()
+        if real in seen:
+            left_out.append((shown(source.path), f"is the same file as {shown(seen[real])}"))
+        else:
+            seen[real] = source.path
+            found.append(source)
+
+    for path in inputs:
+        if not path.exists():
+            raise UserError(f"{shown(path)}: no such file or folder")
+        if not path.is_dir():
+            kind = kind_of_file(path)
+            if kind == "photo":
+                add(Source(path, kind, shown(path.name), Masks(path.parent).of(path.name)))
+            else:
+                add(Source(path, kind, "" if len(inputs) == 1 else _free(path.stem, folders)))
+            continue
+        photos, videos = _scan(path)
+        prefix = "" if len(inputs) == 1 else _free(path.resolve().name, folders)
+        masks = Masks(path)
+        for relative in photos:
+            name = str(PurePosixPath(prefix) / shown(relative))
+            add(Source(path / relative, "photo", name, masks.of(relative)))
+        unused += masks.unused
+        for relative in videos:
+            if photos:
+                reason = "is a video beside photos; give it as an input to take its frames"
+                left_out.append((shown(path / relative), reason))
+            else:
+                stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
+                only = len(videos) == 1
+                add(Source(path / relative, "video", prefix if only else _free(stem, folders)))
+    if not found:
+        raise _nothing_in(inputs)
+    return Found(found, left_out, unused)
+
+
+def _scan(root: Path) -> tuple[list[str], list[str]]:
+    """Photos and videos below a folder by their endings, relative with "/", sorted."""
+    photos, videos = [], []
+    for relative in _files_below(root):
+        suffix = PurePosixPath(relative).suffix.lower()
+        if suffix in PHOTO_SUFFIXES:
+            photos.append(relative)
+        elif suffix in VIDEO_SUFFIXES:
+            videos.append(relative)
+    return photos, videos
+
+
+def _files_below(root: Path, leave_out: Sequence[str] = (MASKS,)) -> list[str]:
+    """Not hidden, relative, with "/", sorted; symbolic links are followed, in circles once."""
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    found = []
+    been = {root.resolve()}
+    for folder, below, files in os.walk(root, followlinks=True, onerror=fail):
+        here = Path(folder)
+        kept = []
+        for name in sorted(below):
+            real = (here / name).resolve()
+            ours = any((here / name / file).is_file() for file in _OUR_FILES)
+            if not (name.startswith(".") or name in leave_out or ours or real in been):
+                been.add(real)
+                kept.append(name)
+        below[:] = kept
+        found += [
+            (here / name).relative_to(root).as_posix()
+            for name in files
+            if not name.startswith(".") and (here / name).is_file()
+        ]
+    return sorted(found)
+
+
+class Masks:
+    """The masks of a folder of photos: ``masks/IMG.jpg.png`` or ``masks/IMG.png``.
+
+    Of a photo in a sub-folder also ``sub/masks/…``. Any image format and case of the ending.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._by_folder: dict[Path, dict[str, Path]] = {}
+        self._used: set[Path] = set()
+
+    def of(self, relative: str) -> Path | None:
+        """The mask of a photo, given relative to the root."""
+        name = PurePosixPath(relative)
+        for folder, key in (
+            (self._root / MASKS, relative),
+            ((self._root / relative).parent / MASKS, name.name),
+        ):
+            listed = self._listed(folder)
+            mask = listed.get(key) or listed.get(str(PurePosixPath(key).with_suffix("")))
+            if mask is not None:
+                self._used.add(mask)
+                return mask
+        return None
+
+    @property
+    def unused(self) -> list[Path]:
+        """Masks of no photo: misspelt, most likely."""
+        there = {path for listed in self._by_folder.values() for path in listed.values()}
+        return sorted(there - self._used)
+
+    def _listed(self, folder: Path) -> dict[str, Path]:
+        """Masks by their name without the ending."""
+        if folder not in self._by_folder:
+            files = _files_below(folder, ()) if folder.is_dir() else []
+            self._by_folder[folder] = {
+                str(PurePosixPath(file).with_suffix("")): folder / file
+                for file in files
+                if PurePosixPath(file).suffix.lower() in PHOTO_SUFFIXES
+            }
+        return self._by_folder[folder]
+
+
+def kind_of_file(path: Path) -> Literal["photo", "video"]:
+    """What a file given by name is, by its content.
+
+    Raises:
+        UserError: neither, or it may not be read.
+    """
+    from snowsplat.sfm.ingest.clip import is_video
+
+    try:
+        with open(path, "rb") as file:
+            head = file.read(32)
+    except OSError as error:
+        raise UserError(f"{shown(path)}: cannot be read ({error.strerror})") from None
+    suffix = path.suffix.lower()
+    if suffix in _RAW_SUFFIXES:  # many are a kind of TIFF, with a thumbnail in front
+        raise UserError(f"{shown(path)}: is a raw photo; save it as JPEG or PNG first")
+    if _is_photo(head):
+        return "photo"
+    if is_video(path):
+        return "video"
+    if suffix in PHOTO_SUFFIXES:
+        raise UserError(f"{shown(path)}: is no photo, whatever its name says; give another file")
+    if suffix in VIDEO_SUFFIXES:
+        raise UserError(
+            f"{shown(path)}: is no video that can be read, whatever its name says; it may be cut "
+            "off or damaged: copy it again, or give another file"
+        )
+    raise UserError(f"{shown(path)}: is neither a photo nor a video")
+
+
+def _is_photo(head: bytes) -> bool:
+    """By the first bytes: formats of photos have a signature each."""
+    if head[4:8] == b"ftyp":  # HEIF shares its container with mp4
+        return head[8:12] in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
+    if head[:4] == b"RIFF":
+        return head[8:12] == b"WEBP"
+    signatures = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"BM", b"P5", b"P6")
+    return head.startswith(signatures)
+
+
+def _nothing_in(inputs: Sequence[Path]) -> UserError:
+    names = ", ".join(map(shown, inputs))
+    for path in inputs:
+        if any(Path(file).suffix.lower() in _RAW_SUFFIXES for file in _files_below(path)):
+            return UserError(f"{names}: only raw photos; save them as JPEG or PNG first")
+    return UserError(
+        f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no video in it; name the folder "
+        "that holds them"
+    )
+
+
+def free_names(names: Sequence[str]) -> Iterator[str]:
+    """The names, each changed where one before it is the same on a disk that ignores case."""
+    taken: set[str] = set()
+    for name in names:
+        yield _free(name, taken)
+
+
+def _free(name: str, taken: set[str]) -> str:
+    name = shown(name)
+    path = PurePosixPath(name)
+    candidate, n = name, 1
+    while candidate.casefold() in taken:
+        n += 1
+        candidate = str(path.with_name(f"{path.stem}_{n}{path.suffix}"))
+    taken.add(candidate.casefold())
+    return candidate

@@ -1,0 +1,144 @@
+"""Which way is up, where the middle is and how large the scene is: from the cameras alone.
+
+SfM leaves the world frame open: its solution is as good when turned, moved and scaled. People and
+viewers care: up should be up, and the thing photographed where one looks first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from snowsplat.scene.geometry import Similarity
+from snowsplat.scene.orientation import up_direction
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: What the median distance from a camera to the points it sees becomes. A unit is then about a
+#: metre for things and rooms photographed by hand, as viewers take it: for their near planes, for
+#: the speed of walking, and in VR.
+VIEWING_DISTANCE = 3.0
+
+_POINTS_SAMPLED = 5000  # enough for medians
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The parts of a model that matter here, world frame of SfM; cameras in order of names."""
+
+    rotations: np.ndarray  # (N, 3, 3), of cam_from_world: rows are the cameras' x, y, z axes
+    centres: np.ndarray  # (N, 3)
+    points: np.ndarray  # (P, 3)
+    distances: np.ndarray  # (N,) from a camera to the median point it sees; NaN if it sees none
+
+    @property
+    def forward(self) -> np.ndarray:
+        return self.rotations[:, 2]
+
+
+def orientation(model: pycolmap.Reconstruction) -> Similarity:
+    """``scene_from_sfm``: y down, z where the cameras look on the whole, the middle at the origin.
+
+    Up is chosen so that the photos are level; the middle is what the cameras look at, or, where
+    they look outwards or all the same way, the median of the points. The scale makes
+    `VIEWING_DISTANCE` the median distance from camera to point.
+
+    Raises:
+        ValueError: the model has no cameras.
+    """
+    seen = _read(model)
+    if not len(seen.centres):
+        raise ValueError("a model without cameras has no orientation")
+    up = up_direction(seen.rotations)
+    forward = _heading(seen, up)
+    down = -up
+    rotation = np.stack([np.cross(down, forward), down, forward])
+    scale = VIEWING_DISTANCE / _distance(seen)
+    middle = _middle(seen)
+    return Similarity(
+        scale, torch.from_numpy(rotation), torch.from_numpy(-scale * rotation @ middle)
+    )
+
+
+def _read(model: pycolmap.Reconstruction) -> _Seen:
+    images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
+    poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+    rotations = poses[:, :, :3]
+    centres = -np.einsum("nji,nj->ni", rotations, poses[:, :, 3])
+    numbers = sorted(model.points3D)
+    chosen = numbers[:: max(1, len(numbers) // _POINTS_SAMPLED)]
+    points = np.array([model.points3D[n].xyz for n in chosen]).reshape(-1, 3)
+    index = {image.image_id: i for i, image in enumerate(images)}
+    pairs = np.array(
+        [
+            (index[element.image_id], p)
+            for p, n in enumerate(chosen)
+            for element in model.points3D[n].track.elements
+        ],
+        np.int64,
+    ).reshape(-1, 2)
+    lengths = np.linalg.norm(points[pairs[:, 1]] - centres[pairs[:, 0]], axis=1)
+    distances = np.full(len(images), np.nan)
+    for i in range(len(images)):
+        of_camera = lengths[pairs[:, 0] == i]
+        if len(of_camera):
+            distances[i] = np.median(of_camera)
+    return _Seen(rotations, centres, points, distances)
+
+
+def _heading(seen: _Seen, up: np.ndarray) -> np.ndarray:
+    """(3,) horizontal: where the cameras look on the whole, else where the first one looks."""
+    level = np.eye(3) - np.outer(up, up)
+    # One that looks straight down is turned as its upper edge says.
+    candidates = (seen.forward.mean(axis=0), seen.forward[0], -seen.rotations[0, 1])
+    for direction, least in zip(candidates, (0.5, 0.1, 0.0), strict=True):
+        horizontal = level @ direction
+        length = float(np.linalg.norm(horizontal))
+        if length > least:
+            break
+    return horizontal / length
+
+
+def _middle(seen: _Seen) -> np.ndarray:
+    """(3,) where the optical axes meet, if they do; else the median of the points."""
+    meeting = _meeting_point(seen)
+    if meeting is not None:
+        return meeting
+    if len(seen.points):
+        return np.median(seen.points, axis=0)
+    return np.median(seen.centres, axis=0)
+
+
+def _meeting_point(seen: _Seen) -> np.ndarray | None:
+    """(3,) the point nearest to the optical axes (least sum of distances).
+
+    None where the axes are nearly parallel, pass each other far off, or meet behind the cameras.
+    """
+    axes, centres = seen.forward, seen.centres
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (N, 3, 3)
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < math.sin(math.radians(10)) ** 2:
+        return None
+    typical = _distance(seen)
+    weights = np.ones(len(axes))
+    for _ in range(30):
+        matrix = np.einsum("n,nij->ij", weights, across)
+        point = np.linalg.solve(matrix, np.einsum("n,nij,nj->i", weights, across, centres))
+        misses = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=1)
+        weights = 1 / np.maximum(misses, 0.01 * typical)
+    ahead = np.einsum("ni,ni->n", point - centres, axes)
+    is_met = (ahead > 0.2 * typical).mean() > 0.75 and np.median(misses) < 0.5 * np.median(ahead)
+    return point if is_met else None
+
+
+def _distance(seen: _Seen) -> float:
+    """The median distance from a camera to the points it sees; without points, between cameras."""
+    distances = seen.distances[np.isfinite(seen.distances)]
+    if not len(distances):
+        distances = np.linalg.norm(seen.centres - np.median(seen.centres, axis=0), axis=1)
+    distance = float(np.median(distances))
+    return distance if distance > 0 else 1.0

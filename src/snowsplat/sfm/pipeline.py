@@ -1,0 +1,325 @@
+"""The folder of a dataset, from photos: gather, find the poses, undistort, report.
+
+    DATASET/input/                the photos or frames, upright
+    DATASET/distorted/            database and models of the photos as they are, log of COLMAP
+    DATASET/images/, sparse/0/    what training reads: photos without lens distortion, their cameras
+    DATASET/masks/                where there are masks
+    DATASET/images_2/, _4, _8     smaller copies, if asked for
+    DATASET/capture.json          what was done with which settings, and what came of it
+    DATASET/capture_report.html   the same for people, with a picture of cameras and points
+
+This is the layout of the reference implementation's convert.py. A run that was stopped goes on
+where it was, see `stages`.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
+from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, find_inputs, gather
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import remove_temporaries
+from snowsplat.util.safe_json import from_json, inside
+from snowsplat.util.stages import Outcome, Stages
+
+if TYPE_CHECKING:
+    from snowsplat.sfm.progress import Report
+
+STAGES = ("photos", "poses", "images", "report")
+RECORD, REPORT = "capture.json", "capture_report.html"
+_IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "masks", "sparse")
+_OURS = ("distorted", *_IMAGE_FOLDERS, RECORD, REPORT)
+
+
+@dataclass(frozen=True)
+class DatasetOptions:
+    """How photos become a dataset.
+
+    Attributes:
+        gather: which frames of a video, and their size.
+        sfm: how the poses are found.
+        resize: also make images_2, images_4 and images_8.
+        skip_matching: take the model that is in distorted/sparse/0 rather than find the poses.
+    """
+
+    gather: GatherOptions = field(default_factory=GatherOptions)
+    sfm: SfmOptions = field(default_factory=SfmOptions)
+    resize: bool = False
+    skip_matching: bool = False
+
+
+class Watcher(Protocol):
+    """Is told what goes on."""
+
+    def begin(self, stage: str) -> Report:
+        """A stage begins, or a finished one is found; gives where it says how far it is."""
+
+    def end(self, stage: str, outcome: Outcome) -> None:
+        """The stage has come to an end."""
+
+    def note(self, line: str) -> None:
+        """Something that the user should know."""
+
+
+def make_dataset(
+    inputs: Sequence[Path],
+    folder: Path,
+    options: DatasetOptions,
+    watcher: Watcher,
+    overwrite: bool = False,
+) -> dict[str, Outcome]:
+    """Make a dataset in ``folder`` from folders of photos, photos and videos.
+
+    Stages that an earlier run with the same inputs and settings has finished are not done again.
+    ``folder / "input"`` may itself be the input; then it stays as it is.
+
+    Args:
+        overwrite: replace a dataset of other inputs that is in ``folder``.
+
+    Returns:
+        the outcome of each stage: "photos" is a `Gathered`, "poses" an `SfmResult`, "images" an
+        `Undistorted`, as JSON values; "report" names the file.
+
+    Raises:
+        UserError: unusable photos, a folder that is taken, poses that cannot be found: then what
+            this run began is removed; or the disk is full.
+        OSError: a file cannot be read or written.
+    """
+    sources = find_inputs(inputs)
+    in_place = any(path.resolve() == (folder / "input").resolve() for path in inputs)
+    _check_free(folder, in_place, inputs, options, overwrite)
+    with _nothing_half_made(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        stages = Stages(folder / RECORD, STAGES)
+        stages.about = {"inputs": [str(path.absolute()) for path in inputs]}
+        stages.save()  # from here on the folder is known to be ours
+        return _run(stages, inputs, sources, folder, options, watcher, in_place)
+
+
+def _run(
+    stages: Stages,
+    inputs: Sequence[Path],
+    sources: Sequence[Path],
+    folder: Path,
+    options: DatasetOptions,
+    watcher: Watcher,
+    in_place: bool,
+) -> dict[str, Outcome]:
+    outcomes: dict[str, Outcome] = {}
+
+    def stage(name: str, settings: dict[str, Any], outputs: Sequence[str], work: Any) -> None:
+        report = watcher.begin(name)
+        outcomes[name] = stages.run(
+            name,
+            settings,
+            [folder / output for output in outputs],
+            lambda: work(report),
+            lambda reason: watcher.note(f"{name}: done again ({reason})"),
+        )
+        watcher.end(name, outcomes[name])
+
+    def gather_photos(report: Report) -> dict[str, Any]:
+        return _gather(inputs, folder, options.gather, report, in_place)
+
+    stage(
+        "photos",
+        {"input": _fingerprint(sources), **asdict(options.gather)},
+        ["input", "distorted/masks"],
+        gather_photos,
+    )
+    photos = _photos(folder, outcomes["photos"].result)
+
+    def find_poses(report: Report) -> dict[str, Any]:
+        if options.skip_matching:
+            return asdict(describe_model(folder, photos))
+        return asdict(estimate_poses(folder, photos, options.sfm, report))
+
+    settings = {k: v for k, v in asdict(options.sfm).items() if k != "threads"}
+    stage(
+        "poses",
+        settings | {"skip_matching": options.skip_matching},
+        ["distorted/sparse"],
+        find_poses,
+    )
+
+    def make_images(report: Report) -> dict[str, Any]:
+        return _undistort(folder, photos, options, report)
+
+    stage("images", {"resize": options.resize}, _IMAGE_FOLDERS, make_images)
+
+    def write(report: Report) -> dict[str, Any]:
+        from snowsplat.sfm.report import write_report
+
+        facts = {
+            "inputs": stages.about["inputs"],
+            "settings": _plain(options),
+            "gathered": outcomes["photos"].result,
+            "sfm": outcomes["poses"].result,
+            "undistorted": outcomes["images"].result,
+            "seconds": {name: outcome.seconds for name, outcome in outcomes.items()},
+        }
+        return {"file": write_report(folder, facts).name}
+
+    stage("report", {}, [REPORT], write)
+    return outcomes
+
+
+# The stages
+
+
+def _gather(
+    inputs: Sequence[Path], folder: Path, options: GatherOptions, report: Report, in_place: bool
+) -> dict[str, Any]:
+    """Into a new folder first: an older `input/` is replaced by a whole one."""
+    masks = Path("distorted") / "masks"
+    if in_place:
+        shutil.rmtree(folder / masks, ignore_errors=True)
+        return asdict(gather(inputs, folder, options, report))
+    new = folder / ".new"
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir()
+    try:
+        gathered = gather(inputs, new, options, report)
+        for part in (Path("input"), masks):
+            shutil.rmtree(folder / part, ignore_errors=True)
+            if (new / part).exists():
+                (folder / part).parent.mkdir(parents=True, exist_ok=True)
+                (new / part).rename(folder / part)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    return asdict(gathered)
+
+
+def _undistort(
+    folder: Path, photos: list[Photo], options: DatasetOptions, report: Report
+) -> dict[str, Any]:
+    import pycolmap
+
+    from snowsplat.sfm.orient import orientation
+    from snowsplat.sfm.undistort import undistort
+
+    for name in _IMAGE_FOLDERS:
+        shutil.rmtree(folder / name, ignore_errors=True)
+    scene_from_sfm = orientation(pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0"))
+    made = undistort(
+        folder, photos, scene_from_sfm, options.resize, report, threads=options.sfm.threads
+    )
+    return asdict(made) | {"scene_from_sfm": scene_from_sfm.to_json()}
+
+
+# What the folder may hold
+
+
+def _check_free(
+    folder: Path,
+    in_place: bool,
+    inputs: Sequence[Path],
+    options: DatasetOptions,
+    overwrite: bool,
+) -> None:
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise UserError(f"{folder}: is a file; name a folder for the dataset")
+    remove_temporaries(folder, (RECORD, REPORT))
+    record = folder / RECORD
+    if record.is_file():
+        before = Stages(record, STAGES).about.get("inputs")
+        if not in_place and _were_in_place(before, folder):
+            raise UserError(
+                f"{folder / 'input'}: holds the photos that were given for the dataset here, not "
+                "copies that could be replaced; name another folder"
+            )
+        if before != [str(path.absolute()) for path in inputs] and not overwrite:
+            what = ", ".join(map(str, before)) if isinstance(before, list) else "something else"
+            raise UserError(
+                f"{folder}: holds a dataset of {what}; name another folder, or add --overwrite"
+            )
+        return
+    allowed = {".new"}  # what a run that was killed in its first stage leaves
+    if in_place:
+        allowed |= {"input"} | ({"distorted"} if options.skip_matching else set())
+    others = sorted(entry.name for entry in folder.iterdir() if entry.name not in allowed)
+    if others:
+        raise UserError(
+            f"{folder}: holds other files ({', '.join(others[:3])}"
+            f"{', …' if len(others) > 3 else ''}); name a new or an empty folder"
+        )
+
+
+def _were_in_place(inputs: Any, folder: Path) -> bool:
+    """``inputs``: those of a dataset in ``folder``, as they are written down."""
+    names = inputs if isinstance(inputs, list) else []
+    there = (folder / "input").resolve()
+    return any(isinstance(name, str) and Path(name).resolve() == there for name in names)
+
+
+@contextmanager
+def _nothing_half_made(folder: Path) -> Iterator[None]:
+    """Take back what was begun in a new folder when the input is of no use.
+
+    After Ctrl-C, or where the disk is full, the stages that are finished stay: the same command
+    goes on.
+    """
+    existed = folder.exists()
+    there = {entry.name for entry in folder.iterdir()} if existed else set()
+    try:
+        yield
+    except BaseException as error:
+        record = folder / RECORD
+        worth = record.is_file() and Stages(record, STAGES).is_finished("photos")
+        if RECORD not in there and (isinstance(error, UserError) or not worth):
+            for name in {"input", ".new", *_OURS} - there:
+                _remove(folder / name)
+            if not existed and folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise UserError(
+                f"{folder}: the disk is full; make room, then give the same command again"
+            ) from None
+        raise
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+# JSON
+
+
+def _fingerprint(files: Sequence[Path]) -> str:
+    """Of names, sizes and times: changes when a photo is added, taken away or edited."""
+    entries = []
+    for file in files:
+        status = file.stat()
+        entries.append([str(file.absolute()), status.st_size, status.st_mtime_ns])
+    return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
+
+
+def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
+    """Raises UserError: they are not what was written down."""
+    try:
+        photos = from_json(Gathered, gathered).photos
+        if not all(inside(folder / "input", photo.name) for photo in photos):
+            raise ValueError("a photo elsewhere")
+    except ValueError:
+        raise UserError(f"{folder / RECORD}: damaged; delete it to begin anew") from None
+    return photos
+
+
+def _plain(options: DatasetOptions) -> dict[str, Any]:
+    values = asdict(options)
+    return {**values.pop("gather"), **values.pop("sfm"), **values}

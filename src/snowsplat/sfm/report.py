@@ -1,0 +1,223 @@
+"""capture_report.html: what came of the photos, on one page that needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from snowsplat.data.colmap import posed_camera
+from snowsplat.data.colmap_files import read_model, read_points
+from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
+from snowsplat.util.files import write_text
+from snowsplat.util.html import bar, cards, duration, page, picture, table, text
+from snowsplat.util.safe_json import printable
+
+_FILE = "capture_report.html"
+_THUMBNAILS = 24  # at most, evenly chosen
+_THUMBNAIL_HEIGHT = 110  # pixels
+_NAMED = 200  # photos that are listed one by one
+_ERROR_HIGH = 1.5  # pixels; good ones are below 1
+
+_FOCAL_FROM = {"exif": "the camera's note (EXIF) refined", "guessed": "found from the photos"}
+_STAGES = {"photos": "reading photos", "poses": "finding poses", "images": "undistorting"}
+
+_STYLE = """
+.maps { display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start; }
+svg.map { width: 100%; height: auto; display: block; }
+.strip { display: flex; gap: 6px; overflow-x: auto; padding-bottom: 8px; }
+.strip img { height: 110px; border-radius: 4px; display: block; }
+"""
+
+
+def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
+    """Write ``capture_report.html`` of a finished dataset; gives its path.
+
+    Args:
+        facts: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm", an
+            `SfmResult`; "undistorted", an `Undistorted`; "seconds" of each stage: JSON values.
+
+    Raises:
+        UserError: the model in ``sparse/0`` or an image cannot be read.
+    """
+    photos = _placed(dataset, facts)
+    name = _name(facts["inputs"])
+    body = [
+        _headline(name, facts),
+        _cards(facts),
+        _maps(dataset, photos),
+        _strip(dataset, [photo.name for photo in photos]),
+        _lenses(facts["sfm"]["cameras"], facts["undistorted"]),
+        _left_out(facts),
+        _course(facts),
+        _next(dataset),
+    ]
+    path = dataset / _FILE
+    write_text(path, page(f"{name} – dataset", body, _STYLE))
+    return path
+
+
+def _placed(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto]:
+    sequences = {photo["name"]: photo["sequence"] for photo in facts["gathered"]["photos"]}
+    model = read_model(dataset / "sparse" / "0")
+    photos = []
+    for image in model.images:
+        camera = posed_camera(model, image)
+        half = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
+        pose = camera.cam_from_world.numpy()
+        photos.append(PlacedPhoto(printable(image.name), sequences.get(image.name), pose, *half))
+    return photos
+
+
+# The parts of the page, from top to bottom
+
+
+def _headline(name: str, facts: dict[str, Any]) -> str:
+    sfm = facts["sfm"]
+    placed, rest = len(sfm["registered"]), len(sfm["unregistered"])
+    if not rest:
+        verdict = f"All {placed} photos have their place."
+    else:
+        verdict = f"{placed} of {placed + rest} photos have their place."
+    lines = [f"<h1>{text(name)}</h1>", f"<p>{verdict}</p>"]
+    if len(sfm["sub_models"]) > 1:
+        sizes = ", ".join(map(str, sfm["sub_models"]))
+        lines.append(
+            f'<p class="bad">The photos fall into {len(sfm["sub_models"])} parts that do not hang '
+            f"together ({sizes} photos); the largest is used. Photos from in between join them.</p>"
+        )
+    error = sfm["reprojection_error"]
+    if error is not None and error > _ERROR_HIGH:
+        lines.append(
+            '<p class="bad">The reprojection error is high: look for photos that are blurred, or '
+            "of things that moved, or another camera model.</p>"
+        )
+    return "\n".join(lines)
+
+
+def _cards(facts: dict[str, Any]) -> str:
+    sfm = facts["sfm"]
+    total = len(sfm["registered"]) + len(sfm["unregistered"])
+    error = sfm["reprojection_error"]
+    figures = [
+        (f"{len(sfm['registered'])} / {total}", "photos placed"),
+        (f"{sfm['points']:,}", f"points, seen {sfm['observations']:,} times"),
+        ("–" if error is None else f"{error:.2f} px", "mean reprojection error"),
+        (str(len(sfm["cameras"])), "lens" if len(sfm["cameras"]) == 1 else "lenses"),
+        (duration(sum(facts["seconds"].values())), "in all"),
+    ]
+    return cards(figures)
+
+
+def _maps(dataset: Path, photos: Sequence[PlacedPhoto]) -> str:
+    points = read_points(dataset / "sparse" / "0")
+    xyz = np.empty((0, 3)) if points is None else points.xyz.numpy().astype(np.float64)
+    rgb = np.empty((0, 3), np.uint8) if points is None else points.rgb.numpy()
+    captions = (
+        "From above. Orange: the cameras; white: the first one.",
+        "From the side. Up is up.",
+    )
+    if any(photo.sequence is not None for photo in photos):
+        captions = (captions[0] + " Blue: the way of the video.", captions[1])
+    # Beside each other they fill the page at one scale: they grow as they are wide.
+    figures = "\n".join(
+        f'<figure style="flex:{drawing.width} 1 {drawing.width // 2}px;'
+        f'max-width:{2 * drawing.width}px">{drawing.svg}'
+        f"<figcaption>{caption}</figcaption></figure>"
+        for drawing, caption in zip(draw_scene(photos, xyz, rgb), captions, strict=True)
+    )
+    return f'<h2>Cameras and points</h2>\n<div class="maps">{figures}</div>'
+
+
+def _strip(dataset: Path, names: Sequence[str]) -> str:
+    count = min(len(names), _THUMBNAILS)
+    chosen = [names[i * len(names) // count] for i in range(count)]
+    images = "".join(
+        picture(_thumbnail(dataset / "images" / name), name)
+        for name in chosen
+        if (dataset / "images" / name).is_file()
+    )
+    return f'<h2>Images</h2>\n<div class="strip">{images}</div>'
+
+
+def _thumbnail(path: Path) -> Image.Image:
+    with Image.open(path) as image:
+        image.draft("RGB", (4 * _THUMBNAIL_HEIGHT, 2 * _THUMBNAIL_HEIGHT))  # JPEG decodes smaller
+        width = max(1, round(image.width * _THUMBNAIL_HEIGHT / image.height))
+        small = image.convert("RGBA" if "A" in image.mode else "RGB")
+        small = small.resize((width, _THUMBNAIL_HEIGHT), Image.Resampling.LANCZOS)
+    if small.mode == "RGBA":
+        ground = Image.new("RGBA", small.size, (128, 128, 128, 255))
+        small = Image.alpha_composite(ground, small).convert("RGB")
+    return small
+
+
+def _lenses(cameras: Iterable[dict[str, Any]], undistorted: dict[str, Any]) -> str:
+    rows = []
+    for camera in cameras:
+        width, height, focal = camera["width"], camera["height"], float(camera["params"][0])
+        # The angle that a pinhole of that focal length sees; a lens' own differs a little.
+        angle = math.degrees(2 * math.atan(max(width, height) / 2 / focal)) if focal > 0 else 0.0
+        parameters = ", ".join(f"{value:.5g}" for value in camera["params"])
+        rows.append(
+            [
+                str(camera["images"]),
+                f"{width} × {height}",
+                f"{focal:.0f} px ({angle:.0f}°), {_FOCAL_FROM[camera['focal_from']]}",
+                f"{camera['model']} <span class='soft'>{parameters}</span>",
+            ]
+        )
+    sizes = ", ".join(f"{w} × {h}" for w, h, *_ in undistorted["sizes"])
+    how = (
+        "without lens distortion" if undistorted["resampled"] else "copied: there is no distortion"
+    )
+    lenses = table(["photos", "size", "focal length (longer side)", "lens model"], rows)
+    return f'<h2>Lenses</h2>\n{lenses}\n<p class="soft">Images for training: {sizes}, {how}.</p>'
+
+
+def _left_out(facts: dict[str, Any]) -> str:
+    entries = [
+        *((name, why) for name, why in facts["sfm"]["unregistered"].items()),
+        *((source, why) for source, why in facts["gathered"]["skipped"]),
+    ]
+    if not entries:
+        return ""
+    rows = [[text(name), text(why)] for name, why in entries[:_NAMED]]
+    more = len(entries) - _NAMED
+    rest = f'<p class="soft">… and {more:,} more, see capture.json.</p>' if more > 0 else ""
+    return f"<h2>Not used</h2>\n{table(['photo', 'why'], rows, 'names')}{rest}"
+
+
+def _course(facts: dict[str, Any]) -> str:
+    seconds = facts["seconds"]
+    longest = max([*seconds.values(), 1e-9])
+    rows = []
+    for stage, value in seconds.items():
+        rows.append([text(_STAGES.get(stage, stage)), duration(value), bar(value / longest)])
+    sfm = facts["sfm"]
+    attempts = "".join(f"<li>{text(attempt)}</li>" for attempt in sfm["attempts"])
+    settings = text(json.dumps(facts["settings"], indent=2, ensure_ascii=False))
+    inputs = ", ".join(text(path) for path in facts["inputs"])
+    return (
+        f"<h2>How it went</h2>\n{table(['stage', 'time', ''], rows)}\n"
+        f'<p class="soft">From {inputs}. Pairs of photos: {text(sfm["pairs"])}.</p>\n'
+        f"<ol>{attempts}</ol>\n"
+        f"<details><summary>Settings</summary><pre>{settings}</pre></details>"
+    )
+
+
+def _name(inputs: Sequence[str]) -> str:
+    """What the dataset is of; of photos in LOCATION/input, that is LOCATION."""
+    first = Path(inputs[0])
+    return first.parent.name if first.name == "input" else first.stem
+
+
+def _next(dataset: Path) -> str:
+    command = f"snowsplat train {shlex.quote(str(dataset))} -o {shlex.quote(dataset.name + '-out')}"
+    return f"<h2>Next</h2>\n<pre>{text(command)}</pre>"

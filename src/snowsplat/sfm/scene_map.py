@@ -1,0 +1,188 @@
+"""Cameras and points of a dataset as a drawing: from above and from the side, to one scale.
+
+The scene's frame is that of `orient`: x right, y down, z ahead, in units of which a camera has
+some three to what it sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from snowsplat.sfm.orient import VIEWING_DISTANCE
+
+_WIDTH, _HEIGHT = 520, 400  # the larger view fits into it; in units of the drawing
+_MARGIN = 16
+_MOST_POINTS = 6000  # in a view; more make the file large and the picture no clearer
+_SHADES = 12  # of each of red, green and blue: points of one colour are one element
+
+
+@dataclass(frozen=True)
+class PlacedPhoto:
+    """What the drawing shows of a photo."""
+
+    name: str
+    sequence: str | None  # photos of one are joined by a line, in their order here
+    cam_from_world: np.ndarray  # (3, 4)
+    half_width: float  # of the picture, over the focal length
+    half_height: float
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) world."""
+        return -self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3]
+
+    def corners(self, depth: float) -> np.ndarray:
+        """(4, 3) of the picture's corners at a depth, world, going around."""
+        x, y = self.half_width, self.half_height
+        rays = depth * np.array([(-x, -y, 1), (x, -y, 1), (x, y, 1), (-x, y, 1)])
+        return (rays - self.cam_from_world[:, 3]) @ self.cam_from_world[:, :3]
+
+
+@dataclass(frozen=True)
+class _Side:
+    title: str
+    right: np.ndarray  # (3,) world direction that points to the right of the drawing
+    down: np.ndarray
+
+
+_Flat = Callable[[np.ndarray], np.ndarray]  # (n, 3) world to (n, 2) of the drawing
+
+_X, _Y, _Z = np.eye(3)
+_SIDES = (_Side("From above", _X, -_Z), _Side("From the side", _Z, _Y))
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """An SVG element, and its width in units of the drawing, the same for all of a scene."""
+
+    svg: str
+    width: int
+
+
+def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) -> list[Drawing]:
+    """A drawing for each side, of points (P, 3) and their colours (P, 3) uint8.
+
+    All cameras are in it; of the points those that lie around them and most other points.
+    """
+    centres = np.array([photo.centre for photo in photos]).reshape(-1, 3)
+    low, high = _box(centres, xyz)
+    inside = ((xyz >= low) & (xyz <= high)).all(axis=1)
+    shown = np.flatnonzero(inside)
+    # Evenly spread, by a stride that has nothing to do with the order of the points.
+    shown = shown[np.random.default_rng(0).permutation(len(shown))[:_MOST_POINTS]]
+    extents = [np.abs((high - low) @ np.stack([side.right, side.down], 1)) for side in _SIDES]
+    scale = min(_fit(extent) for extent in extents)
+    depth = _frustum_depth(centres, high - low)
+    return [
+        _draw(side, photos, xyz[shown], rgb[shown], (low + high) / 2, extent * scale, scale, depth)
+        for side, extent in zip(_SIDES, extents, strict=True)
+    ]
+
+
+def _fit(extent: np.ndarray) -> float:
+    return min((_WIDTH - 2 * _MARGIN) / extent[0], (_HEIGHT - 2 * _MARGIN) / extent[1])
+
+
+def _box(centres: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates (3,) of what is shown: wild and very far points are not."""
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    if len(xyz):
+        reach = 3 * VIEWING_DISTANCE
+        points_low, points_high = np.quantile(xyz, [0.02, 0.98], axis=0)
+        low = np.minimum(low, np.maximum(points_low, low - reach))
+        high = np.maximum(high, np.minimum(points_high, high + reach))
+    room = np.maximum(0.04 * float((high - low).max()), 0.05 * VIEWING_DISTANCE)
+    return low - room, high + room
+
+
+def _frustum_depth(centres: np.ndarray, size: np.ndarray) -> float:
+    """So large that one sees where a camera looks, so small that neighbours stay apart."""
+    large = 0.06 * float(size.max())
+    if len(centres) < 2:
+        return large
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    return float(np.clip(1.5 * np.median(steps), 0.4 * large, large))
+
+
+def _draw(
+    side: _Side,
+    photos: Sequence[PlacedPhoto],
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    middle: np.ndarray,
+    extent: np.ndarray,
+    scale: float,
+    depth: float,
+) -> Drawing:
+    width, height = (float(value) + 2 * _MARGIN for value in extent)
+    axes = np.stack([side.right, side.down], 1)
+
+    def flat(points: np.ndarray) -> np.ndarray:
+        return (points - middle) @ axes * scale + (width / 2, height / 2)
+
+    parts = [
+        f'<svg class="map" xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{side.title}" '
+        f'viewBox="0 0 {width:.0f} {height:.0f}">',
+        f'<rect width="{width:.0f}" height="{height:.0f}" rx="6" fill="#1f242c"/>',
+        *_points(flat(xyz), rgb),
+        *_paths(photos, flat),
+        '<g fill="#ffb454" fill-opacity="0.12" stroke="#ffb454" stroke-width="0.7" '
+        'stroke-linejoin="round">',
+    ]
+    for i, photo in enumerate(photos):
+        a, b, c, d = (_at(xy) for xy in flat(photo.corners(depth)))
+        eye = _at(flat(photo.centre[None])[0])
+        first = ' stroke="#ffffff" stroke-width="1.6"' if i == 0 else ""
+        parts.append(
+            f'<path{first} d="M{a}L{b}L{c}L{d}ZM{a}L{eye}L{b}M{c}L{eye}L{d}">'
+            f"<title>{escape(photo.name)}</title></path>"
+        )
+    svg = "\n".join([*parts, "</g>", _scale_bar(height, scale), "</svg>"])
+    return Drawing(svg, round(width))
+
+
+def _points(xy: np.ndarray, rgb: np.ndarray) -> list[str]:
+    """Dots, one path for each colour, on a dark ground: dark ones are made a little lighter."""
+    shades = np.rint(rgb.astype(np.float64) * ((_SHADES - 1) / 255)).astype(np.int64)
+    lines = []
+    for shade in np.unique(shades, axis=0):
+        here = xy[(shades == shade).all(axis=1)]
+        red, green, blue = (int(v) for v in np.rint(45 + shade * (210 / (_SHADES - 1))))
+        dots = "".join(f"M{_at(position)}h0" for position in here)
+        lines.append(f'<path stroke="#{red:02x}{green:02x}{blue:02x}" d="{dots}"/>')
+    opening = '<g fill="none" stroke-width="1.7" stroke-linecap="round" stroke-opacity="0.85">'
+    return [opening, *lines, "</g>"]
+
+
+def _paths(photos: Sequence[PlacedPhoto], flat: _Flat) -> list[str]:
+    """The way that each video went."""
+    lines = []
+    for sequence in dict.fromkeys(photo.sequence for photo in photos):
+        if sequence is None:
+            continue
+        centres = np.array([photo.centre for photo in photos if photo.sequence == sequence])
+        way = " ".join(_at(xy) for xy in flat(centres))
+        lines.append(
+            f'<polyline fill="none" stroke="#7cc7ff" stroke-width="1" points="{way}">'
+            f"<title>{escape(sequence)}</title></polyline>"
+        )
+    return lines
+
+
+def _scale_bar(height: float, scale: float) -> str:
+    length = next(v for v in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 1e9) if v * scale > 25)
+    y, x = height - 10, 12.0
+    unit = "unit" if length == 1 else "units"
+    return (
+        f'<path d="M{_at((x, y))}h{length * scale:.1f}" stroke="#aab4c0" stroke-width="2"/>'
+        f'<text x="{x:.0f}" y="{y - 6:.0f}" fill="#aab4c0" font-size="11" '
+        f'font-family="sans-serif">{length:g} {unit}</text>'
+    )
+
+
+def _at(xy: Sequence[float] | np.ndarray) -> str:
+    return f"{xy[0]:.1f} {xy[1]:.1f}"

@@ -1,0 +1,266 @@
+"""Photos and the model of SfM -> photos without lens distortion and a model of pinhole cameras.
+
+    distorted/sparse/0, input/, distorted/masks/  ->  sparse/0, images/, masks/, images_2/ …
+
+The layout that training reads. The new model is in the scene's frame (see `orient`).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from snowsplat.data.decode import resize_area
+from snowsplat.data.image_file import open_image, reason_of
+from snowsplat.data.image_loader import available_memory
+from snowsplat.sfm.pinhole import Pinhole, pinhole_of
+from snowsplat.sfm.pinhole_model import write_model
+from snowsplat.sfm.resample import undistort_image, undistort_mask
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from snowsplat.scene.geometry import Similarity
+    from snowsplat.sfm.ingest.photo import Photo
+    from snowsplat.sfm.progress import Report
+
+logger = logging.getLogger(__name__)
+
+_DIVISORS = (2, 4, 8)
+_BYTES_PER_PIXEL = 50  # at the worst moment of a photo, which is when it is made smaller
+# How each format is written: as good as loses nothing that training could see.
+_SAVING: dict[str, dict[str, Any]] = {
+    "JPEG": {"quality": 95, "subsampling": 0},
+    "PNG": {"compress_level": 3},
+    "WEBP": {"lossless": True},
+    "TIFF": {"compression": "tiff_deflate"},
+    "BMP": {},
+    "PPM": {},
+}
+
+
+@dataclass(frozen=True)
+class Undistorted:
+    """What was made. All of it fits JSON."""
+
+    images: int
+    masks: int
+    sizes: list[tuple[int, int, int]]  # width, height, and how many images have it
+    folders: list[str]  # of images, in the dataset
+    resampled: bool  # False where no photo had distortion: then images are copies
+
+
+@dataclass(frozen=True)
+class _Job:
+    name: str  # of the photo, relative
+    camera_size: tuple[int, int]
+    pinhole: Pinhole
+    mask: bool
+
+
+def undistort(
+    dataset: Path,
+    photos: Sequence[Photo],
+    scene_from_sfm: Similarity,
+    resize: bool,
+    report: Report,
+    threads: int | None = None,
+) -> Undistorted:
+    """Make ``images/``, ``masks/`` and ``sparse/0`` of a dataset whose poses are found.
+
+    Photos without a pose are left out. Files keep their names and formats: JPEG at quality 95
+    without chroma subsampling, all others without loss; transparency stays. Where the camera has
+    no distortion, photos are copied. Masks are made for photos that have one; where it leaves out
+    no more than what is transparent, the transparency says it already. The model is written last.
+
+    Args:
+        photos: what is known of those in ``input/``.
+        resize: also make ``images_2``, ``images_4`` and ``images_8``.
+        threads: that work at once; None takes one a core, at most 4. Fewer where the photos are
+            so large that memory is short.
+
+    Raises:
+        UserError: a photo that is absent, damaged or changed; a calibration that makes no sense.
+        OSError: the disk is full.
+    """
+    import pycolmap
+
+    model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
+    pinholes = {number: _pinhole(camera) for number, camera in model.cameras.items()}
+    known = {photo.name: photo for photo in photos}
+    jobs = []
+    for number in model.reg_image_ids():
+        image = model.images[number]
+        photo, camera = known.get(image.name), model.cameras[image.camera_id]
+        masked = photo is not None and photo.mask
+        size = (camera.width, camera.height)
+        jobs.append(_Job(image.name, size, pinholes[image.camera_id], masked))
+    jobs.sort(key=lambda job: job.name)
+    divisors = _DIVISORS if resize else ()
+    folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
+    pixels = max(p.width * p.height for p in pinholes.values())
+    threads = min(
+        threads or min(4, os.cpu_count() or 1),
+        max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
+    )
+    masks = _run(
+        [partial(_undistort_photo, dataset, job, divisors) for job in jobs], report, threads
+    )
+    write_model(model, pinholes, scene_from_sfm, dataset / "sparse")
+    sizes = Counter((job.pinhole.width, job.pinhole.height) for job in jobs)
+    return Undistorted(
+        images=len(jobs),
+        masks=sum(masks),
+        sizes=[(*size, count) for size, count in sizes.most_common()],
+        folders=folders,
+        resampled=any(job.pinhole.nodes is not None for job in jobs),
+    )
+
+
+def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+    found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
+    try:
+        pinhole = pinhole_of(camera)
+    except ValueError as error:
+        raise UserError(
+            f"the lens distortion found ({found}) makes no sense: {error}; take more photos, from "
+            "more sides, or try another --camera-model"
+        ) from None
+    if pinhole.cropped:
+        logger.warning(
+            "the lens distortion found (%s) is sound only near the middle of the photos: images "
+            "show less than them; another --camera-model may keep more",
+            found,
+        )
+    return pinhole
+
+
+def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> list[bool]:
+    """Run jobs in threads; what they give, in any order.
+
+    The first error, and Ctrl-C, ends it after those that are under way.
+    """
+    report(0, len(jobs), "photos")
+    # Pillow and torch let go of the interpreter while they work; torch itself on one thread each.
+    pool = ThreadPoolExecutor(threads, "snowsplat-undistort", torch.set_num_threads, (1,))
+    try:
+        results = []
+        running = [pool.submit(job) for job in jobs]
+        for done, future in enumerate(as_completed(running), 1):
+            results.append(future.result())
+            report(done, len(jobs), "photos")
+        return results
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+# One photo
+
+
+def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> bool:
+    """Write the image, its smaller copies, its mask; whether it has one."""
+    source, target = dataset / "input" / job.name, dataset / "images" / job.name
+    opaque = None
+    with _opened(source, job) as opened:
+        form = "JPEG" if opened.format == "MPO" else str(opened.format)
+        if job.pinhole.nodes is None:
+            with _into(target) as temporary:
+                shutil.copyfile(source, temporary)
+        if job.pinhole.nodes is not None or divisors or job.mask:
+            profile = opened.info.get("icc_profile")
+            photo = _eight_bit(_decoded(opened, source))
+            opaque = np.asarray(photo)[..., 3] > 0 if photo.mode == "RGBA" else None
+        if job.pinhole.nodes is not None or divisors:
+            image = undistort_image(photo, job.pinhole)
+            if job.pinhole.nodes is not None:
+                _save(image, target, form, profile)
+            for divisor in divisors:
+                folder = dataset / f"images_{divisor}"
+                _save(_divided(image, divisor), folder / job.name, form, profile)
+    return job.mask and _undistort_mask(dataset, job, opaque)
+
+
+def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> bool:
+    name = f"{job.name}.png"
+    path = dataset / "distorted" / "masks" / name
+    with _opened(path, job) as opened:
+        mask = _decoded(opened, path).convert("L")
+    if opaque is not None:
+        # What is transparent was left out for SfM. In training it counts: as empty space.
+        counts = (np.asarray(mask) >= 128) | ~opaque
+        if counts.all():
+            return False
+        mask = Image.fromarray(counts.astype(np.uint8) * 255)
+    _save(undistort_mask(mask, job.pinhole), dataset / "masks" / name, "PNG")
+    return True
+
+
+def _opened(path: Path, job: _Job) -> Image.Image:
+    try:
+        image = open_image(path, list(_SAVING))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such image; its pose was found before it went away") from None
+    except Exception as error:  # Pillow's parsers raise anything on damaged files
+        raise UserError(f"{path}: cannot be read ({reason_of(error)}); replace it") from None
+    if image.size != job.camera_size:
+        image.close()
+        raise UserError(
+            f"{path}: is {image.width}x{image.height}, but its pose was found for "
+            f"{job.camera_size[0]}x{job.camera_size[1]}; put the old image back or start again"
+        )
+    return image
+
+
+def _decoded(opened: Image.Image, path: Path) -> Image.Image:
+    try:
+        opened.load()
+    except Exception as error:  # as above
+        raise UserError(f"{path}: cannot be decoded ({reason_of(error)}); replace it") from None
+    return opened
+
+
+def _eight_bit(image: Image.Image) -> Image.Image:
+    """L, RGB or, where anything may be transparent, RGBA."""
+    if image.mode.startswith("I"):  # 16-bit grey, which convert() would clip rather than scale
+        grey = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255).astype(np.uint8)
+        return Image.fromarray(grey)
+    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+        return image.convert("RGBA")
+    return image if image.mode in ("L", "RGB") else image.convert("RGB")
+
+
+def _divided(image: Image.Image, divisor: int) -> Image.Image:
+    """1/divisor of the size, rounded as the loader of datasets does; means over areas."""
+    width, height = (max(1, round(side / divisor)) for side in image.size)
+    # With colours multiplied by alpha, so that what is transparent does not bleed.
+    mode = "RGBa" if image.mode == "RGBA" else image.mode
+    pixels = np.asarray(image.convert(mode)).reshape(image.height, image.width, -1)
+    planes = resize_area(np.ascontiguousarray(pixels.transpose(2, 0, 1)), width, height)
+    small = np.ascontiguousarray(planes.transpose(1, 2, 0))
+    return Image.frombytes(mode, (width, height), small.tobytes()).convert(image.mode)
+
+
+def _into(path: Path) -> AbstractContextManager[Path]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return atomic_path(path)
+
+
+def _save(image: Image.Image, path: Path, form: str, profile: bytes | None = None) -> None:
+    """No metadata but the colour profile, without which the colours are others."""
+    with _into(path) as temporary:
+        image.save(temporary, form, icc_profile=profile, **_SAVING[form])

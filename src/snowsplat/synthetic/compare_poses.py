@@ -1,0 +1,56 @@
+"""How far found poses are from true ones: both are known only up to a similarity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat.scene.geometry import Similarity, invert_rigid, similarity_from_points
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Errors of found poses after they were aligned with the true ones by their centres."""
+
+    names: list[str]  # in both; the errors are in this order
+    missing: list[str]  # true ones that were not found
+    rotations: Tensor  # (N,) degrees, the angle between the found and the true orientation
+    centres: Tensor  # (N,) distance between the camera centres, as a fraction of ``extent``
+    extent: float  # largest distance between two of the true centres, in their unit
+    true_from_found: Similarity
+
+
+def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> PoseErrors:
+    """Compare poses by name; each is a ``cam_from_world`` (3, 4), in a world frame of its own.
+
+    Raises:
+        ValueError: fewer than three names in common, or camera centres that all lie on one line.
+    """
+    names = sorted(found.keys() & true.keys())
+    if len(names) < 3:
+        raise ValueError(f"{len(names)} poses in common: a similarity takes three")
+    found_poses = torch.stack([found[name].double() for name in names])
+    true_poses = torch.stack([true[name].double() for name in names])
+    true_centres = invert_rigid(true_poses)[..., 3]
+    similarity = similarity_from_points(invert_rigid(found_poses)[..., 3], true_centres)
+    aligned = similarity.apply_to_poses(found_poses)
+    extent = float(torch.cdist(true_centres, true_centres).max())
+    distances = (invert_rigid(aligned)[..., 3] - true_centres).norm(dim=1)
+    return PoseErrors(
+        names=names,
+        missing=sorted(true.keys() - found.keys()),
+        rotations=_angles(aligned[..., :3], true_poses[..., :3]),
+        centres=distances / extent,
+        extent=extent,
+        true_from_found=similarity,
+    )
+
+
+def _angles(a: Tensor, b: Tensor) -> Tensor:
+    """Degrees (N,) between rotations (N, 3, 3), exact for small angles too."""
+    # |A − B| (Frobenius) is 2√2 sin(θ/2); the cosine from the trace would lose half the digits.
+    sine = (a - b).flatten(1).norm(dim=1) / 8**0.5
+    return 2 * torch.rad2deg(torch.asin(sine.clamp(max=1.0)))

@@ -1,0 +1,141 @@
+"""How light falls on a face: the lamp with its soft shadows, and light from all around.
+
+Computed on a coarse grid, since shadows without hard edges vary slowly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from snowsplat.synthetic.shapes import Shape
+
+_LIGHT_GRID = 0.015, 64  # light is computed every so many metres, but at this many points a side
+_LIGHT_SAMPLES = 6  # along each side of the lamp
+_AROUND = 48  # directions in which light from all around is looked for
+_REACH = 1.2  # metres; what is farther does not shade from that light
+_RAYS = 1 << 14  # at a time, so that their numbers stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A rectangle of light that shines down, and the light from all around."""
+
+    middle: tuple[float, float, float]
+    size: tuple[float, float]  # metres, along x and y
+    power: float  # irradiance right below it at 1 m, were it small
+    around: float  # irradiance of a face that sees nothing near
+
+
+def irradiance(
+    shape: Shape, face: int, size: tuple[int, int], lamp: Lamp, blockers: Sequence[Shape]
+) -> np.ndarray:
+    """Irradiance (H, W, 3) of a face, ``size`` (H, W); matt white paint is as bright as this."""
+    spacing = max(_LIGHT_GRID[0], max(shape.sizes[face]) / _LIGHT_GRID[1])
+    rows, columns = (
+        int(min(pixels, max(6, round(metres / spacing))))
+        for pixels, metres in zip(size, shape.sizes[face][::-1], strict=True)
+    )
+    u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    positions, normals = shape.points(face, np.stack([u.ravel(), v.ravel()]))
+    positions = positions + np.float32(2e-3) * normals
+    light = _direct(lamp, blockers, positions, normals)
+    light += _indirect(lamp, blockers, positions, normals)
+    planes = light.reshape(3, rows, columns)
+    if shape.wraps[face]:  # so that the seam is not seen
+        planes = np.concatenate([planes[..., -2:], planes, planes[..., :2]], axis=2)
+        box = (2, 0, 2 + columns, rows)
+    else:
+        box = (0, 0, columns, rows)
+    resized = [
+        Image.fromarray(plane).resize(size[::-1], Image.Resampling.BILINEAR, box)
+        for plane in np.ascontiguousarray(planes, np.float32)
+    ]
+    return np.stack([np.asarray(plane) for plane in resized], axis=-1)
+
+
+def _direct(
+    lamp: Lamp, blockers: Sequence[Shape], positions: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Irradiance (3, P) from the lamp."""
+    steps = (np.arange(_LIGHT_SAMPLES) + 0.5) / _LIGHT_SAMPLES - 0.5
+    x, y = np.meshgrid(steps * lamp.size[0], steps * lamp.size[1])
+    samples = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()]).astype(np.float32)
+    samples += np.array(lamp.middle, np.float32)[:, None]
+    to_lamp = samples[:, :, None] - positions[:, None]
+    distance = np.sqrt((to_lamp * to_lamp).sum(axis=0))
+    to_lamp /= distance
+    cosine = (to_lamp * normals[:, None]).sum(axis=0).clip(0, None)
+    strength = cosine * to_lamp[2].clip(0, None) / distance**2
+    if not strength.any():
+        return np.zeros_like(positions)
+    seen = ~_blocked(blockers, positions, to_lamp, distance)
+    warm_white = np.array([[1.0], [0.97], [0.92]], np.float32)
+    return warm_white * (seen * strength).mean(axis=0) * np.float32(lamp.power)
+
+
+def _indirect(
+    lamp: Lamp, blockers: Sequence[Shape], positions: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Irradiance (3, P) from all around: the ceiling brighter, and warm light off what is near.
+
+    The directions are distributed like the cosine, so that each counts the same.
+    """
+    i = np.arange(_AROUND) + 0.5
+    radius, angle = np.sqrt(i / _AROUND), i * (math.pi * (3 - math.sqrt(5)))
+    own = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)])
+    x, y, z = own.astype(np.float32)[:, :, None]
+    tangent = np.cross(normals, [[1], [0], [0]], axis=0)
+    other = np.cross(normals, [[0], [1], [0]], axis=0)
+    tangent = np.where(np.abs(normals[0]) < 0.7, tangent, other).astype(np.float32)
+    tangent /= np.sqrt((tangent * tangent).sum(axis=0))
+    bitangent = np.cross(normals, tangent, axis=0)
+    around = x * tangent[:, None] + y * bitangent[:, None] + z * normals[:, None]
+    blocked = _blocked(blockers, positions, around, np.full_like(around[0], _REACH))
+    strength = np.float32(lamp.around) * (0.75 + 0.25 * around[2])
+    white = np.array([0.95, 0.98, 1.05], np.float32)
+    warm = np.array([0.42, 0.36, 0.30], np.float32)
+    colours = np.where(blocked, warm[:, None, None], white[:, None, None])
+    return (colours * strength).mean(axis=1)
+
+
+def _blocked(
+    blockers: Sequence[Shape], positions: np.ndarray, directions: np.ndarray, within: np.ndarray
+) -> np.ndarray:
+    """Whether (D, P) something is in the direction (3, D, P), nearer than ``within`` (D, P)."""
+    middle = positions.mean(axis=1, keepdims=True)
+    reach = float(np.linalg.norm(positions - middle, axis=0).max() + within.max())
+    shapes = [s for s in blockers if np.linalg.norm(s.centre - middle) < reach + s.radius]
+    blocked = np.zeros(within.shape, bool)
+    at_once = max(1, _RAYS // positions.shape[1])
+    for start in range(0, len(within), at_once):
+        part = slice(start, start + at_once)
+        count = len(within[part])
+        blocked[part] = _any_hit(
+            shapes,
+            np.tile(positions, count),
+            directions[:, part].reshape(3, -1),
+            within[part].ravel(),
+        ).reshape(count, -1)
+    return blocked
+
+
+def _any_hit(
+    shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray, within: np.ndarray
+) -> np.ndarray:
+    """Whether (R,) a ray hits one of the shapes nearer than ``within`` (R,)."""
+    blocked = np.zeros(len(within), bool)
+    for shape in shapes:
+        offset = shape.centre - origins
+        along = np.einsum("kr,kr->r", offset, directions)
+        off2 = np.einsum("kr,kr->r", offset, offset) - along * along
+        near = (off2 < shape.radius**2) & (along > -shape.radius) & ~blocked
+        near &= along < within + shape.radius
+        some = np.flatnonzero(near)
+        if len(some):
+            blocked[some] = shape.hit(origins[:, some], directions[:, some]) < within[some]
+    return blocked

@@ -1,0 +1,169 @@
+"""Walks around the scene and takes photos: JPEGs as from a phone, and where each was taken."""
+
+from __future__ import annotations
+
+import functools
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from snowsplat.data.colmap_files import ColmapCamera, ColmapImage, write_model
+from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
+from snowsplat.sfm.progress import Report, silent
+from snowsplat.synthetic.lens import Lens
+from snowsplat.synthetic.scene import Scene
+from snowsplat.synthetic.still_life import still_life
+from snowsplat.util.files import atomic_path
+
+_RAYS = 2  # along each side of a pixel
+_TILE = 64  # pixels along each side; rays of a tile pass through few shapes
+_FOCAL_35MM = 28  # what EXIF says, as of the wide camera of a phone
+_FOCAL_TRUE = 1.013  # the true focal length is a little longer, as that of any phone
+_DISTORTION = (-0.062, 0.021, 0.00015, -0.0001)  # of COLMAP's model OPENCV: k1, k2, p1, p2
+_WALK_RADIUS, _WALK_HEIGHTS = 1.42, (0.46, 0.92)  # metres, around and above the table's middle
+_FULL_WELL = 15000.0  # electrons of a white pixel: the noise of light is their square root
+_READ_NOISE = 6.0  # electrons
+_JPEG_QUALITY = 92
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the photos do not tell."""
+
+    lens: Lens
+    poses: dict[str, Tensor]  # by name of the photo: cam_from_world (3, 4) float64, metres, z up
+
+    def write(self, folder: Path) -> None:
+        """As a COLMAP model (text) without points."""
+        images = [
+            ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
+            for name, pose in self.poses.items()
+        ]
+        camera = ColmapCamera("OPENCV", self.lens.width, self.lens.height, self.lens.params)
+        nothing = np.zeros((0, 3))
+        write_model(folder, {1: camera}, images, nothing, nothing.astype(np.uint8), text=True)
+
+
+def write_synthetic_photos(
+    folder: Path | str,
+    n_views: int = 40,
+    width: int = 640,
+    height: int = 480,
+    seed: int = 0,
+    distortion: tuple[float, float, float, float] = _DISTORTION,
+    report: Report = silent,
+) -> Truth:
+    """Write photos ``IMG_0001.jpg`` … of a still life into ``folder``, on two walks around it.
+
+    Equal arguments give equal photos; those that are there already are not taken again.
+
+    Args:
+        distortion: k1, k2, p1, p2 of COLMAP's model OPENCV.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    focal = _FOCAL_TRUE * _FOCAL_35MM * math.hypot(width, height) / math.hypot(36, 24)
+    lens = Lens(width, height, focal, distortion)
+    names = [f"IMG_{number:04d}.jpg" for number in range(1, n_views + 1)]
+    truth = Truth(lens, dict(zip(names, walk(n_views, seed), strict=True)))
+    missing = [i for i, name in enumerate(names) if not (folder / name).exists()]
+    if not missing:
+        return truth
+    report(0, len(missing), "building the scene")
+    scene = still_life(seed)
+
+    def take(i: int) -> None:
+        pixels = photograph(scene, lens, truth.poses[names[i]], np.random.default_rng([seed, i]))
+        with atomic_path(folder / names[i]) as temporary:
+            _save(temporary, pixels)
+
+    # numpy lets go of the interpreter, so threads do.
+    with ThreadPoolExecutor(2) as pool:
+        for done, _ in enumerate(pool.map(take, missing), 1):
+            report(done, len(missing), "photos")
+    return truth
+
+
+def walk(count: int, seed: int) -> list[Tensor]:
+    """``cam_from_world`` of a hand-held camera: once around low, once around higher."""
+    random = np.random.default_rng([seed, count])
+    poses = []
+    for i in range(count):
+        second = 2 * i >= count
+        # The second walk's photos are between those of the first.
+        angle = 2 * math.pi * (2 * i + second) / count
+        angle += random.normal(0, 0.02)
+        radius = _WALK_RADIUS * (1 + random.normal(0, 0.03))
+        height = _WALK_HEIGHTS[second] + random.normal(0, 0.025)
+        position = np.array([radius * math.cos(angle), radius * math.sin(angle), height])
+        target = np.array([0, 0, 0.08]) + random.normal(0, 0.05, 3)
+        pose = look_at(
+            torch.from_numpy(position),
+            torch.from_numpy(target),
+            torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64),
+        )
+        poses.append(_rolled(pose, random.normal(0, 0.06)))
+    return poses
+
+
+def _rolled(cam_from_world: Tensor, angle: float) -> Tensor:
+    """The camera turned about its line of sight."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    roll = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64)
+    return roll @ cam_from_world
+
+
+def photograph(
+    scene: Scene, lens: Lens, cam_from_world: Tensor, random: np.random.Generator
+) -> np.ndarray:
+    """(H, W, 3) uint8 sRGB, with the noise of a small sensor."""
+    world_from_cam = invert_rigid(cam_from_world).numpy()
+    rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
+    spread = 1 / (lens.focal * _RAYS)
+    light = np.empty((lens.height, lens.width, 3), np.float32)
+    for rows, columns, rays in _tiles(lens):
+        seen = scene.radiance(origin, rotation @ rays, spread)
+        # A photo saturates: what is brighter than white spreads no farther than its pixel.
+        height, width = rows.stop - rows.start, columns.stop - columns.start
+        seen = seen.clip(0, 1).reshape(3, height, _RAYS, width, _RAYS).mean(axis=(2, 4))
+        light[rows, columns] = seen.transpose(1, 2, 0)
+    electrons = _FULL_WELL * light
+    electrons += np.sqrt(electrons + _READ_NOISE**2) * random.standard_normal(
+        light.shape, np.float32
+    )
+    return _srgb8(electrons / _FULL_WELL)
+
+
+@functools.lru_cache(1)
+def _tiles(lens: Lens) -> list[tuple[slice, slice, np.ndarray]]:
+    """The picture in tiles: rows, columns, and the directions (3, R) of their rays."""
+    tiles = []
+    for top in range(0, lens.height, _TILE):
+        for left in range(0, lens.width, _TILE):
+            bottom, right = min(top + _TILE, lens.height), min(left + _TILE, lens.width)
+            x = left + (np.arange((right - left) * _RAYS) + 0.5) / _RAYS
+            y = top + (np.arange((bottom - top) * _RAYS) + 0.5) / _RAYS
+            rays = lens.directions(np.stack(np.meshgrid(x, y)).reshape(2, -1))
+            tiles.append((slice(top, bottom), slice(left, right), rays.astype(np.float32)))
+    return tiles
+
+
+def _srgb8(linear: np.ndarray) -> np.ndarray:
+    linear = linear.clip(0, 1)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.rint(255 * srgb).astype(np.uint8)
+
+
+def _save(path: Path, pixels: np.ndarray) -> None:
+    image = Image.fromarray(pixels)
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "snowsplat", "ray tracer"  # Make, Model
+    exif[0x0112] = 1  # Orientation: as stored
+    exif.get_ifd(0x8769)[0xA405] = _FOCAL_35MM  # FocalLengthIn35mmFilm
+    image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif)

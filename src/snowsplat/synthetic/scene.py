@@ -1,0 +1,190 @@
+"""Shapes with paint on them, lit once and for all, and what a ray sees of them.
+
+Light does not move and most surfaces are matt, so how bright each point is does not depend on who
+looks: direct light with its soft shadows, and light from all around with its occlusion, are
+computed when the scene is made (`light`) and multiplied into the paint. A ray then costs an
+intersection and a look into a picture. Gloss is what depends on the eye: one more ray, mirrored.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from snowsplat.synthetic.light import Lamp, irradiance
+from snowsplat.synthetic.shapes import Shape
+
+_LEVELS = 5  # each texture is kept at 1, 1/2 … 1/16 of its size
+_BLOCK = 1 << 14  # rays at a time, so that their numbers stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class Thing:
+    """A shape and its paint."""
+
+    shape: Shape
+    paint: Sequence[np.ndarray]  # one for each face, or one for all: sRGB (H, W, 3), 0 to 1
+    gloss: float = 0.0  # share of light mirrored head-on; more at grazing angles (Schlick)
+    shines: bool = False  # as bright as its paint, whatever light falls on it; casts no shadow
+
+
+class Scene:
+    """What `radiance` looks at: linear light, 1 is white in a photo."""
+
+    def __init__(self, things: Sequence[Thing], lamp: Lamp) -> None:
+        self._shapes = [thing.shape for thing in things]
+        self._gloss = np.array([thing.gloss for thing in things], np.float32)
+        blockers = [
+            thing.shape
+            for thing in things
+            if math.isfinite(thing.shape.radius) and not thing.shines
+        ]  # whoever is within a room is not shaded by its walls
+        textures: list[np.ndarray] = []
+        texels, wraps, firsts = [], [], []
+        for thing in things:
+            firsts.append(len(textures))
+            for face, size in enumerate(thing.shape.sizes):
+                paint = _linear(thing.paint[face % len(thing.paint)])
+                if not thing.shines:
+                    paint = paint * irradiance(thing.shape, face, paint.shape[:2], lamp, blockers)
+                textures.append(paint)
+                height, width = paint.shape[:2]
+                texels.append(math.sqrt(size[0] / width * size[1] / height))
+                wraps.append(thing.shape.wraps[face])
+        self._first_texture = np.array(firsts)
+        self._texels, self._wraps = np.array(texels, np.float32), np.array(wraps)
+        self._store(textures)
+
+    def _store(self, textures: Sequence[np.ndarray]) -> None:
+        """All textures at all levels in one array, so that one look-up serves all rays."""
+        texels: list[np.ndarray] = []
+        starts, widths, heights = (np.zeros((len(textures), _LEVELS), np.int32) for _ in range(3))
+        total = 0
+        for i, texture in enumerate(textures):
+            for level in range(_LEVELS):
+                heights[i, level], widths[i, level] = texture.shape[:2]
+                starts[i, level] = total
+                total += texture.shape[0] * texture.shape[1]
+                texels.append(texture.reshape(-1, 3))
+                if level + 1 < _LEVELS:
+                    texture = _halved(texture)
+        self._all = np.concatenate(texels).astype(np.float32)
+        self._starts, self._widths, self._heights = starts, widths, heights
+
+    def radiance(
+        self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool = True
+    ) -> np.ndarray:
+        """Linear colours (3, R) that rays see; black where there is nothing.
+
+        Args:
+            origins: (3, 1) or (3, R) float32, metres.
+            directions: (3, R) float32, of length 1.
+            spread: width of a ray at a distance of 1, for the level of a texture that it reads.
+            mirrored: follow rays on from glossy things, once.
+        """
+        result = np.zeros_like(directions)
+        for start in range(0, directions.shape[1], _BLOCK):
+            block = slice(start, start + _BLOCK)
+            own = origins if origins.shape[1] == 1 else origins[:, block]
+            result[:, block] = self._block(own, directions[:, block], spread, mirrored)
+        return result
+
+    def _block(
+        self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool
+    ) -> np.ndarray:
+        count = directions.shape[1]
+        nearest = np.full(count, np.inf, np.float32)
+        owner = np.full(count, -1)
+        candidates = self._candidates(origins, directions)
+        for i in candidates:
+            distance = self._shapes[i].hit(origins, directions)
+            closer = distance < nearest
+            np.copyto(nearest, distance, where=closer)
+            owner[closer] = i
+        positions = origins + np.where(owner >= 0, nearest, 0) * directions
+        texture = np.zeros(count, np.int64)
+        uv, normals = np.zeros((2, count), np.float32), np.zeros_like(directions)
+        for i in candidates:
+            own = np.flatnonzero(owner == i)
+            face, uv[:, own], normals[:, own] = self._shapes[i].surface(positions[:, own])
+            texture[own] = self._first_texture[i] + face
+        cosine = np.maximum(-(directions * normals).sum(axis=0), np.float32(0.02))
+        # A slanted surface is seen smaller one way only: the root is between the two ways.
+        footprint = nearest * np.float32(spread) / np.sqrt(cosine)
+        colours = self._look_up(texture, uv, footprint)
+        colours[:, owner < 0] = 0
+        glossy = np.flatnonzero((self._gloss[owner] > 0) & (owner >= 0)) if mirrored else ()
+        if len(glossy):
+            facing, normal = cosine[glossy], normals[:, glossy]
+            gloss = self._gloss[owner[glossy]]
+            share = gloss + (1 - gloss) * (1 - facing) ** 5
+            onward = directions[:, glossy] + 2 * facing * normal
+            onward /= np.sqrt((onward * onward).sum(axis=0))
+            start = positions[:, glossy] + np.float32(2e-3) * normal
+            seen = self._block(start, onward, 3 * spread, mirrored=False)
+            colours[:, glossy] += share * (seen - colours[:, glossy])
+        return colours
+
+    def _candidates(self, origins: np.ndarray, directions: np.ndarray) -> list[int]:
+        """The shapes that rays from one point may hit: those whose ball touches their cone."""
+        if origins.shape[1] > 1:
+            return list(range(len(self._shapes)))
+        axis = directions.mean(axis=1, keepdims=True)
+        axis /= np.linalg.norm(axis)
+        opening = math.acos(min(1.0, float((axis * directions).sum(axis=0).min())))
+        kept = []
+        for i, shape in enumerate(self._shapes):
+            offset = shape.centre - origins
+            distance = float(np.linalg.norm(offset))
+            if distance > shape.radius:
+                angle = math.acos(max(-1.0, min(1.0, float((axis * offset).sum()) / distance)))
+                if angle > opening + math.asin(shape.radius / distance) + 1e-4:
+                    continue
+            kept.append(i)
+        return kept
+
+    def _look_up(self, texture: np.ndarray, uv: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        """Colours (3, R), bilinear, at the level whose texels are about as large as a ray."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            level = np.rint(np.log2(footprint / self._texels[texture]))
+        level = np.nan_to_num(level, posinf=0).clip(0, _LEVELS - 1).astype(np.int64)
+        start = self._starts[texture, level]
+        width, height = self._widths[texture, level], self._heights[texture, level]
+        x = uv[0] * width - np.float32(0.5)
+        y = (uv[1] * height - np.float32(0.5)).clip(0, height - 1)
+        left, upper = np.floor(x), np.floor(y)
+        wx, wy = (x - left).astype(np.float32)[:, None], (y - upper).astype(np.float32)[:, None]
+        x0, y0 = left.astype(np.int32), upper.astype(np.int32)
+        wraps = self._wraps[texture]
+        columns = [
+            np.where(wraps, column % width, column.clip(0, width - 1)) for column in (x0, x0 + 1)
+        ]
+        rows = [start + row * width for row in (y0, np.minimum(y0 + 1, height - 1))]
+        corners = [[self._all[row + column] for column in columns] for row in rows]
+        (a, b), (c, d) = corners
+        top, bottom = a + wx * (b - a), c + wx * (d - c)
+        return np.ascontiguousarray((top + wy * (bottom - top)).T)
+
+
+def _linear(srgb: np.ndarray) -> np.ndarray:
+    """Light of sRGB values; above 1, light that is brighter than white, as it is."""
+    low, high = srgb / 12.92, ((srgb.clip(0, 1) + 0.055) / 1.055) ** 2.4
+    return np.where(srgb > 1, srgb, np.where(srgb <= 0.04045, low, high)).astype(np.float32)
+
+
+def _halved(texture: np.ndarray) -> np.ndarray:
+    """Each 2 x 2 averaged; an odd last row or column is stretched over."""
+    height, width = (max(1, side // 2) for side in texture.shape[:2])
+    if texture.shape[0] != 2 * height or texture.shape[1] != 2 * width:
+        planes = [
+            Image.fromarray(np.ascontiguousarray(texture[..., c])).resize(
+                (width, height), Image.Resampling.BOX
+            )
+            for c in range(3)
+        ]
+        return np.stack([np.asarray(plane) for plane in planes], axis=-1)
+    return texture.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))

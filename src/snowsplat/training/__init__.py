@@ -1,0 +1,1 @@
+"""Optimise Gaussians so that they reproduce the photos of a dataset."""

@@ -1,0 +1,162 @@
+"""`TrainConfig`: the knobs of a training, how to change one by name, how to write them down."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Literal
+
+from snowsplat.training.density import AdaptiveDensity, DensityConfig, McmcDensity
+from snowsplat.training.optim import LearningRates
+from snowsplat.training.step_schedule import Schedule, When
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import from_json
+
+_MOST_SEED = 2**61  # generators are seeded with four times as much
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides what a training does; the defaults are the paper's.
+
+    A moment (`When`) is an int, that step, or a float, that fraction of ``iterations``.
+
+    Attributes:
+        iterations: steps in all, one view each.
+        seed: of every random choice. The same seed gives the same scene to the bit, on any number
+            of threads.
+        background: the colour behind the scene; "random" draws one a step, against fog in datasets
+            with a transparent background.
+        sh_degree: of the spherical harmonics in the end, 0 to 3.
+        sh_interval: steps between two degrees, beginning with 0.
+        ssim_weight: λ of (1 − λ) · L1 + λ · D-SSIM.
+        initial_points: how many random ones, for a dataset without points.
+        initial_opacity: of every Gaussian at the start.
+        initial_scale: of every Gaussian at the start, in mean distances to its 3 neighbours.
+        learning_rates, density: see there.
+        gaussians_per_pixel: together with ``density.max_gaussians``, a cap that follows the size of
+            the photos: small ones show no more. 0 is none.
+        visible_only: Gaussians that a view does not see skip the optimiser in its step. The paper
+            lets their momentum carry them on; this is faster and loses nothing measurable.
+        coarse_to_fine: the last moments at a quarter and at a half of the resolution. 0 is never.
+        image_memory: bytes for decoded images; 0 is half of what is available.
+        test_iterations: steps after which `Trainer.run` evaluates the test views.
+        checkpoint_every: steps between checkpoints, which the caller of `Trainer.run` writes; 0 is
+            none.
+    """
+
+    iterations: int = 30_000
+    seed: int = 0
+    background: Literal["black", "white", "random"] = "black"
+    sh_degree: int = 3
+    sh_interval: int = 1000
+    ssim_weight: float = 0.2
+    initial_points: int = 100_000
+    initial_opacity: float = 0.1
+    initial_scale: float = 1.0
+    learning_rates: LearningRates = field(default_factory=LearningRates)
+    density: DensityConfig = field(default_factory=AdaptiveDensity)
+    gaussians_per_pixel: float = 0.0
+    visible_only: bool = False
+    coarse_to_fine: tuple[When, When] = (0, 0)
+    image_memory: int = 0
+    test_iterations: tuple[int, ...] = (7_000, 30_000)
+    checkpoint_every: int = 0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise UserError(f"--iterations is {self.iterations}; it must be at least 1")
+        if self.sh_degree not in (0, 1, 2, 3):
+            raise UserError(f"--sh-degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
+        if not -_MOST_SEED <= self.seed < _MOST_SEED:
+            raise UserError(f"--seed is {self.seed}; take one nearer to 0")
+        rates, density = self.learning_rates, self.density
+        for name, count in (
+            ("--initial-points", self.initial_points),
+            ("--densify-interval", density.densify_interval),
+        ):
+            if count < 1:
+                raise UserError(f"{name} is {count}; it must be at least 1")
+        for name, rate in (("--lr-means", rates.means), ("--lr-means-final", rates.means_final)):
+            if rate <= 0.0:  # from one to the other it goes by equal factors
+                raise UserError(f"{name} is {rate:g}; it must be more than 0, like 1e-12")
+        for name, when in (
+            ("--densify-from", density.densify_from),
+            ("--densify-until", density.densify_until),
+            ("--lr-means-steps", rates.means_steps),
+        ):
+            if not math.isfinite(when):
+                raise UserError(f"{name} is {when}; it must be a step, or a share of all like 0.5")
+
+    def capped(self, pixels: int) -> TrainConfig:
+        """This configuration with the cap that ``gaussians_per_pixel`` means for such photos."""
+        if self.gaussians_per_pixel <= 0:
+            return self
+        cap = max(1, round(self.gaussians_per_pixel * pixels))
+        if self.density.max_gaussians > 0:
+            cap = min(cap, self.density.max_gaussians)
+        return replace(self, density=replace(self.density, max_gaussians=cap))
+
+    def downscale_at(self, step: int, schedule: Schedule) -> int:
+        """1, 2 or 4: by what the images of this step are reduced."""
+        quarter, half = (schedule.step_of(when) for when in self.coarse_to_fine)
+        return 4 if step <= quarter else 2 if step <= half else 1
+
+    def sh_degree_at(self, step: int) -> int:
+        """The degree in use at this step."""
+        return min(self.sh_degree, step // self.sh_interval) if self.sh_interval else self.sh_degree
+
+
+def changed(config: TrainConfig, **knobs: Any) -> TrainConfig:
+    """``config`` with other values for some knobs, wherever they are.
+
+    Args:
+        knobs: fields of `TrainConfig`; fields of its density control (``grad_threshold=4e-4``); and
+            fields of `LearningRates` after ``lr_`` (``lr_means=1e-4``). Those that are None stay.
+
+    Raises:
+        UserError: a knob that this configuration does not have.
+    """
+    given = {name: value for name, value in knobs.items() if value is not None}
+    if "max_gaussians" in given:
+        given.setdefault("gaussians_per_pixel", 0.0)
+    whole = {f.name for f in fields(config)} & given.keys()
+    config = replace(config, **{name: given.pop(name) for name in whole})
+    density = {f.name for f in fields(config.density)} & given.keys()
+    rates = {f"lr_{f.name}" for f in fields(config.learning_rates)} & given.keys()
+    for name in given.keys() - density - rates:
+        raise UserError(
+            f"--{name.replace('_', '-')} means nothing with {type(config.density).__name__}; "
+            "leave it out, or take another recipe"
+        )
+    return replace(
+        config,
+        density=replace(config.density, **{name: given[name] for name in density}),
+        learning_rates=replace(
+            config.learning_rates, **{name.removeprefix("lr_"): given[name] for name in rates}
+        ),
+    )
+
+
+def config_to_json(config: TrainConfig) -> dict[str, Any]:
+    """JSON values from which `config_from_json` makes an equal configuration."""
+    return asdict(config) | {"density_control": type(config.density).__name__}
+
+
+def config_from_json(values: dict[str, Any]) -> TrainConfig:
+    """What `config_to_json` wrote down.
+
+    Raises:
+        UserError: of another version of the program, or damaged.
+    """
+    controls: dict[str, Any] = {kind.__name__: kind for kind in (AdaptiveDensity, McmcDensity)}
+    try:
+        values = dict(values)
+        density = from_json(controls[values.pop("density_control")], values.pop("density"))
+        rates = from_json(LearningRates, values.pop("learning_rates"))
+        config = from_json(TrainConfig, values)
+        return replace(config, density=density, learning_rates=rates)
+    except (KeyError, TypeError, ValueError):
+        raise UserError(
+            "this configuration was written by another version of snowsplat; go on with that one"
+        ) from None

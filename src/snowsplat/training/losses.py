@@ -1,0 +1,26 @@
+"""The training loss of one view: the paper's, where the photo counts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.data.decode import LoadedImage
+
+
+def view_loss(image: Tensor, photo: LoadedImage, background: Tensor, ssim_weight: float) -> Tensor:
+    """(1 − λ) · L1 + λ · (1 − SSIM), λ = ``ssim_weight``, as a scalar; gradient to ``image``.
+
+    A transparent photo is composed over ``background`` first. Where its mask is False the loss sees
+    the photo twice: no difference there, and no gradient.
+
+    Args:
+        image: (H, W, 3) rendering over ``background``.
+        background: (3,) colour in 0..1.
+    """
+    target = photo.rgb if photo.alpha is None else photo.over(background)
+    if photo.mask is not None:
+        counts = photo.mask[:, :, None]
+        image = torch.where(counts, image, target / 255 if target.dtype == torch.uint8 else target)
+    return ops.photometric_loss(image, target, ssim_weight)

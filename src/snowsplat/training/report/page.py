@@ -1,0 +1,228 @@
+"""report.html: how a training went and what came of it, on one page that needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from snowsplat import ops
+from snowsplat.data import Dataset
+from snowsplat.evaluation.metrics import Evaluation, evaluate_views
+from snowsplat.ops import native
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.history import History
+from snowsplat.training.report import pictures
+from snowsplat.util import charts
+from snowsplat.util.files import write_text
+from snowsplat.util.html import bar, cards, duration, page, table, text
+from snowsplat.util.machine import memory_bytes, processor_name, system_name
+from snowsplat.util.process import single_threaded
+
+_TRAINING_VIEWS = 8  # that are measured where none were held out
+_LISTED = 200  # views
+_SMOOTHED = 40  # the loss is the mean of so many parts of the training
+
+_STYLE = (
+    charts.STYLE
+    + pictures.STYLE
+    + """
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr));
+  gap: 22px 28px; }
+td { font-variant-numeric: tabular-nums; }
+"""
+)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What the page tells about.
+
+    Attributes:
+        name: of the scene.
+        step: the last one.
+        background: of the views, in 0..1.
+        evaluation: of the held-out views; without any, some training views are measured.
+        settings: by name: what was set, as JSON values.
+        peak_bytes: the most memory that was held; 0 if that is not known.
+    """
+
+    name: str
+    dataset: Dataset
+    gaussians: Gaussians
+    step: int
+    background: tuple[float, float, float]
+    history: History
+    evaluation: Evaluation | None
+    settings: dict[str, Any]
+    peak_bytes: int = 0
+
+
+def write_training_report(path: Path, trained: Trained) -> None:
+    """Write the page, atomically.
+
+    Raises:
+        UserError: a photo is absent or damaged.
+        OSError: the file cannot be written.
+    """
+    held_out = trained.evaluation is not None and bool(trained.evaluation.views)
+    views = trained.dataset.test
+    if not held_out:
+        views = trained.dataset.train
+        views = views[:: -(-len(views) // _TRAINING_VIEWS)]
+    with single_threaded():
+        evaluation = trained.evaluation
+        if evaluation is None or not held_out:
+            evaluation = evaluate_views(trained.gaussians, views, background=trained.background)
+        body = [
+            _headline(trained, evaluation, held_out),
+            _cards(trained, evaluation, held_out),
+            _curves(trained.history),
+            pictures.compared(trained.gaussians, views, evaluation, trained.background),
+            _figures(evaluation, held_out),
+            _settings(trained),
+            _machine(trained),
+            _next(trained.name),
+        ]
+    write_text(path, page(f"{trained.name} – training", body, _STYLE))
+
+
+# The parts of the page, from top to bottom
+
+
+def _headline(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
+    count = len(evaluation.views)
+    photos = f"{count} photo" if count == 1 else f"{count} photos"
+    if held_out:
+        verdict = f"Measured on {photos} that the training has never seen."
+    else:
+        verdict = (
+            f"No photos were held out, so this was measured on {photos} of the training, which "
+            "flatters it; --eval holds out every 8th."
+        )
+    return f"<h1>{text(trained.name)}</h1>\n<p>{verdict}</p>"
+
+
+def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
+    where = "held-out photos" if held_out else "training photos"
+    figures = [
+        (f"{evaluation.psnr:.2f} dB", f"PSNR, {where}"),
+        (f"{evaluation.ssim:.3f}", f"SSIM, {where}"),
+        (f"{len(trained.gaussians):,}", "Gaussians"),
+        (f"{trained.step:,}", "steps"),
+        (duration(trained.history.seconds), "of training"),
+    ]
+    return cards(figures)
+
+
+def _curves(history: History) -> str:
+    stretches = history.stretches
+    window = max(1, len(stretches) // _SMOOTHED)
+    loss = [(float(s.step), s.loss) for s in stretches]
+    psnr = [(float(m.step), m.psnr) for m in history.measured]
+    milliseconds = [(float(s.step), 1000 * s.seconds / s.steps) for s in stretches]
+    drawings = [
+        (
+            "Loss",
+            charts.chart(charts.smoothed(loss, window), raw=loss, x_label="steps", y_label="loss"),
+        ),
+        (
+            "PSNR of the held-out photos, dB",
+            charts.chart(
+                psnr if len(psnr) > 1 else [],  # one is told above
+                x_label="steps",
+                y_label="PSNR, dB",
+                dots=True,
+                from_zero=False,
+            ),
+        ),
+        (
+            "Gaussians",
+            charts.chart(
+                [(float(s.step), float(s.gaussians)) for s in stretches],
+                x_label="steps",
+                y_label="Gaussians",
+            ),
+        ),
+        (
+            "Time of a step, ms",
+            charts.chart(
+                charts.smoothed(milliseconds, window),
+                raw=milliseconds,
+                x_label="steps",
+                y_label="time of a step, ms",
+            ),
+        ),
+    ]
+    figures = "\n".join(
+        f"<figure><figcaption>{caption}</figcaption>{svg}</figure>"
+        for caption, svg in drawings
+        if svg
+    )
+    return f'<h2>The training</h2>\n<div class="charts">{figures}</div>' if figures else ""
+
+
+def _figures(evaluation: Evaluation, held_out: bool) -> str:
+    """The list of views, and how far each is off: a bar that begins at zero."""
+    errors = [_rms(figures.psnr) for figures in evaluation.views]
+    largest = max([*errors, 1e-9])
+    rows = [
+        [
+            text(figures.name),
+            f"{figures.psnr:.2f}&#160;dB",
+            f"{figures.ssim:.3f}",
+            f"{100 * error:.1f}%",
+            bar(error / largest),
+        ]
+        for figures, error in list(zip(evaluation.views, errors, strict=True))[:_LISTED]
+    ]
+    more = len(evaluation.views) - _LISTED
+    rest = f'<p class="soft">… and {more:,} more, see metrics.json.</p>' if more > 0 else ""
+    which = "held-out" if held_out else "measured"
+    heads = ["photo", "PSNR", "SSIM", "mean error (RMS)", ""]
+    return f"<h2>Each {which} photo</h2>\n{table(heads, rows)}{rest}"
+
+
+def _settings(trained: Trained) -> str:
+    dataset = trained.dataset
+    camera = dataset.train[0].camera
+    points = "none" if dataset.points is None else f"{len(dataset.points):,}"
+    rows = [
+        ["photos", f"{len(dataset.train)} to train on, {len(dataset.test)} held out"],
+        ["size", f"{camera.width} × {camera.height}"],
+        ["points at the start", points],
+        ["degree of the colours (SH)", str(trained.gaussians.sh_degree)],
+    ]
+    everything = text(json.dumps(trained.settings, indent=2, ensure_ascii=False))
+    return (
+        f"<h2>Settings</h2>\n{table([], rows)}\n"
+        f"<details><summary>All of them</summary><pre>{everything}</pre></details>"
+    )
+
+
+def _machine(trained: Trained) -> str:
+    threads = ops.get_num_threads()
+    rows = [
+        ["processor", text(processor_name())],
+        ["threads", f"{threads}, instruction set {native.isa()}"],
+        ["system", text(system_name())],
+    ]
+    memory = [f"{trained.peak_bytes / 1e9:.1f} GB used at most"] if trained.peak_bytes else []
+    if memory_bytes():
+        memory.append(f"{memory_bytes() / 1e9:.0f} GB there")
+    if memory:
+        rows.append(["memory", ", ".join(memory)])
+    return f"<h2>Machine</h2>\n{table([], rows)}"
+
+
+def _next(name: str) -> str:
+    out = text(shlex.quote(name))
+    return f"<h2>Next</h2>\n<pre>snowsplat view {out}\nsnowsplat render {out} --path ellipse</pre>"
+
+
+def _rms(psnr: float) -> float:
+    """Root of the mean square of the differences, of a range of 1."""
+    return 0.0 if math.isinf(psnr) else 10.0 ** (-psnr / 20.0)

@@ -1,0 +1,113 @@
+"""Views beside their photos, and where they differ: the best and the worst."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from snowsplat.data import ImageLoader, View
+from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import render
+from snowsplat.util.html import picture, text
+
+_WORST, _BEST = 3, 2  # views that are shown
+_PICTURE_SIDE = 360  # pixels of the longer side
+_WHITE_ERROR = 0.25  # mean difference of the channels that is drawn white
+
+# From no error to `_WHITE_ERROR`: black, red, orange, white.
+_ERROR_COLORS = np.array(
+    [[0, 0, 0], [96, 14, 30], [200, 60, 20], [250, 170, 60], [255, 255, 255]], np.float32
+)
+
+#: CSS that the page needs.
+STYLE = """
+.views { display: flex; flex-wrap: wrap; gap: 18px 16px; }
+.triple { display: flex; gap: 5px; }
+.triple img { height: auto; max-height: 200px; width: auto; min-width: 0; flex: 0 1 auto;
+  object-fit: contain; border-radius: 3px; }
+"""
+
+
+def compared(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evaluation: Evaluation,
+    background: tuple[float, float, float],
+) -> str:
+    """HTML of the views with the lowest and the highest PSNR in ``evaluation``.
+
+    Raises:
+        UserError: a photo is absent or damaged.
+    """
+    color = torch.tensor(background, device=gaussians.means.device)
+    order = sorted(evaluation.views, key=lambda figures: figures.psnr)
+    if len(order) <= _WORST + _BEST:
+        groups = [("Photo, render, error", order)]
+    else:
+        groups = [
+            ("Least like their photos", order[:_WORST]),
+            ("Most like them", order[: -_BEST - 1 : -1]),
+        ]
+    by_name = {view.name: view for view in views}
+    parts = []
+    with ImageLoader(views, device=gaussians.means.device) as loader:
+        for title, chosen in groups:
+            figures = "\n".join(
+                _triple(gaussians, color, by_name[one.name], one, loader)
+                for one in chosen
+                if one.name in by_name
+            )
+            parts.append(f'<h2>{title}</h2>\n<div class="views">{figures}</div>')
+    white = f"{100 * _WHITE_ERROR:.0f}%"
+    parts.append(
+        '<p class="soft">Photo, render, and error: the mean difference of red, green and blue, '
+        f"from black (none) to white ({white} of the range, or more).</p>"
+    )
+    return "\n".join(parts)
+
+
+def _triple(
+    gaussians: Gaussians, color: Tensor, view: View, figures: ViewMetrics, loader: ImageLoader
+) -> str:
+    loaded = loader.get(view)
+    photo = loaded.over(color)
+    with torch.no_grad():
+        image = render(gaussians, view.camera, color).image.clamp(0.0, 1.0)
+    difference = (image - photo).abs().mean(2)
+    if loaded.mask is not None:
+        difference = torch.where(loaded.mask, difference, 0.0)
+    images = "".join(
+        picture(_small(pixels), f"{view.name}: {what}", quality=80)
+        for what, pixels in (
+            ("photo", _bytes(photo)),
+            ("render", _bytes(image)),
+            ("error", _error_in_color(difference.cpu().numpy())),
+        )
+    )
+    caption = f"{text(view.name)}: PSNR {figures.psnr:.2f} dB, SSIM {figures.ssim:.3f}"
+    return f'<figure><div class="triple">{images}</div><figcaption>{caption}</figcaption></figure>'
+
+
+def _bytes(image: Tensor) -> np.ndarray:
+    return (image * 255.0 + 0.5).byte().contiguous().cpu().numpy()
+
+
+def _error_in_color(difference: np.ndarray) -> np.ndarray:
+    """(H, W) in 0..1 -> (H, W, 3) uint8."""
+    position = np.clip(difference / _WHITE_ERROR, 0.0, 1.0) * (len(_ERROR_COLORS) - 1)
+    low = np.minimum(position.astype(np.int64), len(_ERROR_COLORS) - 2)
+    share = (position - low)[:, :, None]
+    color = _ERROR_COLORS[low] * (1.0 - share) + _ERROR_COLORS[low + 1] * share
+    return np.rint(color).astype(np.uint8)
+
+
+def _small(pixels: np.ndarray) -> Image.Image:
+    image = Image.fromarray(pixels)
+    scale = min(1.0, _PICTURE_SIDE / max(image.size))
+    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+    return image.resize(size, Image.Resampling.LANCZOS)

@@ -1,0 +1,1 @@
+"""Train within a given time: choose the settings, then keep the pace."""

@@ -1,5 +1,0 @@
-"""report.html: how a training went and what came of it."""
-
-from snowsplat.training_report.report import Trained, write_training_report
-
-__all__ = ["Trained", "write_training_report"]

@@ -1,0 +1,1 @@
+"""Helpers without knowledge of Gaussians: files, errors, JSON, processes, HTML."""

@@ -1,0 +1,108 @@
+"""Pages of HTML that need nothing else: one look, light and dark, for all reports.
+
+They are XML too. Arguments called ``html`` are markup already; whatever else comes from outside
+(names of files) goes through `text`.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from PIL import Image
+
+from snowsplat.util.safe_json import printable
+
+_STYLE = """
+:root { color-scheme: light dark; --bg: #fbfaf7; --card: #fff; --ink: #20252c; --soft: #667080;
+  --line: #e3e0d8; --accent: #b8650a; --bad: #b3261e; }
+@media (prefers-color-scheme: dark) { :root { --bg: #14171b; --card: #1c2127; --ink: #e6e9ed;
+  --soft: #98a2ae; --line: #2e353d; --accent: #ffb454; --bad: #ff8a80; } }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--bg); color: var(--ink); line-height: 1.5;
+  font-family: system-ui, -apple-system, "Segoe UI", sans-serif; }
+main { max-width: 1120px; margin: 0 auto; padding: 32px 20px 64px; }
+h1 { font-size: 1.7rem; margin: 0; overflow-wrap: anywhere; }
+h2 { font-size: 1.05rem; margin: 36px 0 10px; }
+p { margin: 6px 0; } .soft, figcaption { color: var(--soft); } .bad { color: var(--bad); }
+.cards { display: flex; flex-wrap: wrap; gap: 12px; margin: 22px 0; }
+.card { flex: 1 1 150px; background: var(--card); border: 1px solid var(--line);
+  border-radius: 8px; padding: 12px 16px; }
+.card b { display: block; font-size: 1.6rem; font-weight: 600; font-variant-numeric: tabular-nums; }
+figure { margin: 0; min-width: 0; } figcaption { font-size: .9rem; margin-top: 4px; }
+table { border-collapse: collapse; width: 100%; font-size: .92rem; }
+th, td { text-align: left; padding: 5px 14px 5px 0; border-bottom: 1px solid var(--line);
+  vertical-align: top; overflow-wrap: break-word; }
+th { color: var(--soft); font-weight: 500; } .facts th { width: 16em; }
+.names td { overflow-wrap: anywhere; }
+code, pre { font-family: ui-monospace, Menlo, Consolas, monospace; font-size: .9em; }
+pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px;
+  padding: 10px 14px; overflow-x: auto; margin: 8px 0; }
+.bar { display: inline-block; height: .7em; border-radius: 2px; background: var(--accent); }
+summary { cursor: pointer; color: var(--soft); } ol { margin: 6px 0; padding-left: 1.4em; }
+"""
+
+
+def page(title: str, html: Iterable[str], style: str = "") -> str:
+    """The whole page: parts one below the other, empty ones left out; ``style`` is more CSS."""
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
+        f"<title>{text(title)}</title><style>{_STYLE}{style}</style></head>\n"
+        "<body><main>\n" + "\n".join(filter(None, html)) + "\n</main></body></html>\n"
+    )
+
+
+def cards(html: Iterable[tuple[str, str]]) -> str:
+    """Large figures, each with a word below it."""
+    inner = "".join(f'<div class="card"><b>{value}</b>{label}</div>' for value, label in html)
+    return f'<div class="cards">{inner}</div>'
+
+
+def table(heads: Sequence[str], html: Iterable[Sequence[str]], kind: str = "plain") -> str:
+    """Rows of cells; ``kind`` "names" breaks long words anywhere.
+
+    Without heads, the first cell of a row is what it is about.
+    """
+    if not heads:
+        lines = (f"<tr><th>{row[0]}</th>{_cells(row[1:])}</tr>" for row in html)
+        return f"<table class='facts'><tbody>{''.join(lines)}</tbody></table>"
+    top = "".join(f"<th>{head}</th>" for head in heads)
+    body = "".join(f"<tr>{_cells(row)}</tr>" for row in html)
+    return f"<table class='{kind}'><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _cells(html: Sequence[str]) -> str:
+    return "".join(f"<td>{cell}</td>" for cell in html)
+
+
+def bar(share: float) -> str:
+    """A bar for a cell of a table; of those in one column the longest has share 1."""
+    share = max(0.01, min(1.0, share))
+    width = f"width:{35 * share:.1f}vw;max-width:{400 * share:.0f}px"
+    return f'<span class="bar" style="{width}"></span>'
+
+
+def picture(image: Image.Image, alt: str, quality: int = 75) -> str:
+    """The picture (RGB) within the page, as JPEG."""
+    data = io.BytesIO()
+    image.save(data, "JPEG", quality=quality)
+    source = base64.b64encode(data.getvalue()).decode("ascii")
+    return f'<img src="data:image/jpeg;base64,{source}" alt="{text(alt)}" title="{text(alt)}"/>'
+
+
+def duration(seconds: float) -> str:
+    """5.1 s, 2 min 10 s or 1 h 40 min."""
+    if seconds < 100:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def text(value: object) -> str:
+    """Anything as text of the page, also within quotes."""
+    return escape(printable(str(value)))

@@ -1,0 +1,238 @@
+"""The PLY container: a header that declares elements, then their rows. Numbers only, no meaning.
+
+Reads any property order and scalar type, ASCII and both byte orders, and other elements around the
+one wanted. Nothing is allocated from a count of the header before the file is known to be large
+enough for it, so that a damaged or hostile file costs one line.
+"""
+
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from snowsplat.util.errors import UserError
+
+_HEADER_LIMIT = 1 << 20
+_LINE_LIMIT, _NUMBER_LIMIT = 1 << 12, 1 << 10  # bytes of a row, and of each number in it
+_CHUNK_BYTES = 4 << 20  # rows are converted in pieces that stay in the cache
+_SCALARS = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: dict[str, str]  # name -> numpy type code, in the order of the file
+    has_list: bool = False
+
+    @property
+    def row_bytes(self) -> int:
+        return sum(int(code[1]) for code in self.properties.values())
+
+
+@dataclass
+class PlyTable:
+    """One element of a PLY file: its columns are known, its rows are still in the file.
+
+    Invariant: the file is large enough for ``count`` rows (for ASCII: for rows of the least size).
+    """
+
+    path: Path
+    format: str
+    count: int
+    columns: dict[str, str]
+    elements: tuple[str, ...]  # the names of all of the file
+    _before: list[_Element]
+    _data_start: int
+
+    def rows(self) -> Iterator[tuple[int, np.ndarray]]:
+        """The rows in pieces: ``(index of the first, structured array with the columns' names)``.
+
+        Raises:
+            UserError: the file ends early, or an ASCII value is not a number.
+        """
+        order = _BYTE_ORDERS[self.format]
+        dtype = np.dtype([(name, order + code) for name, code in self.columns.items()])
+        with open(self.path, "rb") as file:
+            file.seek(self._data_start)
+            chunk = max(1, _CHUNK_BYTES // max(1, dtype.itemsize))  # there may be no columns
+            if self.format != "ascii":
+                file.seek(sum(e.count * e.row_bytes for e in self._before), os.SEEK_CUR)
+                read = self._read_binary
+            else:
+                for _ in range(sum(e.count for e in self._before)):
+                    if not file.readline():
+                        raise self._truncated()
+                read = self._read_ascii
+            for start in range(0, self.count, chunk):
+                yield start, read(file, dtype, min(chunk, self.count - start))
+
+    def _read_binary(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
+        rows = np.fromfile(file, dtype, count)
+        if len(rows) < count:
+            raise self._truncated()
+        return rows
+
+    def _read_ascii(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
+        limit = _LINE_LIMIT + _NUMBER_LIMIT * len(self.columns)
+        lines = (self._line(file, limit) for _ in range(count))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # numpy warns of no rows; the count below tells it
+                values = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
+        except ValueError:
+            raise UserError(
+                f"{self.path}: a row of the PLY file is not {len(self.columns)} numbers"
+            ) from None
+        if len(values) < count:
+            raise self._truncated()
+        if values.shape[1] != len(self.columns):
+            raise UserError(
+                f"{self.path}: the PLY file has {values.shape[1]} numbers in a row, its header "
+                f"declares {len(self.columns)}"
+            )
+        rows = np.empty(count, dtype)
+        with np.errstate(invalid="ignore", over="ignore"):
+            for column, name in enumerate(self.columns):
+                rows[name] = values[:, column]
+        return rows
+
+    def _line(self, file: BinaryIO, limit: int) -> bytes:
+        line = file.readline(limit)
+        if len(line) == limit:
+            raise UserError(f"{self.path}: a row of the PLY file is far too long; export it again")
+        return line
+
+    def _truncated(self) -> UserError:
+        return _truncated(self.path)
+
+
+def _truncated(path: Path) -> UserError:
+    return UserError(f"{path}: the PLY file ends before its last row; copy or export it again")
+
+
+def open_table(path: Path | str, element: str = "vertex") -> PlyTable:
+    """Read the header of a PLY file and check that the rows of ``element`` are there.
+
+    Raises:
+        UserError: absent, not a PLY file, a header that makes no sense, or a file that is too
+        short.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            lines = _header_lines(path, file)
+            data_start = file.tell()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+    format, elements = _parse_header(path, lines)
+    names = [e.name for e in elements]
+    if names.count(element) != 1:
+        raise UserError(
+            f"{path}: the PLY file has {names.count(element)} '{element}' elements, not one"
+        )
+    position = names.index(element)
+    before, wanted = elements[:position], elements[position]
+    if wanted.has_list:
+        raise UserError(f"{path}: the PLY file has a list property in its '{element}' element")
+    if format == "ascii":
+        # A number and what separates it are two bytes at least; the last one may end the file.
+        needed = sum(e.count for e in before) + 2 * wanted.count * len(wanted.properties) - 1
+    else:
+        if any(e.has_list and e.count for e in before):
+            raise UserError(
+                f"{path}: the PLY file has a list element before '{element}'; "
+                f"save it again with '{element}' first"
+            )
+        needed = sum(e.count * e.row_bytes for e in [*before, wanted])
+    if wanted.count and needed > size - data_start:
+        raise _truncated(path)
+    return PlyTable(path, format, wanted.count, wanted.properties, tuple(names), before, data_start)
+
+
+def _header_lines(path: Path, file: BinaryIO) -> list[list[str]]:
+    """The words of each header line; leaves the file at the first byte after ``end_header``."""
+    if file.readline(16).rstrip(b"\r\n") != b"ply":
+        raise UserError(f"{path}: not a PLY file (its first line should be 'ply')")
+    lines: list[list[str]] = []
+    while file.tell() < _HEADER_LIMIT:
+        line = file.readline(4096)
+        if not line.endswith(b"\n"):
+            break
+        words = line.decode("ascii", errors="replace").split()
+        if words == ["end_header"]:
+            return lines
+        if words:
+            lines.append(words)
+    raise UserError(f"{path}: the PLY header has no end; the file is damaged")
+
+
+def _parse_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Element]]:
+    format = None
+    elements: list[_Element] = []
+    for words in lines:
+        match words:
+            case ["comment" | "obj_info", *_]:
+                pass
+            case [
+                "format",
+                ("ascii" | "binary_little_endian" | "binary_big_endian") as name,
+                "1.0",
+            ]:
+                format = name
+            case ["element", name, count] if (
+                count.isascii() and count.isdigit() and len(count) < 16
+            ):
+                elements.append(_Element(name, int(count), {}))
+            case ["property", "list", size, item, _] if (
+                elements and {size, item} <= _SCALARS.keys()
+            ):
+                elements[-1].has_list = True
+            case ["property", kind, name] if elements and kind in _SCALARS:
+                if name in elements[-1].properties:
+                    raise UserError(f"{path}: the PLY header declares the property '{name}' twice")
+                elements[-1].properties[name] = _SCALARS[kind]
+            case _:
+                shown = " ".join(words)[:60]
+                raise UserError(f"{path}: the PLY header has a line that makes no sense: {shown!r}")
+    if format is None:
+        raise UserError(f"{path}: the PLY header does not say its format")
+    return format, elements
+
+
+def header(count: int, properties: list[tuple[str, str]]) -> bytes:
+    """The header of a little-endian file of vertices; properties are pairs (PLY type, name)."""
+    return header_of([("vertex", count, properties)])
+
+
+def header_of(elements: Sequence[tuple[str, int, list[tuple[str, str]]]]) -> bytes:
+    """The header of a little-endian file of elements: name, count, pairs (PLY type, name)."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    for name, count, properties in elements:
+        lines.append(f"element {name} {count}")
+        lines += [f"property {kind} {column}" for kind, column in properties]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")

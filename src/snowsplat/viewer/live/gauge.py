@@ -1,0 +1,106 @@
+"""Curves of a training, as the viewer shows them: loss of every step, PSNR of a few views."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from snowsplat.data import View
+from snowsplat.data.decode import load_image, load_mask, resize_area
+from snowsplat.evaluation.metrics import psnr
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import render
+from snowsplat.util.errors import UserError
+from snowsplat.util.process import single_threaded
+from snowsplat.viewer.live.look import fit
+
+# A curve has at most so many points: more are halved.
+_POINTS = 512
+# PSNR is the mean of so many views, their longer side at most this many pixels.
+_VIEWS, _LONGEST = 4, 480
+
+
+class Curve:
+    """Means of a number over equal stretches of steps, however long the training."""
+
+    def __init__(self) -> None:
+        self._points: list[tuple[float, float]] = []
+        self._every = 1  # numbers that make a point
+        self._steps = self._sum = 0.0
+        self._count = 0
+
+    def add(self, step: int, value: float) -> None:
+        """One more number."""
+        self._steps += step
+        self._sum += value
+        self._count += 1
+        if self._count < self._every:
+            return
+        self._points.append((self._steps / self._count, self._sum / self._count))
+        self._steps = self._sum = 0.0
+        self._count = 0
+        if len(self._points) > _POINTS:
+            pairs = zip(self._points[::2], self._points[1::2], strict=False)
+            self._points = [((a + c) / 2, (b + d) / 2) for (a, b), (c, d) in pairs]
+            self._every *= 2
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Steps and values, float64."""
+        points = np.array(self._points, np.float64).reshape(-1, 2)
+        return points[:, 0].copy(), points[:, 1].copy()
+
+
+class Gauge:
+    """PSNR of a few fixed views, one at a time, since it costs the training time."""
+
+    def __init__(self, views: Sequence[View], background: Tensor) -> None:
+        """``views``: to choose from."""
+        self._background = background
+        chosen = [views[i * len(views) // _VIEWS] for i in range(_VIEWS)] if views else []
+        unique = list(dict.fromkeys(chosen))
+        self._turn = itertools.cycle(unique)
+        self._photos: dict[View, tuple[Tensor, Tensor | None]] = {}
+        self._newest: deque[float] = deque(maxlen=len(unique))
+        self.can_measure = bool(unique)
+
+    def measure(self, gaussians: Gaussians) -> float:
+        """Measure the next view (at first: each); gives the mean of the newest figures, dB.
+
+        NaN where a photo cannot be read.
+        """
+        for _ in range(1 if self._newest else self._newest.maxlen or 0):
+            self._measure_next(gaussians)
+        return sum(self._newest) / len(self._newest) if self.can_measure else math.nan
+
+    @torch.no_grad()
+    def _measure_next(self, gaussians: Gaussians) -> None:
+        view = next(self._turn)
+        size = fit(view.camera.width, view.camera.height, _LONGEST)
+        with single_threaded():
+            try:
+                photo, mask = self._photo(view, size)
+            except UserError:
+                self.can_measure = False  # whoever needs the photo will say so
+                return
+            image = render(gaussians, view.camera.scaled(*size), self._background).image
+            self._newest.append(psnr(image.clamp(0.0, 1.0).cpu(), photo, mask))
+
+    def _photo(self, view: View, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
+        if view not in self._photos:
+            planes = load_image(view.image, self._background.tolist())
+            small = torch.from_numpy(resize_area(planes.numpy(), *size))
+            mask = None
+            if view.mask is not None:
+                whole = load_mask(view.mask).numpy().astype(np.uint8)[None] * 255
+                mask = torch.from_numpy(resize_area(whole, *size)[0] == 255)
+            self._photos[view] = (small.permute(1, 2, 0).to(torch.float32) / 255.0, mask)
+        return self._photos[view]

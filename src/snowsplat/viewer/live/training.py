@@ -1,0 +1,104 @@
+"""`TrainingViewer`: what happens on the page between two steps of a training."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.process import let_interrupt
+from snowsplat.viewer.live.gauge import Curve, Gauge
+from snowsplat.viewer.live.page import TrainingPanel
+from snowsplat.viewer.live.viewer import NetworkViewer, Scene
+
+# Seconds between two looks at the figures. PSNR may take this part of the time.
+_SECONDS, _PSNR_SHARE = 1.0, 0.03
+# The loss shown is the mean of about so many steps, the rate of about so many seconds.
+_LOSS_STEPS, _RATE_SECONDS = 50, 3.0
+
+
+class TrainingViewer:
+    """Shows a training on a page, pauses it from there; call `after_step` after each step."""
+
+    def __init__(self, viewer: NetworkViewer, gauge: Gauge) -> None:
+        self.viewer = viewer
+        self._session = viewer.session
+        self._session.training = True
+        self._panel = TrainingPanel(viewer.server, viewer.session)
+        self._gauge = gauge
+        self._losses, self._psnrs = Curve(), Curve()
+        self._loss = math.nan
+        self._rate = 0.0
+        self._rated = (0, time.monotonic())  # step and time when the rate was reckoned
+        self._next = self._next_psnr = 0.0  # when figures are due
+        self._measured = 0  # the step of the last PSNR
+
+    def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
+        """Make the pictures that are due, and wait while the training is paused.
+
+        Args:
+            steps: in all.
+
+        Returns:
+            Seconds for which it was paused.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C while it was paused.
+        """
+        self._losses.add(step, loss)
+        before = loss if math.isnan(self._loss) else self._loss
+        self._loss = before + (loss - before) / _LOSS_STEPS
+        if not self._session.busy:
+            return 0.0
+        self.viewer.serve(gaussians, step, training=True)
+        self._tell(step, steps, gaussians)
+        if self._session.may_step():
+            return 0.0
+        started = time.monotonic()
+        self._next = 0.0
+        while True:
+            self._tell(step, steps, gaussians)
+            if not self.viewer.serve(gaussians, step, training=False):
+                self.viewer.wait()
+            let_interrupt()
+            if self._session.may_step():
+                return time.monotonic() - started
+
+    def _tell(self, step: int, steps: int, gaussians: Gaussians) -> None:
+        """Figures and curves, now and then."""
+        now = time.monotonic()
+        if now < self._next:
+            return
+        self._next = now + _SECONDS
+        if self._gauge.can_measure and step > self._measured and now >= self._next_psnr:
+            psnr = self._gauge.measure(gaussians)
+            self._measured = step
+            if math.isfinite(psnr):
+                self._psnrs.add(step, psnr)
+            took = time.monotonic() - now
+            self._next_psnr = now + took / _PSNR_SHARE
+        pace = "paused" if self._session.paused else f"{self._steps_a_second(step):.1f} a second"
+        figures = [f"{len(gaussians):,} Gaussians", f"loss {self._loss:.4f}"]
+        if len(self._psnrs):
+            figures.append(f"PSNR {self._psnrs.arrays()[1][-1]:.2f} dB")
+        about = [f"Step {step:,} of {steps:,}, {pace}", ", ".join(figures)]
+        self._panel.show(about, step / steps, self._losses, self._psnrs)
+
+    def _steps_a_second(self, step: int) -> float:
+        now = time.monotonic()
+        step_before, before = self._rated
+        self._rated = step, now
+        if now - before < 2.0 * _RATE_SECONDS and step > step_before:
+            rate = (step - step_before) / (now - before)
+            keep = math.exp((before - now) / _RATE_SECONDS) if self._rate else 0.0
+            self._rate = keep * self._rate + (1.0 - keep) * rate
+        return self._rate
+
+    def end(self, step: int, gaussians: Gaussians) -> None:
+        """The training is over; show what has come of it until Ctrl-C, which it raises."""
+        self._session.training = False
+        self._session.resume()
+        self._panel.end()
+        about = [f"Finished after {step:,} steps", f"{len(gaussians):,} Gaussians"]
+        scene = Scene(gaussians, step, about)
+        self.viewer.hold(lambda: scene)

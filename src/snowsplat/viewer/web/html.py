@@ -1,0 +1,69 @@
+"""One self-contained page: the viewer and the scene in a single file, to send by mail.
+
+It opens from the disk in any browser with WebGL 2 and asks the network for nothing. The scene is in
+it as a compressed PLY file in base64; a page is written, never read.
+"""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+from snowsplat.formats import Format, register_format
+from snowsplat.formats.compressed_ply import compressed_ply
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.initial_view import StartView, overview
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import write_text
+from snowsplat.viewer.web.page import settings, whole_page
+
+#: Browsers hold a text of some 500 million characters; base64 makes 4 of 3 bytes.
+_LARGEST = 360_000_000
+
+# Given to the viewer as the address of a blob: browsers limit the length of data addresses.
+_SCENE = """        <script type="text/plain" id="scene">{scene}</script>
+        <script>
+            const scene = document.getElementById('scene');
+            const base64 = scene.textContent;
+            scene.remove();
+            const parts = [];
+            for (let at = 0; at < base64.length; at += 1 << 22) {{
+                const text = atob(base64.slice(at, at + (1 << 22)));
+                const bytes = new Uint8Array(text.length);
+                for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+                parts.push(bytes);
+            }}
+            const bootstrap = document.getElementById('sse-bootstrap');
+            const contentUrl = URL.createObjectURL(new Blob(parts));
+            bootstrap.textContent = JSON.stringify({{
+                ...JSON.parse(bootstrap.textContent), contentUrl
+            }});
+        </script>"""
+
+
+def write_html(path: Path | str, gaussians: Gaussians, start: StartView | None = None) -> None:
+    """Write the page atomically; it starts at ``start``, else where most of the scene is in view.
+
+    Raises:
+        UserError: no Gaussians, or more than browsers take in one page.
+        OSError: the folder is absent or not writable, or the disk is full.
+    """
+    path = Path(path)
+    if not len(gaussians):
+        raise UserError(f"{path}: a scene without Gaussians shows nothing; no page is made of it")
+    scene = compressed_ply(path, gaussians)
+    if len(scene) > _LARGEST:
+        raise UserError(
+            f"{path}: {len(gaussians):,} Gaussians are too many for one page; "
+            "decimate them, or drop SH degrees"
+        )
+    encoded = base64.b64encode(scene).decode("ascii")
+    background = (0.0, 0.0, 0.0)
+    bootstrap = {
+        "settings": settings(start or overview(gaussians), background),
+        "contentFilename": "scene.compressed.ply",
+    }
+    write_text(path, whole_page(path.stem, bootstrap, _SCENE.format(scene=encoded)))
+
+
+register_format(Format("HTML", (".html",), None, None, write_html, "what compressed PLY loses"))

@@ -1,0 +1,111 @@
+"""A finished scene made ready for the browser: upright, at a size one can walk in, compressed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from snowsplat.formats.compressed_ply import compressed_ply
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.edit import transform
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import Similarity
+from snowsplat.scene.initial_view import StartView, overview, view_of_camera
+from snowsplat.scene.orientation import up_direction
+from snowsplat.scene.render import render
+from snowsplat.sfm.orient import VIEWING_DISTANCE
+from snowsplat.viewer.web.page import asset, content_policy, page, settings
+from snowsplat.viewer.web.server import ServedFile
+
+_SCENE = "scene.compressed.ply"
+_LEVEL_ENOUGH = math.radians(3)  # a horizon that is off by less is not seen
+_TOO_LARGE = 3.0  # times the usual distances, or too small
+
+
+def site(
+    title: str, gaussians: Gaussians, cameras: Sequence[Camera], background: Sequence[float]
+) -> tuple[dict[str, ServedFile], dict[str, str]]:
+    """The files of a page that shows a scene, by name, and the headers that belong to them.
+
+    It starts at the first of ``cameras``; without any, at a place that fits the scene.
+    """
+    gaussians, start = ready(gaussians, cameras)
+    bootstrap = {"settings": settings(start, background), "contentUrl": f"./{_SCENE}"}
+    index = page(title, bootstrap)
+    files = {
+        "": ServedFile(index.encode(), "text/html; charset=utf-8"),
+        "index.css": ServedFile(asset("index.css").encode(), "text/css; charset=utf-8"),
+        "index.js": ServedFile(asset("index.js").encode(), "text/javascript; charset=utf-8"),
+        _SCENE: ServedFile(compressed_ply(Path(_SCENE), gaussians), "application/octet-stream"),
+    }
+    own = "'self'"
+    policy = f"{content_policy(index, own)}; frame-ancestors 'none'"
+    return files, {"Content-Security-Policy": policy}
+
+
+def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[Gaussians, StartView]:
+    """The scene in a frame that suits the viewer, and where one starts in that frame.
+
+    The viewer takes −y for up, and walks some units a second. So where the cameras tell that
+    another direction is up, or that they stood much nearer or farther than `VIEWING_DISTANCE`, the
+    scene is turned and scaled; else it is left as it is.
+    """
+    if not cameras:
+        return gaussians, overview(gaussians)
+    depth = _depth_ahead(gaussians, cameras[0])
+    change = _viewing_frame(cameras, depth)
+    if change is None:
+        return gaussians, view_of_camera(cameras[0], depth)
+    first = cameras[0]
+    pose = change.apply_to_poses(first.cam_from_world)
+    moved = Camera(first.width, first.height, first.fx, first.fy, first.cx, first.cy, pose)
+    return transform(gaussians, change), view_of_camera(moved, change.scale * depth)
+
+
+def _viewing_frame(cameras: Sequence[Camera], depth: float) -> Similarity | None:
+    """From the scene's frame to one with −y up and distances near the usual; None: it is one."""
+    rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
+    up = torch.from_numpy(up_direction(rotations.numpy()))
+    rotation = _shortest_rotation(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
+    tilt = math.acos(max(-1.0, min(1.0, -float(up[1]))))
+    ratio = VIEWING_DISTANCE / depth
+    is_level, is_near = tilt < _LEVEL_ENOUGH, 1 / _TOO_LARGE < ratio < _TOO_LARGE
+    if is_level and is_near:
+        return None
+    turn = torch.eye(3, dtype=torch.float64) if is_level else rotation
+    return Similarity(1.0 if is_near else ratio, turn, torch.zeros(3, dtype=torch.float64))
+
+
+def _shortest_rotation(source: Tensor, target: Tensor) -> Tensor:
+    """(3, 3) that takes one unit vector to another, about the axis across both."""
+    axis = torch.linalg.cross(source, target)
+    cosine = float(source @ target)
+    if cosine < -1 + 1e-9:  # half round, about the x axis, which is across ±y
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    x, y, z = axis.tolist()
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + cross + cross @ cross / (1 + cosine)
+
+
+def _depth_ahead(gaussians: Gaussians, camera: Camera) -> float:
+    """World units from a camera to what its picture shows in the middle."""
+    factor = max(1, max(camera.width, camera.height) // 160)
+    small = camera.downscaled(factor)
+    with torch.no_grad():
+        output = render(gaussians.detach(), small, with_depth=True)
+    assert output.depth is not None
+    rows = slice(3 * small.height // 8, -(-5 * small.height // 8))
+    columns = slice(3 * small.width // 8, -(-5 * small.width // 8))
+    depth, alpha = output.depth[rows, columns], output.alpha[rows, columns]
+    solid = alpha > 0.5
+    if bool(solid.any()):
+        return float((depth[solid] / alpha[solid]).median())
+    # Nothing there: as far as most of the scene is.
+    distances = (gaussians.means.double() - camera.position).norm(dim=1)
+    distances = distances[distances.isfinite()]
+    found = float(distances.median()) if len(distances) else 0.0
+    return found if found > 0 else 1.0

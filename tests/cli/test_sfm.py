@@ -1,0 +1,196 @@
+"""`snowsplat sfm`: what stands in the folder, what is done again, what failures leave."""
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pycolmap
+import pytest
+from PIL import Image
+
+import snowsplat
+from snowsplat.data import load_dataset
+from snowsplat.synthetic import write_synthetic_photos
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
+STAGES = ("photos", "poses", "images", "report")
+QUICK = ("--quality", "draft", "--threads", "1")
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory) -> Path:
+    """16 photos, 320×240; not to be changed."""
+    folder = tmp_path_factory.mktemp("capture") / "photos"
+    write_synthetic_photos(folder, n_views=16, width=320, height=240)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def captured(photos, tmp_path_factory) -> Path:
+    """Their dataset, with smaller copies; not to be changed."""
+    out = tmp_path_factory.mktemp("captured") / "garden"
+    command = [sys.executable, "-m", "snowsplat", "sfm", photos, "-o", out, *QUICK, "--resize"]
+    done = subprocess.run(list(map(str, command)), env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def times(folder: Path) -> dict[str, int]:
+    """When each file was written, but for the record."""
+    found = (p for p in folder.rglob("*") if p.is_file() and p.name != "capture.json")
+    return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in found}
+
+
+def test_layout_is_that_of_convert_py(captured, photos):
+    names = {path.name for path in photos.iterdir()}
+    placed = {path.name: Image.open(path).size for path in (captured / "images").iterdir()}
+    assert placed.keys() <= names
+    for divisor in (2, 4, 8):
+        copies = {p.name: Image.open(p).size for p in (captured / f"images_{divisor}").iterdir()}
+        assert copies == {
+            name: (round(width / divisor), round(height / divisor))
+            for name, (width, height) in placed.items()
+        }
+    assert {path.name for path in (captured / "input").iterdir()} == names
+    assert (captured / "distorted" / "database.db").is_file()
+    distorted = pycolmap.Reconstruction(captured / "distorted" / "sparse" / "0")
+    model = pycolmap.Reconstruction(captured / "sparse" / "0")
+    assert model.num_reg_images() == distorted.num_reg_images() >= 14
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+    record = json.loads((captured / "capture.json").read_text())
+    assert list(record["stages"]) == list(STAGES)
+    # What was turned can be turned back: the record has the similarity.
+    scale = record["stages"]["images"]["result"]["scene_from_sfm"]["scale"]
+    ours, theirs = (
+        sorted(m.images[i].projection_center()[0] for i in m.reg_image_ids())
+        for m in (model, distorted)
+    )
+    assert ours != theirs
+    assert scale > 0
+    dataset = load_dataset(captured, resolution=2, hold_out=8)
+    assert len(dataset.train) + len(dataset.test) == model.num_reg_images()
+    assert len(dataset.points) == model.num_points3D()
+
+
+def test_the_same_again_does_nothing_and_a_changed_photo_is_noticed(
+    captured, photos, run, tmp_path
+):
+    out, mine = tmp_path / "garden", tmp_path / "mine"
+    shutil.copytree(photos, mine)
+    assert run("sfm", mine, "-o", out, *QUICK).code == 0
+    before = times(out)
+    again = run("sfm", mine, "-o", out, *QUICK)
+    assert again.code == 0
+    assert again.out.count("done before") == len(STAGES)
+    assert times(out) == before
+
+    again = run("sfm", mine, "-o", out, *QUICK, "--resize")
+    assert "images: done again (changed: resize)" in again.out
+    assert again.out.count("done before") == 2
+
+    last = max(mine.iterdir())
+    last.unlink()
+    again = run("sfm", mine, "-o", out, *QUICK, "--resize")
+    assert "photos: done again (changed: input)" in again.out
+    assert not (out / "input" / last.name).exists()
+    assert not (out / "images" / last.name).exists()
+
+
+def test_photos_in_place(captured, photos, run, refused, tmp_path):
+    place = tmp_path / "place"
+    shutil.copytree(photos, place / "input")
+    before = times(place / "input")
+    result = run("sfm", "-s", place, *QUICK)
+    assert result.code == 0, result.err
+    assert times(place / "input") == before
+    assert load_dataset(place).train
+    # They are not ours to replace, not even by some of them.
+    for inputs in (sorted((place / "input").iterdir())[:5], [photos]):
+        line = refused("sfm", *inputs, "-o", place, "--overwrite", *QUICK)
+        assert f"{place / 'input'}: holds the photos that were given" in line
+    assert times(place / "input") == before
+
+    # A model that is there already is undistorted as it is.
+    given = tmp_path / "given"
+    shutil.copytree(photos, given / "input")
+    shutil.copytree(captured / "distorted" / "sparse", given / "distorted" / "sparse")
+    model = (given / "distorted" / "sparse" / "0" / "images.bin").read_bytes()
+    assert "distorted" in refused("sfm", "-s", given)  # not ours: nothing of it is touched
+    result = run("sfm", "-s", given, "--skip-matching")
+    assert result.code == 0, result.err
+    assert (given / "distorted" / "sparse" / "0" / "images.bin").read_bytes() == model
+    assert len(load_dataset(given).train) == len(load_dataset(captured).train)
+
+
+def test_a_folder_that_is_taken_is_left_alone(captured, refused, photos, tmp_path):
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    (taken / "mine.txt").write_text("mine")
+    assert "holds other files (mine.txt)" in refused("sfm", photos, "-o", taken)
+    assert "is a file" in refused("sfm", photos, "-o", taken / "mine.txt")
+    before = times(captured)
+    line = refused("sfm", *sorted(photos.iterdir())[:3], "-o", captured)
+    assert "holds a dataset of" in line
+    assert times(captured) == before
+    assert [path.name for path in taken.iterdir()] == ["mine.txt"]
+
+
+def test_a_failure_leaves_nothing(refused, photos, tmp_path):
+    two = tmp_path / "two"
+    two.mkdir()
+    for photo in sorted(photos.iterdir())[:2]:
+        shutil.copy(photo, two)
+    for mistake in (two, tmp_path / "nothing"):
+        refused("sfm", mistake, "-o", tmp_path / "new" / "out")
+        assert not (tmp_path / "new" / "out").exists()
+    refused("sfm", "-s", tmp_path)
+    refused("sfm")
+    refused("sfm", photos)
+    refused("sfm", photos, "-o", tmp_path / "x", "--threads", 0)
+    refused("sfm", photos, "-o", tmp_path / "x", "--skip-matching")
+    refused("sfm", photos, "-o", tmp_path / "x", "--fps", 1, "--frames", 20)
+    assert sorted(path.name for path in tmp_path.iterdir()) in (["new", "two"], ["two"])
+
+
+def test_a_full_disk_loses_nothing_that_is_finished(captured, photos, run, tmp_path, monkeypatch):
+    out = tmp_path / "garden"
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("snowsplat.sfm.undistort.undistort", full)
+    result = run("sfm", photos, "-o", out, *QUICK)
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert "the disk is full; make room, then give the same command again" in result.err
+    monkeypatch.undo()
+    result = run("sfm", photos, "-o", out, *QUICK)
+    assert result.code == 0
+    assert result.out.count("done before") == 2
+
+
+@pytest.mark.parametrize("stage", ["photos", "poses", "images"])
+@pytest.mark.slow
+def test_killed_at_any_stage_the_same_command_goes_on(stage, photos, run, tmp_path):
+    out = tmp_path / "garden"
+    command = [sys.executable, "-m", "snowsplat", "sfm", photos, "-o", out, *QUICK]
+    begun = {
+        "photos": lambda: out.exists(),
+        "poses": lambda: (out / "distorted" / "database.db").exists(),
+        "images": lambda: (out / "images").exists(),
+    }[stage]
+    with subprocess.Popen(
+        list(map(str, command)), env=ENVIRONMENT, stdout=subprocess.DEVNULL
+    ) as process:
+        while not begun():
+            assert process.poll() is None
+            time.sleep(0.005)
+        process.kill()
+    result = run(*command[3:])
+    assert result.code == 0, result.err
+    assert len(load_dataset(out).train) >= 14
+    assert not (out / ".new").exists()

@@ -1,0 +1,64 @@
+"""Where the scene is, from the cameras alone."""
+
+import math
+
+import pytest
+import torch
+
+from snowsplat.data.bounds import scene_bounds
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import look_at
+
+F64 = torch.float64
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
+
+
+def camera(position, target) -> Camera:
+    pose = look_at(torch.tensor(position, dtype=F64), torch.tensor(target, dtype=F64), UP)
+    return Camera(400, 400, 555.5, 555.5, 200, 200, pose)
+
+
+def ring(radius, centre, aim):
+    """12 cameras in a ring, each looking ``aim`` of the way to the centre (negative: outward)."""
+    cameras = []
+    for i in range(12):
+        angle = i * math.pi / 6
+        x, y = radius * math.cos(angle), radius * math.sin(angle)
+        position = [centre[0] + x, centre[1] + y, centre[2]]
+        cameras.append(camera(position, [position[0] - aim * x, position[1] - aim * y, centre[2]]))
+    return cameras
+
+
+def test_cameras_around_an_object():
+    low, high = scene_bounds(ring(4.0, (10.0, 0.0, -3.0), 1.0))
+    assert torch.allclose((low + high) / 2, torch.tensor([10.0, 0.0, -3.0]), atol=1e-5)
+    half = 0.9 * 4.0 * 200 / 555.5  # Blender's cameras: 1.3 around a scene of ±1.3
+    assert torch.allclose(high - low, torch.full((3,), 2 * half), atol=1e-5)
+
+
+def test_cameras_that_look_outward_have_the_scene_around_them():
+    low, high = scene_bounds(ring(1.0, (5.0, 5.0, 0.0), -1.0))
+    assert torch.allclose((low + high) / 2, torch.tensor([5.0, 5.0, 0.0]), atol=1e-4)
+    assert (high - low).min() > 4
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_parallel_cameras_have_the_scene_in_front(count):
+    cameras = [camera([i, 0.0, 0.0], [i, 10.0, 0.0]) for i in range(count)]
+    low, high = scene_bounds(cameras)
+    assert torch.isfinite(low).all()
+    assert low[1] > 0
+    assert low[0] < (count - 1) / 2 < high[0]
+
+
+def test_points_come_first_but_not_the_farthest():
+    points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
+    points[0] = 1e6
+    low, high = scene_bounds(ring(4.0, (0.0, 0.0, 0.0), 1.0), points)
+    assert ((low > 0) & (low < 0.1)).all()
+    assert ((high > 0.9) & (high < 1)).all()
+
+
+def test_no_cameras():
+    with pytest.raises(ValueError, match="needs a camera"):
+        scene_bounds([])

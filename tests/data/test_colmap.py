@@ -1,0 +1,224 @@
+"""COLMAP's files: round trips, other cameras, several models, damage."""
+
+import logging
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.data import load_dataset
+from snowsplat.data.colmap_files import (
+    ColmapCamera,
+    ColmapImage,
+    read_model,
+    read_points,
+    write_model,
+)
+from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.util.errors import UserError
+
+POSE = (0.5, -0.5, 0.5, 0.5, 1.25, -2.5, 1e-3)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_model_round_trip(tmp_path, text):
+    random = np.random.default_rng(0)
+    cameras = {
+        7: ColmapCamera("PINHOLE", 640, 480, (500.5, 501.5, 320.25, 239.75)),
+        2: ColmapCamera("OPENCV", 100, 90, (80.0, 81.0, 50.0, 45.0, 0.1, 0.0, 0.0, -0.2)),
+    }
+    images = [ColmapImage("a b/ä.jpg", 7, POSE), ColmapImage("c.png", 2, (1.0, *[0.1] * 6))]
+    xyz = random.normal(size=(50, 3)).astype(np.float32)
+    rgb = random.integers(0, 256, (50, 3)).astype(np.uint8)
+    tracks = [[(1, i)] * int(random.integers(0, 6)) for i in range(50)]
+    write_model(tmp_path, cameras, images, xyz, rgb, tracks, text=text)
+    model = read_model(tmp_path)
+    assert model.text == text
+    assert model.cameras == cameras
+    assert list(model.images) == images
+    points = read_points(tmp_path)
+    assert torch.equal(points.xyz, torch.from_numpy(xyz))
+    assert torch.equal(points.rgb, torch.from_numpy(rgb))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_model_without_points(tmp_path, text):
+    images = [ColmapImage("a", 1, POSE)]
+    write_model(tmp_path, {}, images, np.empty((0, 3)), np.empty((0, 3), np.uint8), text=text)
+    assert read_points(tmp_path) is None
+
+
+def test_observations_are_skipped(tmp_path):
+    """As COLMAP writes them: each image with the points that it saw."""
+    write_model(tmp_path, {}, [], np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    record = struct.pack("<I7dI", 1, *POSE, 3) + b"x.jpg\0" + struct.pack("<Q", 2) + bytes(48)
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 2) + record * 2)
+    assert list(read_model(tmp_path).images) == [ColmapImage("x.jpg", 3, POSE)] * 2
+    line = "1 " + " ".join(map(str, POSE)) + " 3 x.jpg\n"
+    for file in tmp_path.iterdir():
+        file.unlink()
+    (tmp_path / "cameras.txt").write_text("# none\n")
+    (tmp_path / "images.txt").write_text("# head\n" + (line + "1.5 2.5 -1 3 4 17\n") + line)
+    assert list(read_model(tmp_path).images) == [ColmapImage("x.jpg", 3, POSE)] * 2
+
+
+def test_pose_is_cam_from_world_of_the_quaternion(dataset_copy):
+    folder = dataset_copy("colmap-bin")
+    image = read_model(folder / "sparse/0").images[1]
+    camera = load_dataset(folder, hold_out=None).train[1].camera
+    rotation = rotation_from_quat(torch.tensor(image.pose[:4], dtype=torch.float64))
+    assert torch.equal(camera.cam_from_world[:, :3], rotation)
+    assert camera.cam_from_world[:, 3].tolist() == list(image.pose[4:])
+
+
+def rewrite_cameras(folder, model, params):
+    colmap = read_model(folder / "sparse/0")
+    camera = ColmapCamera(model, 32, 24, params)
+    nothing = np.empty((0, 3))
+    write_model(folder / "sparse/0", {1: camera}, colmap.images, nothing, nothing)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", (30.0, 16.0, 12.0)),
+        ("SIMPLE_RADIAL", (30.0, 16.0, 12.0, 0.0)),
+        ("OPENCV", (30.0, 30.0, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_cameras_that_are_pinholes_by_another_name(dataset_copy, model, params):
+    folder = dataset_copy("colmap-bin")
+    rewrite_cameras(folder, model, params)
+    camera = load_dataset(folder).train[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30.0, 30.0, 16.0, 12.0)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", (30.0, 16.0, 12.0, 0.01)),
+        ("OPENCV_FISHEYE", (30.0, 30.0, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_distorted_cameras_are_refused_with_the_fix(dataset_copy, model, params):
+    folder = dataset_copy("colmap-bin")
+    rewrite_cameras(folder, model, params)
+    with pytest.raises(UserError, match=f"{model}.*snowsplat sfm -s NEW --skip-matching"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    "params", [(0.0, 16.0, 12.0), (-1.0, 16.0, 12.0), (float("nan"), 1.0, 1.0), (1e300, 1.0, 1.0)]
+)
+def test_intrinsics_that_make_no_sense_are_refused(dataset_copy, params):
+    folder = dataset_copy("colmap-bin")
+    rewrite_cameras(folder, "SIMPLE_PINHOLE", params)
+    with pytest.raises(UserError, match="intrinsics"):
+        load_dataset(folder)
+
+
+def test_each_image_has_its_own_camera(dataset_copy):
+    folder = dataset_copy("colmap-txt")
+    model = read_model(folder / "sparse/0")
+    cameras = {i: ColmapCamera("PINHOLE", 32, 24, (30.0 + i, 30, 16, 12)) for i in range(9)}
+    images = [ColmapImage(v.name, i, v.pose) for i, v in enumerate(model.images)]
+    nothing = np.empty((0, 3))
+    write_model(folder / "sparse/0", cameras, images, nothing, nothing, text=True)
+    views = load_dataset(folder, hold_out=None).train
+    assert [view.camera.fx for view in views] == [30.0 + i for i in range(9)]
+
+
+@pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
+def test_the_model_with_most_images_is_taken(dataset_copy, caplog, kind):
+    folder = dataset_copy(kind)
+    model = read_model(folder / "sparse/0")
+    (folder / "sparse/0").rename(folder / "sparse/3")
+    nothing = np.empty((0, 3))
+    for number in (0, 1):  # first by name, fewer images
+        some = model.images[: 2 + number]
+        write_model(folder / f"sparse/{number}", model.cameras, some, nothing, nothing)
+    with caplog.at_level(logging.WARNING):
+        dataset = load_dataset(folder)
+    assert len(dataset.train) + len(dataset.test) == 9
+    assert "sparse/3 (9 images), not sparse/1 (3), sparse/0 (2)" in caplog.text
+    assert "sparse/3" in dataset.description
+
+
+def test_a_model_right_in_sparse(dataset_copy):
+    folder = dataset_copy("colmap-bin")
+    (folder / "sparse/0").rename(folder / "elsewhere")
+    (folder / "sparse").rmdir()
+    (folder / "elsewhere").rename(folder / "sparse")
+    assert len(load_dataset(folder).train) == 7
+
+
+def test_missing_images_are_skipped_and_counted(dataset_copy, caplog):
+    folder = dataset_copy("colmap-bin")
+    (folder / "images/view_03.png").unlink()
+    (folder / "images/view_05.png").unlink()
+    with caplog.at_level(logging.WARNING):
+        dataset = load_dataset(folder, hold_out=None)
+    assert len(dataset.train) == 7
+    assert "2 of 9 images are missing (the first is 'view_03.png')" in caplog.text
+
+
+def test_no_image_at_all(dataset_copy):
+    folder = dataset_copy("colmap-bin")
+    with pytest.raises(
+        UserError, match=r"photos: no such folder.*--images.*there are: images, sparse"
+    ):
+        load_dataset(folder, images="photos")
+    for image in (folder / "images").iterdir():
+        image.unlink()
+    with pytest.raises(UserError, match="none of the 9 images of the model is here"):
+        load_dataset(folder)
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path, caplog):
+    xyz = np.array([[0, 0, 1.0], [0, np.nan, 1], [1e300, 0, 0], [1, 2, 3], [0, -1e20, 0]])
+    write_model(tmp_path, {}, [], xyz, np.zeros((5, 3), np.uint8))
+    with caplog.at_level(logging.WARNING):
+        points = read_points(tmp_path)
+    assert points.xyz.tolist() == [[0, 0, 1], [1, 2, 3]]
+    assert "3 points are not finite, or absurdly far" in caplog.text
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("count", [2**63, 2**40, 10**6, 10])
+def test_a_count_larger_than_the_file_allocates_nothing(dataset_copy, file, count):
+    folder = dataset_copy("colmap-bin")
+    path = folder / "sparse/0" / file
+    count += struct.unpack("<Q", path.read_bytes()[:8])[0]
+    path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
+    with pytest.raises(UserError, match=f"{file}: damaged"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_damaged_files_are_one_line(dataset_copy, refusals, kind, name):
+    folder = dataset_copy(kind)
+    path = folder / "sparse/0" / (name + kind.replace("colmap-", "."))
+    refused = refusals(path, lambda: load_dataset(folder))
+    # Whatever is cut is noticed, but for an empty text of points, or one cut between lines.
+    assert refused >= (20 if kind == "colmap-bin" else 5)
+
+
+def test_a_text_that_its_comment_calls_longer(dataset_copy, caplog):
+    folder = dataset_copy("colmap-txt")
+    path = folder / "sparse/0/points3D.txt"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:21]))
+    with caplog.at_level(logging.WARNING):
+        assert len(load_dataset(folder).points) == 20
+    assert "20 points, its comment says 60" in caplog.text
+
+
+def test_an_image_of_an_unknown_camera(dataset_copy):
+    folder = dataset_copy("colmap-bin")
+    model = read_model(folder / "sparse/0")
+    nothing = np.empty((0, 3))
+    write_model(folder / "sparse/0", {5: model.cameras[1]}, model.images, nothing, nothing)
+    with pytest.raises(UserError, match="camera 1, which the model does not hold"):
+        load_dataset(folder)

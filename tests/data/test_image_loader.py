@@ -1,0 +1,225 @@
+"""Decoding, scaling, alpha, and the loader's cache: always the same pixels, within the budget."""
+
+import threading
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.data import ImageLoader, ImageSource, View
+from snowsplat.data.decode import load_image, resize_area
+from snowsplat.data.image_loader import available_memory
+from snowsplat.scene.camera import Camera
+from snowsplat.util.errors import UserError
+
+POSE = torch.eye(4, dtype=torch.float64)[:3]
+
+
+def make_view(path, pixels, mask=None, **save) -> View:
+    Image.fromarray(pixels).save(path, **save)
+    height, width = pixels.shape[:2]
+    camera = Camera(width, height, 10.0, 10.0, width / 2, height / 2, POSE)
+    return View(path.name, camera, ImageSource(path, width, height), mask)
+
+
+@pytest.fixture
+def views(tmp_path):
+    """Ten images of noise, 20×16."""
+    random = np.random.default_rng(0)
+    noise = random.integers(0, 256, (10, 16, 20, 3)).astype(np.uint8)
+    return [make_view(tmp_path / f"{i}.png", pixels) for i, pixels in enumerate(noise)]
+
+
+def stored(view: View) -> torch.Tensor:
+    return torch.from_numpy(np.array(Image.open(view.image.path)))
+
+
+def test_images_are_planar_in_memory(views):
+    with ImageLoader(views) as loader:
+        image = loader.get(views[3])
+    assert torch.equal(image.rgb, stored(views[3]))
+    assert image.planes.is_contiguous()
+    assert image.planes.shape == (3, 16, 20)
+    assert image.alpha is None
+    assert torch.equal(image.over(torch.zeros(3)), stored(views[3]) / 255.0)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_downscale_is_the_mean_of_a_box(views, factor):
+    with ImageLoader(views) as loader:
+        small = loader.get(views[0], factor).rgb.double()
+    boxes = stored(views[0]).double().unflatten(0, (-1, factor)).unflatten(2, (-1, factor))
+    assert (small - boxes.mean((1, 3))).abs().max() <= 0.5 + 1e-9
+
+
+def test_downscale_of_sizes_that_do_not_divide():
+    """A ramp stays a ramp, at the positions that intrinsics scaled by each axis' ratio say."""
+    ramp = np.tile(np.linspace(0, 250, 51).astype(np.uint8), (3, 33, 1))
+    small = resize_area(ramp, 12, 8)
+    assert small.shape == (3, 8, 12)
+    centres = (np.arange(12) + 0.5) * 51 / 12
+    assert np.abs(small[0, 0] - 5 * (centres - 0.5)).max() <= 0.5 + 1e-9
+    assert resize_area(np.full((1, 7, 9), 255, np.uint8), 4, 3).min() == 255
+
+
+def rgba(tmp_path):
+    pixels = np.zeros((8, 8, 4), np.uint8)
+    pixels[..., 0] = 200
+    pixels[:4, :, 3] = 255
+    pixels[4:, :4, 3] = 51  # a fifth
+    return make_view(tmp_path / "a.png", pixels)
+
+
+def test_alpha_is_kept_or_composed(tmp_path):
+    view = rgba(tmp_path)
+    with ImageLoader([view]) as loader:
+        image = loader.get(view)
+        assert image.planes.shape == (4, 8, 8)
+        assert image.alpha[[0, 7, 7], [0, 0, 7]].tolist() == [255, 51, 0]
+        over = image.over(torch.tensor([0.0, 1.0, 0.0]))
+        expected = torch.tensor([0.2 * 200 / 255, 0.8, 0.0])
+        assert torch.allclose(over[7, 0], expected, atol=1e-6)
+    with ImageLoader([view], background=(0, 1, 0)) as loader:
+        composed = loader.get(view)
+    assert composed.planes.shape == (3, 8, 8)
+    assert composed.rgb[7, 0].tolist() == [40, 204, 0]
+    assert composed.rgb[7, 7].tolist() == [0, 255, 0]
+
+
+def test_downscale_and_background_commute(tmp_path):
+    view = rgba(tmp_path)
+    background = torch.tensor([0.3, 0.6, 0.9])
+    with ImageLoader([view]) as loader:
+        later = loader.get(view, 4).over(background) * 255
+    with ImageLoader([view], background=background.tolist()) as loader:
+        before = loader.get(view, 4).rgb
+    assert (later - before).abs().max() <= 1.1
+
+
+def test_alpha_that_is_opaque_everywhere_is_dropped(tmp_path):
+    view = make_view(tmp_path / "a.png", np.full((4, 4, 4), 255, np.uint8))
+    assert load_image(view.image).shape == (3, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("mode", "expected"),
+    [
+        ("L", [100, 100, 100]),
+        ("1", [255, 255, 255]),
+        ("P", [100, 100, 100]),
+        ("CMYK", [100, 100, 100]),
+    ],
+)
+def test_other_kinds_of_pixels(tmp_path, mode, expected):
+    path = tmp_path / ("a.tif" if mode == "CMYK" else "a.png")
+    Image.new("L", (4, 4), expected[0]).convert(mode).save(path)
+    assert load_image(ImageSource(path, 4, 4))[:, 0, 0].tolist() == expected
+
+
+def test_sixteen_bit_grey_is_scaled(tmp_path):
+    Image.fromarray(np.full((4, 4), 100 * 257, np.uint16)).save(tmp_path / "a.png")
+    assert load_image(ImageSource(tmp_path / "a.png", 4, 4)).unique().tolist() == [100]
+
+
+def test_masks_shrink_to_what_is_wholly_inside(views, tmp_path):
+    mask = np.zeros((16, 20), np.uint8)
+    mask[:, :7] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    view = View("v", views[0].camera, views[0].image, ImageSource(tmp_path / "mask.png", 20, 16))
+    with ImageLoader([view]) as loader:
+        assert loader.get(view).mask.sum() == 7 * 16
+        assert loader.get(view, 2).mask.sum() == 3 * 8
+
+
+def test_a_budget_for_two_images_gives_the_same_pixels(views):
+    one = 3 * 16 * 20
+    order = [views[i] for i in torch.randperm(10).tolist() * 3]
+    with ImageLoader(views, budget_bytes=2 * one, threads=3) as loader:
+        for start in range(0, 30, 10):
+            loader.prefetch(order[start : start + 10])
+            for view in order[start : start + 10]:
+                assert torch.equal(loader.get(view).rgb, stored(view))
+                assert loader.cached_bytes <= 2 * one
+
+
+def test_a_budget_of_nothing_still_works(views):
+    with ImageLoader(views, budget_bytes=0) as loader:
+        loader.prefetch(views)
+        for view in views:
+            assert torch.equal(loader.get(view).rgb, stored(view))
+
+
+def test_what_fits_is_decoded_once(views, monkeypatch):
+    decoded = []
+    lock = threading.Lock()
+
+    def counting(source, background=None):
+        with lock:
+            decoded.append(source.path.name)
+        return load_image(source, background)
+
+    monkeypatch.setattr("snowsplat.data.image_loader.load_image", counting)
+    with ImageLoader(views) as loader:
+        for _ in range(3):
+            loader.prefetch(reversed(views))
+            for view in reversed(views):
+                loader.get(view)
+        for view in views:  # smaller ones come from those that are there
+            loader.get(view, 2)
+        assert loader.cached_bytes == 10 * 3 * (16 * 20 + 8 * 10)
+    assert sorted(decoded) == [f"{i}.png" for i in range(10)]
+
+
+def test_prefetching_stays_within_half_of_the_budget(views):
+    one = 4 * 16 * 20  # what an image may take, alpha counted
+    with ImageLoader(views, budget_bytes=6 * one, threads=2) as loader:
+        loader.prefetch(views)
+        for future in list(loader._running.values()):
+            future.result()
+        assert loader.cached_bytes <= 3 * one
+        for view in views:
+            assert torch.equal(loader.get(view).rgb, stored(view))
+
+
+def test_asking_in_another_order_than_announced(views):
+    with ImageLoader(views, threads=2, budget_bytes=3000) as loader:
+        loader.prefetch(views)
+        for view in [*views[::-1], *views]:
+            assert torch.equal(loader.get(view).rgb, stored(view))
+
+
+def test_damaged_images_are_reported_when_asked_for(views):
+    path = views[4].image.path
+    path.write_bytes(path.read_bytes()[:-200])
+    with ImageLoader(views) as loader:
+        loader.prefetch(views)
+        for view in views[:4]:
+            loader.get(view)
+        with pytest.raises(UserError, match=r"4\.png: cannot be decoded"):
+            loader.get(views[4])
+        assert torch.equal(loader.get(views[5]).rgb, stored(views[5]))
+
+
+@pytest.mark.filterwarnings("ignore:::PIL")
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif"])
+def test_any_damage_is_a_user_error(tmp_path, refusals, suffix):
+    random = np.random.default_rng(0)
+    pixels = random.integers(0, 256, (16, 20, 3)).astype(np.uint8)
+    view = make_view(tmp_path / f"a{suffix}", pixels)
+    assert refusals(view.image.path, lambda: load_image(view.image)) > 0
+
+
+def test_an_image_that_vanished(views):
+    views[0].image.path.unlink()
+    with ImageLoader(views) as loader, pytest.raises(UserError, match="no such image"):
+        loader.get(views[0])
+
+
+def test_downscales_other_than_the_three_are_refused(views):
+    with ImageLoader(views) as loader, pytest.raises(ValueError, match="1, 2 or 4"):
+        loader.get(views[0], 3)
+
+
+def test_available_memory_is_plausible():
+    assert 1 << 20 < available_memory() < 1 << 46

@@ -1,0 +1,196 @@
+"""What load_dataset decides whatever the reader: sizes, smaller copies, splits, bad images."""
+
+import logging
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.data import ImageLoader, load_dataset
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.util.errors import UserError
+
+
+def resize_folder(source, target, size):
+    target.mkdir(exist_ok=True)
+    for path in source.iterdir():
+        with Image.open(path) as image:
+            image.resize(size).save(target / path.name)
+
+
+def test_every_eighth_by_name_is_held_out(pristine):
+    dataset = load_dataset(pristine["colmap-bin"])
+    assert [view.name for view in dataset.test] == ["view_00.png", "view_08.png"]
+    assert [view.name for view in dataset.train] == [f"view_0{i}.png" for i in range(1, 8)]
+    assert len(load_dataset(pristine["colmap-bin"], hold_out=3).test) == 3
+    everything = load_dataset(pristine["colmap-bin"], hold_out=None)
+    assert (len(everything.train), len(everything.test)) == (9, 0)
+
+
+def test_extent_is_that_of_the_training_cameras(pristine):
+    dataset = load_dataset(pristine["colmap-bin"])
+    centres = torch.stack([view.camera.position for view in dataset.train])
+    farthest = (centres - centres.mean(0)).norm(dim=1).max()
+    assert dataset.extent == pytest.approx(1.1 * float(farthest))
+
+
+def test_lists_of_test_images(pristine, tmp_path):
+    names = ["view_02.png", "view_05"]
+    dataset = load_dataset(pristine["colmap-txt"], test_list=names)
+    assert [view.name for view in dataset.test] == ["view_02.png", "view_05.png"]
+    (tmp_path / "test.txt").write_text("view_02.png\n\n view_05 \n")
+    again = load_dataset(pristine["colmap-txt"], test_list=tmp_path / "test.txt")
+    assert [view.name for view in again.test] == ["view_02.png", "view_05.png"]
+    with pytest.raises(UserError, match="'view_99' is not an image"):
+        load_dataset(pristine["colmap-txt"], test_list=["view_99"])
+    with pytest.raises(UserError, match="cannot be read"):
+        load_dataset(pristine["colmap-txt"], test_list=tmp_path / "absent.txt")
+
+
+def test_nothing_left_to_train_on(pristine):
+    with pytest.raises(UserError, match="all 9 images are held out"):
+        load_dataset(pristine["colmap-bin"], hold_out=1)
+
+
+@pytest.mark.parametrize(
+    ("resolution", "size"),
+    [(None, (32, 24)), (-1, (32, 24)), (1, (32, 24)), (23, (23, 17)), (1600, (32, 24))],
+)
+def test_resolution_at_decode(pristine, resolution, size):
+    view = load_dataset(pristine["colmap-bin"], resolution=resolution).train[0]
+    full = load_dataset(pristine["colmap-bin"]).train[0]
+    with ImageLoader([view]) as loader:
+        assert loader.get(view).rgb.shape == (size[1], size[0], 3)
+    assert (view.camera.width, view.camera.height) == size
+    assert view.image.stored == 32 * 24
+    assert view.camera.fx == pytest.approx(full.camera.fx * size[0] / 32)
+    assert view.camera.cy == pytest.approx(full.camera.cy * size[1] / 24)
+
+
+@pytest.mark.parametrize("resolution", [0, -2, 3, 8])
+def test_resolutions_that_make_no_sense(pristine, resolution):
+    with pytest.raises(UserError, match=f"resolution of {resolution} makes"):
+        load_dataset(pristine["colmap-bin"], resolution=resolution)
+
+
+@pytest.fixture(scope="module")
+def large_source(tmp_path_factory):
+    return write_toy_dataset(tmp_path_factory.mktemp("large"), "colmap-bin", 3, 75, 64)
+
+
+@pytest.fixture
+def large(large_source, tmp_path):
+    """A dataset whose images are large enough to divide, to change."""
+    return shutil.copytree(large_source, tmp_path / "large")
+
+
+def test_dividing_makes_intrinsics_follow_the_rounded_size(large):
+    view = load_dataset(large, resolution=2).train[0]
+    full = load_dataset(large).train[0]
+    assert (view.camera.width, view.camera.height) == (38, 32)
+    assert view.camera.fx == pytest.approx(full.camera.fx * 38 / 75)
+    assert view.camera.fy == pytest.approx(full.camera.fy / 2)
+    assert "images" in view.image.path.parts
+
+
+def test_folders_of_smaller_copies_are_used(large):
+    resize_folder(large / "images", large / "images_2", (37, 32))
+    view = load_dataset(large, resolution=2).train[0]
+    assert view.image.path.parent.name == "images_2"
+    assert (view.camera.width, view.camera.height) == (37, 32)
+    # By their own name too, and then divided further.
+    view = load_dataset(large, images="images_2").train[0]
+    assert (view.camera.width, view.camera.height) == (37, 32)
+    view = load_dataset(large, images="images_2", resolution=2).train[0]
+    assert (view.camera.width, view.camera.height) == (18, 16)
+
+
+@pytest.mark.parametrize("trouble", ["absent", "not 1/2"])
+def test_folders_of_smaller_copies_that_do_not_fit_are_not_used(large, caplog, trouble):
+    resize_folder(large / "images", large / "images_2", (75, 64) if "not" in trouble else (37, 32))
+    if trouble == "absent":
+        (large / "images_2/view_01.png").unlink()
+    with caplog.at_level(logging.WARNING):
+        view = load_dataset(large, resolution=2).train[0]
+    assert view.image.path.parent.name == "images"
+    assert view.camera.width == 38
+    assert trouble in caplog.text
+
+
+def test_images_that_are_all_a_whole_number_smaller(large, caplog):
+    """As some datasets are passed around: the poses' images were twice as large."""
+    resize_folder(large / "images", large / "images", (38, 32))
+    with caplog.at_level(logging.WARNING):
+        view = load_dataset(large).train[0]
+    assert (view.camera.width, view.camera.height) == (38, 32)
+    assert "1/2 of their cameras' size" in caplog.text
+
+
+@pytest.mark.parametrize("size", [(74, 64), (64, 75), (150, 128), (50, 43), (38, 32)])
+def test_one_image_of_another_size(large, size):
+    path = large / "images/view_01.png"
+    with Image.open(path) as image:
+        resized = image.resize(size)
+    resized.save(path)
+    with pytest.raises(UserError, match=f"view_01.png: is {size[0]}x{size[1]}, .*camera is 75x64"):
+        load_dataset(large)
+
+
+def jpeg_with_orientation(path, pixels, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(pixels).save(path, exif=exif, quality=100, subsampling=0)
+
+
+def test_exif_orientation_is_applied_only_if_the_size_proves_it(dataset_copy):
+    folder = dataset_copy("colmap-bin")
+    path = folder / "images/view_01.png"
+    pixels = np.zeros((24, 32, 3), np.uint8)
+    pixels[:12] = 200  # the upper half, as stored
+    path.unlink()
+    jpeg_with_orientation(path.with_suffix(".jpg"), pixels, 3)
+    path.with_suffix(".jpg").rename(path)
+    view = next(v for v in load_dataset(folder).train if v.name == "view_01.png")
+    with ImageLoader([view]) as loader:
+        assert loader.get(view).rgb[0, 0, 0] > 150  # as stored, not upside down
+    # 24 wide as stored, its left half bright: turned clockwise it fits, and that is the upper half.
+    jpeg_with_orientation(path.with_suffix(".jpg"), pixels.transpose(1, 0, 2).copy(), 6)
+    path.with_suffix(".jpg").rename(path)
+    view = next(v for v in load_dataset(folder).train if v.name == "view_01.png")
+    with ImageLoader([view]) as loader:
+        image = loader.get(view).rgb
+    assert image.shape == (24, 32, 3)
+    assert image[:11].min() > 150
+    assert image[13:].max() < 50
+
+
+def test_masks_beside_the_images(dataset_copy):
+    folder = dataset_copy("colmap-bin")
+    (folder / "masks").mkdir()
+    Image.new("L", (32, 24)).save(folder / "masks/view_01.png.png")
+    Image.new("L", (32, 24), 255).save(folder / "masks/view_02.png")
+    views = load_dataset(folder).train
+    assert [view.mask is not None for view in views[:3]] == [True, True, False]
+    with ImageLoader(views) as loader:
+        assert not loader.get(views[0]).mask.any()
+        assert loader.get(views[1], 2).mask.all()
+
+
+@pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])
+def test_a_file_that_is_no_image_is_found_before_training(dataset_copy, content):
+    folder = dataset_copy("colmap-bin")
+    (folder / "images/view_04.png").write_bytes(content)
+    with pytest.raises(UserError, match="view_04.png: cannot be decoded"):
+        load_dataset(folder)
+
+
+def test_folders_that_are_no_datasets(tmp_path):
+    with pytest.raises(UserError, match="no such folder"):
+        load_dataset(tmp_path / "absent")
+    with pytest.raises(UserError, match="no camera poses here"):
+        load_dataset(tmp_path)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(UserError, match="not a dataset"):
+        load_dataset(tmp_path / "file")

@@ -1,0 +1,258 @@
+"""transforms.json in its three spellings: intrinsics, axes, names, splits, points, damage."""
+
+import json
+import logging
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.data import ImageLoader, load_dataset
+from snowsplat.data.points_ply import write_points
+from snowsplat.util.errors import UserError
+
+F64 = torch.float64
+# In OpenGL's axes the camera at (1, 2, 3) looks along −z of the world, its up is the world's y.
+UPRIGHT = [[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A function that writes transforms.json with some frames, and the images 40×30 it names."""
+
+    def write(common, frames, file="transforms.json", existing=None):
+        for number, frame in enumerate(frames):
+            frame.setdefault("file_path", f"images/{number}.png")
+            frame.setdefault("transform_matrix", UPRIGHT)
+            if existing is None or number in existing:
+                path = tmp_path / frame["file_path"]
+                path = path if path.suffix else path.with_suffix(".png")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                Image.new("RGB", (40, 30), (number, 0, 0)).save(path)
+        (tmp_path / file).write_text(json.dumps({**common, "frames": frames}))
+        return tmp_path
+
+    return write
+
+
+def camera_of(common, frame, scene):
+    return load_dataset(scene(common, [frame]), hold_out=None).train[0].camera
+
+
+def test_axes_are_converted(scene):
+    camera = camera_of({"fl_x": 50}, {}, scene)
+    assert camera.position.tolist() == [1, 2, 3]
+    ahead = torch.tensor([[1.0, 2, 2], [1.1, 2.2, 2]], dtype=F64)
+    pixels, depth = camera.project(ahead)
+    assert torch.allclose(depth, torch.ones(2, dtype=F64))
+    # Right in the world is right in the picture, up in the world is up: towards row 0.
+    expected = torch.tensor([[20.0, 15], [20 + 50 * 0.1, 15 - 50 * 0.2]], dtype=F64)
+    assert torch.allclose(pixels, expected)
+
+
+FIELD = 2 * math.atan(0.4)  # 40 pixels at a focal length of 50
+
+
+@pytest.mark.parametrize(
+    ("common", "expected"),
+    [
+        ({"camera_angle_x": FIELD}, (50, 50, 20, 15)),
+        ({"camera_angle_x": FIELD, "camera_angle_y": 2 * math.atan(0.3)}, (50, 50, 20, 15)),
+        ({"x_fov": math.degrees(FIELD)}, (50, 50, 20, 15)),
+        ({"fl_x": 50.0, "fl_y": 60.0, "cx": 19.0, "cy": 14.5}, (50, 60, 19, 14.5)),
+        ({"fl_x": 50, "fl_y": 60, "cx": 19, "cy": 14.5, "w": 40, "h": 30.0}, (50, 60, 19, 14.5)),
+        ({"fl_y": 60.0, "k1": 0.0, "camera_model": "OPENCV"}, (60, 60, 20, 15)),
+        # A folder of images at half the size of the intrinsics.
+        ({"fl_x": 100.0, "cx": 41.0, "w": 80, "h": 60}, (50, 50, 20.5, 15)),
+    ],
+)
+def test_intrinsics_in_all_spellings(scene, common, expected):
+    camera = camera_of(common, {}, scene)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(expected)
+    assert (camera.width, camera.height) == (40, 30)
+
+
+def test_a_frame_overrides_the_file(scene):
+    folder = scene({"fl_x": 50.0, "cx": 3.0}, [{"fl_x": 70.0}, {}])
+    assert [v.camera.fx for v in load_dataset(folder, hold_out=None).train] == [70.0, 50.0]
+
+
+@pytest.mark.parametrize(
+    ("common", "message"),
+    [
+        ({"fl_x": 50, "k1": 0.1}, r"distorted \(k1 = 0.1\).*snowsplat sfm"),
+        ({"fl_x": 50, "p2": -0.001}, "distorted.*snowsplat sfm"),
+        ({"fl_x": 50, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE.*snowsplat sfm"),
+        ({"fl_x": 50, "is_fisheye": True}, "fisheye.*snowsplat sfm"),
+        ({}, "no focal length"),
+        ({"fl_x": "wide"}, "fl_x should be a number"),
+        ({"fl_x": 0}, "focal lengths of 0"),
+        ({"fl_x": float("nan")}, "makes no sense"),
+        ({"camera_angle_x": 3.5}, "field of view"),
+        ({"fl_x": 50, "w": 64, "h": 48}, "is 40x30, but its camera is 64x48"),
+    ],
+)
+def test_cameras_that_cannot_be_used(scene, common, message):
+    with pytest.raises(UserError, match=message):
+        camera_of(common, {}, scene)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], "4 rows of 4"),
+        ("none", "4 rows of 4"),
+        ([[float("inf")] * 4] * 4, "4 rows of 4"),
+        ([[0, 0, 0, 1]] * 4, "no rotation"),
+        ([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "no rotation"),
+        ([[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "mirrors"),
+    ],
+)
+def test_matrices_that_are_no_poses(scene, matrix, message):
+    with pytest.raises(UserError, match=message):
+        camera_of({"fl_x": 50}, {"transform_matrix": matrix}, scene)
+
+
+def test_a_scaled_matrix_keeps_its_directions(scene):
+    matrix = np.array(UPRIGHT)
+    matrix[:3, :3] *= 0.01
+    camera = camera_of({"fl_x": 50}, {"transform_matrix": matrix.tolist()}, scene)
+    assert camera.position.tolist() == pytest.approx([1, 2, 3])
+    assert torch.allclose(camera.cam_from_world[:, :3].abs(), torch.eye(3, dtype=F64))
+
+
+def test_missing_frames_are_skipped_and_counted(scene, caplog):
+    folder = scene({"fl_x": 50}, [{}, {}, {}], existing=[1])
+    with caplog.at_level(logging.WARNING):
+        dataset = load_dataset(folder, hold_out=None)
+    assert [view.name for view in dataset.train] == ["images/1.png"]
+    assert "2 of 3 images are missing (the first is 'images/0.png')" in caplog.text
+    (folder / "images/1.png").unlink()
+    with pytest.raises(UserError, match="none of its 3 images is there"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize("spelling", ["./a/b", "a/b.png", "a\\b.png", "./a//b", "{root}/a/b"])
+def test_file_names(scene, tmp_path, spelling):
+    folder = scene({"fl_x": 50}, [{"file_path": "a/b"}])
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"][0]["file_path"] = spelling.format(root=tmp_path)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    view = load_dataset(folder, hold_out=None).train[0]
+    assert view.image.path.samefile(folder / "a/b.png")
+    assert view.name.endswith("a/b.png")
+    assert not view.name.startswith(("/", "."))
+    assert load_dataset(folder / "transforms.json", hold_out=None).train[0].name == view.name
+
+
+def test_blender_splits(dataset_copy):
+    folder = dataset_copy("blender")
+    dataset = load_dataset(folder)
+    assert [view.name for view in dataset.test] == ["test/r_0.png", "test/r_8.png"]
+    assert len(dataset.train) == 7
+    assert dataset.points is None
+    # Training on all takes the test split too, every other list of names overrides.
+    assert len(load_dataset(folder, hold_out=None).train) == 9
+    assert [view.name for view in load_dataset(folder, test_list=["r_3"]).test] == ["train/r_3.png"]
+    # Without a test split (or its images) the rule by number holds.
+    (folder / "transforms_test.json").unlink()
+    assert [v.name for v in load_dataset(folder, hold_out=4).test] == [
+        "train/r_1.png",
+        "train/r_5.png",
+    ]
+
+
+def test_blender_validation_split_stands_in_for_a_missing_test_split(dataset_copy):
+    folder = dataset_copy("blender")
+    (folder / "transforms_test.json").rename(folder / "transforms_val.json")
+    assert len(load_dataset(folder).test) == 2
+
+
+def test_alpha_is_honoured(dataset_copy):
+    view = load_dataset(dataset_copy("blender")).train[0]
+    with ImageLoader([view]) as loader:
+        image = loader.get(view)
+    assert image.alpha is not None
+    assert image.alpha.min() == 0
+    assert image.alpha.max() == 255
+    corner = image.over(torch.tensor([0.2, 0.4, 1.0]))[0, 0]
+    assert torch.allclose(corner, torch.tensor([0.2, 0.4, 1.0]))
+
+
+def test_splits_named_by_nerfstudio(scene):
+    names = [f"images/{i}.png" for i in range(4)]
+    lists = {"train_filenames": names[:3], "test_filenames": names[3:]}
+    folder = scene({"fl_x": 50, **lists}, [{} for _ in names])
+    assert [view.name for view in load_dataset(folder).test] == names[3:]
+
+
+def test_points_of_ply_file_path(scene, tmp_path):
+    xyz = np.array([[1.0, 2, 3], [np.nan, 0, 0]], np.float32)
+    write_points(tmp_path / "cloud.ply", xyz, np.array([[1, 2, 3]] * 2, np.uint8))
+    points = load_dataset(scene({"fl_x": 50, "ply_file_path": "cloud.ply"}, [{}, {}])).points
+    assert points.xyz.tolist() == [[1, 2, 3]]
+    assert points.rgb.tolist() == [[1, 2, 3]]
+
+
+def test_missing_ply_is_told(scene, caplog):
+    with caplog.at_level(logging.WARNING):
+        dataset = load_dataset(scene({"fl_x": 50, "ply_file_path": "cloud.ply"}, [{}, {}]))
+    assert dataset.points is None
+    assert "cloud.ply: the points it should begin with are missing" in caplog.text
+
+
+def test_points_of_the_model_that_nerfstudio_began_with(scene, dataset_copy, tmp_path):
+    source = load_dataset(dataset_copy("colmap-bin")).points
+    transform = [[0.0, 1, 0, 5], [1, 0, 0, 6], [0, 0, -1, 7]]
+    folder = scene({"fl_x": 50, "applied_transform": transform}, [{}, {}])
+    (folder / "colmap").mkdir()
+    (tmp_path / "colmap-bin/sparse").rename(folder / "colmap/sparse")
+    points = load_dataset(folder).points
+    matrix = torch.tensor(transform)
+    assert torch.allclose(points.xyz, source.xyz @ matrix[:, :3].T + matrix[:, 3])
+
+
+def test_masks(scene, tmp_path):
+    left = Image.new("L", (40, 30))
+    left.paste(255, (0, 0, 20, 30))
+    left.save(tmp_path / "left.png")
+    folder = scene({"fl_x": 50}, [{"mask_path": "left.png"}, {}])
+    views = load_dataset(folder, hold_out=None).train
+    with ImageLoader(views) as loader:
+        mask = loader.get(views[0]).mask
+        assert mask[:, :20].all()
+        assert not mask[:, 20:].any()
+        assert loader.get(views[1]).mask is None
+    Image.new("L", (10, 30)).save(tmp_path / "left.png")
+    with pytest.raises(UserError, match="mask is 10x30, but its image is 40x30"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "not a whole JSON file"),
+        ("[" * 100_000, "not a whole JSON file"),
+        ("[1]", "no list of frames"),
+        ('{"frames": 3}', "no list of frames"),
+        ('{"frames": []}', "it has no frames"),
+        ('{"frames": [{}]}', "frame 0 has no file_path"),
+        ('{"frames": [4]}', "frame 0 has no file_path"),
+    ],
+)
+def test_files_of_another_kind(tmp_path, text, message):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(UserError, match=message):
+        load_dataset(tmp_path)
+
+
+def test_the_same_image_twice(scene):
+    with pytest.raises(UserError, match="as another one has"):
+        load_dataset(scene({"fl_x": 50}, [{"file_path": "a.png"}, {"file_path": "./a.png"}]))
+
+
+def test_damaged_files_are_one_line(dataset_copy, refusals):
+    folder = dataset_copy("blender")
+    assert refusals(folder / "transforms_train.json", lambda: load_dataset(folder)) >= 20

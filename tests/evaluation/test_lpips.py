@@ -1,0 +1,121 @@
+"""LPIPS against the same networks put together anew, layer by layer, with random weights."""
+
+import pytest
+import torch
+from safetensors.torch import save_file as save
+from torch import nn
+
+from snowsplat.evaluation.lpips import Lpips
+from snowsplat.util.errors import UserError
+
+
+def alexnet_features() -> nn.Sequential:
+    return nn.Sequential(
+        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
+    )
+
+
+def vgg16_features() -> nn.Sequential:
+    layers: list[nn.Module] = []
+    inputs = 3
+    for stage in ([64] * 2, [128] * 2, [256] * 3, [512] * 3, [512] * 3):
+        for outputs in stage:
+            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
+            inputs = outputs
+        layers.append(nn.MaxPool2d(2, 2))
+    return nn.Sequential(*layers)
+
+
+BACKBONES = {
+    "alex": (alexnet_features, [1, 4, 7, 9, 11], [64, 192, 384, 256, 256]),
+    "vgg": (vgg16_features, [3, 8, 15, 22, 29], [64, 128, 256, 512, 512]),
+}
+
+
+@pytest.fixture(params=["alex", "vgg"])
+def network(request):
+    """Name, backbone, taps, heads, and the state under torchvision's names."""
+    build, taps, channels = BACKBONES[request.param]
+    torch.manual_seed(0)
+    features = build()
+    heads = [torch.rand(1, c, 1, 1) for c in channels]
+    state = {f"features.{name}": value.clone() for name, value in features.state_dict().items()}
+    state |= {f"lin{k}.model.1.weight": head for k, head in enumerate(heads)}
+    return request.param, features, taps, heads, state
+
+
+@torch.no_grad()
+def expected_distance(features, taps, heads, a, b) -> float:
+    mean, deviation = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    x, y = (((image - mean) / deviation).permute(2, 0, 1)[None] for image in (a, b))
+    total = 0.0
+    for i, layer in enumerate(features):
+        x, y = layer(x), layer(y)
+        if i in taps:
+            difference = nn.functional.normalize(x, dim=1) - nn.functional.normalize(y, dim=1)
+            head = heads[taps.index(i)]
+            total += float(nn.functional.conv2d(difference**2, head).mean())
+    return total
+
+
+def images() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(5)
+    a = torch.rand(41, 53, 3, generator=generator)
+    return a, (a + 0.2 * torch.randn(41, 53, 3, generator=generator)).clamp(0, 1)
+
+
+def test_equals_the_networks_layer_by_layer(network, tmp_path):
+    name, features, taps, heads, state = network
+    save(state, tmp_path / "weights.safetensors")
+    lpips = Lpips.load(tmp_path / "weights.safetensors")
+    assert lpips.name == name
+    a, b = images()
+    expected = expected_distance(features, taps, heads, a, b)
+    assert expected > 0.01
+    assert lpips(a, b) == pytest.approx(expected, rel=1e-4)
+    assert lpips(b, a) == pytest.approx(expected, rel=1e-4)
+    assert lpips(a, a) == 0.0
+
+
+def test_the_names_of_the_lpips_package(network, tmp_path):
+    _, _, _, _, state = network
+    save(state, tmp_path / "plain")
+    renamed = {
+        name.replace("features.", "net.slice1.").replace("scaling", ""): value.contiguous()
+        for name, value in state.items()
+    }
+    renamed["scaling_layer.shift"] = torch.zeros(1, 3, 1, 1)
+    renamed["lins.0.model.1.weight"] = torch.zeros(1, 64, 1, 1)
+    save(renamed, tmp_path / "package")
+    a, b = images()
+    plain, ours = (Lpips.load(tmp_path / name) for name in ("plain", "package"))
+    assert plain(a, b) == ours(a, b)
+
+
+def test_files_that_will_not_do(network, tmp_path):
+    name, _, _, _, state = network
+    path = tmp_path / "weights.safetensors"
+    with pytest.raises(UserError, match="cannot be read"):
+        Lpips.load(path)
+    for content in (b"", b"hello", b"\x80\x02cos\nsystem\n."):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match="not a safetensors file"):
+            Lpips.load(path)
+    torch.save(state, path)  # a pickle
+    with pytest.raises(UserError, match="not a safetensors file"):
+        Lpips.load(path)
+    missing = {key: value for key, value in state.items() if key != "lin3.model.1.weight"}
+    save(missing, path)
+    with pytest.raises(UserError, match=r"lin3.model.1.weight is missing"):
+        Lpips.load(path)
+    save({**state, "features.0.bias": torch.zeros(5)}, path)
+    with pytest.raises(UserError, match=r"features.0.bias is of shape \(5,\)"):
+        Lpips.load(path)
+    if name == "alex":
+        save(state, path)
+        with pytest.raises(UserError, match="at least 32 pixels"):
+            Lpips.load(path)(torch.zeros(31, 80, 3), torch.zeros(31, 80, 3))

@@ -1,0 +1,96 @@
+"""Figures of images: analytic answers, the twin, and views on disk."""
+
+import json
+import math
+
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.data.dataset import View
+from snowsplat.data.decode import ImageSource
+from snowsplat.evaluation.metrics import Evaluation, ViewMetrics, compare, evaluate_views, psnr
+from snowsplat.ops import reference
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+
+
+def planar(height: int, width: int, seed: int) -> torch.Tensor:
+    """(H, W, 3) as all images of the program are: planes in memory."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(3, height, width, generator=generator).permute(1, 2, 0)
+
+
+def test_psnr_of_known_errors():
+    target = torch.full((4, 5, 3), 0.5)
+    assert psnr(target, target) == math.inf
+    assert psnr(target + 0.1, target) == pytest.approx(20.0, abs=1e-5)
+    one_pixel = target.clone()
+    one_pixel[2, 3] += 0.2  # a twentieth of the pixels
+    assert psnr(one_pixel, target) == pytest.approx(10 * math.log10(20 / 0.04), abs=1e-5)
+    mask = torch.zeros(4, 5, dtype=torch.bool)
+    mask[2, 3:] = True
+    assert psnr(one_pixel, target, mask) == pytest.approx(10 * math.log10(2 / 0.04), abs=1e-5)
+    assert psnr(one_pixel, target, torch.zeros_like(mask)) == math.inf
+
+
+def test_compare_clamps_and_agrees_with_the_twin():
+    image, target = 1.5 * planar(23, 31, 0) - 0.25, planar(23, 31, 1)
+    figures = compare(image, target, name="a")
+    clamped = image.clamp(0, 1)
+    assert figures.psnr == pytest.approx(
+        -10 * math.log10(float((clamped - target).square().mean()))
+    )
+    assert figures.ssim == pytest.approx(
+        float(reference.ssim(clamped.double(), target.double())), rel=1e-4
+    )
+    assert figures.lpips is None
+    assert figures.name == "a"
+
+
+def test_what_a_mask_hides_does_not_count():
+    target = planar(20, 20, 2)
+    image = target.clone()
+    image[:, :10] = 0.0
+    mask = torch.ones(20, 20, dtype=torch.bool)
+    assert compare(image, target, mask).psnr < 20
+    mask[:, :10] = False
+    figures = compare(image, target, mask)
+    assert figures.psnr == math.inf
+    assert figures.ssim == pytest.approx(1.0)
+
+
+def test_views_against_the_bare_background(tmp_path):
+    """No Gaussian in sight: the render is the background, so every figure is known."""
+    pose = torch.eye(3, 4, dtype=torch.float64)
+    views = []
+    for i, color in enumerate([(255, 255, 255), (204, 204, 204), (102, 102, 102)]):
+        Image.new("RGB", (16, 12), color).save(tmp_path / f"{i}.png")
+        camera = Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)
+        views.append(View(f"{i}.png", camera, ImageSource(tmp_path / f"{i}.png", 16, 12)))
+    # One that is transparent shows the background itself.
+    Image.new("RGBA", (16, 12), (9, 9, 9, 0)).save(tmp_path / "3.png")
+    views.append(View("3.png", views[0].camera, ImageSource(tmp_path / "3.png", 16, 12)))
+    behind = Gaussians(
+        torch.tensor([[0.0, 0.0, -5.0]]),
+        *(torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1)),
+        *(torch.zeros(1, 1, 3), torch.zeros(1, 0, 3)),
+    )
+    seen = []
+    evaluation = evaluate_views(behind, views, background=(1.0, 1.0, 1.0), on_view=seen.append)
+    figures = [view.psnr for view in evaluation.views]
+    assert figures[0] == figures[3] == math.inf
+    assert figures[1] == pytest.approx(-20 * math.log10(0.2), abs=1e-4)
+    assert figures[2] == pytest.approx(-20 * math.log10(0.6), abs=1e-4)
+    assert seen == evaluation.views
+    assert [view.name for view in seen] == ["0.png", "1.png", "2.png", "3.png"]
+
+
+def test_means_and_json():
+    evaluation = Evaluation([ViewMetrics("a", 20.0, 0.5, 0.25), ViewMetrics("b", 30.0, 0.75, 0.5)])
+    assert (evaluation.psnr, evaluation.ssim, evaluation.lpips) == (25.0, 0.625, 0.375)
+    values = json.loads(json.dumps(evaluation.as_json()))
+    assert values["psnr"] == 25.0
+    assert values["views"]["b"] == {"psnr": 30.0, "ssim": 0.75, "lpips": 0.5}
+    assert math.isnan(Evaluation([]).psnr)
+    assert Evaluation([]).lpips is None

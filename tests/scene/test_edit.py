@@ -1,0 +1,149 @@
+"""Editing: the scene is the same thing, elsewhere; what is dropped is what was asked for."""
+
+import math
+
+import pytest
+import torch
+
+from snowsplat.ops import reference
+from snowsplat.scene import edit
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
+from snowsplat.scene.render import render
+
+
+def random_gaussians(n: int, degree: int, seed: int = 0, dtype=torch.float64) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=dtype)
+
+    return Gaussians(
+        means=0.5 * normal(n, 3),
+        log_scales=0.4 * normal(n, 3) - 2.0,
+        quats=normal(n, 4),
+        opacity_logits=normal(n),
+        sh_dc=normal(n, 1, 3),
+        sh_rest=0.3 * normal(n, SH_REST_COUNTS[degree], 3),
+    )
+
+
+def random_similarity(seed: int) -> Similarity:
+    generator = torch.Generator().manual_seed(seed)
+    quat = torch.randn(4, generator=generator, dtype=torch.float64)
+    shift = torch.randn(3, generator=generator, dtype=torch.float64)
+    return Similarity(0.3 + seed, rotation_from_quat(quat), shift)
+
+
+def colors(gaussians: Gaussians, directions: torch.Tensor) -> torch.Tensor:
+    """(N, M, 3) as seen along directions (M, 3), before the clamp."""
+    basis = reference.sh_basis(directions, gaussians.sh_degree)
+    coefficients = torch.cat([gaussians.sh_dc, gaussians.sh_rest], 1)
+    return 0.5 + torch.einsum("mk,nkc->nmc", basis, coefficients)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_colours_turn_with_the_scene(degree, seed):
+    gaussians, similarity = random_gaussians(20, degree), random_similarity(seed)
+    moved = edit.transform(gaussians, similarity)
+    directions = torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    )
+    after = colors(moved, directions @ similarity.rotation.T)
+    torch.testing.assert_close(after, colors(gaussians, directions), rtol=0, atol=1e-9)
+
+
+def test_sh_rotations_are_orthogonal_and_compose():
+    a, b = (random_similarity(seed).rotation for seed in (3, 4))
+    pairs = zip(edit.sh_rotation(a, 3), edit.sh_rotation(b, 3), strict=True)
+    for (one, two), both in zip(pairs, edit.sh_rotation(a @ b, 3), strict=True):
+        torch.testing.assert_close(one @ one.T, torch.eye(len(one)).double(), rtol=0, atol=1e-12)
+        torch.testing.assert_close(one @ two, both, rtol=0, atol=1e-12)
+    # About z, a quarter turn takes x to y: of degree 1, whose order is (-y, z, -x).
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    expected = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).double()
+    torch.testing.assert_close(edit.sh_rotation(quarter, 1)[0], expected, rtol=0, atol=1e-12)
+
+
+def test_covariances_turn_and_grow_with_the_scene():
+    gaussians, similarity = random_gaussians(30, 1), random_similarity(2)
+    gaussians.quats[3] = 0.0  # stands for no rotation
+
+    def covariances(of: Gaussians) -> torch.Tensor:
+        axes = rotation_from_quat(of.quats) * of.scales[:, None, :]
+        return axes @ axes.transpose(1, 2)
+
+    moved = edit.transform(gaussians, similarity)
+    full = similarity.scale * similarity.rotation
+    torch.testing.assert_close(covariances(moved), full @ covariances(gaussians) @ full.T)
+    torch.testing.assert_close(moved.means, similarity.apply(gaussians.means))
+    back = edit.transform(moved, similarity.inverse())
+    torch.testing.assert_close(back.means, gaussians.means)
+    torch.testing.assert_close(back.sh_rest, gaussians.sh_rest)
+    torch.testing.assert_close(back.log_scales, gaussians.log_scales)
+
+
+def test_a_moved_scene_renders_the_same_from_a_moved_camera():
+    gaussians = random_gaussians(300, 3, dtype=torch.float32)
+    similarity = random_similarity(1)
+    pose = look_at(torch.tensor([0.2, -0.4, -3.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
+    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, pose)
+    moved_camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, similarity.apply_to_poses(pose))
+    before = render(gaussians, camera).image
+    after = render(edit.transform(gaussians, similarity), moved_camera).image
+    assert float(before.std()) > 0.05
+    # What is left is the low-pass filter of the renderer: pixels, which no similarity changes.
+    torch.testing.assert_close(after, before, rtol=0, atol=2e-3)
+
+
+def test_crop():
+    gaussians = random_gaussians(500, 1)
+    box = torch.tensor([[-0.3, -1.0, 0.0], [0.4, 1.0, 0.5]])
+    kept = edit.crop(gaussians, box)
+    inside = ((gaussians.means >= box[0]) & (gaussians.means <= box[1])).all(1)
+    assert 0 < len(kept) == int(inside.sum()) < 500
+    torch.testing.assert_close(kept.sh_rest, gaussians.sh_rest[inside])
+
+
+def test_decimate_keeps_what_is_large_and_opaque():
+    gaussians = random_gaussians(100, 2)
+    gaussians.opacity_logits[:] = -3.0
+    gaussians.opacity_logits[[7, 50]] = 3.0
+    gaussians.log_scales[[7, 50]] = 0.0
+    kept = edit.decimate(gaussians, 2)
+    torch.testing.assert_close(kept.means, gaussians.means[[7, 50]])
+    assert len(edit.decimate(gaussians, 0)) == 0
+    assert edit.decimate(gaussians, 100) is gaussians
+    assert edit.decimate(gaussians, 1000) is gaussians
+
+
+def test_merge_raises_the_degree():
+    low, high = random_gaussians(3, 0), random_gaussians(4, 2, seed=1)
+    both = edit.merge([low, high])
+    assert (len(both), both.sh_degree) == (7, 2)
+    assert not both.sh_rest[:3].any()
+    torch.testing.assert_close(both.sh_rest[3:], high.sh_rest)
+    assert len(edit.merge([low])) == 3
+
+
+def test_sh_degree_changes_what_is_beyond_it_only():
+    gaussians = random_gaussians(5, 2)
+    for degree in range(4):
+        changed = edit.with_sh_degree(gaussians, degree)
+        assert changed.sh_degree == degree
+        same = min(SH_REST_COUNTS[degree], SH_REST_COUNTS[2])
+        torch.testing.assert_close(changed.sh_rest[:, :same], gaussians.sh_rest[:, :same])
+        assert not changed.sh_rest[:, same:].any()
+    assert len(edit.with_sh_degree(gaussians.select(torch.zeros(0).long()), 3)) == 0
+
+
+def test_nothing_and_a_half_turn():
+    none = random_gaussians(0, 3)
+    assert len(edit.transform(none, random_similarity(1))) == 0
+    half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    signs = [torch.diagonal(m) for m in edit.sh_rotation(half, 3)]
+    orders = [abs(m) for level in (1, 2, 3) for m in range(-level, level + 1)]
+    expected = torch.tensor([math.cos(math.pi * m) for m in orders]).double()
+    torch.testing.assert_close(torch.cat(signs), expected, rtol=0, atol=1e-12)

@@ -1,0 +1,130 @@
+"""Small photos of textured boards, taken by known cameras: structure from motion in seconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from snowsplat.sfm.ingest.photo import Photo
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 280.0
+
+
+@dataclass(frozen=True)
+class Board:
+    """A textured parallelogram: corner, two edges (3,), texture (T, T) grey 0–1."""
+
+    corner: np.ndarray
+    right: np.ndarray
+    down: np.ndarray
+    texture: np.ndarray
+
+
+def texture(seed: int, size: int = 256) -> np.ndarray:
+    """Blotches of all sizes, (size, size) 0–1: features everywhere, no two alike."""
+    random = np.random.default_rng(seed)
+    sum_ = np.zeros((size, size))
+    for cells in (8, 16, 32, 64):
+        noise = Image.fromarray(random.random((cells, cells)).astype(np.float32))
+        sum_ += np.asarray(noise.resize((size, size), Image.Resampling.BICUBIC))
+    low, high = np.percentile(sum_, [2, 98])
+    return np.clip((sum_ - low) / (high - low), 0, 1)
+
+
+def boards(seed: int = 0) -> list[Board]:
+    """A back wall, a floor, and three boards in front of it. x right, y down, z forward."""
+
+    def board(seed2, corner, right, down):
+        vectors = [np.array(v, float) for v in (corner, right, down)]
+        return Board(*vectors, texture(1000 * seed + seed2))
+
+    return [
+        board(1, (-4, -3, 7), (8, 0, 1), (0, 5, 0)),
+        board(2, (-4, 1.5, 2), (8, 0, 0), (0, 0, 6)),
+        board(3, (-2, -1, 4.5), (1.4, 0, 0.5), (0, 2.5, 0)),
+        board(4, (0.6, -0.8, 3.8), (1.2, 0, -0.4), (0, 2.3, 0)),
+        board(5, (-0.6, 0, 5.5), (1.3, 0, 0), (0, 1.5, 0.2)),
+    ]
+
+
+def wall(seed: int = 0) -> list[Board]:
+    """One flat picture."""
+    return [
+        Board(np.array([-6.0, -4, 6]), np.array([12.0, 0, 0]), np.array([0, 8.0, 0]), texture(seed))
+    ]
+
+
+def look(position, target) -> np.ndarray:
+    """(3, 4) cam_from_world of a camera there, that looks there; its y axis down."""
+    position, target = np.array(position, float), np.array(target, float)
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.concatenate([rotation, -rotation @ position[:, None]], 1)
+
+
+def arc(count: int) -> list[np.ndarray]:
+    """Cameras along an arc in front of the boards."""
+    angles = np.linspace(-0.5, 0.5, count)
+    return [
+        look((5 * np.sin(a), -0.2 + 0.3 * np.cos(5 * a), 5 - 5 * np.cos(a)), (0, 0, 5))
+        for a in angles
+    ]
+
+
+def photograph(scene: list[Board], cam_from_world: np.ndarray, seed: int = 0) -> np.ndarray:
+    """(HEIGHT, WIDTH) uint8: what a pinhole camera sees, four rays a pixel, a little noise."""
+    rotation, translation = cam_from_world[:, :3], cam_from_world[:, 3]
+    centre = -rotation.T @ translation
+    y, x = (np.indices((2 * HEIGHT, 2 * WIDTH)) + 0.5) / 2
+    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1)
+    rays = rays @ rotation
+    nearest, grey = np.full(x.shape, np.inf), np.full(x.shape, 0.5)
+    for board in scene:
+        # centre + t ray = corner + u right + v down
+        normal = np.cross(board.right, board.down)
+        t = (board.corner - centre) @ normal / (rays @ normal)
+        offset = centre + t[..., None] * rays - board.corner
+        edges = np.linalg.pinv(np.stack([board.right, board.down], 1))
+        u, v = np.moveaxis(offset @ edges.T, -1, 0)
+        hit = (t > 0) & (t < nearest) & (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
+        nearest[hit] = t[hit]
+        size = len(board.texture)
+        grey[hit] = _sample(board.texture, v[hit] * (size - 1), u[hit] * (size - 1))
+    grey = grey.reshape(HEIGHT, 2, WIDTH, 2).mean((1, 3))
+    noise = np.random.default_rng(seed).normal(0, 1.5, grey.shape)
+    return np.clip(20 + 215 * grey + noise, 0, 255).astype(np.uint8)
+
+
+def _sample(texture: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    i, j = row.astype(int), column.astype(int)
+    i2, j2 = np.minimum(i + 1, len(texture) - 1), np.minimum(j + 1, len(texture) - 1)
+    a, b = row - i, column - j
+    upper = texture[i, j] * (1 - b) + texture[i, j2] * b
+    return upper * (1 - a) + (texture[i2, j] * (1 - b) + texture[i2, j2] * b) * a
+
+
+def write(dataset: Path, images: list[np.ndarray], **of_all) -> list[Photo]:
+    """Put the images into ``capture/input`` as 000.png …; the photos that they are."""
+    names = [f"{i:03}.png" for i in range(len(images))]
+    return [save(dataset, name, image, **of_all) for name, image in zip(names, images, strict=True)]
+
+
+def save(dataset: Path, name: str, image: np.ndarray, **of_it) -> Photo:
+    path = dataset / "input" / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(path)
+    facts = {
+        "group": "camera",
+        "sequence": None,
+        "focal": None,
+        "location": None,
+        "mask": False,
+        "alpha": False,
+    }
+    height, width = image.shape[:2]
+    return Photo(name=name, source=name, width=width, height=height, **(facts | of_it))

@@ -1,0 +1,185 @@
+"""The child process: it ends with its parent, and its death is told or mended."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from snowsplat.sfm.colmap import SfmOptions, estimate_poses
+from snowsplat.sfm.progress import silent
+from snowsplat.util.errors import UserError
+
+from . import scenes
+
+DRAFT = SfmOptions(effort="draft", threads=2)
+CHILDREN = Path("/proc/self/task") / str(os.getpid()) / "children"
+# `snowsplat` as this process finds it.
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+
+PARENT = """
+import json, sys
+from pathlib import Path
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.colmap import SfmOptions, estimate_poses
+
+def report(done, total, what):
+    print(what, flush=True)
+
+photos = [Photo(**photo) for photo in json.loads(sys.argv[2])]
+estimate_poses(Path(sys.argv[1]), photos, SfmOptions(threads=2), report)
+print("finished", flush=True)
+"""
+
+needs_proc = pytest.mark.skipif(
+    not CHILDREN.exists(), reason="needs /proc, to find the child process"
+)
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    boards = scenes.boards()
+    return [scenes.photograph(boards, pose, i) for i, pose in enumerate(scenes.arc(6))]
+
+
+@pytest.fixture
+def photos(tmp_path, pictures):
+    return scenes.write(tmp_path, pictures)
+
+
+def children_of(pid):
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_until(condition, seconds=20):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+def kill_child(number=signal.SIGKILL):
+    for child in children_of(os.getpid()):
+        os.kill(child, number)
+
+
+@needs_proc
+@pytest.mark.parametrize(
+    ("number", "words"), [(signal.SIGKILL, "memory"), (signal.SIGSEGV, "crashed (SIGSEGV)")]
+)
+def test_one_death_is_mended_with_gentler_settings(tmp_path, photos, number, words):
+    killed = []
+
+    def report(done, total, what):
+        if what == "pairs" and not killed:
+            killed.append(True)
+            kill_child(number)
+
+    result = estimate_poses(tmp_path, photos, DRAFT, report)
+    assert len(result.registered) == len(photos)
+    assert words in result.attempts[0]
+    assert "1024 features" in result.attempts[1]
+
+
+@needs_proc
+@pytest.mark.parametrize("what", ["features", "pairs", "photos placed"])
+def test_two_deaths_are_one_clear_line(tmp_path, photos, what):
+    def report(done, total, now):
+        if now == what:
+            kill_child()
+
+    with pytest.raises(UserError, match="failed twice: it was killed.*memory") as caught:
+        estimate_poses(tmp_path, photos, DRAFT, report)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "distorted" / "sparse").exists()
+    # And then it works, with what is left.
+    assert len(estimate_poses(tmp_path, photos, DRAFT, silent).registered) == len(photos)
+
+
+@needs_proc
+def test_interrupt_ends_the_child(tmp_path, photos):
+    seen = []
+
+    def report(done, total, what):
+        if what == "pairs":
+            seen.extend(children_of(os.getpid()))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_poses(tmp_path, photos, DRAFT, report)
+    assert seen
+    assert not any(is_alive(child) for child in seen)
+    assert len(estimate_poses(tmp_path, photos, DRAFT, silent).registered) == len(photos)
+
+
+@needs_proc
+@pytest.mark.parametrize("what", ["features", "pairs", "photos placed"])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_child_ends_with_a_killed_parent(tmp_path, photos, what, number):
+    told = json.dumps([asdict(photo) for photo in photos])
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT, str(tmp_path), told],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+    )
+    with parent:
+        while parent.stdout.readline().strip() != what:
+            pass
+        children = children_of(parent.pid)
+        assert len(children) == 1
+        parent.send_signal(number)
+        parent.wait()
+        wait_until(lambda: not is_alive(children[0]))
+    assert len(estimate_poses(tmp_path, photos, DRAFT, silent).registered) == len(photos)
+
+
+def test_child_finds_its_modules_from_any_folder(tmp_path, photos, monkeypatch):
+    """Whatever lies in the current folder, and with paths of the search that are relative."""
+    root = next(path for path in sys.path if (Path(path) / "snowsplat" / "__init__.py").exists())
+    elsewhere = tmp_path / "else where"
+    elsewhere.mkdir()
+    (elsewhere / "numpy.py").write_text("raise ImportError('the wrong numpy')")
+    monkeypatch.chdir(elsewhere)
+    monkeypatch.setattr(sys, "path", [os.path.relpath(root), *sys.path])
+    if sys.version_info < (3, 11):
+        (elsewhere / "numpy.py").unlink()  # Python knows no safe path yet
+    result = estimate_poses(Path(os.path.relpath(tmp_path)), photos[:3], DRAFT, silent)
+    assert len(result.registered) == 3
+
+
+def test_what_goes_wrong_in_the_child_is_in_the_log(tmp_path, photos):
+    """A dataset whose photos are gone: no answer, twice; one line with what it said last."""
+    for path in (tmp_path / "input").iterdir():
+        path.unlink()
+    with pytest.raises(
+        UserError, match=r"failed twice: it ended with status 1; report it \(.*FileNotFoundError"
+    ):
+        estimate_poses(tmp_path, photos, DRAFT, silent)
+    assert "FileNotFoundError" in (tmp_path / "distorted" / "colmap.log").read_text()
+
+
+def test_files_that_cannot_grow_are_told_as_such(tmp_path, photos):
+    """As on a full disk, where the child ends in COLMAP's words; here by a limit, which is real."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            estimate_poses(tmp_path, photos, DRAFT, silent)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.filename == str(tmp_path / "distorted")
+    assert estimate_poses(tmp_path, photos, DRAFT, silent).registered

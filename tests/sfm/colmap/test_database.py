@@ -1,0 +1,153 @@
+"""The database: cameras by group, the same after any kill, used again only where it fits."""
+
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pycolmap
+import pytest
+
+from snowsplat.sfm.colmap.database import (
+    closing_database,
+    feature_counts,
+    open_database,
+    read_descriptors,
+    replace_database,
+    set_names,
+    trim_features,
+    verified_pairs,
+)
+from snowsplat.sfm.ingest.photo import Photo
+
+
+def photo(name, group="phone", focal=None, size=(640, 480)):
+    return Photo(name, name, *size, group, None, focal, None, False, False)
+
+
+PHOTOS = [photo(f"ünter wegs/{i} b.jpg") for i in range(8)] + [
+    photo("x.jpg", "zoom", 900.0, (480, 640)),
+    photo("y.jpg", "zoom", 910.0, (480, 640)),
+]
+
+
+@pytest.fixture
+def path(tmp_path):
+    folder = tmp_path / "mit Lücke"
+    folder.mkdir()
+    path = folder / "database.db"
+    open_database(path, PHOTOS, "auto", "one")
+    return path
+
+
+def add_features(path, count=5):
+    with closing_database(path) as database:
+        database.write_keypoints(1, np.ones((count, 4), np.float32))
+
+
+def names(path):
+    with closing_database(path) as database:
+        return {image.image_id: image.name for image in database.read_all_images()}
+
+
+def test_photos_of_a_group_share_a_camera(path):
+    with closing_database(path) as database:
+        cameras = {c.camera_id: c for c in database.read_all_cameras()}
+        of_photo = {i.name: cameras[i.camera_id] for i in database.read_all_images()}
+        assert database.num_rigs() == 2
+        assert database.num_frames() == len(PHOTOS)
+    assert len(cameras) == 2
+    phone, zoom = of_photo[PHOTOS[0].name], of_photo["x.jpg"]
+    assert of_photo[PHOTOS[7].name] is phone
+    assert of_photo["y.jpg"] is zoom
+    assert (phone.model_name, phone.width, phone.has_prior_focal_length) == ("OPENCV", 640, False)
+    # Two photos cannot fix eight numbers.
+    assert (zoom.model_name, zoom.width, zoom.has_prior_focal_length) == (
+        "SIMPLE_RADIAL",
+        480,
+        True,
+    )
+    assert zoom.mean_focal_length() == 905
+
+
+def test_what_was_computed_is_kept_for_the_same_settings(path):
+    add_features(path)
+    open_database(path, PHOTOS, "auto", "one")
+    assert feature_counts(path, len(PHOTOS))[0] == 5
+    open_database(path, PHOTOS, "auto", "another")
+    assert feature_counts(path, len(PHOTOS)) == [0] * len(PHOTOS)
+
+
+def test_another_camera_model_keeps_the_features(path):
+    add_features(path)
+    open_database(path, PHOTOS, "RADIAL", "one")
+    assert feature_counts(path, len(PHOTOS))[0] == 5
+    with closing_database(path) as database:
+        assert {c.model_name for c in database.read_all_cameras()} == {"RADIAL"}
+
+
+def test_names_are_mended_after_a_kill_in_matching(path):
+    set_names(path, [str(i) for i in range(len(PHOTOS))])
+    open_database(path, PHOTOS, "auto", "one")
+    assert names(path) == {i: p.name for i, p in enumerate(PHOTOS, start=1)}
+
+
+@pytest.mark.parametrize("how", ["truncated", "no fingerprint", "text", "empty"])
+def test_a_damaged_database_is_made_anew(path, how):
+    add_features(path, 5000)
+    if how == "truncated":
+        with open(path, "rb+") as file:
+            file.truncate(path.stat().st_size // 2)
+    elif how == "no fingerprint":
+        with closing(sqlite3.connect(path)) as connection, connection:
+            connection.execute("DROP TABLE snowsplat")
+    else:
+        path.write_bytes(b"" if how == "empty" else b"not a database" * 1000)
+    open_database(path, PHOTOS, "auto", "one")
+    assert len(names(path)) == len(PHOTOS)
+    assert feature_counts(path, len(PHOTOS)) == [0] * len(PHOTOS)
+
+
+def test_a_database_takes_the_place_of_another(path):
+    strong = path.with_name("strong.db")
+    open_database(strong, PHOTOS, "auto", "strong")
+    add_features(strong)
+    replace_database(path, by=strong)
+    assert not strong.exists()
+    assert feature_counts(path, len(PHOTOS))[0] == 5
+
+
+def test_pairs_come_back_with_their_kind(path):
+    matches = np.stack([np.arange(20), np.arange(20)], 1).astype(np.uint32)
+    with closing_database(path) as database:
+        for other, config in ((2, "CALIBRATED"), (3, "PANORAMIC")):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = getattr(pycolmap.TwoViewGeometryConfiguration, config)
+            geometry.inlier_matches = matches
+            database.write_two_view_geometry(1, other, geometry)
+    pairs = {(p.first, p.second): (p.inliers, p.flat) for p in verified_pairs(path)}
+    assert pairs == {(0, 1): (20, False), (0, 2): (20, True)}
+
+
+def test_the_largest_features_are_kept(path):
+    random = np.random.default_rng(0)
+    scale = random.permutation(30) + 1.0
+    keypoints = np.zeros((30, 6), np.float32)
+    keypoints[:, 0], keypoints[:, 2], keypoints[:, 5] = scale, scale, scale
+    with closing_database(path) as database:
+        for image_id, count in ((1, 30), (2, 8)):
+            database.write_keypoints(image_id, keypoints[:count])
+            data = np.repeat(scale[:count, None], 128, 1).astype(np.uint8)
+            sift = pycolmap.FeatureExtractorType.SIFT
+            database.write_descriptors(image_id, pycolmap.FeatureDescriptors(sift, data))
+    trim_features(path, 10)
+    assert feature_counts(path, len(PHOTOS))[:2] == [10, 8]
+    with closing_database(path) as database:
+        left = database.read_keypoints(1)
+        assert left.shape == (10, 6)
+        assert np.array_equal(left[:, 0], scale[scale > 20])
+        assert np.array_equal(database.read_descriptors(1).data[:, 5], left[:, 0].astype(np.uint8))
+    assert np.array_equal(read_descriptors(path, 0, 3)[:, 0], [30, 29, 28])
+
+
+def test_a_photo_without_features_has_no_descriptors(path):
+    assert read_descriptors(path, 3, 100).shape == (0, 128)

@@ -1,0 +1,262 @@
+"""From small photos of known cameras to poses, and what comes of photos that give none."""
+
+import dataclasses
+import json
+import shutil
+from contextlib import closing
+from sqlite3 import connect
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.scene.geometry import similarity_from_points
+from snowsplat.sfm.colmap import SfmOptions, SfmResult, describe_model, estimate_poses
+from snowsplat.sfm.colmap.options import CAMERA_MODELS
+from snowsplat.sfm.progress import silent
+from snowsplat.util.errors import UserError
+
+from . import scenes
+
+DRAFT = SfmOptions(effort="draft", threads=2)
+BLACK = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """Ten photos along an arc."""
+    boards = scenes.boards()
+    return [scenes.photograph(boards, pose, i) for i, pose in enumerate(scenes.arc(10))]
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory, pictures):
+    """A dataset with poses, in a folder with an awkward name; not to be changed."""
+    dataset = tmp_path_factory.mktemp("Größe 10 – ä b")
+    names = [f"ünter weg/{i} b.png" for i in range(10)]
+    photos = [
+        scenes.save(dataset, name, image) for name, image in zip(names, pictures, strict=True)
+    ]
+    said = []
+    result = estimate_poses(dataset, photos, DRAFT, lambda *line: said.append(line))
+    return dataset, photos, result, said
+
+
+def centres(model, photos):
+    images = {image.name: image for image in model.images.values()}
+    return np.stack([images[photo.name].projection_center() for photo in photos])
+
+
+def test_poses_are_those_of_the_cameras(done):
+    dataset, photos, result, _ = done
+    assert result.registered == sorted(photo.name for photo in photos)
+    assert result.unregistered == {}
+    assert result.sub_models == [10]
+    assert 0 < result.reprojection_error < 0.3
+    model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
+    truth = np.stack([-pose[:, :3].T @ pose[:, 3] for pose in scenes.arc(10)])
+    found, truth = torch.tensor(centres(model, photos)), torch.tensor(truth)
+    error = (similarity_from_points(found, truth).apply(found) - truth).norm(dim=1)
+    assert error.max() < 0.01 * (truth - truth.mean(0)).norm(dim=1).max()
+    assert (result.points, result.observations) == (
+        model.num_points3D(),
+        model.compute_num_observations(),
+    )
+    (camera,) = result.cameras
+    assert (camera["model"], camera["focal_from"], camera["images"]) == ("OPENCV", "guessed", 10)
+    assert abs(camera["params"][0] / scenes.FOCAL - 1) < 0.03
+
+
+def test_result_fits_json(done):
+    result = done[2]
+    assert SfmResult(**json.loads(json.dumps(dataclasses.asdict(result)))) == result
+
+
+def test_progress_tells_the_stages_in_order(done):
+    said = done[3]
+    assert list(dict.fromkeys(what for _, _, what in said)) == [
+        "features",
+        "pairs",
+        "photos placed",
+    ]
+    assert all(0 <= done <= total for done, total, _ in said)
+    assert (10, 10, "features") in said
+    assert (45, 45, "pairs") in said
+    assert said[-1] == (10, 10, "photos placed")
+
+
+def test_colmap_prints_into_its_log_alone(done, pictures, tmp_path, capfd):
+    estimate_poses(tmp_path, scenes.write(tmp_path, pictures[:3]), DRAFT, silent)
+    assert capfd.readouterr() == ("", "")
+    assert "Feature extraction" in (tmp_path / "distorted" / "colmap.log").read_text()
+    left = {path.name for path in (tmp_path / "distorted").iterdir()}
+    assert left == {"colmap.log", "database.db", "sparse"}
+
+
+def test_same_photos_give_the_same_pairs_and_poses(done, tmp_path):
+    dataset, photos, result, _ = done
+    shutil.copytree(dataset / "input", tmp_path / "input")
+    again = estimate_poses(tmp_path, photos, DRAFT, silent)
+    assert again.pairs == result.pairs
+    assert again.registered == result.registered
+    first, second = (
+        centres(pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0"), photos)
+        for folder in (dataset, tmp_path)
+    )
+    assert np.abs(first - second).max() < 1e-3
+
+
+def test_model_that_is_there_is_described(done):
+    dataset, photos, result, _ = done
+    described = describe_model(dataset, photos)
+    for name in ("registered", "points", "observations", "sub_models", "cameras"):
+        assert getattr(described, name) == getattr(result, name)
+    assert described.reprojection_error == pytest.approx(result.reprojection_error, rel=1e-6)
+    other = dataclasses.replace(photos[0], name="other.png")
+    assert "other.png" in describe_model(dataset, [*photos, other]).unregistered
+    with pytest.raises(UserError, match="none of the photos"):
+        describe_model(dataset, [other])
+    with pytest.raises(UserError, match="no COLMAP model here"):
+        describe_model(dataset / "input", photos)
+
+
+@pytest.mark.parametrize("camera_model", ["SIMPLE_PINHOLE", "RADIAL"])
+def test_camera_model_and_focal_length_are_as_given(tmp_path, pictures, camera_model):
+    photos = scenes.write(tmp_path, pictures[3:7], focal=scenes.FOCAL)
+    options = dataclasses.replace(DRAFT, camera_model=camera_model, threads=1)
+    (camera,) = estimate_poses(tmp_path, photos, options, silent).cameras
+    assert (camera["model"], camera["focal_from"]) == (camera_model, "exif")
+
+
+def test_unknown_camera_model(tmp_path, pictures):
+    photos = scenes.write(tmp_path, pictures[:3])
+    options = dataclasses.replace(DRAFT, camera_model="OPENVC")
+    with pytest.raises(UserError, match="'OPENVC': no such camera model; there are auto, .*OPENCV"):
+        estimate_poses(tmp_path, photos, options, silent)
+
+
+@pytest.mark.parametrize("camera_model", CAMERA_MODELS)
+def test_camera_models_are_known_to_colmap(camera_model):
+    camera = pycolmap.Camera.create_from_model_name(1, camera_model, 500.0, 640, 480)
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    assert pinhole.model_name == "PINHOLE"
+
+
+def test_global_mapper(tmp_path, pictures):
+    photos = scenes.write(tmp_path, pictures[:6])
+    options = dataclasses.replace(DRAFT, mapper="global")
+    result = estimate_poses(tmp_path, photos, options, silent)
+    assert len(result.registered) == 6
+    assert "global" in result.attempts[0]
+
+
+def test_nothing_is_looked_for_under_a_mask(tmp_path, pictures):
+    """Two photos have the left half masked, one has not; features of the two are on the right."""
+    photos = scenes.write(tmp_path, pictures[:3])
+    masks = tmp_path / "distorted" / "masks"
+    masks.mkdir(parents=True)
+    mask = np.full((scenes.HEIGHT, scenes.WIDTH), 255, np.uint8)
+    mask[:, : scenes.WIDTH // 2] = 0
+    for photo in photos[:2]:
+        Image.fromarray(mask).save(masks / f"{photo.name}.png")
+    photos = [dataclasses.replace(photo, mask=i < 2) for i, photo in enumerate(photos)]
+    estimate_poses(tmp_path, photos, DRAFT, silent)
+    database = pycolmap.Database.open(tmp_path / "distorted" / "database.db")
+    leftmost = [database.read_keypoints(i)[:, 0].min() for i in (1, 2, 3)]
+    database.close()
+    assert min(leftmost[:2]) > scenes.WIDTH / 2 - 1
+    assert leftmost[2] < scenes.WIDTH / 4
+
+
+def test_photos_that_do_not_belong_are_named(tmp_path, pictures):
+    stranger = scenes.photograph(scenes.boards(7), scenes.arc(3)[1])
+    photos = scenes.write(tmp_path, [*pictures, BLACK, stranger])
+    result = estimate_poses(tmp_path, photos, DRAFT, silent)
+    assert len(result.registered) == 10
+    assert "hardly any detail" in result.unregistered["010.png"]
+    assert result.unregistered["011.png"] == "it matches no other photo"
+    # Nothing could be gained from these two: no second try.
+    assert len(result.attempts) == 1
+
+
+@pytest.mark.slow
+def test_two_scenes_give_the_larger_and_a_second_try(tmp_path, pictures):
+    other = [scenes.photograph(scenes.boards(9), pose, i) for i, pose in enumerate(scenes.arc(5))]
+    photos = scenes.write(tmp_path, [*other, *pictures[:7]])
+    result = estimate_poses(tmp_path, photos, DRAFT, silent)
+    assert result.registered == [f"{i:03}.png" for i in range(5, 12)]
+    assert result.sub_models == [7, 5]
+    assert "another part of 5 photos" in result.unregistered["000.png"]
+    assert len(result.attempts) > 1
+    assert "4096 features" in result.attempts[1]
+    sparse = tmp_path / "distorted" / "sparse"
+    assert sorted(path.name for path in sparse.iterdir()) == ["0", "1"]
+    left = {path.name for path in (tmp_path / "distorted").iterdir()}
+    assert left == {"colmap.log", "database.db", "sparse"}
+
+
+def turned(count):
+    return [
+        scenes.look((0, 0, 0), (5 * np.sin(angle), 0, 5 * np.cos(angle)))
+        for angle in np.linspace(-0.4, 0.4, count)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [
+        ([scenes.arc(3)[1]] * 5, "the camera hardly moved between the photos"),
+        (turned(5), "only turned on the spot"),
+    ],
+    ids=["still", "turned"],
+)
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_camera_that_did_not_move(tmp_path, poses, message, mapper):
+    boards = scenes.boards()
+    photos = scenes.write(
+        tmp_path, [scenes.photograph(boards, pose, i) for i, pose in enumerate(poses)]
+    )
+    options = dataclasses.replace(DRAFT, mapper=mapper)
+    with pytest.raises(UserError, match=message):
+        estimate_poses(tmp_path, photos, options, silent)
+    assert not (tmp_path / "distorted" / "sparse").exists()
+
+
+def test_photos_of_different_things(tmp_path):
+    different = [scenes.photograph(scenes.boards(i), scenes.arc(3)[i % 3]) for i in range(1, 5)]
+    with pytest.raises(UserError, match="do not show the same things"):
+        estimate_poses(tmp_path, scenes.write(tmp_path, different), DRAFT, silent)
+
+
+def test_black_photos(tmp_path):
+    with pytest.raises(UserError, match="too dark, blurred or plain"):
+        estimate_poses(tmp_path, scenes.write(tmp_path, [BLACK] * 4), DRAFT, silent)
+
+
+def test_two_photos(tmp_path, pictures):
+    with pytest.raises(UserError, match="2 photos are too few"):
+        estimate_poses(tmp_path, scenes.write(tmp_path, pictures[:2]), DRAFT, silent)
+
+
+def test_a_wall_is_found_although_it_is_flat(tmp_path):
+    flat = [scenes.photograph(scenes.wall(), pose, i) for i, pose in enumerate(scenes.arc(6))]
+    result = estimate_poses(tmp_path, scenes.write(tmp_path, flat), DRAFT, silent)
+    assert len(result.registered) == 6
+
+
+def test_features_and_matches_are_used_again(tmp_path, pictures):
+    photos = scenes.write(tmp_path, pictures[:4])
+    estimate_poses(tmp_path, photos, DRAFT, silent)
+    said = []
+    estimate_poses(tmp_path, photos, DRAFT, lambda *line: said.append(line))
+    assert said[0] == (4, 4, "features")
+    assert next(line for line in said if line[2] == "pairs") == (6, 6, "pairs")
+    # A photo that has changed is noticed.
+    scenes.save(tmp_path, photos[0].name, pictures[5])
+    said.clear()
+    estimate_poses(tmp_path, photos, DRAFT, lambda *line: said.append(line))
+    assert said[0] == (0, 4, "features")
+    with closing(connect(tmp_path / "distorted" / "database.db")) as connection:
+        assert connection.execute("SELECT COUNT(*) FROM images").fetchone() == (4,)

@@ -1,0 +1,90 @@
+"""Which pairs are compared, for each kind of input."""
+
+import numpy as np
+import pytest
+
+from snowsplat.sfm.colmap.options import EFFORTS
+from snowsplat.sfm.colmap.pairs import choose_pairs
+from snowsplat.sfm.ingest.photo import Photo
+
+EFFORT = EFFORTS["normal"]
+
+
+def photo(number, sequence=None, location=None):
+    name = f"{sequence or 'photo'}/{number:04}.jpg"
+    return Photo(name, name, 640, 480, "phone", sequence, None, location, False, False)
+
+
+def not_asked():
+    raise AssertionError("retrieval is not needed here")
+
+
+def ring(count, places):
+    """How alike photos look that stand on a ring of ``places``: the nearer, the more."""
+    angles = 2 * np.pi * np.arange(count) / places
+    return np.cos(angles[:, None] - angles[None])
+
+
+def test_few_photos_are_compared_each_with_each():
+    choice = choose_pairs([photo(i) for i in range(20)], EFFORT, not_asked)
+    assert len(choice.pairs) == len(set(choice.pairs)) == 190
+    assert "each" in choice.words
+
+
+def test_frames_are_compared_with_the_next_and_sparser_further_on():
+    count = 400
+    photos = [photo(i, "walk.mp4") for i in range(count)]
+    chosen = set(choose_pairs(photos, EFFORT, lambda: np.eye(count)).pairs)
+    steps = {j - i for i, j in chosen if i == 100}
+    assert set(range(1, EFFORT.overlap + 1)) <= steps
+    assert {20, 40, 80, 160} <= steps
+    assert len(chosen) < 40 * count
+
+
+def test_loop_of_a_video_is_closed():
+    """The walk comes round to its start: the first frames are compared with the last."""
+    count = 300
+    photos = [photo(i, "walk.mp4") for i in range(count)]
+    chosen = set(choose_pairs(photos, EFFORT, lambda: ring(count, count)).pairs)
+    assert {(0, 299), (1, 299), (0, 298)} <= chosen
+
+
+def test_photos_with_gps_are_compared_with_the_nearest():
+    """Two streets 500 m apart; one degree of latitude is 111 km."""
+    photos = [
+        photo(i, location=(52 + street * 500 / 111_320 + 1e-6 * i, 4 + i * 5e-5, 0))
+        for street in (0, 1)
+        for i in range(100)
+    ]
+    chosen = set(choose_pairs(photos, EFFORT, lambda: ring(200, 200)).pairs)
+    assert all((i, i + 1) in chosen for i in range(99))
+    near = sum((i < 100) == (j < 100) for i, j in chosen)
+    assert near > 0.6 * len(chosen)
+
+
+def test_many_photos_are_compared_with_those_that_look_alike():
+    count = 200
+    choice = choose_pairs([photo(i) for i in range(count)], EFFORT, lambda: ring(count, count))
+    partners = {j for i, j in choice.pairs if i == 50} | {i for i, j in choice.pairs if j == 50}
+    assert partners >= set(range(40, 61)) - {50}
+    assert len(choice.pairs) < 20 * count
+    assert choice.pairs == sorted(set(choice.pairs))
+    assert "alike" in choice.words
+
+
+def test_two_videos_and_photos_are_joined():
+    photos = (
+        [photo(i, "a.mp4") for i in range(60)]
+        + [photo(i, "b.mp4") for i in range(60)]
+        + [photo(i) for i in range(10)]
+    )
+    chosen = choose_pairs(photos, EFFORT, lambda: ring(130, 65)).pairs
+    kinds = {tuple(sorted((photos[i].sequence or "", photos[j].sequence or ""))) for i, j in chosen}
+    assert {("a.mp4", "b.mp4"), ("", "a.mp4"), ("", "b.mp4"), ("a.mp4", "a.mp4")} <= kinds
+
+
+@pytest.mark.parametrize("effort", EFFORTS.values(), ids=EFFORTS)
+def test_a_stronger_effort_compares_more(effort):
+    photos = [photo(i) for i in range(300)]
+    few = choose_pairs(photos, effort, lambda: ring(300, 300)).pairs
+    assert len(choose_pairs(photos, effort.stronger(), lambda: ring(300, 300)).pairs) > len(few)

@@ -1,0 +1,354 @@
+"""Photos, videos and masks as users have them become input/; what is of no use is named."""
+
+import errno
+import logging
+import os
+
+import numpy as np
+import pillow_heif
+import pytest
+from PIL import Image
+
+from snowsplat.sfm.ingest.inputs import GatherOptions, find_inputs, gather
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.progress import silent
+from snowsplat.util.errors import UserError
+
+from ..pictures import HEIGHT, WIDTH, blurred, exif, pan, photo, wall, write_photos, write_video
+
+
+def gathered(inputs, dataset, report=silent, **options):
+    dataset.mkdir(exist_ok=True)
+    inputs = inputs if isinstance(inputs, list) else [inputs]
+    return gather(inputs, dataset, GatherOptions(**options), report)
+
+
+def files(folder):
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+def content(folder):
+    return {name: (folder / name).read_bytes() for name in files(folder)}
+
+
+def test_plain_photos_are_linked_as_they_are(tmp_path):
+    root = write_photos(tmp_path / "p q")
+    photo(60).save(root / "Ünïcode name (1).JPG", quality=90)
+    (root / "deep").mkdir()
+    photo(80).convert("L").save(root / "deep" / "grey.tif")
+    made = gathered(root, tmp_path / "out")
+    assert [p.name for p in made.photos] == files(root)
+    assert content(tmp_path / "out" / "input") == content(root)
+    assert (tmp_path / "out" / "input" / "0.jpg").samefile(root / "0.jpg")
+    assert made.skipped == []
+    assert made.photos[0] == Photo(
+        name="0.jpg",
+        source=str(root / "0.jpg"),
+        width=WIDTH,
+        height=HEIGHT,
+        group=made.photos[1].group,
+        sequence=None,
+        focal=None,
+        location=None,
+        mask=False,
+        alpha=False,
+    )
+    assert made.photos[0].group != next(p for p in made.photos if "grey" in p.name).group
+    assert not (tmp_path / "out" / "distorted").exists()
+
+
+def test_what_colmap_cannot_read_is_converted_and_upright(tmp_path):
+    pillow_heif.register_heif_opener()
+    root = write_photos(tmp_path / "p", 1)
+    photo(20).save(root / "0.heic", quality=90)
+    photo(40).save(root / "a.webp", quality=95)
+    notes = exif({0x0112: 6, 0x0110: "M1"}, {0xA405: 26})
+    photo(60).transpose(Image.Transpose.ROTATE_90).save(root / "turned.jpg", exif=notes, quality=95)
+    made = gathered(root, tmp_path / "out")
+    assert [p.name for p in made.photos] == ["0.jpg", "0_2.jpg", "a.jpg", "turned.jpg"]
+    assert [os.path.basename(p.source) for p in made.photos][1] == "0.heic"
+    for p, offset in zip(made.photos, (0, 20, 40, 60), strict=True):
+        with Image.open(tmp_path / "out" / "input" / p.name) as image:
+            assert image.size == (p.width, p.height) == (WIDTH, HEIGHT)
+            assert image.getexif().get(0x0112, 1) == 1
+            difference = np.abs(np.asarray(image).astype(int) - wall(offset)).mean()
+        assert difference < 12
+    assert made.photos[3].focal == pytest.approx(26 / 43.267 * 400, rel=1e-3)
+
+
+def test_size_scales_pictures_and_their_focal_lengths(tmp_path):
+    root = tmp_path / "p"
+    root.mkdir()
+    for i in range(3):
+        photo(20 * i).save(root / f"{i}.jpg", exif=exif(details={0xA405: 26}))
+    made = gathered(root, tmp_path / "out", size=160)
+    assert {(p.width, p.height) for p in made.photos} == {(160, 120)}
+    assert made.photos[0].focal == pytest.approx(26 / 43.267 * 200, rel=1e-3)
+    with Image.open(tmp_path / "out" / "input" / "0.jpg") as image:
+        assert image.size == (160, 120)
+
+
+def test_groups(tmp_path):
+    """One camera with one zoom, held the same way, in one folder."""
+    root = tmp_path / "p"
+    (root / "other").mkdir(parents=True)
+
+    def take(name, model="M1", zoom=26, orientation=1):
+        notes = exif({0x0110: model, 0x0112: orientation}, {0xA405: zoom})
+        photo(20).save(root / name, exif=notes)
+
+    take("a.jpg"), take("b.jpg"), take("other.jpg", model="M2"), take("zoomed.jpg", zoom=52)
+    take("portrait.jpg", orientation=6), take("portrait2.jpg", orientation=8)
+    take("other/a.jpg")
+    group = {p.name: p.group for p in gathered(root, tmp_path / "out").photos}
+    assert group["a.jpg"] == group["b.jpg"]
+    assert group["portrait.jpg"] == group["portrait2.jpg"]
+    assert len(set(group.values())) == 5
+
+
+def test_masks_and_alpha(tmp_path):
+    root = write_photos(tmp_path / "p", 2)
+    left = np.zeros((HEIGHT, WIDTH), np.uint8)
+    left[:, : WIDTH // 2] = 255
+    image = photo(40)
+    image.putalpha(Image.fromarray(left[:, ::-1].copy()))
+    image.save(root / "cut.png")
+    image.save(root / "both.png")
+    (root / "masks").mkdir()
+    Image.fromarray(left).save(root / "masks" / "0.jpg.png")
+    top = np.zeros((HEIGHT, WIDTH), np.uint8)
+    top[: HEIGHT // 2] = 255
+    Image.fromarray(top).save(root / "masks" / "both.png")
+    made = gathered(root, tmp_path / "out", size=160)
+    facts = {p.name: (p.mask, p.alpha) for p in made.photos}
+    assert facts == {
+        "0.jpg": (True, False),
+        "1.jpg": (False, False),
+        "cut.png": (True, True),
+        "both.png": (True, True),
+    }
+    masks = tmp_path / "out" / "distorted" / "masks"
+    assert files(masks) == ["0.jpg.png", "both.png.png", "cut.png.png"]
+    read = {name: np.asarray(Image.open(masks / name)) for name in files(masks)}
+    assert {(m.shape, m.dtype.name) for m in read.values()} == {((120, 160), "uint8")}
+    assert (read["0.jpg.png"][:, :80] == 255).all()
+    assert (read["0.jpg.png"][:, 80:] == 0).all()
+    assert (read["cut.png.png"][:, 84:] == 255).all()
+    assert (read["cut.png.png"][:, :76] == 0).all()
+    assert np.array_equal(read["both.png.png"][:60], read["cut.png.png"][:60])
+    assert (read["both.png.png"][60:] == 0).all()
+    with Image.open(tmp_path / "out" / "input" / "cut.png") as image:
+        assert image.mode == "RGBA"
+
+
+def test_a_mask_of_the_wrong_size_and_one_of_no_photo(tmp_path, caplog):
+    root = write_photos(tmp_path / "p")
+    (root / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT), 255).save(root / "masks" / "7.png")
+    with caplog.at_level(logging.WARNING, "snowsplat"):
+        gathered(root, tmp_path / "out")
+    assert "7.png: is the mask of no photo here" in caplog.text
+    Image.new("L", (99, 99)).save(root / "masks" / "1.png")
+    with pytest.raises(UserError, match=r"1.png: the mask is 99x99, but its photo is 320x240"):
+        gathered(root, tmp_path / "other")
+
+
+def test_a_photo_whose_mask_leaves_nothing_is_skipped(tmp_path):
+    root = write_photos(tmp_path / "p", 4)
+    (root / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT)).save(root / "masks" / "1.png")
+    made = gathered(root, tmp_path / "out")
+    assert made.skipped == [(str(root / "1.jpg"), "is masked out all over")]
+    assert files(tmp_path / "out" / "input") == ["0.jpg", "2.jpg", "3.jpg"]
+
+
+def test_unusable_ones_among_good_ones_are_skipped_and_named(tmp_path):
+    root = write_photos(tmp_path / "p", 4)
+    cut = (root / "1.jpg").read_bytes()
+    (root / "1.jpg").write_bytes(cut[: len(cut) // 2])
+    (root / "text.jpg").write_text("no photo")
+    Image.new("RGB", (WIDTH, HEIGHT)).save(root / "cap.png")
+    made = gathered(root, tmp_path / "out")
+    assert [p.name for p in made.photos] == ["0.jpg", "2.jpg", "3.jpg"]
+    assert files(tmp_path / "out" / "input") == ["0.jpg", "2.jpg", "3.jpg"]
+    reasons = {os.path.basename(source): reason for source, reason in made.skipped}
+    assert reasons.keys() == {"1.jpg", "text.jpg", "cap.png"}
+    assert "truncated" in reasons["1.jpg"]
+    assert "not an image of a known format" in reasons["text.jpg"]
+    assert reasons["cap.png"] == "is black all over"
+
+
+def test_the_same_on_one_thread(tmp_path, monkeypatch):
+    root = write_photos(tmp_path / "p", 5, "webp")
+    (root / "2.webp").write_text("no photo")
+    many = gathered(root, tmp_path / "a")
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    one = gathered(root, tmp_path / "b")
+    assert many == one
+    assert content(tmp_path / "a") == content(tmp_path / "b")
+
+
+def test_a_video(tmp_path):
+    path = write_video(tmp_path / "walk around.MP4", pan(30))
+    made = gathered(path, tmp_path / "out", frames=6)
+    assert [p.name for p in made.photos] == [f"frame_{i:05d}.jpg" for i in range(1, 7)]
+    assert {p.sequence for p in made.photos} == {"walk around.MP4"}
+    assert len({p.group for p in made.photos}) == 1
+    assert made.photos[0].source.startswith("walk around.MP4 at 0.")
+    assert len(gathered(path, tmp_path / "fps", fps=2).photos) == 6
+
+
+def test_photos_and_videos_together(tmp_path):
+    root = write_photos(tmp_path / "p", 2)
+    one = write_video(tmp_path / "a.mp4", pan(12))
+    two = write_video(tmp_path / "a.mkv", pan(12, seed=1))
+    made = gathered([root, one, two], tmp_path / "out", frames=3)
+    assert [p.name for p in made.photos] == [
+        *(f"a/frame_{i:05d}.jpg" for i in (1, 2, 3)),
+        *(f"a_2/frame_{i:05d}.jpg" for i in (1, 2, 3)),
+        *("p/0.jpg", "p/1.jpg"),
+    ]
+    assert [p.sequence for p in made.photos] == ["a"] * 3 + ["a_2"] * 3 + [None] * 2
+    assert files(tmp_path / "out" / "input") == [p.name for p in made.photos]
+    assert len({p.group for p in made.photos}) == 3
+
+
+def test_in_place_nothing_is_changed(tmp_path):
+    dataset = tmp_path / "location"
+    root = write_photos(dataset / "input", 4)
+    (root / "3.jpg").write_text("no photo")
+    (root / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT), 255).save(root / "masks" / "0.png")
+    before = content(root)
+    made = gathered(root, dataset)
+    assert [p.name for p in made.photos] == ["0.jpg", "1.jpg", "2.jpg"]
+    assert made.skipped[0][0].endswith("3.jpg")
+    assert content(root) == before
+    assert files(dataset / "distorted") == ["masks/0.jpg.png"]
+
+
+@pytest.mark.parametrize("kind", ["webp", "turned", "size", "video"])
+def test_in_place_what_would_have_to_be_changed_is_refused(kind, tmp_path):
+    root = write_photos(tmp_path / "location" / "input", 0 if kind == "video" else 4)
+    if kind == "webp":
+        photo().save(root / "x.webp")
+    elif kind == "turned":
+        photo().save(root / "x.jpg", exif=exif({0x0112: 3}))
+    elif kind == "video":
+        write_video(root / "x.mp4", pan(9))
+    before = content(tmp_path)
+    with pytest.raises(UserError, match=r"has to be converted.*use snowsplat sfm PHOTOS -o"):
+        gathered(root, tmp_path / "location", size=160 if kind == "size" else None)
+    assert content(tmp_path) == before
+
+
+def write_all(folder, picture, count=5):
+    folder.mkdir()
+    for i in range(count):
+        Image.fromarray(picture).save(folder / f"{i}.jpg")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (
+            np.zeros((240, 320, 3), np.uint8),
+            "all 5 pictures are black all over; check the lens cap",
+        ),
+        (np.full((240, 320, 3), 255, np.uint8), "all 5 pictures are white all over"),
+        (blurred(wall(), 12), "all 5 pictures are blurred all over.*hold the camera still"),
+    ],
+)
+def test_photos_of_nothing(picture, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        gathered(write_all(tmp_path / "p", picture), tmp_path / "out")
+
+
+def test_a_video_of_a_still_scene(tmp_path):
+    path = write_video(tmp_path / "still.mp4", [wall()] * 20)
+    with pytest.raises(UserError, match=r"still.mp4: the camera does not move .* walking around"):
+        gathered(path, tmp_path / "out")
+
+
+def test_too_few(tmp_path):
+    root = write_photos(tmp_path / "p", 2)
+    with pytest.raises(UserError, match="only 2 usable pictures, .* at least 3, better 20"):
+        gathered(root, tmp_path / "out")
+    (root / "broken.jpg").write_text("no photo")
+    with pytest.raises(UserError, match=r"only 2 .*; .*broken.jpg cannot be decoded \(not an"):
+        gathered(root, tmp_path / "out2")
+    for name in ("0.jpg", "1.jpg"):
+        (root / name).write_text("no photo")
+    with pytest.raises(
+        UserError, match=r"no usable picture: all 3 pictures, .*0.jpg first, cannot be decoded"
+    ):
+        gathered(root, tmp_path / "out3")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fps": 2.0, "frames": 60}, "both --fps and --frames"),
+        ({"fps": 0.0}, "--fps 0 makes no sense"),
+        ({"fps": float("nan")}, "--fps nan makes no sense"),
+        ({"frames": 2}, "--frames 2 is too few"),
+        ({"size": 50}, "--size 50 is too small"),
+    ],
+)
+def test_settings_that_make_no_sense(options, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        gathered(write_photos(tmp_path / "p"), tmp_path / "out", **options)
+
+
+def test_not_enough_room(tmp_path, monkeypatch):
+    root = write_photos(tmp_path / "p", 3, "webp")
+    path = write_video(tmp_path / "a.mp4", pan(9))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage)
+    for source in (root, path):
+        with pytest.raises(UserError, match=r"need about \d+ MB and the disk has \d+ MB left"):
+            gathered(source, tmp_path / "out")
+        assert files(tmp_path / "out") == []
+
+
+class _Usage:
+    free = 1000
+
+
+@pytest.mark.parametrize("writes", ["photos", "video"])
+def test_the_disk_is_full_on_the_way(writes, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    if writes == "photos":
+        source = write_photos(tmp_path / "p", 3, "webp")
+        monkeypatch.setattr("snowsplat.sfm.ingest.gather_photos.save", full)
+    else:
+        source = write_video(tmp_path / "a.mp4", pan(9))
+        monkeypatch.setattr("snowsplat.sfm.ingest.video.save", full)
+    with pytest.raises(UserError, match="the disk is full; make room"):
+        gathered(source, tmp_path / "out")
+
+
+def test_ctrl_c_and_progress(tmp_path):
+    root = write_photos(tmp_path / "p", 12)
+    calls = []
+    gathered(root, tmp_path / "out", report=lambda *call: calls.append(call))
+    assert calls == [(i, 12, "photos") for i in range(1, 13)]
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        gathered(root, tmp_path / "other", report=stop)
+
+
+def test_find_inputs_lists_what_is_read(tmp_path):
+    root = write_photos(tmp_path / "p")
+    (root / "masks").mkdir()
+    photo().save(root / "masks" / "1.png")
+    path = write_video(tmp_path / "a.mp4", pan(3))
+    listed = [p.relative_to(tmp_path).as_posix() for p in find_inputs([root, path])]
+    assert listed == ["p/0.jpg", "p/1.jpg", "p/masks/1.png", "p/2.jpg", "a.mp4"]
+    with pytest.raises(UserError):
+        find_inputs([tmp_path / "absent"])

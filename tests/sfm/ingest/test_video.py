@@ -1,0 +1,182 @@
+"""Frames of a video: sharp, upright, different from each other, and as many as asked."""
+
+import logging
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from snowsplat.sfm.ingest.clip import frames_wanted, read_clip
+from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED
+from snowsplat.sfm.ingest.video import SAME_VIEW, extract_frames
+from snowsplat.sfm.progress import silent
+from snowsplat.util.errors import UserError
+
+from ..pictures import HEIGHT, WIDTH, blurred, pan, wall, write_video
+
+REAL = Path(__file__).resolve().parents[4] / "shared" / "captures" / "walkaround.mp4"
+
+
+def extract(path, folder, windows, size=None, report=silent):
+    folder.mkdir(exist_ok=True)
+    return extract_frames(read_clip(path), folder, windows, size, report)
+
+
+def difference(path, picture) -> float:
+    with Image.open(path) as image:
+        return float(np.abs(np.asarray(image, np.float64) - picture).mean())
+
+
+def test_the_sharpest_of_each_window(tmp_path):
+    pictures = pan(24)
+    sharp = [2, 5, 8, 15, 16, 23]
+    frames = [p if i in sharp else blurred(p, 1.5) for i, p in enumerate(pictures)]
+    made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", 6)
+    assert [round(10 * frame.seconds) for frame in made.kept] == sharp
+    assert made.read == 24
+    assert [frame.name for frame in made.kept] == [f"frame_{i:05d}.jpg" for i in range(1, 7)]
+    assert sorted(p.name for p in (tmp_path / "f").iterdir()) == [f.name for f in made.kept]
+    for frame, index in zip(made.kept, sharp, strict=True):
+        right, wrong = pictures[index], pictures[index - 1]
+        assert difference(tmp_path / "f" / frame.name, right) < 16
+        assert difference(tmp_path / "f" / frame.name, wrong) > 20
+
+
+def test_windows_are_of_equal_time_where_the_rate_varies(tmp_path):
+    # 20 frames in the first second, 4 in the three that follow.
+    times = [50 * i for i in range(20)] + [1000 + 750 * i for i in range(4)]
+    video = write_video(tmp_path / "a.mkv", pan(24), rate=20, times=times)
+    made = extract(video, tmp_path / "f", 4)
+    assert len(made.kept) == 4
+    length = read_clip(video).seconds
+    assert length == pytest.approx(3.4, abs=0.05)
+    assert [int(4 * frame.seconds / length) for frame in made.kept] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("rotation", [90, -90, 180])
+def test_turned_upright(rotation, tmp_path):
+    upright = pan(4)
+    turns = {90: 3, -90: 1, 180: 2}[rotation]  # undone by turning so far counter-clockwise
+    frames = [np.ascontiguousarray(np.rot90(picture, turns)) for picture in upright]
+    video = write_video(tmp_path / "a.mp4", frames, rotation=rotation)
+    made = extract(video, tmp_path / "f", 4)
+    assert {(frame.width, frame.height) for frame in made.kept} == {(WIDTH, HEIGHT)}
+    assert difference(tmp_path / "f" / made.kept[0].name, upright[0]) < 16
+
+
+def test_pixels_become_square(tmp_path):
+    video = write_video(tmp_path / "a.mp4", pan(3), aspect=Fraction(4, 3))
+    made = extract(video, tmp_path / "f", 1)
+    assert (made.kept[0].width, made.kept[0].height) == (427, HEIGHT)
+
+
+def test_scaled(tmp_path):
+    made = extract(write_video(tmp_path / "a.mp4", pan(4)), tmp_path / "f", 2, size=160)
+    assert (made.kept[0].width, made.kept[0].height) == (160, 120)
+    with Image.open(tmp_path / "f" / "frame_00001.jpg") as image:
+        assert image.size == (160, 120)
+
+
+def test_where_the_camera_stands_still_one_frame_is_kept(tmp_path):
+    moving = pan(12)
+    frames = [*moving[:4], *[moving[4]] * 8, *moving[5:]]
+    made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", len(frames))
+    assert len(made.kept) == len(moving)
+    assert [reason for _, reason in made.skipped] == [SAME_VIEW] * 7
+
+
+def test_frames_of_nothing_are_left_out(tmp_path):
+    frames = pan(8)
+    frames[0] = np.zeros_like(frames[0])
+    frames[5] = blurred(frames[5], 12)
+    made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", 8)
+    assert [(round(t, 1), why) for t, why in made.skipped] == [(0.0, BLACK), (0.5, BLURRED)]
+    assert len(made.kept) == 6
+
+
+def test_a_damaged_video_gives_what_can_be_read_and_says_so(tmp_path, caplog):
+    pictures = pan(60, seed=3)
+    path = write_video(tmp_path / "a.avi", pictures, codec="mjpeg")
+    content = bytearray(path.read_bytes())
+    for i in range(len(content) // 3, len(content) // 3 + 60000):
+        content[i] = (i * 7919) % 256
+    path.write_bytes(content[: len(content) * 3 // 4])
+    with caplog.at_level(logging.WARNING, "snowsplat"):
+        made = extract(path, tmp_path / "f", 10)
+    assert 3 <= len(made.kept) <= 10
+    assert made.read < 58
+    assert "a.avi: is damaged or cut off" in caplog.text
+
+
+def test_colours(tmp_path):
+    """Of both matrices that videos come with: named in the file, or guessed by its size."""
+    colours = np.zeros((720, 1280, 3), np.uint8)
+    colours[:360], colours[360:] = (210, 40, 60), (30, 190, 50)
+    colours[::16, ::16] = 255  # something to see
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=5)
+        stream.width, stream.height, stream.pix_fmt = 1280, 720, "yuv420p"
+        frame = av.VideoFrame.from_ndarray(colours, "rgb24").reformat(
+            format="yuv420p", dst_colorspace="ITU709"
+        )
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    made = extract(tmp_path / "a.mp4", tmp_path / "f", 1)
+    with Image.open(tmp_path / "f" / made.kept[0].name) as image:
+        got = np.asarray(image).astype(int)
+    assert np.abs(got[104, 104] - (210, 40, 60)).max() <= 6
+    assert np.abs(got[600, 104] - (30, 190, 50)).max() <= 6
+
+
+def test_progress_reaches_the_end(tmp_path):
+    calls = []
+    extract(
+        write_video(tmp_path / "a.mp4", pan(25)),
+        tmp_path / "f",
+        5,
+        report=lambda *c: calls.append(c),
+    )
+    assert calls[0] == (10, 25, "frames of a.mp4")
+    assert calls[-1] == (25, 25, "frames of a.mp4")
+
+
+def test_ctrl_c_comes_through(tmp_path):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    video = write_video(tmp_path / "a.mp4", pan(25))
+    with pytest.raises(KeyboardInterrupt):
+        extract(video, tmp_path / "f", 5, report=stop)
+
+
+def test_a_full_disk_is_no_damaged_video(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("snowsplat.sfm.ingest.video.save", full)
+    with pytest.raises(OSError, match="No space left"):
+        extract(write_video(tmp_path / "a.mp4", [wall()] * 3), tmp_path / "f", 1)
+
+
+def test_a_real_video(tmp_path):
+    if not REAL.is_file():
+        pytest.skip("no real video at ../shared/captures/walkaround.mp4")
+    clip = read_clip(REAL)
+    assert (clip.packets, clip.width, clip.height) == (706, 720, 1280)
+    assert clip.seconds == pytest.approx(23.53, abs=0.05)
+    made = extract(REAL, tmp_path / "f", frames_wanted(clip, None, None))
+    assert made.read == 706
+    assert 54 <= len(made.kept) <= 60
+    assert {reason for _, reason in made.skipped} == {SAME_VIEW}
+    # By the eye: around 4.5 s and 22.7 s the hand jerks; the frames taken there are sharp.
+    taken = [round(frame.seconds * 30) for frame in made.kept]
+    assert not {137, 138, 683, 684} & set(taken)
+
+
+def test_no_video(tmp_path):
+    (tmp_path / "a.mp4").write_text("x")
+    with pytest.raises(UserError):
+        extract(tmp_path / "a.mp4", tmp_path / "f", 3)

@@ -1,0 +1,85 @@
+"""The pinhole camera of a lens: sound for every calibration that may come up."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from snowsplat.sfm.pinhole import pinhole_of
+
+LENSES = {
+    "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),
+    "barrel": ("SIMPLE_RADIAL", [260.0, 158.3, 121.6, -0.2]),
+    "tangential": ("OPENCV", [262.0, 258.0, 165.0, 117.0, -0.12, 0.05, 0.003, -0.004]),
+    "fisheye": ("OPENCV_FISHEYE", [150.0, 150.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0]),
+}
+
+
+def lens(model: str, params: list[float], width: int = 320, height: int = 240) -> pycolmap.Camera:
+    return pycolmap.Camera(model=model, width=width, height=height, params=params)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_no_blank_borders_and_as_large_as_colmap_makes_it(name):
+    camera = lens(*LENSES[name])
+    pinhole = pinhole_of(camera)
+    assert pinhole.nodes.min() > -1
+    assert (pinhole.nodes.max(axis=(0, 1)) < (321, 241)).all()
+    theirs = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    assert (pinhole.width, pinhole.height) == (theirs.width, theirs.height)
+    assert np.allclose(pinhole.params, theirs.params)
+    assert not pinhole.cropped
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_nodes_are_where_the_lens_puts_them(name):
+    camera = lens(*LENSES[name])
+    pinhole = pinhole_of(camera)
+    fx, fy, cx, cy = pinhole.params
+    rows, columns = pinhole.nodes.shape[:2]
+    for row, column in ((0, 0), (rows - 1, columns - 1), (rows // 2, 1)):
+        x, y = column * pinhole.width / (columns - 1), row * pinhole.height / (rows - 1)
+        expected = camera.img_from_cam(np.array([(x - cx) / fx, (y - cy) / fy, 1.0]))
+        assert np.allclose(pinhole.nodes[row, column], expected)
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "expected"),
+    [
+        ("SIMPLE_PINHOLE", [260.0, 160.0, 120.0], (260.0, 260.0, 160.0, 120.0)),
+        ("PINHOLE", [260.0, 255.0, 160.0, 120.0], (260.0, 255.0, 160.0, 120.0)),
+        ("RADIAL", [260.0, 161.0, 122.0, 0.0, 0.0], (260.0, 260.0, 161.0, 122.0)),
+    ],
+)
+def test_without_distortion_the_camera_stays_as_it_is(model, params, expected):
+    pinhole = pinhole_of(lens(model, params))
+    assert pinhole.nodes is None
+    assert (pinhole.width, pinhole.height) == (320, 240)
+    assert pinhole.params == expected
+
+
+def test_a_fisheye_without_coefficients_is_no_pinhole():
+    assert pinhole_of(lens(*LENSES["fisheye"])).nodes is not None
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        # Polynomials that turn back within the picture.
+        ("SIMPLE_RADIAL", [250.0, 160.0, 120.0, -0.6]),
+        ("FULL_OPENCV", [250.0, 250.0, 160.0, 120.0, 0.1, 0.1, 0.0, 0.0, 0.1, -2.0, 0.0, 0.0]),
+    ],
+)
+def test_what_is_folded_is_cropped(model, params):
+    pinhole = pinhole_of(lens(model, params))
+    assert pinhole.cropped
+    assert pinhole.width >= 64
+    # Left to right in the photo is left to right in the picture, all the way; and so downwards.
+    assert (np.diff(pinhole.nodes[..., 0], axis=1) > 0).all()
+    assert (np.diff(pinhole.nodes[..., 1], axis=0) > 0).all()
+    assert pinhole.nodes.min() > -1
+
+
+@pytest.mark.parametrize("strength", [-30.0, 300.0])
+def test_nonsense_is_refused(strength):
+    with pytest.raises(ValueError, match="next to nothing"):
+        pinhole_of(lens("SIMPLE_RADIAL", [250.0, 160.0, 120.0, strength]))

@@ -1,0 +1,79 @@
+"""The model of the undistorted images sees what that of the photos saw, in another frame."""
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
+from snowsplat.sfm.pinhole import pinhole_of
+from snowsplat.sfm.pinhole_model import write_model
+
+F64 = torch.float64
+SCENE = Similarity(
+    1.7,
+    rotation_from_quat(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=F64)),
+    torch.tensor([0.3, 0.2, -0.1], dtype=F64),
+)
+
+
+def opencv(strength: float) -> pycolmap.Camera:
+    params = [260.0, 258.0, 164.0, 119.0, strength, 0.02, 0.001, -0.002]
+    return pycolmap.Camera(model="OPENCV", width=320, height=240, params=params)
+
+
+@pytest.fixture
+def found(model_of) -> pycolmap.Reconstruction:
+    """Two lenses, four photos, as SfM finds them."""
+    up = torch.tensor([0, -1.0, 0], dtype=F64)
+    centres = torch.tensor([[-1.0, 0, -4], [-0.3, 0.2, -4], [0.4, 0, -4], [1, -0.2, -4]]).double()
+    poses = torch.stack([look_at(centre, 0 * up, up) for centre in centres])
+    points = 0.8 * torch.randn(200, 3, generator=torch.Generator().manual_seed(1), dtype=F64)
+    return model_of(poses, points, [opencv(-0.12), opencv(0.08)])
+
+
+def written(model: pycolmap.Reconstruction, folder) -> pycolmap.Reconstruction:
+    pinholes = {number: pinhole_of(camera) for number, camera in model.cameras.items()}
+    write_model(model, pinholes, SCENE, folder / "sparse")
+    return pycolmap.Reconstruction(folder / "sparse" / "0")
+
+
+def test_keypoints_are_where_the_moved_points_fall(found, tmp_path):
+    before = {number: point.xyz.copy() for number, point in found.points3D.items()}
+    after = written(found, tmp_path)
+    assert after.num_points3D() == len(before)
+    for number, xyz in before.items():
+        there = SCENE.apply(torch.from_numpy(xyz)).numpy()
+        assert np.allclose(after.points3D[number].xyz, there)
+    errors = [
+        np.linalg.norm(image.project_point(after.points3D[p.point3D_id].xyz) - p.xy)
+        for image in after.images.values()
+        for p in image.points2D
+        if p.has_point3D()
+    ]
+    assert len(errors) > 400
+    assert max(errors) < 1e-3  # pixels; the keypoints were exact
+
+
+def test_an_older_model_is_replaced_whole(found, tmp_path):
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sparse" / "1").mkdir()
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("old")
+    written(found, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
+    names = {path.name for path in (tmp_path / "sparse").rglob("*")}
+    assert {"0", "cameras.bin", "images.bin", "points3D.bin", "points3D.ply"} <= names
+    assert not {"1", "images.txt"} & names
+
+
+def test_keypoints_beyond_the_lens_model_are_numbers_all_the_same(found, tmp_path):
+    camera = opencv(-0.9)  # turns back inside of the picture
+    corner = np.array([[1.0, 1.0]])
+    assert not np.isfinite(camera.cam_from_img(corner)).all()
+    found.cameras[1].params = camera.params
+    image = found.images[1]
+    image.points2D[0].xy = corner[0]
+    after = written(found, tmp_path)
+    positions = np.array([p.xy for p in after.images[1].points2D])
+    assert np.isfinite(positions).all()
+    assert tuple(positions[0]) == (-1.0, -1.0)

@@ -1,0 +1,160 @@
+"""The page about a dataset: whole, alone, well-formed, whatever the names are."""
+
+import base64
+import io
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.scene.geometry import look_at
+from snowsplat.sfm.report import write_report
+
+NAMES = [
+    "one.jpg",
+    "sub/zwei ñandú 雪.jpg",
+    "a <b> & 'c' \"d\".png",
+    *(f"{i:03d}.jpg" for i in range(27)),
+]
+UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory, model_of) -> Path:
+    root = tmp_path_factory.mktemp("captures") / "mon <château>"
+    angles = torch.arange(len(NAMES), dtype=torch.float64) * 0.2
+    centres = torch.stack([4 * angles.sin(), -1 + 0 * angles, -4 * angles.cos()], 1)
+    poses = torch.stack([look_at(centre, 0 * UP, UP) for centre in centres])
+    points = torch.randn(3000, 3, generator=torch.Generator().manual_seed(0)) * 0.6
+    camera = pycolmap.Camera(model="PINHOLE", width=160, height=120, params=[100, 100, 80, 60])
+    (root / "sparse" / "0").mkdir(parents=True)
+    model_of(poses, points, [camera], NAMES).write(root / "sparse" / "0")
+    for name in NAMES:
+        (root / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        mode = "RGBA" if name.endswith("png") else "RGB"
+        Image.new(mode, (160, 120), (90, 120, 40, 128)[: len(mode)]).save(root / "images" / name)
+    return root
+
+
+def facts(**sfm: Any) -> dict[str, Any]:
+    lens = {
+        "model": "SIMPLE_RADIAL",
+        "width": 160,
+        "height": 120,
+        "params": [100.0, 80.0, 60.0, 0.01],
+        "focal_from": "guessed",
+        "images": len(NAMES),
+    }
+    return {
+        "inputs": ["/photos/mon <château>"],
+        "settings": {"fps": None, "camera_model": "SIMPLE_RADIAL <i>"},
+        "gathered": {
+            "photos": [
+                {"name": name, "sequence": "walk.mp4" if name[0] == "0" else None} for name in NAMES
+            ],
+            "skipped": [["/photos/bad <script>.jpg", "cannot be decoded"]],
+        },
+        "sfm": {
+            "registered": NAMES,
+            "unregistered": {"lost & found.jpg": "too few points in common"},
+            "points": 3000,
+            "observations": 51234,
+            "reprojection_error": 0.613,
+            "sub_models": [len(NAMES)],
+            "cameras": [lens],
+            "pairs": "each with each",
+            "attempts": ["incremental: 30 of 31 photos"],
+        }
+        | sfm,
+        "undistorted": {"sizes": [[158, 118, 30]], "resampled": True},
+        "seconds": {"photos": 3.21, "poses": 6000.0, "images": 130.0},
+    }
+
+
+def words(page: Path) -> str:
+    return " ".join("".join(ET.parse(page).getroot().find("body").itertext()).split())
+
+
+def test_page_is_well_formed_and_needs_nothing_else(dataset):
+    page = write_report(dataset, facts())
+    assert page == dataset / "capture_report.html"
+    text = page.read_text(encoding="utf-8")
+    ET.fromstring(text)  # strict: it is XML too
+    HTMLParser().feed(text)
+    sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert sources
+    assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
+    assert "<script" not in text
+    assert "url(" not in text
+
+
+def test_page_tells_what_came_of_it(dataset):
+    told = words(write_report(dataset, facts()))
+    for expected in (
+        "mon <château>",
+        "30 of 31 photos",
+        "30 / 31",
+        "3,000",
+        "51,234",
+        "0.61 px",
+        "100 px (77°)",
+        "1 h 40 min",
+        "2 min 10 s",
+        "3.2 s",
+        "lost & found.jpg",
+        "too few points in common",
+        "bad <script>.jpg",
+        "cannot be decoded",
+        "each with each",
+        "incremental: 30 of 31 photos",
+        "158 × 118",
+        "snowsplat train '",
+    ):
+        assert expected in told
+
+
+def test_all_cameras_appear_in_both_drawings(dataset):
+    root = ET.parse(write_report(dataset, facts())).getroot()
+    drawings = list(root.iter("{http://www.w3.org/2000/svg}svg"))
+    assert len(drawings) == 2
+    for drawing in drawings:
+        titles = [title.text for title in drawing.iter("{http://www.w3.org/2000/svg}title")]
+        assert sorted(titles) == sorted([*NAMES, "walk.mp4"])
+
+
+def test_thumbnails_are_small_images(dataset):
+    root = ET.parse(write_report(dataset, facts())).getroot()
+    images = list(root.iter("img"))
+    assert len(images) == 24
+    assert {image.attrib["alt"] for image in images} <= set(NAMES)
+    for image in images:
+        with Image.open(io.BytesIO(base64.b64decode(image.attrib["src"].split(",")[1]))) as decoded:
+            assert decoded.format == "JPEG"
+            assert decoded.height == 110
+    assert (dataset / "capture_report.html").stat().st_size < 600_000
+
+
+def test_trouble_is_told(dataset):
+    told = words(write_report(dataset, facts(sub_models=[30, 12, 4], reprojection_error=2.5)))
+    assert "fall into 3 parts" in told
+    assert "30, 12, 4 photos" in told
+    assert "reprojection error is high" in told
+    calm = words(write_report(dataset, facts(unregistered={})))
+    assert "All 30 photos have their place." in calm
+    assert "parts" not in calm
+    assert "error is high" not in calm
+
+
+def test_long_lists_are_cut_and_odd_names_survive(dataset):
+    lost = {f"p{i}\udcff\x07.jpg": "blurred" for i in range(900)}
+    page = write_report(dataset, facts(unregistered=lost, reprojection_error=None))
+    told = words(page)
+    assert "p199" in told
+    assert "p200" not in told
+    assert "and 701 more" in told  # one of them was not read at all

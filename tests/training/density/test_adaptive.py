@@ -1,0 +1,237 @@
+"""Adaptive density control on hand-made Gaussians and hand-made gradients."""
+
+import math
+
+import pytest
+import torch
+
+from snowsplat.ops.splats import Splats2D
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.training.density.adaptive import (
+    RESET_OPACITY,
+    SPLIT_SHRINK,
+    AdaptiveDensity,
+    AdaptiveDensityControl,
+)
+from snowsplat.training.optim import Adam, LearningRates
+from snowsplat.training.step_schedule import Schedule
+
+EXTENT = 10.0  # with percent_dense = 0.01: clone up to a scale of 0.1, split beyond
+
+
+def gaussians_of(scales: list[float], opacity: float = 0.5) -> Gaussians:
+    """A row along x, one each; the colour (sh_dc) says which is which."""
+    n = len(scales)
+    generator = torch.Generator().manual_seed(1)
+    return Gaussians(
+        means=torch.tensor([[float(i), 0.0, 0.0] for i in range(n)]),
+        log_scales=torch.tensor(scales).log()[:, None].repeat(1, 3),
+        quats=torch.randn(n, 4, generator=generator),
+        opacity_logits=torch.full((n,), math.log(opacity / (1 - opacity))),
+        sh_dc=torch.arange(float(n))[:, None, None].repeat(1, 1, 3),
+        sh_rest=torch.zeros(n, 0, 3),
+    )
+
+
+def names(gaussians: Gaussians) -> list[int]:
+    """Which Gaussians these came from, in ascending order."""
+    return sorted(int(name) for name in gaussians.sh_dc[:, 0, 0])
+
+
+def set_up(
+    gaussians: Gaussians, iterations: int = 30_000, random_start: bool = False, **knobs: object
+) -> tuple[AdaptiveDensityControl, Adam]:
+    control = AdaptiveDensity(**knobs).control(  # type: ignore[arg-type]
+        len(gaussians),
+        schedule=Schedule(iterations),
+        extent=EXTENT,
+        random_start=random_start,
+        generator=torch.Generator().manual_seed(0),
+    )
+    adam = Adam(gaussians, LearningRates(), schedule=Schedule(30_000), extent=EXTENT)
+    for moments in (adam.exp_avg, adam.exp_avg_sq):
+        for moment in moments.values():
+            moment.fill_(1.0)
+    return control, adam
+
+
+def seen(control: AdaptiveDensityControl, grads: list[float]) -> None:
+    control.grad_sum, control.views = torch.tensor(grads), torch.ones(len(grads))
+
+
+def view(ids: list[int], grad: list[list[float]], radii: list[float] | None = None) -> Splats2D:
+    """Splats with the position gradient of one backward pass."""
+    n = len(ids)
+    ones = torch.ones(n)
+    splats = Splats2D.pack(
+        torch.zeros(n, 2),
+        torch.ones(n, 3),
+        ones,
+        ones,
+        torch.zeros(n, 3),
+        torch.tensor(radii) if radii else ones,
+        torch.tensor(ids, dtype=torch.int32),
+    )
+    splats.packed.grad = torch.zeros_like(splats.packed)
+    splats.packed.grad[:, :2] = torch.tensor(grad)
+    return splats
+
+
+def test_statistic_is_the_mean_over_views_in_half_image_sizes():
+    gaussians = gaussians_of([0.05] * 4)
+    control, _ = set_up(gaussians)
+    control.after_backward(1, gaussians, view([0, 2], [[3e-6, 0.0], [0.0, 4e-6]]), 200, 100)
+    control.after_backward(2, gaussians, view([2, 3], [[3e-6, 4e-6], [1e-6, 0.0]]), 100, 50)
+    # Gaussian 2: 4e-6 · 50 in the first view; (3e-6 · 50, 4e-6 · 25) in the second, at half the
+    # size.
+    expected = [3e-4, 0.0, 2e-4 + math.hypot(1.5e-4, 1e-4), 5e-5]
+    torch.testing.assert_close(control.grad_sum, torch.tensor(expected))
+    assert control.views.tolist() == [1, 0, 2, 1]
+
+
+def test_statistics_end_with_densification():
+    gaussians = gaussians_of([0.05])
+    control, _ = set_up(gaussians, densify_until=10)
+    control.after_backward(11, gaussians, view([0], [[1.0, 1.0]]), 10, 10)
+    assert not control.views.any()
+
+
+def test_small_are_cloned_large_are_split_calm_are_left():
+    gaussians = gaussians_of([0.05, 0.5, 0.05, 0.5])
+    before = gaussians.clone()
+    control, adam = set_up(gaussians)
+    seen(control, [3e-4, 3e-4, 1e-4, 1e-4])
+    refined = control.after_step(600, gaussians, adam)
+
+    assert names(refined) == [0, 0, 1, 1, 2, 3]
+    rows = {name: (refined.sh_dc[:, 0, 0] == name).nonzero()[:, 0] for name in range(4)}
+    for name in (0, 2, 3):  # kept, and cloned in the same place
+        assert torch.equal(refined.means[rows[name]], before.means[[name] * len(rows[name])])
+        assert torch.equal(
+            refined.log_scales[rows[name]], before.log_scales[[name] * len(rows[name])]
+        )
+    children = refined.select(rows[1])
+    assert (children.means != before.means[1]).all()
+    assert not torch.equal(children.means[0], children.means[1])
+    torch.testing.assert_close(children.scales, torch.full((2, 3), 0.5 / SPLIT_SHRINK))
+    assert torch.equal(children.quats, before.quats[[1, 1]])
+    # The original of a clone keeps its moments and so goes its own way; twin and children have
+    # none.
+    moments = adam.exp_avg["means"][:, 0]
+    assert sorted(moments[rows[0]].tolist()) == [0.0, 1.0]
+    assert moments[rows[1]].tolist() == [0.0, 0.0]
+    assert moments[rows[2]].tolist() == [1.0]
+    # Everything is as long as the new set, and counts from zero again.
+    for statistic in control.state_tensors().values():
+        assert statistic.shape == (6,)
+        assert not statistic.any()
+
+
+def test_children_are_drawn_from_their_parent():
+    """Whitened by the parent's covariance, 4000 children are standard normal."""
+    n = 2000
+    parent = gaussians_of([0.5])
+    parent.log_scales[0] = torch.tensor([2.0, 0.4, 0.1]).log()
+    gaussians = parent.select(torch.zeros(n, dtype=torch.int64))
+    control, adam = set_up(gaussians)
+    seen(control, [1.0] * n)
+    refined = control.after_step(600, gaussians, adam)
+    assert len(refined) == 2 * n
+    rotation = rotation_from_quat(parent.quats[0])
+    white = (refined.means - parent.means[0]) @ rotation / parent.scales[0]
+    torch.testing.assert_close(white.mean(dim=0), torch.zeros(3), atol=0.08, rtol=0)
+    torch.testing.assert_close(white.T.cov(), torch.eye(3), atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize("step", [400, 650, 15_100])
+def test_nothing_happens_outside_of_the_schedule(step):
+    gaussians = gaussians_of([0.05])
+    control, adam = set_up(gaussians)
+    seen(control, [1.0])
+    assert control.after_step(step, gaussians, adam) is gaussians
+    assert control.views.any()
+
+
+def test_transparent_ones_are_removed():
+    gaussians = gaussians_of([0.05] * 4)
+    gaussians.opacity_logits[1:3] = math.log(0.004 / 0.996)
+    control, adam = set_up(gaussians)
+    seen(control, [0.0, 1.0, 1.0, 0.0])  # even where they would be densified
+    assert names(control.after_step(600, gaussians, adam)) == [0, 3]
+
+
+def test_size_pruning_waits_for_the_first_reset():
+    def refined(step: int, **knobs: object) -> list[int]:
+        gaussians = gaussians_of([0.05, 1.1, 0.05])
+        control, adam = set_up(gaussians, **knobs)
+        control.max_radii[2] = 21.0
+        return names(control.after_step(step, gaussians, adam))
+
+    assert refined(2900) == [0, 1, 2]
+    assert refined(3100) == [0]
+    assert refined(3100, prune_world_size=0.0) == [0, 1]
+    assert refined(3100, prune_screen_size=0.0) == [0, 2]
+    assert refined(3100, opacity_reset_interval=0) == [0, 1, 2]
+
+
+def test_a_split_is_judged_by_the_size_of_its_children():
+    gaussians = gaussians_of([1.5, 1.7])  # children of 0.94 and 1.06; the limit is 1.0
+    control, adam = set_up(gaussians)
+    seen(control, [1.0, 1.0])
+    assert names(control.after_step(3100, gaussians, adam)) == [0, 0]
+
+
+def test_the_cap_lets_the_largest_gradients_go_first():
+    gaussians = gaussians_of([0.05, 0.05, 0.5, 0.5, 0.05])
+    control, adam = set_up(gaussians, max_gaussians=7)
+    seen(control, [3e-4, 9e-4, 5e-4, 8e-4, 0.0])
+    refined = control.after_step(600, gaussians, adam)
+    assert names(refined) == [0, 1, 1, 2, 3, 3, 4]
+    seen(control, [1.0] * 7)
+    assert len(control.after_step(700, refined, adam)) == 7
+
+
+def test_opacity_reset_and_its_moments():
+    gaussians = gaussians_of([0.05, 0.05])
+    gaussians.opacity_logits[1] = math.log(0.006 / 0.994)
+    control, adam = set_up(gaussians)
+    reset = control.after_step(3000, gaussians, adam)
+    assert reset.opacities.tolist() == pytest.approx([RESET_OPACITY, 0.006])
+    assert not adam.exp_avg["opacity_logits"].any()
+    assert not adam.exp_avg_sq["opacity_logits"].any()
+    assert adam.exp_avg["means"].any()
+
+
+def test_when_opacity_is_reset():
+    def resets(steps: range, **knobs: object) -> list[int]:
+        control, _ = set_up(gaussians_of([0.05]), **knobs)
+        return [step for step in steps if control._resets_at(step)]
+
+    every_hundred = range(0, 30_001, 100)
+    assert resets(every_hundred[1:]) == [3000, 6000, 9000, 12_000]
+    assert resets(every_hundred[1:], random_start=True)[:2] == [500, 3000]
+    assert resets(every_hundred[1:], random_start=True, reset_random_start=False)[0] == 3000
+    assert resets(every_hundred[1:], random_start=True, iterations=900) == []
+    assert resets(every_hundred[1:], densify_until=6400) == [3000]
+    assert resets(every_hundred[1:], opacity_reset_interval=0) == []
+
+
+def test_rows_are_kept_in_morton_order():
+    generator = torch.Generator().manual_seed(3)
+    gaussians = gaussians_of([0.05] * 500)
+    gaussians.means.copy_(torch.rand(500, 3, generator=generator))
+    control, adam = set_up(gaussians)
+    adam.exp_avg["means"].copy_(gaussians.means)
+    refined = control.after_step(600, gaussians, adam)
+    assert torch.equal(adam.exp_avg["means"], refined.means)  # moments went along
+    steps = (refined.means[1:] - refined.means[:-1]).norm(dim=1).median()
+    assert steps < 0.2
+
+
+def test_fractions_scale_with_the_training_and_steps_do_not():
+    gaussians = gaussians_of([0.05])
+    control, _ = set_up(gaussians, iterations=3000, densify_from=100, densify_until=0.5)
+    assert (control.first, control.last) == (100, 1500)
+    control, _ = set_up(gaussians, iterations=7000)
+    assert (control.first, control.last) == (500, 7000)

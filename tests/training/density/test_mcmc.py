@@ -1,0 +1,168 @@
+"""MCMC density control: eq. 8 and 9 of Kheradmand et al. 2024, and the cap."""
+
+import math
+
+import pytest
+import torch
+
+from snowsplat.ops.splats import Splats2D
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.training.density.mcmc import McmcDensity, McmcDensityControl, shared_opacity
+from snowsplat.training.optim import Adam, LearningRates
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.util.errors import UserError
+
+
+def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
+    generator = torch.Generator().manual_seed(n)
+    return Gaussians(
+        means=torch.rand(n, 3, generator=generator),
+        log_scales=torch.rand(n, 3, generator=generator) - 3.0,
+        quats=torch.randn(n, 4, generator=generator),
+        opacity_logits=torch.full((n,), math.log(opacity / (1 - opacity))),
+        sh_dc=torch.arange(float(n))[:, None, None].repeat(1, 1, 3),
+        sh_rest=torch.zeros(n, 0, 3),
+    )
+
+
+def set_up(gaussians: Gaussians, **knobs: object) -> tuple[McmcDensityControl, Adam]:
+    control = McmcDensity(**knobs).control(  # type: ignore[arg-type]
+        len(gaussians),
+        schedule=Schedule(30_000),
+        extent=1.0,
+        random_start=False,
+        generator=torch.Generator().manual_seed(0),
+    )
+    adam = Adam(gaussians, LearningRates(means_steps=1.0), schedule=Schedule(30_000), extent=1.0)
+    for moments in (adam.exp_avg, adam.exp_avg_sq):
+        for moment in moments.values():
+            moment.fill_(1.0)
+    return control, adam
+
+
+@pytest.mark.parametrize("copies", [1, 2, 3, 7, 51])
+@pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
+def test_equation_9_as_the_paper_writes_it(opacity, copies):
+    """The double sum, term by term."""
+    new, shrink = shared_opacity(
+        torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies])
+    )
+    assert float(new) == pytest.approx(1 - (1 - opacity) ** (1 / copies), rel=1e-9)
+    total = sum(
+        math.comb(i - 1, k) * (-1) ** k * float(new) ** (k + 1) / math.sqrt(k + 1)
+        for i in range(1, copies + 1)
+        for k in range(i)
+    )
+    assert float(shrink) == pytest.approx(opacity / total, rel=1e-6)
+
+
+def test_alone_nothing_changes():
+    opacities = torch.tensor([0.1, 0.5, 0.99])
+    new, shrink = shared_opacity(opacities, torch.ones(3, dtype=torch.int64))
+    torch.testing.assert_close(new, opacities)
+    torch.testing.assert_close(shrink, torch.ones(3))
+
+
+def test_opaque_ones_and_crowds_stay_finite():
+    new, shrink = shared_opacity(torch.tensor([1.0, 1.0, 1e-6]), torch.tensor([51, 1000, 1000]))
+    assert ((new > 0) & (new < 1)).all()
+    assert ((shrink > 0) & (shrink <= 1.001)).all()
+
+
+def test_a_ray_through_the_copies_keeps_its_integral():
+    """What eq. 9 stands for: along a line, N copies together block as much as the one did."""
+    opacity, copies = 0.8, 4
+    new, shrink = shared_opacity(
+        torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies])
+    )
+    x = torch.linspace(-12, 12, 100_001, dtype=torch.float64)
+    alone = opacity * torch.exp(-0.5 * x**2)
+    together = 1 - (1 - new * torch.exp(-0.5 * (x / shrink) ** 2)) ** copies
+    torch.testing.assert_close(together.max(), alone.max())
+    torch.testing.assert_close(torch.trapezoid(together, x), torch.trapezoid(alone, x))
+
+
+def test_dead_are_relocated_onto_live_ones():
+    gaussians = some_gaussians(200)
+    dead = torch.arange(200) % 4 == 0
+    gaussians.opacity_logits[dead] = -6.0
+    gaussians.means[0] = torch.nan  # broken counts as dead
+    control, adam = set_up(gaussians, max_gaussians=200)
+    total = gaussians.opacities[~dead].double()
+    refined = control._relocate(gaussians, adam)
+
+    assert len(refined) == 200
+    sources = refined.sh_dc[:, 0, 0].long()
+    assert not dead[sources].any()
+    assert refined.means.isfinite().all()
+    copies = torch.bincount(sources, minlength=200)
+    assert (copies[~dead] >= 1).all()
+    # Together, those in one place are as opaque as the one that was there; with no momentum.
+    together = 1 - (1 - refined.opacities.double()) ** copies[sources]
+    torch.testing.assert_close(together, total.new_full((200,), 0.5), atol=1e-5, rtol=0)
+    crowded = copies[sources] > 1
+    for moments in (adam.exp_avg, adam.exp_avg_sq):
+        for moment in moments.values():
+            assert not moment[crowded].any()
+            assert (moment[~crowded] == 1).all()
+
+
+def test_sources_are_drawn_by_opacity():
+    gaussians = some_gaussians(3000, opacity=0.9)
+    gaussians.opacity_logits[1000:] = math.log(0.1 / 0.9)
+    gaussians.opacity_logits[2000:] = -6.0
+    control, adam = set_up(gaussians, max_gaussians=3000)
+    refined = control._relocate(gaussians, adam)
+    copies = torch.bincount(refined.sh_dc[:, 0, 0].long(), minlength=3000) - 1
+    share = float(copies[:1000].sum()) / 1000
+    assert share == pytest.approx(0.9, abs=0.04)
+
+
+def test_growth_and_the_hard_cap():
+    gaussians = some_gaussians(100)
+    control, adam = set_up(gaussians, max_gaussians=112, densify_from=0)
+    counts = []
+    for step in range(100, 600, 100):
+        gaussians = control.after_step(step, gaussians, adam)
+        assert adam.exp_avg["means"].shape == gaussians.means.shape
+        counts.append(len(gaussians))
+    assert counts == [105, 110, 112, 112, 112]
+
+
+def test_noise_follows_the_covariance_of_transparent_gaussians():
+    """Eq. 8: deviations of Σ η are those of Σ: R diag(s²) Rᵀ applied to unit noise."""
+    n = 4000
+    one = some_gaussians(1, opacity=0.001)
+    one.log_scales[0] = torch.tensor([0.3, 0.1, 0.02]).log()
+    gaussians = one.select(torch.zeros(n, dtype=torch.int64))
+    opaque = one.clone()
+    opaque.opacity_logits[:] = 2.0
+    gaussians = gaussians.append(opaque)
+    before = gaussians.clone()
+    control, _ = set_up(gaussians)
+    control._add_noise(gaussians, rate=1e-5)
+    moved = gaussians.means - before.means
+    assert not moved[n].any()  # the opaque one stays
+    gate = 1 / (1 + math.exp(-100 * (0.005 - 0.001)))
+    rotation = rotation_from_quat(one.quats[0])
+    deviations = ((moved[:n] @ rotation) / (1e-5 * 5e5 * gate)).std(dim=0)
+    torch.testing.assert_close(deviations, one.scales[0] ** 2, rtol=0.06, atol=0)
+
+
+def test_regularisers_are_the_gradients_of_mean_opacity_and_scale():
+    gaussians = some_gaussians(7)
+    control, _ = set_up(gaussians, opacity_regularizer=0.02, scale_regularizer=0.03)
+    splats = Splats2D(torch.zeros(0, 16), None, 3)
+    control.after_backward(1, gaussians, splats, 10, 10)
+    leaves = gaussians.clone()
+    leaves.opacity_logits.requires_grad_()
+    leaves.log_scales.requires_grad_()
+    (0.02 * leaves.opacities.mean() + 0.03 * leaves.scales.mean()).backward()
+    torch.testing.assert_close(gaussians.opacity_logits.grad, leaves.opacity_logits.grad)
+    torch.testing.assert_close(gaussians.log_scales.grad, leaves.log_scales.grad)
+
+
+def test_without_a_cap_there_is_a_clear_error():
+    with pytest.raises(UserError, match="--max-gaussians"):
+        set_up(some_gaussians(3), max_gaussians=0)

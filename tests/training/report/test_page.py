@@ -1,0 +1,140 @@
+"""The page about a training: whole, alone, true, and silent about the machine's owner."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from snowsplat.data import load_dataset
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training.config import TrainConfig
+from snowsplat.training.history import History
+from snowsplat.training.report import Trained, write_training_report
+from snowsplat.training.trainer import Trainer
+
+NAME = "mon <château>"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> dict[str, Any]:
+    """Arguments of `Trained`; the dataset's names are nasty, one photo has a mask."""
+    folder = tmp_path_factory.mktemp("report") / "capture"
+    write_toy_dataset(folder, n_views=17, width=48, height=36, n_points=300)
+    dataset = load_dataset(folder, hold_out=2)
+    trainer = Trainer(dataset, TrainConfig(iterations=40, test_iterations=(20, 40)))
+    history = History()
+
+    def record(progress: Any) -> None:
+        history.step_ends(progress.step, progress.loss, progress.gaussians)
+        if progress.metrics is not None:
+            history.measure(progress.step, progress.metrics.psnr, progress.metrics.ssim)
+        history.step_begins()
+
+    trainer.run(record)
+    return {
+        "name": NAME,
+        "capture": dataset,
+        "gaussians": trainer.gaussians,
+        "step": 40,
+        "background": (0.0, 0.0, 0.0),
+        "history": history,
+        "evaluation": trainer.evaluate(),
+        "settings": {"recipe": "a & b", "training": {"iterations": 40}},
+        "peak_bytes": 123_000_000,
+    }
+
+
+def words(page: Path) -> str:
+    return " ".join("".join(ET.parse(page).getroot().find("body").itertext()).split())
+
+
+def test_page_is_well_formed_and_needs_nothing_else(trained, tmp_path):
+    page = tmp_path / "report.html"
+    write_training_report(page, Trained(**trained))
+    text = page.read_text(encoding="utf-8")
+    root = ET.fromstring(text)
+    sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert len(sources) == 3 * 5
+    assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
+    assert "<script" not in text
+    assert "url(" not in text
+    assert page.stat().st_size < 200_000
+    charts = root.findall(".//{http://www.w3.org/2000/svg}svg")
+    titles = [chart.find("{http://www.w3.org/2000/svg}title").text for chart in charts]
+    assert titles == ["loss", "PSNR, dB", "Gaussians", "time of a step, ms"]
+
+
+def test_page_tells_what_came_of_it(trained, tmp_path):
+    write_training_report(tmp_path / "report.html", Trained(**trained))
+    told = words(tmp_path / "report.html")
+    evaluation = trained["evaluation"]
+    for expected in (
+        NAME,
+        f"{evaluation.psnr:.2f} dB",
+        f"{evaluation.ssim:.3f}",
+        f"{len(trained['gaussians']):,}",
+        "9 photos that the training has never seen",
+        "8 to train on, 9 held out",
+        "48 × 36",
+        "a & b",
+        "0.1 GB used at most",
+        "instruction set",
+        f"snowsplat view '{NAME}'",
+    ):
+        assert expected in told
+    # The worst first; the best first among the best; each view in the list.
+    order = sorted(evaluation.views, key=lambda view: view.psnr)
+    shown = [f"{view.name}: PSNR" for view in (*order[:3], order[-1], order[-2])]
+    places = [told.index(name) for name in shown]
+    assert places == sorted(places)
+    assert all(told.count(view.name) >= 1 for view in evaluation.views)
+
+
+def test_without_held_out_photos_those_of_the_training_are_measured(trained, tmp_path):
+    dataset = trained["capture"]
+    whole = type(dataset)(dataset.train, [], dataset.points, dataset.extent)
+    changed = trained | {"capture": whole, "evaluation": None, "history": History()}
+    write_training_report(tmp_path / "report.html", Trained(**changed))
+    told = words(tmp_path / "report.html")
+    assert "No photos were held out" in told
+    assert "8 photos of the training" in told
+    assert "8 to train on, 0 held out" in told
+
+
+def test_train_writes_it_and_a_resumed_training_goes_on_with_its_curves(tmp_path):
+    """On the command line; and it tells no more of paths than names."""
+    from snowsplat.cli.main import main
+
+    write_toy_dataset(tmp_path / "photos", n_views=9, width=48, height=36, n_points=300)
+    out = tmp_path / "out"
+    train = ["train", str(tmp_path / "photos"), "-o", str(out), "--eval", "-q"]
+    assert main([*train, "--iterations", "20", "--checkpoint-every", "10"]) == 0
+    first = words(out / "report.html")
+    again = ["train", "-o", str(out), "--resume", "-q", "--iterations", "30"]
+    assert main([*again, "--test-iterations", "25"]) == 0
+    history = json.loads((out / "history.json").read_text())
+    assert sum(stretch["steps"] for stretch in history["stretches"]) == 30
+    assert [measured["step"] for measured in history["measured"]] == [20, 25, 30]
+    page = (out / "report.html").read_text()
+    assert words(out / "report.html") != first
+    assert str(tmp_path) not in page
+    assert "photos" in page
+    assert main([*train, "--iterations", "10", "--overwrite"]) == 0
+    history = json.loads((out / "history.json").read_text())
+    assert sum(stretch["steps"] for stretch in history["stretches"]) == 10
+
+
+def test_what_a_kill_left_of_a_file_goes_with_the_next_training(tmp_path):
+    from snowsplat.cli.main import main
+
+    write_toy_dataset(tmp_path / "photos", n_views=9, width=48, height=36, n_points=300)
+    out = tmp_path / "out"
+    train = ["train", str(tmp_path / "photos"), "-o", str(out), "-q", "--checkpoint-every", "10"]
+    assert main([*train, "--iterations", "10"]) == 0
+    for name in ("history.json", "report.html"):
+        (out / f".{name}.ab12cd_9.tmp").write_text("half")
+    assert main(["train", "-o", str(out), "--resume", "-q", "--iterations", "20"]) == 0
+    assert not list(out.rglob("*.tmp"))

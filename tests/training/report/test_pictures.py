@@ -1,0 +1,45 @@
+"""Photo, render and error of a view."""
+
+import base64
+import io
+import re
+
+import numpy as np
+import torch
+from PIL import Image
+
+from snowsplat.data import View
+from snowsplat.data.decode import ImageSource
+from snowsplat.evaluation.metrics import evaluate_views
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.report.pictures import compared
+
+
+def test_error_is_where_they_differ_and_not_where_the_mask_is(tmp_path):
+    """An empty scene is black: it is off where the photo is white, but for the masked part."""
+    photo = np.zeros((40, 60, 3), np.uint8)
+    photo[:, 20:] = 255
+    Image.fromarray(photo).save(tmp_path / "a.png")
+    mask = np.full((40, 60), 255, np.uint8)
+    mask[:, 40:] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    pose = torch.eye(4, dtype=torch.float64)[:3]
+    view = View(
+        "a <b>.png",
+        Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose),
+        ImageSource(tmp_path / "a.png", 60, 40),
+        ImageSource(tmp_path / "mask.png", 60, 40),
+    )
+    shapes = ((0, 3), (0, 3), (0, 4), (0,), (0, 1, 3), (0, 0, 3))
+    nothing = Gaussians(*(torch.zeros(shape) for shape in shapes))
+    html = compared(nothing, [view], evaluate_views(nothing, [view]), (0.0, 0.0, 0.0))
+    assert "a &lt;b&gt;.png: PSNR" in html
+    sources = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', html)
+    shown = [np.asarray(Image.open(io.BytesIO(base64.b64decode(s)))) for s in sources]
+    assert [picture.shape for picture in shown] == [(40, 60, 3)] * 3
+    means = [
+        [picture[5:35, start + 4 : start + 16].mean() for start in (0, 20, 40)] for picture in shown
+    ]
+    expected = [[0, 255, 255], [0, 0, 0], [0, 255, 0]]
+    np.testing.assert_allclose(means, expected, atol=6)

@@ -1,0 +1,211 @@
+"""Checkpoints: back to the bit, and never a part of one, whatever happens."""
+
+import contextlib
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+
+from snowsplat.training import checkpoint
+from snowsplat.util.errors import UserError
+
+
+def some_tensors() -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    table = torch.randn(50, 16, generator=generator)
+    return {
+        "means": torch.randn(100, 3, generator=generator),
+        "view": table[:, 2:5],  # neither contiguous nor alone in its storage
+        "row": table[7],
+        "exact": torch.tensor([3.4e38, -1.2e-38, -0.0, 1e-45]),
+        "random_state": generator.get_state(),
+        "order": torch.randperm(9),
+        "mask": torch.tensor([True, False]),
+        "scalar": torch.tensor(2.5, dtype=torch.float64),
+        "empty": torch.zeros(0, 3),
+    }
+
+
+def test_back_to_the_bit(tmp_path):
+    tensors = some_tensors()
+    meta = {"config": {"iterations": 30_000, "background": "black", "lr": 1.6e-4}, "note": "ä\n"}
+    path = checkpoint.save(tmp_path / "checkpoints", 500, tensors, meta)
+    assert path == tmp_path / "checkpoints" / "step_000500.safetensors"
+    again = checkpoint.load(path)
+    assert (again.step, again.meta) == (500, meta)
+    assert again.tensors.keys() == tensors.keys()
+    for name, tensor in tensors.items():
+        assert again.tensors[name].dtype == tensor.dtype
+        assert again.tensors[name].shape == tensor.shape
+        assert again.tensors[name].numpy().tobytes() == tensor.contiguous().numpy().tobytes()
+
+
+def test_a_random_state_goes_on_where_it_was(tmp_path):
+    generator = torch.Generator().manual_seed(1)
+    torch.rand(17, generator=generator)
+    path = checkpoint.save(tmp_path, 1, {"random": generator.get_state()}, {})
+    expected = torch.rand(5, generator=generator)
+    generator.set_state(checkpoint.load(path).tensors["random"])
+    assert torch.equal(torch.rand(5, generator=generator), expected)
+
+
+def test_keeps_the_newest_and_sorts_by_number(tmp_path):
+    for step in (500, 999_500, 1_000_000, 1_000_500):
+        checkpoint.save(tmp_path, step, {"a": torch.tensor(step)}, {})
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "step_1000000.safetensors",
+        "step_1000500.safetensors",
+    ]
+    newest = checkpoint.latest(tmp_path)
+    assert newest is not None
+    assert newest.step == newest.tensors["a"] == 1_000_500
+
+
+def test_none_there(tmp_path):
+    assert checkpoint.latest(tmp_path / "absent") is None
+    (tmp_path / "step_000500.safetensors.bak").write_bytes(b"")
+    assert checkpoint.latest(tmp_path) is None
+    with pytest.raises(UserError, match="cannot be read"):
+        checkpoint.load(tmp_path / "step_000001.safetensors")
+
+
+def test_truncated_at_any_length_falls_back_with_a_warning(tmp_path):
+    checkpoint.save(tmp_path, 500, some_tensors(), {})
+    newest = checkpoint.save(tmp_path, 1000, some_tensors(), {})
+    whole = newest.read_bytes()
+    for length in {0, 1, 7, 8, 9, 100, len(whole) - 1, *range(0, len(whole), 211)}:
+        newest.write_bytes(whole[:length])
+        with pytest.warns(UserWarning, match=r"step_001000.*using the one before"):
+            used = checkpoint.latest(tmp_path)
+        assert used is not None
+        assert used.step == 500
+
+
+def test_one_that_cannot_be_read_is_not_taken_for_damaged(tmp_path):
+    """Going on from an older one, or anew, would be for nothing."""
+    checkpoint.save(tmp_path, 500, some_tensors(), {})
+    checkpoint.save(tmp_path, 1000, some_tensors(), {})
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    for spare in (0, 1):  # torch opens it once more
+        taken = []
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(512, limits[0]), limits[1]))
+        try:
+            with contextlib.suppress(OSError):
+                while True:
+                    taken.append(os.open(tmp_path, os.O_RDONLY))
+            for _ in range(spare):
+                os.close(taken.pop())
+            os.close(taken.pop())  # for the list of the folder
+            found = checkpoint.files(tmp_path)
+            assert len(found) == 2
+            taken.append(os.open(tmp_path, os.O_RDONLY))
+            with (
+                mock.patch.object(checkpoint, "files", return_value=found),
+                pytest.raises(UserError, match=r"step_001000.*cannot be read"),
+            ):
+                checkpoint.latest(tmp_path)
+        finally:
+            for handle in taken:
+                os.close(handle)
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_any_damaged_byte_is_noticed(tmp_path):
+    path = checkpoint.save(tmp_path, 500, some_tensors(), {"seed": 1})
+    whole = path.read_bytes()
+    header = 8 + int.from_bytes(whole[:8], "little")
+    for position in {*range(0, len(whole), 97), header, header + 1, len(whole) - 1}:
+        damaged = bytearray(whole)
+        damaged[position] ^= 0x10
+        path.write_bytes(damaged)
+        if position >= header:
+            with pytest.raises(UserError):
+                checkpoint.load(path)
+        else:  # in the header a change may fall on what means nothing, such as padding
+            with contextlib.suppress(UserError):
+                checkpoint.load(path)
+
+
+def test_not_ours_and_another_version(tmp_path, monkeypatch):
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.zeros(3)}, tmp_path / "step_000001.safetensors")
+    with pytest.raises(UserError, match="not a checkpoint"):
+        checkpoint.load(tmp_path / "step_000001.safetensors")
+    monkeypatch.setattr(checkpoint, "VERSION", 99)
+    path = checkpoint.save(tmp_path, 2, {"a": torch.zeros(3)}, {})
+    monkeypatch.undo()
+    with pytest.raises(UserError, match="version 99"):
+        checkpoint.load(path)
+
+
+def test_failed_save_leaves_the_older_ones(tmp_path, monkeypatch):
+    checkpoint.save(tmp_path, 1, {"a": torch.zeros(3)}, {})
+    checkpoint.save(tmp_path, 2, {"a": torch.zeros(3)}, {})
+
+    def full_disk(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint.safetensors.torch, "save_file", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        checkpoint.save(tmp_path, 3, {"a": torch.zeros(3)}, {})
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "step_000001.safetensors",
+        "step_000002.safetensors",
+    ]
+
+
+SAVER = """
+import sys, torch
+from snowsplat.training import checkpoint
+table = torch.arange(4_000_000, dtype=torch.float32)
+print("ready", flush=True)
+step = 0
+while True:
+    step += 1
+    checkpoint.save(sys.argv[1], step, {"table": table + step}, {"step": step})
+"""
+
+
+def test_kill_9_in_the_middle_of_a_save(tmp_path):
+    """Killed at moments spread over a save of 16 MB: all that has its name is whole."""
+    cut = 0
+    for attempt in range(2):
+        folder = tmp_path / str(attempt)
+        process = subprocess.Popen(
+            [sys.executable, "-c", SAVER, str(folder)],
+            stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": str(Path(checkpoint.__file__).parents[2])},
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        deadline = time.monotonic() + 20
+        while not checkpoint.exists(folder):  # one is complete
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        time.sleep(0.05)
+        while time.monotonic() < deadline:  # and another is being written
+            if any(folder.glob(".*tmp*")):
+                time.sleep(0.004 * attempt)
+                break
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        cut += any(folder.glob(".*tmp*"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # the newest must be whole
+            newest = checkpoint.latest(folder)
+        assert newest is not None
+        assert newest.step == newest.meta["step"] > 0
+        assert newest.tensors["table"][1] == 1 + newest.step
+        checkpoint.save(folder, newest.step + 1, {"a": torch.zeros(1)}, {})
+        assert not list(folder.glob(".*"))  # the next save sweeps up
+    assert cut, "no kill fell into a save"

@@ -1,0 +1,273 @@
+"""Numbers that are not finite: stopped at their step, named, and never in what is kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from snowsplat.data import Dataset
+from snowsplat.data.dataset import Points
+from snowsplat.data.decode import LoadedImage
+from snowsplat.ops.native import LAUNCHERS
+from snowsplat.training import checkpoint
+from snowsplat.training.config import TrainConfig
+from snowsplat.training.density import McmcDensity
+from snowsplat.training.finite import Diverged, check_loss, rows_not_finite
+from snowsplat.training.optim import Adam
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.trainer import Trainer
+from snowsplat.util.errors import UserError
+
+from ..ops.engines import launcher
+from .test_trainer import BUSY, BUSY_MCMC, CALM, dataset
+from .test_trainer_gpu import with_room
+
+__all__ = ["dataset"]  # a fixture
+
+VALUES = [math.nan, math.inf, -math.inf]
+ENGINES = [
+    "native",
+    pytest.param("emulated", marks=pytest.mark.emulated),
+    pytest.param("cuda", marks=pytest.mark.gpu),
+]
+#: Its regulariser gives huge scales a huge gradient, whether or not they are seen.
+HUGE_GRADIENTS = replace(
+    CALM, density=McmcDensity(densify_from=10, densify_interval=10, max_gaussians=50)
+)
+
+
+@pytest.fixture(params=ENGINES)
+def begun(
+    request: pytest.FixtureRequest, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[TrainConfig], Trainer]:
+    """A training of two steps, by the kernels of each kind of machine."""
+    if request.param != "native":
+        monkeypatch.setitem(LAUNCHERS, "cpu", launcher(request.param))
+
+    def begin(config: TrainConfig) -> Trainer:
+        trainer = with_room(Trainer(dataset, config), 100_000)
+        trainer.run(until=2)
+        return trainer
+
+    return begin
+
+
+def assert_finite(trainer: Trainer) -> None:
+    assert not rows_not_finite(trainer.state_tensors())
+
+
+def one_line(error: pytest.ExceptionInfo[BaseException]) -> str:
+    text = str(error.value)
+    assert "\n" not in text
+    assert len(text) < 300
+    return text
+
+
+# ------------------------------------------------------------------------------- while it trains
+
+
+def test_a_gradient_that_is_not_finite_is_not_taken(begun) -> None:
+    """The loss of its step is finite: the training stops one step later, with nothing broken."""
+    trainer = begun(HUGE_GRADIENTS)
+    trainer.gaussians.log_scales[3, 1] = 60.0
+    trainer.gaussians.log_scales[7] = 90.0
+    before, moments = trainer.gaussians.clone(), trainer._optimizer.exp_avg["log_scales"].clone()
+    trainer.step_once()
+    after = trainer.gaussians
+    assert trainer.step == 3
+    assert_finite(trainer)
+    assert torch.equal(after.log_scales[7], before.log_scales[7])
+    assert torch.equal(trainer._optimizer.exp_avg["log_scales"][7], moments[7])
+    assert after.log_scales[3, 1] == 60.0
+    assert (after.log_scales[8:] != before.log_scales[8:]).any(dim=1).all()
+
+    kept = trainer.gaussians.clone()
+    with pytest.raises(Diverged, match=r"gradient .* at step 3.* log_scales \(2\)") as error:
+        trainer.run(until=5)
+    one_line(error)
+    assert trainer.step == 3
+    for name, parameter in trainer.gaussians.parameters().items():
+        if name != "means":  # of which the noise of the coming step has begun
+            assert torch.equal(parameter, kept.parameters()[name]), name
+    assert_finite(trainer)
+
+
+def test_a_gradient_of_the_last_step_is_told_too(dataset: Dataset) -> None:
+    trainer = Trainer(dataset, HUGE_GRADIENTS)
+    trainer.run(until=2)
+    trainer.gaussians.log_scales[7] = 90.0
+    with pytest.raises(Diverged, match="at step 3"):
+        trainer.run(until=3)
+    assert_finite(trainer)
+
+
+@pytest.mark.parametrize("value", VALUES)
+@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh_dc"])
+def test_parameters_that_are_not_finite(begun, name: str, value: float) -> None:
+    trainer = begun(CALM)
+    broken = trainer.gaussians.parameters()[name]
+    broken[4:7] = value
+    other = {n: rows_not_finite({n: t}) for n, t in trainer.state_tensors().items()}
+    with pytest.raises(Diverged, match=rf"Gaussians .*{name} \(3\)") as error:
+        trainer.run(until=5)
+    assert re_step(one_line(error)) == 3
+    # The harm does not spread.
+    for n, found in other.items():
+        assert rows_not_finite({n: trainer.state_tensors()[n]}) == found, n
+
+
+def re_step(text: str) -> int:
+    return int(text.partition("at step ")[2].partition(",")[0])
+
+
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+def test_one_that_nobody_sees_is_found_where_the_scene_is_refined(dataset, config) -> None:
+    """Adam of the visible ones alone does not come across it."""
+    trainer = Trainer(dataset, config)
+    trainer.run(until=2)
+    trainer.gaussians.quats[5] = math.nan
+    with pytest.raises(Diverged, match=r"Gaussians .* at step 10, their quats \(1\)") as error:
+        trainer.run()
+    one_line(error)
+    assert trainer.step == 10
+
+
+@pytest.mark.parametrize("rate", [math.nan, math.inf, 1e38])
+def test_a_learning_rate_that_leads_there(dataset: Dataset, rate: float) -> None:
+    rates = replace(CALM.learning_rates, quats=rate, opacity_logits=rate)
+    trainer = Trainer(dataset, replace(CALM, learning_rates=rates))
+    with pytest.raises(Diverged, match="lower learning rates"):
+        trainer.run()
+    assert_finite(trainer)
+
+
+def test_noise_is_finite_whatever_the_scales(dataset: Dataset) -> None:
+    trainer = Trainer(dataset, BUSY_MCMC)
+    trainer.gaussians.log_scales[:] = 80.0
+    trainer.gaussians.opacity_logits[:] = -9.0
+    optimizer = Adam(trainer.gaussians, BUSY.learning_rates, schedule=Schedule(60), extent=1.0)
+    trainer._density.after_step(1, trainer.gaussians, optimizer)
+    assert trainer.gaussians.means.isfinite().all()
+
+
+def test_what_a_loss_comes_from_is_named(dataset: Dataset) -> None:
+    trainer, view = Trainer(dataset, CALM), dataset.train[2]
+    planes = torch.full((3, 20, 24), 0.5)
+    planes[1, 3, 4:6] = math.nan
+    pose = view.camera.cam_from_world.clone()
+    pose[0, 3] = math.inf
+    lost = replace(view, camera=replace(view.camera, cam_from_world=pose))
+    good = LoadedImage(torch.zeros(3, 20, 24, dtype=torch.uint8))
+    cases = [
+        (view, LoadedImage(planes), f"2 pixels of {view.name} are not finite"),
+        (lost, good, f"the camera of {view.name} is not finite"),
+        (view, good, "training has diverged"),
+    ]
+    for seen, photo, expected in cases:
+        with pytest.raises(Diverged, match=expected) as error:
+            check_loss(7, math.nan, trainer.gaussians, seen, photo)
+        assert "step 7" in one_line(error)
+        check_loss(7, 0.5, trainer.gaussians, seen, photo)
+
+
+# ----------------------------------------------------------------------------- before it trains
+
+
+@pytest.mark.parametrize("value", [*VALUES, 1e300])
+def test_cameras_and_points_that_are_not_finite(dataset: Dataset, value: float) -> None:
+    view = dataset.train[1]
+    assert dataset.points is not None
+    pose = view.camera.cam_from_world.clone()
+    pose[1, 3] = value
+    broken = [{"cam_from_world": pose}]
+    if value > 0 or math.isnan(value):
+        broken += [{"cx": value}, {"fx": value}] if value > 0 else [{"cx": value}]
+    for change in broken:
+        lost = replace(view, camera=replace(view.camera, **change))
+        train = [dataset.train[0], lost, *dataset.train[2:]]
+        with pytest.raises(UserError, match=f"1 of 8 cameras .*{view.name}") as error:
+            replace(dataset, train=train, description="somewhere")
+        assert one_line(error).startswith("somewhere: ")
+    xyz = dataset.points.xyz.clone()
+    xyz[3:5, 1] = torch.tensor(value)
+    with pytest.raises(UserError, match="2 of 40 points are not finite") as error:
+        replace(dataset, points=Points(xyz, dataset.points.rgb))
+    one_line(error)
+
+
+@pytest.mark.parametrize("extent", [math.nan, math.inf, 0.0])
+def test_an_extent_that_is_no_number(dataset: Dataset, extent: float) -> None:
+    with pytest.raises(UserError, match="the extent"):
+        replace(dataset, extent=extent)
+
+
+@pytest.mark.parametrize("far", [1e18, 1e20, 3e38])
+def test_points_absurdly_far(dataset: Dataset, far: float) -> None:
+    """They train, or they are named."""
+    assert dataset.points is not None
+    xyz = dataset.points.xyz.clone()
+    xyz[3] = far
+    moved = replace(dataset, points=Points(xyz, dataset.points.rgb))
+    if far <= 1e18:
+        trainer = Trainer(moved, CALM)
+        trainer.run(until=5)
+        assert_finite(trainer)
+        return
+    with pytest.raises(UserError, match=r"log_scales \(\d+\); remove the points") as error:
+        Trainer(moved, CALM)
+    one_line(error)
+
+
+# ---------------------------------------------------------------------------------- checkpoints
+
+
+@pytest.mark.parametrize("key", ["gaussians.means", "optimizer.exp_avg_sq.quats", "density.views"])
+def test_checkpoints_are_finite(dataset: Dataset, key: str, tmp_path, monkeypatch) -> None:
+    trainer = Trainer(dataset, BUSY)
+    trainer.run(until=3)
+    good = checkpoint.save(tmp_path, 3, trainer.state_tensors(), {})
+    kept = good.read_bytes()
+    bad = {name: tensor.clone() for name, tensor in trainer.state_tensors().items()}
+    bad[key][2] = math.nan
+    with pytest.raises(
+        UserError, match=rf"state of step 4 is not finite, rows of {key} \(1\)"
+    ) as error:
+        checkpoint.save(tmp_path, 4, bad, {})
+    one_line(error)
+    assert [path.name for path in tmp_path.iterdir()] == [good.name]
+    assert good.read_bytes() == kept
+
+    # One that something else wrote.
+    with monkeypatch.context() as without:
+        without.setattr(checkpoint, "check_finite", lambda *_: None)
+        newer = checkpoint.save(tmp_path, 5, bad, {})
+    with pytest.raises(UserError, match=rf"{key} \(1\)"):
+        checkpoint.load(newer)
+    with pytest.warns(UserWarning, match="using the one before it"):
+        newest = checkpoint.latest(tmp_path)
+    assert newest is not None
+    assert newest.path == good
+    with pytest.raises(UserError, match=rf"the checkpoint is not finite, rows of {key} \(1\)"):
+        Trainer(dataset, BUSY).load_state(bad)
+
+
+def test_after_a_good_checkpoint_is_loaded_it_goes_on(dataset: Dataset) -> None:
+    trainer = Trainer(dataset, HUGE_GRADIENTS)
+    trainer.run(until=2)
+    state = {name: tensor.clone() for name, tensor in trainer.state_tensors().items()}
+    trainer.gaussians.log_scales[7] = 90.0
+    with pytest.raises(Diverged):
+        trainer.run(until=4)
+    trainer.load_state(state)
+    trainer.run(until=4)
+    assert trainer.step == 4
+
+
+@pytest.mark.parametrize(("values", "rows"), [([3e38, 3e38], 0), ([3e38, math.inf], 1)])
+def test_sums_that_overflow_are_no_harm(values: list[float], rows: int) -> None:
+    found = rows_not_finite({"a": torch.tensor(values), "b": torch.tensor(1.0)})
+    assert found == ({"a": rows} if rows else {})

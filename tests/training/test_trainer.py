@@ -1,0 +1,310 @@
+"""The training loop on a tiny scene: it learns, repeats and resumes to the bit, and stops well."""
+
+import math
+import os
+import signal
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat import ops
+from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.data.decode import ImageSource
+from snowsplat.ops import reference
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import look_at
+from snowsplat.scene.render import render
+from snowsplat.training import checkpoint
+from snowsplat.training.config import TrainConfig
+from snowsplat.training.density import AdaptiveDensity, McmcDensity
+from snowsplat.training.optim import LearningRates
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.trainer import Progress, Trainer
+from snowsplat.util.errors import UserError
+
+WIDTH, HEIGHT, COUNT = 24, 20, 40
+
+
+def true_scene() -> Gaussians:
+    generator = torch.Generator().manual_seed(11)
+    return Gaussians(
+        means=torch.rand(COUNT, 3, generator=generator) * 2 - 1,
+        log_scales=torch.rand(COUNT, 3, generator=generator) - 2.0,
+        quats=torch.randn(COUNT, 4, generator=generator),
+        opacity_logits=torch.rand(COUNT, generator=generator) * 3,
+        sh_dc=torch.rand(COUNT, 1, 3, generator=generator) * 3 - 1.5,
+        sh_rest=torch.zeros(COUNT, 15, 3),
+    )
+
+
+def camera_at(angle: float) -> Camera:
+    position = torch.tensor([3.5 * math.cos(angle), 0.8, 3.5 * math.sin(angle)]).double()
+    pose = look_at(position, torch.zeros(3).double(), torch.tensor([0.0, 1.0, 0.0]).double())
+    return Camera(WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2, pose)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder: Path = tmp_path_factory.mktemp("tiny")
+    scene = true_scene()
+    views = []
+    for i in range(8):
+        camera = camera_at(2 * math.pi * i / 8)
+        image = render(scene, camera, torch.zeros(3)).image.clamp(0, 1)
+        path = folder / f"{i}.png"
+        Image.fromarray((255 * image).round().to(torch.uint8).numpy().copy()).save(path)
+        views.append(View(path.name, camera, ImageSource(path, WIDTH, HEIGHT)))
+    generator = torch.Generator().manual_seed(12)
+    xyz = scene.means + 0.05 * torch.randn(COUNT, 3, generator=generator)
+    rgb = (255 * scene.base_colors.clamp(0, 1)).to(torch.uint8)
+    return Dataset(views[1:], views[:1], Points(xyz, rgb), extent=3.5)
+
+
+#: Everything happens within 60 steps: densification, coarse to fine, higher degrees.
+BUSY = TrainConfig(
+    iterations=60,
+    background="random",
+    sh_interval=10,
+    coarse_to_fine=(0.1, 0.2),
+    visible_only=True,
+    density=AdaptiveDensity(
+        densify_from=10,
+        densify_until=50,
+        densify_interval=10,
+        opacity_reset_interval=0,
+        max_gaussians=150,
+    ),
+    test_iterations=(),
+)
+BUSY_MCMC = replace(
+    BUSY, density=McmcDensity(densify_from=10, densify_interval=10, max_gaussians=50)
+)
+CALM = TrainConfig(
+    iterations=300,
+    sh_interval=100,
+    learning_rates=LearningRates(means_steps=1.0),
+    density=AdaptiveDensity(densify_until=0),
+    test_iterations=(),
+)
+
+
+def trained(dataset: Dataset, config: TrainConfig) -> Gaussians:
+    trainer = Trainer(dataset, config)
+    trainer.run()
+    return trainer.gaussians
+
+
+def assert_identical(a: Gaussians, b: Gaussians) -> None:
+    for name, parameter in a.parameters().items():
+        assert torch.equal(parameter, b.parameters()[name]), name
+
+
+def test_it_learns_and_is_the_same_training_in_float64(dataset, monkeypatch):
+    """300 steps with the native ops, and with the twin in double precision: one loss curve."""
+
+    def losses(trainer: Trainer) -> torch.Tensor:
+        return torch.tensor([trainer.step_once() for _ in range(300)], dtype=torch.float64)
+
+    trainer = Trainer(dataset, CALM)
+    before = trainer.evaluate()
+    native = losses(trainer)
+    after = trainer.evaluate()
+    assert native[-50:].mean() < 0.35 * native[:50].mean()
+    assert after.psnr > before.psnr + 3
+
+    exact = Trainer(dataset, CALM)
+    exact.gaussians = exact.gaussians.to(dtype=torch.float64)
+    for moments in (exact._optimizer.exp_avg, exact._optimizer.exp_avg_sq):
+        moments.update({name: moment.double() for name, moment in moments.items()})
+    for name in ("project", "rasterize", "photometric_loss", "adam_step"):
+        monkeypatch.setattr(ops, name, getattr(reference, name))
+    twin = losses(exact)
+    torch.testing.assert_close(native[:30], twin[:30], rtol=1e-3, atol=0)
+    # Rounding errors grow as the training goes on, so only the course is the same in the end.
+    torch.testing.assert_close(native, twin, rtol=0.1, atol=0)
+    assert float(native[-50:].mean()) == pytest.approx(float(twin[-50:].mean()), rel=0.02)
+
+
+@pytest.mark.isa
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+def test_any_number_of_threads_gives_the_same_bits(dataset, config):
+    torch_threads, ops_threads = torch.get_num_threads(), ops.get_num_threads()
+    try:
+        scenes = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            ops.set_num_threads(threads)
+            scenes.append(trained(dataset, config))
+            assert torch.get_num_threads() == threads  # as it was before
+    finally:
+        torch.set_num_threads(torch_threads)
+        ops.set_num_threads(ops_threads)
+    assert_identical(*scenes)
+    assert len(scenes[0]) > COUNT
+
+
+def test_another_seed_gives_another_scene(dataset):
+    a, b = (trained(dataset, replace(BUSY, seed=seed)) for seed in (0, 1))
+    assert len(a) != len(b) or not torch.equal(a.means, b.means)
+
+
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@pytest.mark.parametrize("stop", [30, 37])
+def test_resume_goes_on_to_the_same_bits(dataset, config, stop, tmp_path):
+    """From a step that is about to densify (30), and from one in between."""
+    whole = trained(dataset, config)
+    first = Trainer(dataset, config)
+    first.run(until=stop)
+    path = checkpoint.save(tmp_path, first.step, first.state_tensors(), {})
+    second = Trainer(dataset, config)
+    second.load_state(checkpoint.load(path).tensors)
+    assert second.step == stop
+    second.run()
+    assert_identical(second.gaussians, whole)
+
+
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+def test_a_stretched_training_comes_to_its_end_and_resumes_to_the_same_bits(
+    dataset, config, tmp_path
+):
+    """60 steps become 90 after step 20, and 45 after step 40."""
+    rates = LearningRates(means_steps=1.0)
+    config = replace(config, coarse_to_fine=(0.2, 0.5), learning_rates=rates)
+    reports: list[Progress] = []
+    first = Trainer(dataset, config)
+
+    def stretch(progress: Progress) -> None:
+        reports.append(progress)
+        if progress.step == 20:
+            first.schedule.stretch(20, 90)
+        if progress.step == 40:
+            first.schedule.stretch(40, 45)
+            checkpoint.save(tmp_path, 40, first.state_tensors(), asdict(first.schedule))
+
+    first.run(stretch)
+    assert [report.iterations for report in reports] == 20 * [60] + 20 * [90] + 5 * [45]
+    assert [report.downscale for report in reports] == 12 * [4] + 26 * [2] + 7 * [1]
+    assert first._optimizer.rates_at(45) == Trainer(dataset, config)._optimizer.rates_at(60)
+    saved = checkpoint.latest(tmp_path)
+    assert saved is not None
+    second = Trainer(dataset, config, Schedule(**saved.meta))
+    second.load_state(saved.tensors)
+    second.run()
+    assert second.step == 45
+    assert_identical(second.gaussians, first.gaussians)
+
+
+def test_a_checkpoint_of_something_else_is_refused(dataset):
+    state = Trainer(dataset, BUSY).state_tensors()
+    for other in (BUSY_MCMC, replace(BUSY, sh_degree=1)):
+        with pytest.raises(UserError, match="another dataset or recipe"):
+            Trainer(dataset, other).load_state(state)
+    trainer = Trainer(dataset, BUSY)
+    trainer.run(until=1)
+    fewer = replace(dataset, train=dataset.train[:2])
+    with pytest.raises(UserError, match="another dataset or recipe"):
+        Trainer(fewer, BUSY).load_state(trainer.state_tensors())
+
+
+def test_a_checkpoint_whose_tensors_do_not_fit_each_other_is_refused(dataset):
+    """The kernels take one number of rows for all: more would be read than there is."""
+    trainer = Trainer(dataset, BUSY)
+    trainer.run(until=1)
+    whole = trainer.state_tensors()
+    for name, changed in (
+        ("gaussians.means", whole["gaussians.means"][:3]),
+        ("optimizer.exp_avg.quats", whole["optimizer.exp_avg.quats"][:3]),
+        ("gaussians.quats", whole["gaussians.quats"].to(torch.int32)),
+        ("gaussians.opacity_logits", whole["gaussians.opacity_logits"][0]),
+        ("random.views", whole["random.views"][:5]),
+        ("order", whole["order"] - 100),
+        ("step", torch.tensor([1, 2])),
+        ("step", torch.tensor(-2)),
+        ("random.views", torch.zeros_like(whole["random.views"])),
+    ):
+        assert name in whole
+        with pytest.raises(UserError, match="another dataset or recipe|is damaged"):
+            Trainer(dataset, BUSY).load_state({**whole, name: changed})
+    Trainer(dataset, BUSY).load_state(whole)
+
+
+def test_refinement_waits_for_the_next_step(dataset):
+    """What is evaluated and saved after step 20, which densifies, is the scene before that."""
+    counts = []
+    Trainer(dataset, BUSY).run(lambda progress: counts.append(progress.gaussians), until=21)
+    assert counts[19] == counts[10]
+    assert counts[20] > counts[19]
+
+
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@pytest.mark.parametrize("cap", [25, 46])
+def test_the_cap_is_never_exceeded(dataset, config, cap):
+    counts = []
+    capped = replace(config, density=replace(config.density, max_gaussians=cap))
+    Trainer(dataset, capped).run(lambda progress: counts.append(progress.gaussians))
+    assert max(counts) == cap
+    assert counts[0] == min(cap, COUNT)
+
+
+def test_a_dataset_without_points_starts_at_random(dataset):
+    config = replace(CALM, initial_points=300)
+    trainer = Trainer(replace(dataset, points=None), config)
+    assert len(trainer.gaussians) == 300
+    losses = [trainer.step_once() for _ in range(60)]
+    assert sum(losses[-7:]) < 0.8 * sum(losses[:7])
+
+
+def test_every_view_once_an_epoch(dataset, monkeypatch):
+    trainer = Trainer(dataset, CALM)
+    seen = [trainer._next_view(step)[1].position for step in range(1, 15)]
+    positions = torch.stack(seen)
+    for epoch in (positions[:7], positions[7:]):
+        assert len(epoch.unique(dim=0)) == 7
+    assert not torch.equal(positions[:7], positions[7:])
+
+
+def test_reports_and_evaluations(dataset):
+    reports: list[Progress] = []
+    config = replace(BUSY, iterations=20, test_iterations=(5, 20))
+    Trainer(dataset, config).run(reports.append)
+    assert [report.step for report in reports] == list(range(1, 21))
+    assert [report.step for report in reports if report.metrics is not None] == [5, 20]
+    assert [report.downscale for report in reports] == [4, 4, 2, 2] + 16 * [1]
+    assert all(math.isfinite(report.loss) for report in reports)
+
+
+def test_ctrl_c_waits_for_the_end_of_the_step(dataset, monkeypatch):
+    trainer = Trainer(dataset, BUSY)
+    photometric_loss = ops.photometric_loss
+
+    def interrupted(*args):
+        if trainer.step == 12:  # in the middle of step 13
+            os.kill(os.getpid(), signal.SIGINT)
+        return photometric_loss(*args)
+
+    monkeypatch.setattr(ops, "photometric_loss", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    assert trainer.step == 13
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    trainer.run()  # and it could go on as if nothing had been
+    monkeypatch.undo()
+    assert_identical(trainer.gaussians, trained(dataset, BUSY))
+
+
+def test_divergence_is_one_clear_line_with_the_step(dataset):
+    trainer = Trainer(dataset, CALM)
+    trainer.run(until=3)
+    trainer.gaussians.sh_dc[:] = torch.inf
+    with pytest.raises(UserError, match=r"at step 4, .*sh_dc \(40\)"):
+        trainer.run()
+    assert trainer.step == 3
+
+
+def test_a_dataset_without_training_views(dataset):
+    with pytest.raises(UserError, match="no training views"):
+        Trainer(replace(dataset, train=[]), CALM)

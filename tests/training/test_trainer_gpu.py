@@ -1,0 +1,170 @@
+"""Training on a GPU: its kernels on the CPU, tensors that are not there, and, with one, on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from snowsplat import ops
+from snowsplat.data import Dataset
+from snowsplat.data.decode import LoadedImage
+from snowsplat.ops.cuda.kernels import Argument, Kernel
+from snowsplat.ops.cuda.launches import launch_by
+from snowsplat.ops.native import LAUNCHERS
+from snowsplat.ops.readback import Readback
+from snowsplat.training.config import TrainConfig
+from snowsplat.training.trainer import Trainer
+
+from ..ops.engines import launcher
+from .test_trainer import BUSY, BUSY_MCMC, CALM, dataset
+
+__all__ = ["dataset"]  # a fixture
+
+STEPS = 14  # the first densification is among them
+
+
+def losses(trainer: Trainer, steps: int = STEPS) -> Tensor:
+    return torch.tensor([trainer.step_once() for _ in range(steps)], dtype=torch.float64)
+
+
+def with_room(trainer: Trainer, instances: int) -> Trainer:
+    trainer._room = ops.Room(instances, torch.zeros(1, dtype=torch.int64))
+    return trainer
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+def test_the_kernels_of_a_gpu_train_as_those_of_the_cpu(
+    dataset: Dataset, config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Too little room at first: the steps that do not fit are taken again, and nothing differs."""
+    expected = losses(Trainer(dataset, config))
+    monkeypatch.setitem(LAUNCHERS, "cpu", launcher("emulated"))
+    ample = with_room(Trainer(dataset, config), 100_000)
+    found = losses(ample)
+    torch.testing.assert_close(found, expected, rtol=2e-3, atol=0)
+    narrow = with_room(Trainer(dataset, config), 3)
+    assert torch.equal(losses(narrow), found)
+    assert narrow._room.instances > 3
+    monkeypatch.undo()
+    for name, parameter in narrow.gaussians.parameters().items():
+        assert torch.equal(parameter, ample.gaussians.parameters()[name]), name
+
+
+@pytest.mark.emulated
+def test_a_loss_that_is_not_finite_changes_nothing(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(LAUNCHERS, "cpu", launcher("emulated"))
+    trainer = with_room(Trainer(dataset, CALM), 100_000)
+    trainer.step_once()
+    trainer._background = torch.full((3,), torch.nan)
+    before = trainer.gaussians.clone()
+    with pytest.raises(Exception, match="the loss is nan at step 2"):
+        trainer.step_once()
+    for name, parameter in trainer.gaussians.parameters().items():
+        assert torch.equal(parameter, before.parameters()[name]), name
+
+
+def backward_by_hand(loss: Tensor) -> None:
+    """`loss.backward()` along a chain, by this thread: autograd's own for a GPU want to see it."""
+    node, grads = loss.grad_fn, [torch.ones_like(loss)]
+    while "AccumulateGrad" not in type(node).__name__:
+        by_us = getattr(node, "_forward_cls", None)
+        found = node(*grads) if by_us is None else by_us.backward(node, *grads)
+        found = found if isinstance(found, tuple) else (found,)
+        edges = zip(found, node.next_functions, strict=True)
+        grad, (node, output) = next(edge for edge in edges if edge[0] is not None)
+        outputs = 2 if "Rasterize" in type(node).__name__ else 1
+        grads = [grad if i == output else None for i in range(outputs)]
+    node.variable.grad = grads[0]
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+def test_a_step_waits_for_nothing_and_mixes_no_devices(
+    dataset: Dataset,
+    config: TrainConfig,
+    deterministic: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With tensors that have a device but no memory: to look at a value of theirs is an error."""
+    seen: list[str] = []
+
+    def record(kernel: Kernel, name: str, blocks: int, args: Sequence[Argument]) -> None:
+        for arg in args:
+            assert not isinstance(arg, Tensor) or arg.device.type == "cuda", name
+        seen.append(name)
+
+    def launch(name: str, n: int, args: Sequence[Argument]) -> int:
+        return launch_by(record, name, n, args)
+
+    trainer = Trainer(dataset, config)
+    _, camera, photo = trainer._next_view(1)
+    monkeypatch.setitem(LAUNCHERS, "cuda", launch)
+    monkeypatch.setattr(Tensor, "backward", backward_by_hand)
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+
+        def there(value: Any) -> Any:
+            return mode.from_tensor(value).to("cuda") if isinstance(value, Tensor) else value
+
+        trainer.gaussians = trainer.gaussians.map(there)
+        for moments in (trainer._optimizer.exp_avg, trainer._optimizer.exp_avg_sq):
+            moments.update({name: there(moment) for name, moment in moments.items()})
+        for name, statistic in trainer._density.state_tensors().items():
+            setattr(trainer._density, name, there(statistic))
+        trainer._room = ops.Room(5000, there(torch.zeros(1, dtype=torch.int64)))
+        trainer._optimizer.held = there(trainer._optimizer.held)
+        trainer._readback = Readback(8, torch.device("cpu"))
+        camera = replace(camera, cam_from_world=there(camera.cam_from_world))
+        photo = LoadedImage(there(photo.planes), there(photo.mask))
+        torch.use_deterministic_algorithms(deterministic)
+        try:
+            trainer._queue_step(1, camera, photo, there(torch.zeros(3)))
+        finally:
+            torch.use_deterministic_algorithms(False)
+    order = ["project_fwd", "tiles_", "blend_fwd", "photometric", "blend_bwd", "adam_"]
+    places = [min(i for i, name in enumerate(seen) if part in name) for part in order]
+    assert places == sorted(places), seen
+    assert ("splats_reduce" in seen) == deterministic
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU that torch can use")
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+def test_training_on_a_gpu(dataset: Dataset, config: TrainConfig) -> None:
+    device = torch.device("cuda")
+    config = replace(config, background="black")
+    expected = losses(Trainer(dataset, config), 9)  # before the first densification
+    trainer = Trainer(dataset, config, device=device)
+    # The noise of MCMC is drawn elsewhere, so that only the course is the same.
+    tolerance = 2e-3 if config is not BUSY_MCMC else 0.2
+    torch.testing.assert_close(losses(trainer, 9), expected, rtol=tolerance, atol=0)
+    trainer.run()
+    assert trainer.gaussians.means.device.type == "cuda"
+    assert bool(trainer.gaussians.finite_rows().all())
+    again = Trainer(dataset, config, device=device)
+    again.load_state({name: tensor.cpu() for name, tensor in trainer.state_tensors().items()})
+    assert len(again.gaussians) == len(trainer.gaussians)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU that torch can use")
+def test_the_same_bits_on_a_gpu(dataset: Dataset) -> None:
+    results = []
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        for _ in range(2):
+            trainer = Trainer(dataset, BUSY, device=torch.device("cuda"))
+            trainer.run()
+            results.append(trainer.gaussians.to("cpu"))
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for name, parameter in results[0].parameters().items():
+        assert torch.equal(parameter, results[1].parameters()[name]), name

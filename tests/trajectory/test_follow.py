@@ -1,0 +1,122 @@
+"""The way of the training, smoothed, and ways through key cameras."""
+
+import math
+
+import pytest
+import torch
+
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import look_at, rotation_from_quat
+from snowsplat.trajectory import key_path, training_path
+from snowsplat.util.errors import UserError
+
+from .rigs import FOCUS, UP, camera_at, misses, positions, ring, rolls, speeds, turns
+
+
+def shaken(cameras: list[Camera], by: float) -> list[Camera]:
+    random = torch.Generator().manual_seed(3)
+    result = []
+    for camera in cameras:
+        place = camera.position + by * torch.randn(3, generator=random, dtype=torch.float64)
+        result.append(camera_at(place.tolist()))
+    return result
+
+
+def test_training_path_is_the_way_without_the_shaking():
+    truth = ring(60, 3.0, 3.0, turn=4.0)
+    names = [f"frame_{i}" for i in range(60)]
+    given = shaken(truth, 0.05)
+    path = training_path(given, names, 200, 3.0)
+    assert len(path) == 200
+    offsets = positions(path) - FOCUS
+    away = offsets[:, [0, 2]].norm(dim=1) - 3.0
+    shaking = (positions(given) - FOCUS)[:, [0, 2]].norm(dim=1) - 3.0
+    assert float(away.square().mean().sqrt()) < 0.6 * float(shaking.square().mean().sqrt())
+    # It goes from the first to the last, looks where they look, and stays level.
+    assert float((path[0].position - truth[0].position).norm()) < 0.15
+    assert float((path[-1].position - truth[-1].position).norm()) < 0.15
+    assert float(misses(path, FOCUS).max()) < 3.0
+    assert float(rolls(path).abs().max()) < 0.02
+    steps, angles = speeds(path, closed=False) / 3.0, turns(path, closed=False)
+    moved = (steps.square() + angles.square()).sqrt()
+    assert float(moved.max() / moved.min()) < 1.05
+    assert float(angles.max()) < 2 * float(angles.median())
+
+
+def test_training_path_takes_a_tour_where_names_jump():
+    cameras = ring(30, 3.0, 3.0, turn=5.0)
+    names = [f"{(7 * i) % 30:02d}" for i in range(30)]
+    path = training_path(cameras, names, 100, 3.0)
+    length = float(speeds(path, closed=False).sum())
+    assert length == pytest.approx(3.0 * 5.0 * 29 / 30, rel=0.05)
+
+
+def test_photos_held_sideways_do_not_roll_the_film():
+    quarter = rotation_from_quat(torch.tensor([0.5**0.5, 0, 0, 0.5**0.5]).double())
+    cameras = ring(30, 3.0, 3.0, turn=3.0)
+    for i in (4, 5, 6, 17):
+        c = cameras[i]
+        pose = quarter @ c.cam_from_world
+        cameras[i] = Camera(48, 64, 60.0, 60.0, 24.0, 32.0, pose)
+    path = training_path(cameras, [f"{i:02d}" for i in range(30)], 90, 3.0)
+    assert float(rolls(path).abs().max()) < 0.02
+    assert {(camera.width, camera.height) for camera in path} == {(64, 48)}
+
+
+def keys() -> list[Camera]:
+    places = [(0.0, 0.0, -3.0), (2.0, -0.5, -2.0), (3.0, -1.0, 0.5), (2.0, 0.3, 3.0)]
+    return [camera_at(place) for place in places]
+
+
+def test_key_path_goes_through_its_keys():
+    given = keys()
+    path = key_path(given, 400, 3.0)
+    for key in given:
+        nearest = min(path, key=lambda camera: float((camera.position - key.position).norm()))
+        assert float((nearest.position - key.position).norm()) < 0.02
+        turned = nearest.cam_from_world[:, :3] - key.cam_from_world[:, :3]
+        assert float(turned.norm()) < 0.02
+    torch.testing.assert_close(path[0].cam_from_world, given[0].cam_from_world)
+    torch.testing.assert_close(path[-1].cam_from_world, given[-1].cam_from_world)
+    moved = (speeds(path, False).square() / 9 + turns(path, False).square()).sqrt()
+    assert float(moved.max() / moved.min()) < 1.02
+
+
+def test_key_path_that_ends_where_it_began_is_a_loop():
+    given = [keys()[i] for i in (0, 1, 2, 3)]
+    given += [camera_at((-2.5, -0.4, 1.0)), given[0]]
+    path = key_path(given, 100, 3.0)
+    steps = speeds(path, closed=True)
+    assert float(steps[-1]) == pytest.approx(float(steps[0]), rel=0.1)
+    # No corner: the direction changes there as little as elsewhere.
+    places = positions(path)
+    ways = torch.nn.functional.normalize(places.roll(-1, 0) - places, dim=1)
+    bends = (ways * ways.roll(1, 0)).sum(1)
+    assert float(bends[0]) > float(bends.min()) - 1e-3
+    assert float(bends.min()) > math.cos(0.3)
+
+
+def test_key_path_turns_the_short_way_and_zooms():
+    """From −170° to 170° are 20 degrees; and the angles of view are those of the keys."""
+    origin = torch.zeros(3).double()
+
+    def looking(degrees: float, fx: float) -> Camera:
+        t = math.radians(degrees)
+        target = torch.tensor([math.sin(t), 0.0, math.cos(t)]).double()
+        return Camera(64, 48, fx, fx, 32.0, 24.0, look_at(origin, target, UP))
+
+    path = key_path([looking(-170, 50.0), looking(170, 80.0)], 50, 3.0)
+    assert float(turns(path, closed=False).sum()) == pytest.approx(math.radians(20), rel=0.01)
+    assert path[0].fx == pytest.approx(50.0)
+    assert path[-1].fy == pytest.approx(80.0)
+    widths = [camera.fx for camera in path]
+    assert widths == sorted(widths)
+
+
+def test_equal_keys_are_one_and_one_is_refused():
+    one, two = keys()[:2]
+    with pytest.raises(UserError, match="needs two that differ"):
+        key_path([one, one, one], 10, 3.0)
+    path = key_path([one, one, two, two], 10, 3.0)
+    assert all(bool(camera.cam_from_world.isfinite().all()) for camera in path)
+    assert len(key_path([one, two], 1, 3.0)) == 1

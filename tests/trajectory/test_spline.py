@@ -1,0 +1,80 @@
+"""The smoothing spline, against what is known of it."""
+
+import math
+
+import pytest
+import torch
+
+from snowsplat.trajectory.spline import Spline
+
+
+def test_goes_through_its_samples_without_smoothing():
+    random = torch.Generator().manual_seed(0)
+    times = torch.rand(12, generator=random, dtype=torch.float64).sort().values
+    values = torch.randn(12, 3, generator=random, dtype=torch.float64)
+    torch.testing.assert_close(Spline(times, values)(times), values)
+
+
+def test_follows_a_smooth_curve_between_its_samples():
+    times = torch.linspace(0, 2 * math.pi, 40, dtype=torch.float64)
+    between = torch.linspace(0.5, 5.5, 333, dtype=torch.float64)
+    curve = Spline(times, times.sin()[:, None])(between)[:, 0]
+    assert float((curve - between.sin()).abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 1.0, 1e6])
+def test_a_straight_line_stays_one(smoothing):
+    times = torch.tensor([0.0, 1.0, 1.5, 4.0, 4.2], dtype=torch.float64)
+    line = torch.stack([2 * times - 1, -times], 1)
+    middle = torch.tensor([0.2, 2.0, 4.1], dtype=torch.float64)
+    expected = torch.stack([2 * middle - 1, -middle], 1)
+    torch.testing.assert_close(Spline(times, line, smoothing)(middle), expected)
+
+
+def test_makes_its_penalty_least():
+    """Nothing near it has a smaller sum of misses and bending, by numbers."""
+    random = torch.Generator().manual_seed(1)
+    times = torch.arange(9, dtype=torch.float64)
+    values = torch.randn(9, 1, generator=random, dtype=torch.float64)
+    fine = torch.linspace(0, 8, 8001, dtype=torch.float64)
+
+    def penalty(at_knots: torch.Tensor) -> float:
+        curve = Spline(times, at_knots)(fine)  # the least bent one through these values
+        bending = float((curve.diff(n=2, dim=0) / 0.001**2).square().sum() * 0.001)
+        return float((values - at_knots).square().sum()) + 0.7 * bending
+
+    best = Spline(times, values, 0.7)(times)
+    least = penalty(best)
+    for i in range(9):
+        for change in (-0.02, 0.02):
+            other = best.clone()
+            other[i] += change
+            assert penalty(other) > least
+
+
+def test_waves_longer_than_the_smoothing_stay_and_shorter_ones_go():
+    times = torch.arange(400, dtype=torch.float64)
+    smoothing = (8 / (2 * math.pi)) ** 4  # half of a wave of 8 steps
+    middle = times[100:300]
+    for wavelength, kept in ((3, 0.03), (8, 0.5), (40, 0.998)):
+        wave = (2 * math.pi * times / wavelength).sin()[:, None]
+        left = Spline(times, wave, smoothing)(middle).square().mean()
+        share = float((left / wave[100:300].square().mean()).sqrt())
+        assert share == pytest.approx(kept, abs=0.05)
+
+
+def test_many_samples_take_no_more_time_each():
+    """A film may be asked for through all cameras of a long video, or a list that anybody wrote."""
+    times = torch.arange(20_000.0, dtype=torch.float64)
+    values = torch.stack([torch.sin(times / 100), torch.cos(times / 100)], 1)
+    assert torch.allclose(
+        Spline(times, values)(times[:-1] + 0.5)[5:-5, 0],
+        torch.sin((times[:-1] + 0.5) / 100)[5:-5],
+        atol=1e-6,
+    )
+
+
+def test_refused():
+    for times in ([0.0], [0.0, 0.0], [1.0, 0.0]):
+        with pytest.raises(ValueError, match="times that increase"):
+            Spline(torch.tensor(times), torch.zeros(len(times), 2))

@@ -1,0 +1,50 @@
+"""The order in which cameras are visited."""
+
+import itertools
+
+import torch
+
+from snowsplat.trajectory.tour import MOST_CAMERAS, in_order, short_tour
+
+from .rigs import camera_at, ring
+
+
+def length(lengths: torch.Tensor, tour: list[int]) -> float:
+    return float(lengths[tour[:-1], tour[1:]].sum())
+
+
+def test_short_tours_are_nearly_the_shortest():
+    for seed in range(5):
+        random = torch.Generator().manual_seed(seed)
+        places = torch.rand(8, 2, generator=random, dtype=torch.float64)
+        lengths = torch.cdist(places, places)
+        tour = short_tour(lengths)
+        assert sorted(tour) == list(range(8))
+        best = min(length(lengths, list(order)) for order in itertools.permutations(range(8)))
+        assert length(lengths, tour) < 1.15 * best
+
+
+def test_a_tour_of_few():
+    for count in range(4):
+        assert sorted(short_tour(torch.rand(count, count))) == list(range(count))
+
+
+def test_names_of_a_walk_are_its_order():
+    """frame_10 comes after frame_9, and the list may be in any order."""
+    cameras = ring(30, turn=5.0)
+    mixed = torch.randperm(30, generator=torch.Generator().manual_seed(0)).tolist()
+    order = in_order([cameras[i] for i in mixed], [f"frame_{i}" for i in mixed], 3.0)
+    assert [mixed[i] for i in order] == list(range(30))
+
+
+def test_names_that_jump_are_not():
+    cameras = ring(30, turn=5.0)
+    order = in_order(cameras, [f"{(7 * i) % 30:02d}" for i in range(30)], 3.0)
+    assert order in (list(range(30)), list(range(29, -1, -1)))
+
+
+def test_many_cameras_are_thinned_out():
+    count = 3 * MOST_CAMERAS
+    cameras = [camera_at((0.01 * i, 0.0, -3.0)) for i in range(count)]
+    order = in_order(cameras, [f"{i:05d}" for i in range(count)], 3.0)
+    assert order == list(range(0, count, 3))

@@ -1,0 +1,118 @@
+"""Films: what is decoded is what was written, and there is no half of one."""
+
+import itertools
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from snowsplat.trajectory import video as film_module
+from snowsplat.trajectory.video import film
+from snowsplat.util.errors import UserError
+
+WIDTH, HEIGHT, FRAMES = 64, 48, 10
+
+
+def picture(i: int) -> np.ndarray:
+    """Colours that change slowly over the picture and with time."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    red, green, blue = x * 255 // WIDTH, y * 255 // HEIGHT, 0 * x + 20 * i
+    return np.stack([red, green, blue], 2).astype(np.uint8)
+
+
+def write(path: Path) -> None:
+    with film(path, WIDTH, HEIGHT, 24) as add:
+        for i in range(FRAMES):
+            add(picture(i))
+
+
+def decoded(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+@pytest.mark.parametrize("encoder", ["libx264", "mpeg4"])
+def test_what_is_decoded_is_what_was_written(tmp_path, monkeypatch, encoder):
+    monkeypatch.setattr(film_module, "_ENCODERS", (encoder,))
+    write(tmp_path / "a.mp4")
+    frames = decoded(tmp_path / "a.mp4")
+    assert len(frames) == FRAMES
+    for i, frame in enumerate(frames):
+        error = frame[4:-4, 4:-4].astype(int) - picture(i)[4:-4, 4:-4]
+        # The colours too: neither their range nor their matrix is mistaken.
+        assert abs(error.mean(axis=(0, 1))).max() < 4
+        assert abs(error).mean() < 6
+
+
+def test_size_rate_length_and_index(tmp_path):
+    path = tmp_path / "a.mp4"
+    write(path)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height, stream.pix_fmt) == (WIDTH, HEIGHT, "yuv420p")
+        assert stream.average_rate == 24
+        assert container.duration == pytest.approx(1e6 * FRAMES / 24, abs=1000)
+        assert stream.codec_context.name == "h264"
+    content = path.read_bytes()
+    assert 0 < content.find(b"moov") < content.find(b"mdat")
+
+
+def interrupted(path: Path, stop: type[BaseException]) -> None:
+    with film(path, WIDTH, HEIGHT, 24) as add:
+        add(picture(0))
+        raise stop
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, ValueError])
+def test_a_block_that_raises_leaves_no_file(tmp_path, stop):
+    (tmp_path / "a.mp4").write_bytes(b"the old one")
+    with pytest.raises(stop):
+        interrupted(tmp_path / "a.mp4", stop)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+    assert (tmp_path / "a.mp4").read_bytes() == b"the old one"
+
+
+def test_a_file_that_cannot_be_written_whole_is_told(tmp_path):
+    """As on a full disk, by a limit of the process."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(UserError, match="a.mp4: the film cannot be written"):
+            write(tmp_path / "a.mp4")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+
+
+def test_refused(tmp_path, monkeypatch):
+    for size, fps in (((63, 48), 24), ((64, 47), 24), ((0, 0), 24), ((64, 48), 0)):
+        with pytest.raises(ValueError, match="a film has"), film(tmp_path / "a.mp4", *size, fps):
+            pass
+    with (
+        pytest.raises(ValueError, match="does not fit"),
+        film(tmp_path / "a.mp4", 66, HEIGHT, 24) as add,
+    ):
+        add(picture(0))
+    monkeypatch.setattr(film_module, "_ENCODERS", ("no_such_encoder",))
+    with pytest.raises(UserError, match="writes no films"):
+        write(tmp_path / "a.mp4")
+    assert not list(tmp_path.iterdir())
+
+
+def test_memory_does_not_grow_with_the_film(tmp_path):
+    """Pictures are taken one by one, not gathered first."""
+    import tracemalloc
+
+    def peak(count: int) -> int:
+        tracemalloc.start()
+        with film(tmp_path / "a.mp4", WIDTH, HEIGHT, 24) as add:
+            for i in itertools.islice(itertools.cycle(range(10)), count):
+                add(picture(i))
+        memory = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return memory
+
+    peak(5)
+    assert peak(200) < peak(20) + 3 * WIDTH * HEIGHT * 10

@@ -1,0 +1,57 @@
+"""Curves of any length, and the PSNR of a few views."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.data import load_dataset
+from snowsplat.evaluation.metrics import evaluate_views
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.viewer.live.gauge import Curve, Gauge
+
+
+def test_a_curve_stays_short_and_true():
+    curve = Curve()
+    for step in range(1, 10_001):
+        curve.add(step, 2.0 * step)
+    steps, values = curve.arrays()
+    assert 250 < len(curve) == len(steps) <= 513
+    assert np.allclose(values, 2.0 * steps)
+    assert (np.diff(steps) > 0).all()
+    assert steps[0] < 40
+    assert steps[-1] > 9_950
+    assert len(Curve().arrays()[0]) == 0
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root = tmp_path_factory.mktemp("gauge") / "capture"
+    return load_dataset(write_toy_dataset(root, "colmap-bin", 6, 48, 36, n_points=200))
+
+
+def test_psnr_is_that_of_an_evaluation(dataset):
+    gaussians = Gaussians.from_points(dataset.points)
+    black = torch.zeros(3)
+    gauge = Gauge(dataset.train, black)
+    chosen = dataset.train[:4]  # evenly spaced, of five
+    expected = evaluate_views(gaussians, chosen).psnr
+    assert gauge.measure(gaussians) == pytest.approx(expected, abs=1e-4)
+    gaussians.opacity_logits += 1.0
+    later = [gauge.measure(gaussians) for _ in range(4)]  # one after the other
+    assert later[0] != pytest.approx(expected, abs=1e-4)
+    assert later[3] == pytest.approx(evaluate_views(gaussians, chosen).psnr, abs=1e-4)
+    assert Gauge(dataset.train[:2], black).measure(gaussians) > 0
+
+
+def test_no_photos_no_figure(dataset, tmp_path):
+    assert not Gauge([], torch.zeros(3)).can_measure
+    root = write_toy_dataset(tmp_path / "capture", "colmap-bin", 2, 48, 36, n_points=50)
+    views = load_dataset(root).train
+    for photo in (root / "images").iterdir():
+        photo.unlink()
+    gauge = Gauge(views, torch.zeros(3))
+    assert math.isnan(gauge.measure(Gaussians.from_points(dataset.points)))
+    assert not gauge.can_measure

@@ -1,0 +1,255 @@
+"""The page in real Chromium, on a training that runs: what it shows, what its controls do."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import snowsplat
+from snowsplat.scene.camera_json import read_cameras
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.viewer.live.server import free_port
+
+from ...browser import Browser, Page, needs_chromium
+
+pytestmark = needs_chromium
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
+BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() === '{}')"
+
+
+class Training:
+    """A training as a process of its own, with a page."""
+
+    def __init__(self, dataset: Path, out: Path) -> None:
+        port = free_port("127.0.0.1", None)
+        self.url, self.lines, self.out = f"http://127.0.0.1:{port}", [], out
+        flags = ["--iterations", "500000", "--threads", "1", "--view", "--port", str(port)]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "snowsplat", "train", dataset, "-o", out, "--eval", *flags],
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        while not self.lines or not self.lines[-1].startswith("step"):
+            line = self.process.stdout.readline()
+            assert line, self.lines
+            self.lines.append(line)
+
+    def interrupt(self) -> str:
+        """Ctrl-C; what is said after it."""
+        self.process.send_signal(signal.SIGINT)
+        out, _ = self.process.communicate(timeout=60)
+        return out
+
+
+@pytest.fixture(scope="module")
+def training(tmp_path_factory) -> Iterator[Training]:
+    root = tmp_path_factory.mktemp("page")
+    dataset = write_toy_dataset(root / "capture", "colmap-bin", 9, 96, 72, n_points=600)
+    training = Training(dataset, root / "out")
+    yield training
+    if training.process.poll() is None:
+        training.process.kill()
+        training.process.communicate()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with Browser(900, 1300) as browser:
+        yield browser
+
+
+@pytest.fixture
+def page(training, browser) -> Iterator[Page]:
+    page = browser.open(training.url)
+    page.wait_for("/Step [1-9]/.test(document.body.innerText)")
+    yield page
+    page.close()
+
+
+def press(page: Page, name: str) -> None:
+    page.wait_for("!!" + BUTTON.format(name))
+    page.evaluate(BUTTON.format(name) + ".click()")
+
+
+def choose(page: Page, now: str, name: str) -> None:
+    """Another entry of the list that shows ``now``."""
+    box = f"[...document.querySelectorAll('input')].find(i => i.value === '{now}')"
+    page.wait_for("!!" + box)
+    page.evaluate(f"(() => {{ const i = {box}; i.focus(); i.click(); }})()")
+    option = f"[...document.querySelectorAll('[role=option]')].find(o => o.innerText === '{name}')"
+    page.wait_for("!!" + option)
+    page.evaluate(option + ".click()")
+
+
+def step_of(page: Page) -> int:
+    text = page.evaluate("document.body.innerText")
+    return int(re.search(r"Step ([\d,]+) of 500,000", text)[1].replace(",", ""))
+
+
+def scene(page: Page) -> np.ndarray:
+    """What is to the left of the controls and below the browser's own notes."""
+    return page.screenshot()[200:, :560].astype(int)
+
+
+def differ(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.abs(a - b).mean())
+
+
+def wait(true: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def settled(page: Page) -> np.ndarray:
+    """The scene when it no longer changes."""
+    before = scene(page)
+    for _ in range(40):
+        time.sleep(0.4)
+        now = scene(page)
+        if differ(before, now) < 0.05:
+            return now
+        before = now
+    raise AssertionError("the picture does not come to rest")
+
+
+def test_it_shows_a_training_that_goes_on(training, page):
+    lines = "".join(training.lines)
+    assert f"watch it in a browser: {training.url}\n" in lines
+    assert "ssh -L" in lines
+    first = step_of(page)
+    wait(lambda: scene(page).std() > 10)  # a picture, not one colour
+    wait(lambda: step_of(page) > first + 10)
+    wait(lambda: "PSNR (dB)" in page.evaluate("document.body.innerText"))
+    text = page.evaluate("document.body.innerText")
+    assert "Gaussians, loss 0." in text
+    assert page.evaluate("document.querySelectorAll('.uplot canvas').length") == 2
+    assert page.errors == []
+    outside = [url for url in page.requests if not url.startswith(training.url)]
+    assert [url for url in outside if not url.startswith(("data:", "blob:"))] == []
+
+
+def test_pause_step_and_go_on(page):
+    press(page, "Pause")
+    page.wait_for("document.body.innerText.includes(', paused')")
+    paused = step_of(page)
+    still = settled(page)
+    time.sleep(1.5)
+    assert step_of(page) == paused
+    press(page, "One step")
+    wait(lambda: step_of(page) == paused + 1)
+    # Where it is paused the camera can be moved all the same, and what is seen changes.
+    page.drag(200, 600, 320, 640)
+    assert differ(settled(page), still) > 2
+    press(page, "Go on")
+    wait(lambda: step_of(page) > paused + 10)
+
+
+def test_what_is_shown_can_be_chosen(page):
+    press(page, "Pause")
+    page.wait_for("document.body.innerText.includes(', paused')")
+    before, seen = "Colour", [settled(page)]
+    for name in ("Depth", "Normals", "Points", "Ellipsoids", "Gaussians per pixel"):
+        choose(page, before, name)
+        wait(lambda: differ(scene(page), seen[-1]) > 1)
+        seen.append(settled(page))
+        before = name
+    choose(page, before, "Colour")
+    wait(lambda: differ(scene(page), seen[0]) < 1)
+    press(page, "Go on")
+
+
+def test_standing_at_a_photo(training, page):
+    press(page, "Pause")
+    page.wait_for("document.body.innerText.includes(', paused')")
+    press(page, "Next")
+    page.wait_for("document.body.innerText.includes('At view_01.png')")
+    render = settled(page)
+    press(page, "Photo")
+    wait(lambda: differ(scene(page), render) > 0.2)
+    photo = settled(page)
+    assert differ(photo, render) < 30  # it is the same place
+    press(page, "Next")
+    page.wait_for("document.body.innerText.includes('At view_02.png')")
+    wait(lambda: differ(scene(page), photo) > 1)
+    page.drag(200, 600, 320, 640)
+    page.wait_for("document.body.innerText.includes('stand where its photo was taken')")
+    press(page, "Go on")
+
+
+def test_views_are_kept_for_a_film(page, tmp_path):
+    page.evaluate(
+        "(() => { const make = URL.createObjectURL; URL.createObjectURL = "
+        "blob => { if (blob.type.includes('json')) window.kept = blob; "
+        "return make.call(URL, blob); }; })()"
+    )
+    press(page, "Keep this view")
+    page.wait_for("document.body.textContent.includes('1 kept')")
+    page.drag(200, 600, 320, 640)
+    settled_after = time.monotonic() + 1.0
+    wait(lambda: time.monotonic() > settled_after)  # the browser has told where it is now
+    press(page, "Keep this view")
+    page.wait_for("document.body.textContent.includes('2 kept')")
+    press(page, "Download them")
+    page.wait_for("!!window.kept")
+    (tmp_path / "cameras.json").write_text(page.evaluate("window.kept.text()"))
+    names, cameras = read_cameras(tmp_path / "cameras.json")
+    assert names == ["key_000", "key_001"]
+    assert float((cameras[0].position - cameras[1].position).norm()) > 0.01
+    press(page, "Forget the last")
+    page.wait_for("document.body.textContent.includes('1 kept')")
+
+
+def test_two_pages_have_a_camera_each(training, browser, page):
+    press(page, "Pause")
+    page.wait_for("document.body.innerText.includes(', paused')")
+    other = browser.open(training.url)
+    other.wait_for("document.body.innerText.includes(', paused')")
+    here, there = settled(page), settled(other)
+    assert differ(here, there) < 1
+    other.drag(200, 600, 330, 640)
+    wait(lambda: differ(scene(other), there) > 2)
+    assert differ(settled(page), here) < 1
+    choose(other, "Colour", "Depth")
+    assert differ(settled(page), here) < 1
+    press(other, "Go on")  # the training is one
+    paused = step_of(page)
+    wait(lambda: step_of(page) > paused)
+    other.close()
+
+
+def test_a_page_that_closes_in_mid_stream_harms_nobody(training, browser, page):
+    first = step_of(page)
+    for _ in range(3):
+        other = browser.open(training.url)
+        other.wait_for("/Step [1-9]/.test(document.body.innerText)")
+        other.drag(200, 600, 400, 700, steps=30)
+        other.close()
+    wait(lambda: step_of(page) > first + 10)
+    assert training.process.poll() is None
+
+
+def test_ctrl_c_while_paused_saves_and_closes(training, browser):
+    page = browser.open(training.url)
+    press(page, "Pause")
+    page.wait_for("document.body.innerText.includes(', paused')")
+    paused = step_of(page)
+    out = training.interrupt()
+    assert training.process.returncode == 130
+    assert f"stopped after step {paused}" in out
+    assert "Traceback" not in out
+    assert "warning" not in out
+    assert (training.out / f"point_cloud/iteration_{paused}/point_cloud.ply").is_file()
+    page.close()
+    assert free_port("127.0.0.1", int(training.url.rpartition(":")[2]))

@@ -1,0 +1,89 @@
+"""One page with everything in it: opened from the disk by a real browser, without a network."""
+
+import base64
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.formats.compressed_ply import read_compressed_ply
+from snowsplat.pipeline.convert import read_gaussians, write_gaussians
+from snowsplat.scene.gaussians import SH_C0, Gaussians
+from snowsplat.scene.initial_view import StartView
+from snowsplat.util.errors import UserError
+from snowsplat.viewer.web import html
+
+from ...browser import Browser, needs_chromium
+
+
+def three_balls() -> Gaussians:
+    """Red on the left, green above it, blue on the right, as seen from −z with y down."""
+    means = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+    colors = torch.eye(3)
+    return Gaussians(
+        means,
+        torch.full((3, 3), -2.0),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(3, 1),
+        torch.full((3,), 6.0),
+        ((colors - 0.5) / SH_C0)[:, None],
+        torch.zeros(3, 0, 3),
+    )
+
+
+FRONT = StartView((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), 60.0)
+
+
+def test_the_scene_is_in_it(tmp_path):
+    path = tmp_path / "a <b>.html"
+    write_gaussians(path, three_balls())
+    page = path.read_text(encoding="utf-8")
+    assert "<title>a &lt;b&gt;</title>" in page
+    (scene,) = re.findall(r'<script type="text/plain" id="scene">(.*?)</script>', page)
+    (tmp_path / "scene.ply").write_bytes(base64.b64decode(scene))
+    back = read_compressed_ply(tmp_path / "scene.ply")
+    assert sorted(back.means.round(decimals=2).tolist()) == sorted(three_balls().means.tolist())
+    (bootstrap,) = re.findall(r'id="sse-bootstrap">(.*?)</script>', page)
+    assert json.loads(bootstrap)["contentFilename"] == "scene.compressed.ply"
+    assert "./index.js" not in page
+    assert "./index.css" not in page
+    assert "createViewer({ container" in page
+    assert sorted(p.name for p in tmp_path.iterdir()) == [path.name, "scene.ply"]
+
+
+def test_it_is_not_read_back(tmp_path):
+    write_gaussians(tmp_path / "scene.html", three_balls())
+    with pytest.raises(UserError, match="HTML files are written here, not read"):
+        read_gaussians(tmp_path / "scene.html")
+
+
+def test_what_makes_no_page(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="without Gaussians"):
+        write_gaussians(tmp_path / "scene.html", three_balls().select(torch.zeros(0).long()))
+    monkeypatch.setattr(html, "_LARGEST", 100)
+    with pytest.raises(UserError, match="too many for one page; decimate"):
+        write_gaussians(tmp_path / "scene.html", three_balls())
+    assert not list(tmp_path.iterdir())
+
+
+@needs_chromium
+def test_a_real_browser_opens_it_from_the_disk(tmp_path):
+    path = tmp_path / "scene.html"
+    html.write_html(path, three_balls(), FRONT)
+    with Browser(400, 300) as browser:
+        page = browser.open(f"{path.as_uri()}?webgl&noui")
+        page.wait_for("!!window.app", 60)
+        shown = page.screenshot(tmp_path / "scene.png").astype(float)
+        assert not page.errors
+        assert all(url.startswith(("file://", "blob:null/")) for url in page.requests)
+        # A scene of other people's making cannot make it ask the network either.
+        refused = "fetch('http://127.0.0.1:9/').then(() => 'sent', () => 'refused')"
+        assert page.evaluate(refused) == "refused"
+        assert any("Content Security Policy" in line for line in page.errors)
+    # Half the width is 4 tan 30° = 2.31 world units: 86.6 pixels each.
+    for channel, (x, y) in enumerate(((200 - 87, 150), (200 - 87, 150 - 87), (200 + 87, 150))):
+        ball = shown[y - 4 : y + 4, x - 4 : x + 4].mean((0, 1))
+        assert ball[channel] > 200
+        assert np.delete(ball, channel).max() < 60
+    assert shown[-40:].max() < 10  # the background

@@ -1,0 +1,71 @@
+"""The viewer's page: what is put into it, and what it is allowed to do."""
+
+import base64
+import hashlib
+import html
+import json
+import re
+
+import pytest
+
+from snowsplat.scene.initial_view import StartView
+from snowsplat.util.errors import UserError
+from snowsplat.viewer.web import page as viewer_page
+from snowsplat.viewer.web.page import asset, content_policy, page, settings, whole_page
+
+HOSTILE = "</script><script>alert(1)</script><!-- <script>"
+
+
+def bootstrap_of(text: str) -> dict:
+    (found,) = re.findall(r'id="sse-bootstrap">(.*?)</script>', text, re.DOTALL)
+    return json.loads(found)
+
+
+def test_settings_are_in_the_viewers_frame():
+    """It turns scenes half round about z."""
+    made = settings(StartView((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 50.0), (0.1, 0.2, 0.3))
+    (camera,) = made["cameras"]
+    expected = {"position": [-1.0, -2.0, 3.0], "target": [-4.0, -5.0, 6.0], "fov": 50.0}
+    assert camera["initial"] == expected
+    assert made["background"] == {"color": [0.1, 0.2, 0.3]}
+
+
+def test_nothing_put_into_the_page_becomes_markup():
+    for text in (page(HOSTILE, {"x": HOSTILE}), whole_page(HOSTILE, {"x": HOSTILE}, "")):
+        assert bootstrap_of(text) == {"x": HOSTILE}
+        assert "alert(1)</script>" not in text
+        (title,) = re.findall("<title>(.*?)</title>", text)
+        assert html.unescape(title) == HOSTILE
+
+
+def test_the_page_is_theirs_but_for_what_is_put_into_it():
+    theirs, ours = asset("index.html").splitlines(), page("scene", {}).splitlines()
+    assert sum(line not in ours for line in theirs) <= 6
+
+
+def test_the_policy_names_each_script():
+    text = page("scene", {"contentUrl": "./x"})
+    policy = content_policy(text, "'self'")
+    scripts = re.findall(r'<script type="module">(.*?)</script>', text, re.DOTALL)
+    assert len(scripts) == 2
+    for script in scripts:
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+
+
+def test_the_whole_page_carries_everything_and_the_licence():
+    text = whole_page("scene", {}, "<p>body</p>")
+    assert "<p>body</p>\n    </body>" in text
+    assert asset("LICENSE") in text
+    assert "sourceMappingURL=index" not in text
+    (policy,) = re.findall(r'Content-Security-Policy" content="(.*?)"', text)
+    assert "self" not in policy
+    assert "http" not in policy
+    # Before all that it is about.
+    assert text.index("Content-Security-Policy") < text.index("<script")
+
+
+def test_a_checkout_that_is_not_built(tmp_path, monkeypatch):
+    monkeypatch.setattr(viewer_page, "_FOLDER", tmp_path)
+    with pytest.raises(UserError, match="run make native"):
+        page("scene", {})

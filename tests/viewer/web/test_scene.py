@@ -1,0 +1,163 @@
+"""The finished viewer: what it is given, and what a real browser makes of it."""
+
+import dataclasses
+import json
+import math
+import re
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.edit import transform
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
+from snowsplat.scene.initial_view import StartView
+from snowsplat.scene.render import render
+from snowsplat.viewer.web.scene import ready, site
+from snowsplat.viewer.web.server import StaticServer
+
+from ...browser import Browser, Page, needs_chromium
+
+WIDTH, HEIGHT = 480, 360
+LOADED = "!!window.app"  # the viewer sets it after its first whole picture
+
+
+def camera_of(start: StartView) -> Camera:
+    """The viewer's camera in a window wider than high: level, with −y up."""
+    position, target = (
+        torch.tensor(p, dtype=torch.float64) for p in (start.position, start.target)
+    )
+    pose = look_at(position, target, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
+    focal = 0.5 * WIDTH / math.tan(math.radians(start.fov / 2))
+    return Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, pose)
+
+
+def wide(camera: Camera, start: StartView) -> Camera:
+    """A camera's pose, with the window and the angle of the start."""
+    like = camera_of(start)
+    return dataclasses.replace(like, cam_from_world=camera.cam_from_world)
+
+
+def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    with torch.no_grad():
+        return render(gaussians, camera).image.clamp(0, 1).mul(255).numpy()
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((a.astype(float) - b) ** 2) / 255**2))
+
+
+def test_it_starts_at_the_first_camera_upright(trained):
+    gaussians, start = ready(trained.gaussians, trained.cameras)
+    camera = trained.cameras[0]
+    # World z was up; the distances, near the usual ones, are as they were.
+    turned = transform(trained.gaussians, _similarity(1.0, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    torch.testing.assert_close(gaussians.means, turned.means, rtol=0, atol=1e-2)
+    torch.testing.assert_close(gaussians.sh_rest, turned.sh_rest, rtol=0, atol=1e-2)
+    x, y, z = camera.position.tolist()
+    assert start.position == pytest.approx((x, -z, y), abs=1e-3)
+    # What lies ahead is the ball of radius 0.6 around the origin, 3 away.
+    distance = math.dist(start.position, start.target)
+    assert distance == pytest.approx(2.4, abs=0.3)
+    assert math.dist(start.target, (0, 0, 0)) == pytest.approx(3 - distance, abs=0.05)
+    assert start.fov == pytest.approx(math.degrees(2 * math.atan(1.2 * 0.5 / 0.9)), abs=1e-6)
+    # Its picture is that of the photo, and a little on both sides.
+    ours = picture(trained.gaussians, wide(camera, start))
+    assert psnr(picture(gaussians, camera_of(start)), ours) > 45
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_scenes_of_odd_size_are_brought_to_one_that_can_be_walked_in(trained, scale):
+    change = _similarity(scale, rotation_from_quat(torch.tensor([0.9, 0.2, -0.3, 0.1])).tolist())
+    odd = transform(trained.gaussians, change)
+    cameras = [
+        Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy, change.apply_to_poses(c.cam_from_world))
+        for c in trained.cameras
+    ]
+    gaussians, start = ready(odd, cameras)
+    assert math.dist(start.position, start.target) == pytest.approx(3.0, abs=1e-3)
+    ours = picture(trained.gaussians, wide(trained.cameras[0], start))
+    assert psnr(picture(gaussians, camera_of(start)), ours) > 40
+
+
+def test_an_upright_scene_is_left_as_it_is(trained):
+    upright, _ = ready(trained.gaussians, trained.cameras)
+    change = _similarity(1.0, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    cameras = [
+        Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy, change.apply_to_poses(c.cam_from_world))
+        for c in trained.cameras
+    ]
+    assert ready(upright, cameras)[0] is upright
+    assert ready(trained.gaussians, [])[0] is trained.gaussians
+
+
+def test_nothing_ahead_of_the_camera(trained):
+    away = torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64)
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    camera = Camera(96, 72, 90.0, 90.0, 48.0, 36.0, look_at(away, 2 * away, up))
+    _, start = ready(trained.gaussians, [camera])
+    assert all(map(math.isfinite, (*start.position, *start.target, start.fov)))
+
+
+def test_the_page_and_its_policy(trained):
+    files, headers = site("<b>&", trained.gaussians, trained.cameras, (1.0, 1.0, 1.0))
+    assert sorted(files) == ["", "index.css", "index.js", "scene.compressed.ply"]
+    page = files[""].content.decode()
+    assert "<title>&lt;b&gt;&amp;</title>" in page
+    (bootstrap,) = re.findall(r'id="sse-bootstrap">(.*?)</script>', page)
+    settings = json.loads(bootstrap)["settings"]
+    assert settings["background"]["color"] == [1.0, 1.0, 1.0]
+    assert files["scene.compressed.ply"].content.startswith(b"ply\n")
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "frame-ancestors 'none'" in policy
+    (scripts,) = re.findall(r"script-src ([^;]*)", policy)
+    assert "'unsafe-inline'" not in scripts
+    assert "'unsafe-eval'" not in scripts
+    assert "http" not in policy
+
+
+@needs_chromium
+def test_a_real_browser_shows_what_we_render(trained, tmp_path):
+    gaussians, start = ready(trained.gaussians, trained.cameras)
+    ours = picture(gaussians, camera_of(start))
+    files, headers = site("scene", trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
+    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
+        page = browser.open(f"{server.url}?webgl&noui")
+        page.wait_for(LOADED, 60)
+        shown = soon(page, lambda shown: psnr(shown, ours) > 30)
+        page.screenshot(tmp_path / "viewer.png")  # to be looked at
+        assert shown.std() > 10
+        assert np.corrcoef(shown.ravel(), ours.ravel())[0, 1] > 0.98
+        assert not page.errors
+        assert all(url.startswith((server.url, f"blob:{server.url[:16]}")) for url in page.requests)
+        with_controls(browser, server, shown)
+
+
+def with_controls(browser: Browser, server: StaticServer, before: np.ndarray) -> None:
+    """A second viewer at the same time, with its controls; dragging turns the scene."""
+    page: Page = browser.open(f"{server.url}?webgl")
+    page.wait_for(LOADED, 60)
+    still = page.screenshot().astype(float)
+    assert psnr(still, before) > 12  # but for the controls
+    page.drag(WIDTH / 2, HEIGHT / 2, WIDTH / 2 + 120, HEIGHT / 2 + 20)
+    soon(page, lambda shown: psnr(shown, still) < 22)
+    assert not page.errors
+
+
+def soon(page: Page, fits: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """The first screenshot that fits: frames come when the machine has time for them."""
+    end = time.monotonic() + 30
+    while not fits(shown := page.screenshot().astype(float)):
+        assert time.monotonic() < end, "the picture that was waited for did not come"
+        time.sleep(0.2)
+    return shown
+
+
+def _similarity(scale: float, rotation: list[list[float]]) -> Similarity:
+    matrix = torch.tensor(rotation, dtype=torch.float64)
+    return Similarity(scale, matrix, torch.zeros(3, dtype=torch.float64))

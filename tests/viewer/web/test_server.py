@@ -1,0 +1,327 @@
+"""The small web server: what it gives, what it refuses, and that nobody's leaving stops it."""
+
+import contextlib
+import http.client
+import os
+import re
+import socket
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from snowsplat.util.errors import UserError
+from snowsplat.viewer.hosts import is_own_host
+from snowsplat.viewer.web import server as static_server
+from snowsplat.viewer.web.server import ServedFile, StaticServer
+
+from .. import clients
+
+SCENE = bytes(range(256)) * 4096  # 1 MiB
+FILES = {
+    "": ServedFile(b"<!doctype html>", "text/html; charset=utf-8"),
+    "scene.ply": ServedFile(SCENE, "application/octet-stream"),
+}
+POLICY = {"Content-Security-Policy": "default-src 'none'"}
+
+
+@pytest.fixture(scope="module")
+def server():
+    with StaticServer(FILES, POLICY) as server:
+        yield server
+
+
+def ask(
+    server: StaticServer,
+    name: str = "",
+    method: str = "GET",
+    path: str | None = None,
+    **headers: str,
+) -> tuple[http.client.HTTPResponse, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
+    target = path if path is not None else "/" + server.url.split("/", 3)[3] + name
+    connection.putrequest(method, target, skip_host="Host" in headers)
+    for key, value in headers.items():
+        connection.putheader(key.replace("_", "-"), value)
+    connection.endheaders()
+    response = connection.getresponse()
+    body = response.read()
+    connection.close()
+    return response, body
+
+
+def test_address(server):
+    assert re.fullmatch(rf"http://127\.0\.0\.1:{server.port}/[\w-]{{20,}}/", server.url)
+    with StaticServer(FILES, POLICY) as other:
+        assert other.url.split("/")[3] != server.url.split("/")[3]
+
+
+def test_whole_files(server):
+    response, body = ask(server)
+    assert (response.status, body) == (200, b"<!doctype html>")
+    assert response.headers["Content-Type"] == "text/html; charset=utf-8"
+    assert response.headers["X-Content-Type-Options"] == "nosniff"
+    assert response.headers["Content-Security-Policy"] == "default-src 'none'"
+    assert response.headers["Referrer-Policy"] == "no-referrer"
+    response, body = ask(server, "scene.ply")
+    assert body == SCENE
+    assert response.headers["Accept-Ranges"] == "bytes"
+    response, body = ask(server, "scene.ply?webgl", method="HEAD")
+    assert (response.status, body) == (200, b"")
+    assert response.headers["Content-Length"] == str(len(SCENE))
+
+
+def test_unchanged_files_are_not_sent_again(server):
+    etag = ask(server, "scene.ply")[0].headers["ETag"]
+    response, body = ask(server, "scene.ply", If_None_Match=etag)
+    assert (response.status, body) == (304, b"")
+    assert ask(server, "scene.ply", If_None_Match='"another"')[0].status == 200
+
+
+@pytest.mark.parametrize(
+    ("asked", "start", "end"),
+    [
+        ("bytes=0-0", 0, 1),
+        ("bytes=100-299", 100, 300),
+        ("bytes=1048000-", 1048000, 1 << 20),
+        ("bytes=-10", (1 << 20) - 10, 1 << 20),
+        ("bytes=-9999999", 0, 1 << 20),
+        ("bytes=5-99999999999999999999999999", 5, 1 << 20),
+    ],
+)
+def test_ranges(server, asked, start, end):
+    response, body = ask(server, "scene.ply", Range=asked)
+    assert response.status == 206
+    assert body == SCENE[start:end]
+    assert response.headers["Content-Range"] == f"bytes {start}-{end - 1}/{1 << 20}"
+
+
+@pytest.mark.parametrize("asked", ["bytes=1048576-", "bytes=2000000-3000000", "bytes=-0"])
+def test_ranges_past_the_end(server, asked):
+    response, body = ask(server, "scene.ply", Range=asked)
+    assert (response.status, body) == (416, b"")
+    assert response.headers["Content-Range"] == f"bytes */{1 << 20}"
+
+
+@pytest.mark.parametrize("asked", ["bytes=9-3", "bytes=-", "lines=1-2", "bytes=0-1,4-5", "x" * 999])
+def test_what_is_no_range_gives_the_whole_file(server, asked):
+    response, body = ask(server, "scene.ply", Range=asked)
+    assert (response.status, len(body)) == (200, 1 << 20)
+
+
+def test_a_range_of_what_has_changed_gives_the_whole_file(server):
+    response, body = ask(server, "scene.ply", Range="bytes=0-9", If_Range='"older"')
+    assert (response.status, len(body)) == (200, 1 << 20)
+    etag = response.headers["ETag"]
+    assert ask(server, "scene.ply", Range="bytes=0-9", If_Range=etag)[0].status == 206
+
+
+def test_nothing_but_what_it_was_given(server):
+    prefix = "/" + server.url.split("/", 3)[3]
+    for path in (
+        *("/", "/scene.ply", "/favicon.ico", prefix[:-1], prefix[:-2] + "/", "//", "*"),
+        *(prefix + name for name in ("absent", "scene.ply/", ".", "..", "/", "SCENE.PLY", "%00")),
+        *(prefix + up + "etc/passwd" for up in ("../" * 9, "..%2f" * 9, "%2e%2e/" * 9, "..\\" * 9)),
+        *(prefix + name for name in ("%2Fetc%2Fpasswd", "//etc/passwd", "....//etc/passwd")),
+        server.url,  # as a proxy would be asked
+    ):
+        response, body = ask(server, path=path)
+        assert (response.status, body) == (404, b""), path
+
+
+@pytest.mark.parametrize(
+    "method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT"]
+)
+def test_only_reading(server, method):
+    response, _ = ask(server, method=method)
+    assert response.status == 405
+    assert response.headers["Allow"] == "GET, HEAD"
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example", "10.0.0.1:80", "", "a b"]
+)
+def test_foreign_hosts_are_refused(server, host):
+    response, body = ask(server, Host=host)
+    assert (response.status, body) == (421, b"")
+
+
+@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:1234", "127.0.0.1:5", "[::1]:99"])
+def test_its_own_names_at_any_port(server, host):
+    """With SSH forwarding the port at the other end is another one."""
+    assert ask(server, Host=host)[0].status == 200
+
+
+def test_hosts_when_others_are_let_in():
+    assert is_own_host("192.168.1.7:8080", "0.0.0.0")
+    assert is_own_host(f"{socket.gethostname()}:8080", "0.0.0.0")
+    assert is_own_host("[fe80::1]", "::")
+    assert is_own_host("box.lan", "box.lan")
+    assert not is_own_host("evil.example", "0.0.0.0")
+    assert not is_own_host(socket.gethostname() + ".evil.example", "0.0.0.0")
+    assert not is_own_host("192.168.1.7", "127.0.0.1")
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "", "http://localhost:1", "http://127.0.0.1:{port}.x"]
+)
+def test_foreign_pages_are_refused(server, origin):
+    response, body = ask(server, Origin=origin.format(port=server.port))
+    assert (response.status, body) == (403, b"")
+    assert ask(server, Origin=f"http://127.0.0.1:{server.port}")[0].status == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        ["Content-Length: 5"],
+        ["Content-Length: 0", "Content-Length: 5"],
+        ["Transfer-Encoding: chunked"],
+        ["Transfer-Encoding: chunked", "Content-Length: 3"],
+        ["Host: localhost", "Host: evil.example"],
+        ["Host : localhost"],
+        ["X: y\r\n folded"],
+        ["X: y\n\nGET /"],
+        ["X: \0"],
+        ["no colon"],
+        [f"X: {'y' * 17_000}"],
+        [f"X-{i}: {'y' * 900}" for i in range(40)],
+        [f"X-{i}: y" for i in range(300)],
+    ],
+)
+def test_requests_that_could_be_two(server, headers):
+    """One answer, that refuses, and the end of the connection."""
+    path = "/" + server.url.split("/", 3)[3]
+    body = f"GET {path}scene.ply HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    answer = clients.ask(
+        server.url,
+        "\r\n".join([f"GET {path} HTTP/1.1", "Host: localhost", *headers, "", body]).encode(),
+    )
+    assert clients.status(answer) in (400, 431)
+    assert answer.count(b"HTTP/1.1") == 1
+    assert ask(server)[0].status == 200
+
+
+def test_two_requests_at_once_get_two_answers(server):
+    path = "/" + server.url.split("/", 3)[3]
+    request = f"GET {path} HTTP/1.1\r\nHost: localhost\r\n"
+    both = f"{request}\r\n{request}Connection: close\r\n\r\n".encode()
+    assert clients.ask(server.url, both).count(b"<!doctype html>") == 2
+
+
+def test_a_request_has_its_time(monkeypatch):
+    """However often another byte of it comes."""
+    monkeypatch.setattr(static_server, "_REQUEST_SECONDS", 0.5)
+    with StaticServer(FILES, POLICY) as server, clients.open_socket(server.url) as client:
+        began = time.monotonic()
+        with contextlib.suppress(ConnectionError):
+            for byte in b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 100:
+                client.send(bytes([byte]))
+                time.sleep(0.05)
+        assert time.monotonic() - began < 3.0
+
+
+def test_a_client_that_takes_nothing_is_left(monkeypatch):
+    monkeypatch.setattr(static_server._Handler, "timeout", 0.5)
+    threads = threading.active_count()
+    big = {"big": ServedFile(bytes(64 << 20), "application/octet-stream")}
+    with StaticServer(big, {}) as server:
+        path = "/" + server.url.split("/", 3)[3] + "big"
+        stuck = [clients.open_socket(server.url) for _ in range(20)]
+        for client in stuck:
+            client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        end = time.monotonic() + 20
+        while threading.active_count() > threads + 1:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        for client in stuck:
+            client.close()
+
+
+def test_a_thousand_connections(server):
+    """Half a request each: those who ask are served, threads and descriptors are bounded."""
+    threads, descriptors = threading.active_count(), len(os.listdir("/proc/self/fd"))
+    known = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    path = "/" + server.url.split("/", 3)[3]
+    known.request("GET", path)
+    known.getresponse().read()
+    strangers = []
+    try:
+        for i in range(1000):
+            client = clients.open_socket(server.url)
+            with contextlib.suppress(OSError):
+                client.sendall(b"GET / HT" if i % 2 else b"")
+            strangers.append(client)
+            if i % 100 == 99:
+                assert ask(server)[0].status == 200
+        most = static_server._CONNECTIONS
+        assert threading.active_count() - threads <= most + 20
+        own = len(os.listdir("/proc/self/fd")) - descriptors - len(strangers)
+        assert own <= most + 20
+        known.request("GET", path)  # who has the address keeps its connection
+        assert known.getresponse().read() == b"<!doctype html>"
+    finally:
+        known.close()
+        for client in strangers:
+            client.close()
+    end = time.monotonic() + 20
+    while threading.active_count() > threads:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_two_clients_and_one_connection_for_many(server):
+    connections = [http.client.HTTPConnection("127.0.0.1", server.port) for _ in range(2)]
+    path = "/" + server.url.split("/", 3)[3] + "scene.ply"
+    for connection in connections * 3:
+        connection.request("GET", path)
+        assert connection.getresponse().read() == SCENE
+    for connection in connections:
+        connection.close()
+    with ThreadPoolExecutor(8) as pool:
+        bodies = list(pool.map(lambda _: ask(server, "scene.ply")[1], range(16)))
+    assert all(body == SCENE for body in bodies)
+
+
+def test_a_browser_that_leaves_in_the_middle(capfd, caplog):
+    big = {"big": ServedFile(bytes(64 << 20), "application/octet-stream")}
+    with StaticServer(big, {}) as server:
+        path = "/" + server.url.split("/", 3)[3] + "big"
+        for _ in range(5):
+            with socket.create_connection(("127.0.0.1", server.port)) as client:
+                client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+                client.recv(1000)
+        for garbage in (
+            b"",
+            b"\x16\x03\x01\x00",
+            b"GET\r\n\r\n",
+            b"x" * 70_000,
+            b"GET / HTTP/9\r\n\r\n",
+        ):
+            with socket.create_connection(("127.0.0.1", server.port)) as client:
+                client.sendall(garbage)
+        assert len(ask(server, "big")[1]) == 64 << 20
+    assert capfd.readouterr() == ("", "")
+    assert not caplog.records
+
+
+def test_closing_ends_it():
+    threads = threading.active_count()
+    server = StaticServer(FILES, POLICY)
+    server.close()
+    server._thread.join(5)
+    assert threading.active_count() <= threads
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", server.port)).close()
+
+
+def test_places_where_it_cannot_listen(server):
+    with pytest.raises(UserError, match=f"port {server.port} is taken; name another"):
+        StaticServer(FILES, POLICY, port=server.port)
+    with pytest.raises(UserError, match="0 to 65535"):
+        StaticServer(FILES, POLICY, port=70_000)
+    with pytest.raises(UserError, match="not a name or address of this machine|listened on"):
+        StaticServer(FILES, POLICY, host="no-such-host.invalid")
+    with pytest.raises(UserError, match=r"192\.0\.2\.1"):
+        StaticServer(FILES, POLICY, host="192.0.2.1")
