@@ -31,7 +31,7 @@ def test_python_example_runs(tmp_path, monkeypatch, capsys):
 def commands() -> list[str]:
     shown = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
     lines = [line for block in shown for line in block.splitlines()]
-    lines += re.findall(r"`(snowsplat (?:dataset|make|train|render|evaluate) [^`]+)`", README)
+    lines += re.findall(r"`(snowsplat (?:sfm|make|train|render|evaluate) [^`]+)`", README)
     return lines
 
 
