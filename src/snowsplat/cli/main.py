@@ -24,7 +24,7 @@ from snowsplat.cli.sfm import Sfm
 from snowsplat.cli.train import Train
 from snowsplat.cli.view import View
 from snowsplat.cli.watch import Watch
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import printable
 
 VERBS: dict[str, Any] = {
@@ -71,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     _say_notes_and_warnings_in_one_line()
     try:
         return int(_parse(arguments or ["--help"]).run())
+    except SettingError as error:
+        return _fail(f"--{error.setting.replace('_', '-')}: {error.problem}", 2)
     except UserError as error:
         return _fail(str(error), 2)
     except KeyboardInterrupt:

@@ -9,10 +9,11 @@ from typing import Any, Literal
 from snowsplat.training.density import AdaptiveDensity, DensityConfig, McmcDensity
 from snowsplat.training.optim import LearningRates
 from snowsplat.training.step_schedule import Schedule, When
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import from_json
 
-_MOST_SEED = 2**61  # generators are seeded with four times as much
+#: The generators are seeded with four times the seed, which has to fit into 64 bits.
+_SEED_LIMIT = 2**61
 
 
 @dataclass(frozen=True)
@@ -64,29 +65,28 @@ class TrainConfig:
     checkpoint_every: int = 0
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise UserError(f"--iterations is {self.iterations}; it must be at least 1")
-        if self.sh_degree not in (0, 1, 2, 3):
-            raise UserError(f"--sh-degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
-        if not -_MOST_SEED <= self.seed < _MOST_SEED:
-            raise UserError(f"--seed is {self.seed}; take one nearer to 0")
         rates, density = self.learning_rates, self.density
         for name, count in (
-            ("--initial-points", self.initial_points),
-            ("--densify-interval", density.densify_interval),
+            ("iterations", self.iterations),
+            ("initial_points", self.initial_points),
+            ("densify_interval", density.densify_interval),
         ):
             if count < 1:
-                raise UserError(f"{name} is {count}; it must be at least 1")
-        for name, rate in (("--lr-means", rates.means), ("--lr-means-final", rates.means_final)):
-            if rate <= 0.0:  # from one to the other it goes by equal factors
-                raise UserError(f"{name} is {rate:g}; it must be more than 0, like 1e-12")
+                raise SettingError(name, f"{count} is too small; use at least 1")
+        if self.sh_degree not in (0, 1, 2, 3):
+            raise SettingError("sh_degree", f"{self.sh_degree} is not supported; use 0, 1, 2 or 3")
+        if not -_SEED_LIMIT <= self.seed < _SEED_LIMIT:
+            raise SettingError("seed", f"{self.seed} is too large; use one closer to 0")
+        for name, rate in (("lr_means", rates.means), ("lr_means_final", rates.means_final)):
+            if rate <= 0.0:  # the schedule interpolates their logarithms
+                raise SettingError(name, f"{rate:g} is not positive; use e.g. 1e-12 instead of 0")
         for name, when in (
-            ("--densify-from", density.densify_from),
-            ("--densify-until", density.densify_until),
-            ("--lr-means-steps", rates.means_steps),
+            ("densify_from", density.densify_from),
+            ("densify_until", density.densify_until),
+            ("lr_means_steps", rates.means_steps),
         ):
             if not math.isfinite(when):
-                raise UserError(f"{name} is {when}; it must be a step, or a share of all like 0.5")
+                raise SettingError(name, f"{when} is not a step; use e.g. 500, or a fraction, 0.5")
 
     def capped(self, pixels: int) -> TrainConfig:
         """This configuration with the cap that ``gaussians_per_pixel`` means for such photos."""
@@ -125,9 +125,9 @@ def changed(config: TrainConfig, **knobs: Any) -> TrainConfig:
     density = {f.name for f in fields(config.density)} & given.keys()
     rates = {f"lr_{f.name}" for f in fields(config.learning_rates)} & given.keys()
     for name in given.keys() - density - rates:
-        raise UserError(
-            f"--{name.replace('_', '-')} means nothing with {type(config.density).__name__}; "
-            "leave it out, or take another recipe"
+        raise SettingError(
+            name,
+            f"not a setting of {type(config.density).__name__}; remove it or use another recipe",
         )
     return replace(
         config,

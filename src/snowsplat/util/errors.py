@@ -1,5 +1,20 @@
-"""The one kind of error that is the user's to mend."""
+"""The errors that a user can fix: the command line prints them as one line."""
 
 
 class UserError(Exception):
     """One line: what is wrong, and what to do about it. The command line exits with 2 after it."""
+
+
+class SettingError(UserError):
+    """A value that a setting cannot have: ``"<setting>: <what is wrong>; <what to do>"``.
+
+    Attributes:
+        setting: name of the argument or field in Python, such as ``lr_means``. The command line
+            prints its flag in its place, ``--lr-means``.
+        problem: the rest of the message.
+    """
+
+    def __init__(self, setting: str, problem: str) -> None:
+        super().__init__(f"{setting}: {problem}")
+        self.setting = setting
+        self.problem = problem

@@ -11,7 +11,7 @@ from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.training.density.mcmc import McmcDensity, McmcDensityControl, shared_opacity
 from snowsplat.training.optim import Adam, LearningRates
 from snowsplat.training.step_schedule import Schedule
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError
 
 
 def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
@@ -164,5 +164,5 @@ def test_regularisers_are_the_gradients_of_mean_opacity_and_scale():
 
 
 def test_without_a_cap_there_is_a_clear_error():
-    with pytest.raises(UserError, match="--max-gaussians"):
+    with pytest.raises(SettingError, match="^max_gaussians: MCMC density control needs a limit"):
         set_up(some_gaussians(3), max_gaussians=0)

@@ -22,7 +22,7 @@ from snowsplat.scene.geometry import morton_order, rotation_from_quat
 from snowsplat.training.finite import check_parameters
 from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule, When
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError
 
 #: Copies of one Gaussian that a relocation reckons with; more are rare.
 MAX_COPIES = 51
@@ -70,8 +70,8 @@ class McmcDensity:
     ) -> McmcDensityControl:
         """Fresh state, which depends on ``schedule`` and ``generator`` alone."""
         if self.max_gaussians <= 0:
-            raise UserError(
-                "MCMC density control needs a cap: give --max-gaussians a positive number"
+            raise SettingError(
+                "max_gaussians", "MCMC density control needs a limit; use a positive number"
             )
         return McmcDensityControl(self, schedule, generator)
 
