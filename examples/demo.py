@@ -12,8 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-from snowsplat.data.colmap import posed_camera
-from snowsplat.data.colmap_files import read_model
+from snowsplat.data.colmap import posed_camera, read_model
 from snowsplat.synthetic import Truth, write_synthetic_photos
 from snowsplat.synthetic.compare_poses import compare_poses
 

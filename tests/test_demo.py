@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.data.colmap_files import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.synthetic import Truth
 from snowsplat.synthetic.lens import Lens

@@ -1,4 +1,4 @@
-"""COLMAP's files: round trips, other cameras, several models, damage."""
+"""COLMAP's files: round trips, camera models, several models, damaged files."""
 
 import logging
 import struct
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from snowsplat.data import load_dataset
-from snowsplat.data.colmap_files import (
+from snowsplat.data.colmap import (
     ColmapCamera,
     ColmapImage,
     read_model,
@@ -50,7 +50,7 @@ def test_model_without_points(tmp_path, text):
 
 
 def test_observations_are_skipped(tmp_path):
-    """As COLMAP writes them: each image with the points that it saw."""
+    """COLMAP writes, for each image, the points that it observes."""
     write_model(tmp_path, {}, [], np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
     record = struct.pack("<I7dI", 1, *POSE, 3) + b"x.jpg\0" + struct.pack("<Q", 2) + bytes(48)
     (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 2) + record * 2)
@@ -87,7 +87,7 @@ def rewrite_cameras(folder, model, params):
         ("OPENCV", (30.0, 30.0, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0)),
     ],
 )
-def test_cameras_that_are_pinholes_by_another_name(dataset_copy, model, params):
+def test_models_with_zero_distortion_are_pinhole_cameras(dataset_copy, model, params):
     folder = dataset_copy("colmap-bin")
     rewrite_cameras(folder, model, params)
     camera = load_dataset(folder).train[0].camera
@@ -101,7 +101,7 @@ def test_cameras_that_are_pinholes_by_another_name(dataset_copy, model, params):
         ("OPENCV_FISHEYE", (30.0, 30.0, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0)),
     ],
 )
-def test_distorted_cameras_are_refused_with_the_fix(dataset_copy, model, params):
+def test_distorted_cameras_are_rejected_with_instructions(dataset_copy, model, params):
     folder = dataset_copy("colmap-bin")
     rewrite_cameras(folder, model, params)
     with pytest.raises(UserError, match=f"{model}.*snowsplat sfm -s NEW --skip-matching"):
@@ -111,14 +111,14 @@ def test_distorted_cameras_are_refused_with_the_fix(dataset_copy, model, params)
 @pytest.mark.parametrize(
     "params", [(0.0, 16.0, 12.0), (-1.0, 16.0, 12.0), (float("nan"), 1.0, 1.0), (1e300, 1.0, 1.0)]
 )
-def test_intrinsics_that_make_no_sense_are_refused(dataset_copy, params):
+def test_invalid_intrinsics_are_rejected(dataset_copy, params):
     folder = dataset_copy("colmap-bin")
     rewrite_cameras(folder, "SIMPLE_PINHOLE", params)
     with pytest.raises(UserError, match="intrinsics"):
         load_dataset(folder)
 
 
-def test_each_image_has_its_own_camera(dataset_copy):
+def test_one_camera_per_image(dataset_copy):
     folder = dataset_copy("colmap-txt")
     model = read_model(folder / "sparse/0")
     cameras = {i: ColmapCamera("PINHOLE", 32, 24, (30.0 + i, 30, 16, 12)) for i in range(9)}
@@ -130,12 +130,12 @@ def test_each_image_has_its_own_camera(dataset_copy):
 
 
 @pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
-def test_the_model_with_most_images_is_taken(dataset_copy, caplog, kind):
+def test_the_model_with_most_images_is_used(dataset_copy, caplog, kind):
     folder = dataset_copy(kind)
     model = read_model(folder / "sparse/0")
     (folder / "sparse/0").rename(folder / "sparse/3")
     nothing = np.empty((0, 3))
-    for number in (0, 1):  # first by name, fewer images
+    for number in (0, 1):  # first by name, but with fewer images
         some = model.images[: 2 + number]
         write_model(folder / f"sparse/{number}", model.cameras, some, nothing, nothing)
     with caplog.at_level(logging.WARNING):
@@ -145,7 +145,7 @@ def test_the_model_with_most_images_is_taken(dataset_copy, caplog, kind):
     assert "sparse/3" in dataset.description
 
 
-def test_a_model_right_in_sparse(dataset_copy):
+def test_a_model_directly_in_sparse(dataset_copy):
     folder = dataset_copy("colmap-bin")
     (folder / "sparse/0").rename(folder / "elsewhere")
     (folder / "sparse").rmdir()
@@ -163,25 +163,25 @@ def test_missing_images_are_skipped_and_counted(dataset_copy, caplog):
     assert "2 of 9 images are missing (the first is 'view_03.png')" in caplog.text
 
 
-def test_no_image_at_all(dataset_copy):
+def test_no_images(dataset_copy):
     folder = dataset_copy("colmap-bin")
     with pytest.raises(
-        UserError, match=r"photos: no such folder.*--images.*there are: images, sparse"
+        UserError, match=r"photos: no such folder.*set images.*existing folders: images, sparse"
     ):
         load_dataset(folder, images="photos")
     for image in (folder / "images").iterdir():
         image.unlink()
-    with pytest.raises(UserError, match="none of the 9 images of the model is here"):
+    with pytest.raises(UserError, match="has none of the 9 images of the model"):
         load_dataset(folder)
 
 
-def test_points_that_are_not_finite_are_left_out(tmp_path, caplog):
+def test_points_that_are_not_finite_are_skipped(tmp_path, caplog):
     xyz = np.array([[0, 0, 1.0], [0, np.nan, 1], [1e300, 0, 0], [1, 2, 3], [0, -1e20, 0]])
     write_model(tmp_path, {}, [], xyz, np.zeros((5, 3), np.uint8))
     with caplog.at_level(logging.WARNING):
         points = read_points(tmp_path)
     assert points.xyz.tolist() == [[0, 0, 1], [1, 2, 3]]
-    assert "3 points are not finite, or absurdly far" in caplog.text
+    assert "skipped 3 points that are not finite or too far away" in caplog.text
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
@@ -197,28 +197,29 @@ def test_a_count_larger_than_the_file_allocates_nothing(dataset_copy, file, coun
 
 @pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_damaged_files_are_one_line(dataset_copy, refusals, kind, name):
+def test_damaged_files_raise_one_line_errors(dataset_copy, refusals, kind, name):
     folder = dataset_copy(kind)
     path = folder / "sparse/0" / (name + kind.replace("colmap-", "."))
     refused = refusals(path, lambda: load_dataset(folder))
-    # Whatever is cut is noticed, but for an empty text of points, or one cut between lines.
+    # Truncation is always detected, except in a text file of points that is empty or ends between
+    # two lines.
     assert refused >= (20 if kind == "colmap-bin" else 5)
 
 
-def test_a_text_that_its_comment_calls_longer(dataset_copy, caplog):
+def test_a_text_file_shorter_than_its_comment_promises(dataset_copy, caplog):
     folder = dataset_copy("colmap-txt")
     path = folder / "sparse/0/points3D.txt"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:21]))
     with caplog.at_level(logging.WARNING):
         assert len(load_dataset(folder).points) == 20
-    assert "20 points, its comment says 60" in caplog.text
+    assert "20 points, but its comment promises 60" in caplog.text
 
 
-def test_an_image_of_an_unknown_camera(dataset_copy):
+def test_an_image_with_an_unknown_camera(dataset_copy):
     folder = dataset_copy("colmap-bin")
     model = read_model(folder / "sparse/0")
     nothing = np.empty((0, 3))
     write_model(folder / "sparse/0", {5: model.cameras[1]}, model.images, nothing, nothing)
-    with pytest.raises(UserError, match="camera 1, which the model does not hold"):
+    with pytest.raises(UserError, match="camera 1, which the model does not contain"):
         load_dataset(folder)

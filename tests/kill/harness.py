@@ -29,7 +29,7 @@ import torch
 from PIL import Image
 
 import snowsplat
-from snowsplat.data.colmap_files import ColmapImage, read_model, read_points
+from snowsplat.data.colmap import ColmapImage, read_model, read_points
 from snowsplat.formats import read_gaussians
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat

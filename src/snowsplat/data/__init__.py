@@ -1,4 +1,4 @@
-"""Photos with known cameras, from whatever describes them, as one `Dataset`."""
+"""Posed images: reads COLMAP models and transforms.json files into one type, `Dataset`."""
 
 from snowsplat.data.dataset import Dataset, Points, View, scene_extent
 from snowsplat.data.decode import ImageSource, LoadedImage

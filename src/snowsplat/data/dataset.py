@@ -1,12 +1,14 @@
-"""A dataset: posed images, split into training and test, and the points to start from."""
+"""The types of a dataset: posed images, split into training and test, and 3D points."""
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,6 +16,11 @@ from snowsplat.data.bounds import scene_bounds
 from snowsplat.data.decode import ImageSource
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
+
+logger = logging.getLogger(__name__)
+
+# Largest coordinate of a point, in world units. Squared distances must be finite in float32.
+_MAX_COORDINATE = 1e18
 
 
 @dataclass
@@ -27,92 +34,115 @@ class Points:
         return self.xyz.shape[0]
 
     def to(self, device: torch.device) -> Points:
-        """On another device; no copy where they are there already."""
+        """These points on ``device``; not copied if they are already there."""
         return Points(self.xyz.to(device), self.rgb.to(device))
+
+
+def usable_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> Points | None:
+    """The points whose coordinates are finite and below 1e18; None if there are none.
+
+    Logs a warning with the number of other points.
+
+    Args:
+        path: the file that the points were read from, for the warning.
+        xyz: (P, 3) positions in the world frame, of any float dtype.
+        rgb: (P, 3) colours in 0..255.
+    """
+    with np.errstate(over="ignore"):
+        xyz = np.ascontiguousarray(xyz, np.float32)
+    usable = (np.abs(xyz) < _MAX_COORDINATE).all(axis=1)
+    if not usable.all():
+        count = (~usable).sum()
+        logger.warning("%s: skipped %d points that are not finite or too far away", path, count)
+        xyz, rgb = xyz[usable], rgb[usable]
+    if not len(xyz):
+        return None
+    return Points(torch.from_numpy(xyz), torch.from_numpy(np.ascontiguousarray(rgb, np.uint8)))
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One posed image. ``camera`` has the size that ``image`` has when decoded."""
+    """One posed image. ``camera`` has the size of the decoded ``image``."""
 
-    name: str  # unique in its dataset; relative, with '/', and without '..': fit to name a file
+    name: str  # unique in its dataset; a relative path with '/' and without '..'
     camera: Camera
     image: ImageSource
-    mask: ImageSource | None = None  # where it is black, the image does not count
+    mask: ImageSource | None = None  # black pixels of the mask are ignored in the image
 
 
 @dataclass
 class Dataset:
-    """What training needs; always posed, all of it finite.
-
-    ``train`` and ``test`` are in the order of their names. ``points`` is None where the dataset
-    came without: then `bounds` says where to begin.
+    """Posed images and points for training. Cameras and points are finite.
 
     Raises:
-        UserError: cameras or points that are not finite.
+        UserError: a camera or a point is not finite.
     """
 
-    train: list[View]
-    test: list[View]
-    points: Points | None
-    extent: float  # world units: 1.1 × the largest distance of a training camera from their mean
-    description: str = ""  # which files it was read from, for people
+    train: list[View]  # sorted by name
+    test: list[View]  # sorted by name
+    points: Points | None  # None: the dataset has no points; `bounds` is estimated from cameras
+    extent: float  # world units; see `scene_extent`
+    description: str = ""  # the files it was read from, for messages
 
     def __post_init__(self) -> None:
-        of = f"{self.description}: " if self.description else ""
+        prefix = f"{self.description}: " if self.description else ""
         views = [*self.train, *self.test]
         bad = [view.name for view in views if not view.camera.is_finite()]
         if bad:
             raise UserError(
-                f"{of}{len(bad)} of {len(views)} cameras are not finite, that of {bad[0]} first; "
-                "correct their poses or leave these photos out"
+                f"{prefix}{len(bad)} of {len(views)} cameras are not finite (the first is that of "
+                f"{bad[0]}); correct their poses or remove these photos"
             )
         if not 0.0 < self.extent < math.inf:
-            raise UserError(f"{of}the extent of its cameras is {self.extent}; correct them")
+            raise UserError(
+                f"{prefix}the extent of the cameras is {self.extent}; correct their poses"
+            )
         if self.points is not None:
             rows = int((~self.points.xyz.isfinite().all(dim=1)).sum())
             if rows:
                 raise UserError(
-                    f"{of}{rows:,} of {len(self.points):,} points are not finite; remove them"
+                    f"{prefix}{rows:,} of {len(self.points):,} points are not finite; remove them"
                 )
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float32: low and high corner of a box around the scene; see `scene_bounds`."""
+        """(2, 3) float32: lower and upper corner of a box around the scene; see `scene_bounds`."""
         points = None if self.points is None else self.points.xyz
         return scene_bounds([view.camera for view in self.train or self.test], points)
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """What a reader found: an image file, and its camera at the size it was made for."""
+    """What a reader returns: an existing image file and its camera.
+
+    The camera has the image size that the pose was estimated with; the file may be smaller.
+    """
 
     name: str  # as `View.name`
     camera: Camera
-    folder: (
-        Path  # the folder of images; beside it are those of smaller copies: images_2, images_4 …
-    )
-    file: str  # relative to ``folder``; the file is there
+    folder: Path  # of images; smaller copies may be in the sibling folders images_2, images_4 …
+    file: str  # relative to ``folder``
     mask: Path | None = None
-    split: Literal["train", "test"] | None = None  # what the dataset's own files say
-    divided: int = 1  # by how much the files here are smaller because -r asked for such copies
+    split: Literal["train", "test"] | None = None  # from the dataset's own files
+    divided: int = 1  # 2, 4 or 8 if ``folder`` is images_2, images_4 or images_8
 
     @property
     def path(self) -> Path:
+        """The image file."""
         return self.folder / self.file
 
 
 def safe_name(path: str) -> str:
-    """A path as a dataset names its image, made fit for `View.name`."""
+    """A valid `View.name` from the path of an image as written in a dataset file."""
     parts = path.replace("\\", "/").split("/")
     return "/".join(part for part in parts if part not in ("", ".", "..") and ":" not in part)
 
 
 def scene_extent(cameras: list[Camera]) -> float:
-    """1.1 × the largest distance of a camera centre from their mean (the paper's scene extent).
+    """1.1 × the largest distance of a camera centre from the mean centre, in world units.
 
-    It scales the learning rate of positions, so it must not be 0: cameras that all stand in one
-    place give 1.
+    This is the paper's scene extent. It scales the learning rate of positions and must not be 0,
+    so it is 1 if all cameras have the same centre.
     """
     centres = torch.stack([camera.position.detach() for camera in cameras])
     radius = float((centres - centres.mean(0)).norm(dim=1).max())

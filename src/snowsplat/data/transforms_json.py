@@ -22,9 +22,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from snowsplat.data.colmap import find_models
-from snowsplat.data.colmap_files import make_points, read_points
-from snowsplat.data.dataset import Points, PosedImage, safe_name
+from snowsplat.data.colmap import find_models, read_points
+from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.decode import IMAGE_SUFFIXES, read_header
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.scene.camera import Camera
@@ -283,7 +282,7 @@ def _points(root: Path, scene: _Json) -> Points | None:
     if isinstance(named, str):
         path = _at_home(f"{root}: ply_file_path", root, named)
     if is_file(path):
-        return make_points(path, *read_points_ply(path))
+        return usable_points(path, *read_points_ply(path))
     if isinstance(named, str):
         logger.warning("%s: the points it should begin with are missing", path)
     models = find_models(root / "colmap" / "sparse")
@@ -297,4 +296,4 @@ def _points(root: Path, scene: _Json) -> Points | None:
     except (TypeError, ValueError, IndexError, RuntimeError, OverflowError):
         logger.warning("%s: applied_transform makes no sense; COLMAP's points are left out", root)
         return None
-    return make_points(models[0], xyz.numpy(), points.rgb.numpy())
+    return usable_points(models[0], xyz.numpy(), points.rgb.numpy())

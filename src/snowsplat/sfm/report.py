@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.colmap import posed_camera
-from snowsplat.data.colmap_files import read_model, read_points
+from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.files import write_text
 from snowsplat.util.html import bar, cards, duration, page, picture, table, text

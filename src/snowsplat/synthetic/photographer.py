@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap_files import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic.lens import Lens

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.data.colmap_files import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation
 

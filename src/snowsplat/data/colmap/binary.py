@@ -1,0 +1,200 @@
+"""COLMAP's binary files: cameras.bin, images.bin, points3D.bin. All numbers are little-endian.
+
+Counts in the files are not trusted: before anything is allocated, the promised number of records
+must fit into the file.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.data.colmap.types import (
+    CAMERA_MODELS,
+    ColmapCamera,
+    ColmapImage,
+    PointRecords,
+    check_count,
+    checked_camera,
+    damaged,
+    unreadable,
+)
+from snowsplat.util.errors import UserError
+
+_COUNT = struct.Struct("<Q")
+# Id, index into CAMERA_MODELS, width, height. The parameters (doubles) follow.
+_CAMERA_HEAD = struct.Struct("<IiQQ")
+_SMALLEST_CAMERA = _CAMERA_HEAD.size + 3 * 8
+# Id, quaternion (w, x, y, z), translation, camera id. The name, ended by a zero byte, and the
+# observations follow.
+_IMAGE_HEAD = struct.Struct("<I4d3dI")
+_SMALLEST_IMAGE = _IMAGE_HEAD.size + 1 + _COUNT.size
+# x, y and point id.
+_OBSERVATION_BYTES = 24
+# Id, xyz, rgb, reprojection error, track length. The track follows, 8 bytes per element.
+_POINT_BYTES = 8 + 24 + 3 + 8 + 8
+_TRACK_ELEMENT_BYTES = 8
+
+
+class _Cursor:
+    """Reads a file that starts with a record count; raises `UserError` if data is missing."""
+
+    def __init__(self, path: Path, kind: str, least_bytes: int) -> None:
+        self.path = path
+        try:
+            self.data = path.read_bytes()
+        except OSError as error:
+            raise unreadable(path, error) from None
+        self.offset = 0
+        (self.count,) = self.take(_COUNT)
+        if self.count * least_bytes > len(self.data) - self.offset:
+            raise damaged(path, f"it promises {self.count} {kind}, more than fit into it")
+
+    def take(self, layout: struct.Struct) -> tuple:
+        if self.offset + layout.size > len(self.data):
+            raise self.truncated()
+        values = layout.unpack_from(self.data, self.offset)
+        self.offset += layout.size
+        return values
+
+    def take_string(self) -> str:
+        end = self.data.find(b"\0", self.offset)
+        if end < 0:
+            raise self.truncated()
+        text = self.data[self.offset : end].decode("utf-8", errors="surrogateescape")
+        self.offset = end + 1
+        return text
+
+    def skip(self, size: int) -> None:
+        if size > len(self.data) - self.offset:
+            raise self.truncated()
+        self.offset += size
+
+    def finish(self) -> None:
+        surplus = len(self.data) - self.offset
+        if surplus:
+            raise damaged(self.path, f"{surplus} bytes are left over at its end")
+
+    def truncated(self) -> UserError:
+        return damaged(self.path, "it is truncated")
+
+
+def count_images(path: Path) -> int:
+    """Number of images that the head of an images.bin promises, at most as many as can fit."""
+    with open(path, "rb") as file:
+        head = file.read(_COUNT.size)
+    if len(head) < _COUNT.size:
+        return 0
+    return min(_COUNT.unpack(head)[0], path.stat().st_size // _SMALLEST_IMAGE)
+
+
+def read_cameras(path: Path) -> dict[int, ColmapCamera]:
+    """Read a cameras.bin: cameras by id.
+
+    Raises:
+        UserError: the file is unreadable or damaged, or has a camera model that is not supported.
+    """
+    cursor = _Cursor(path, "cameras", _SMALLEST_CAMERA)
+    check_count(path, "cameras", cursor.count)
+    cameras = {}
+    for _ in range(cursor.count):
+        camera_id, number, width, height = cursor.take(_CAMERA_HEAD)
+        if not 0 <= number < len(CAMERA_MODELS):
+            raise UserError(
+                f"{path}: unknown camera model {number}; undistort the images first "
+                "(colmap image_undistorter), or copy the file again if it is damaged"
+            )
+        model, count = CAMERA_MODELS[number]
+        params = cursor.take(struct.Struct(f"<{count}d"))
+        cameras[camera_id] = checked_camera(path, model, width, height, params)
+    cursor.finish()
+    return cameras
+
+
+def read_images(path: Path) -> list[ColmapImage]:
+    """Read an images.bin, in the order of the file. Observations are skipped.
+
+    Raises:
+        UserError: the file is unreadable or damaged.
+    """
+    cursor = _Cursor(path, "images", _SMALLEST_IMAGE)
+    check_count(path, "images", cursor.count)
+    images = []
+    for _ in range(cursor.count):
+        _, *pose, camera_id = cursor.take(_IMAGE_HEAD)
+        name = cursor.take_string()
+        (observations,) = cursor.take(_COUNT)
+        cursor.skip(_OBSERVATION_BYTES * observations)
+        images.append(ColmapImage(name, camera_id, tuple(pose)))
+    cursor.finish()
+    return images
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a points3D.bin: positions (P, 3) float64 and colours (P, 3) uint8.
+
+    Raises:
+        UserError: the file is unreadable or damaged.
+    """
+    cursor = _Cursor(path, "points", _POINT_BYTES)
+    # The length of a record is stored in the record, so a loop finds where each record starts.
+    # Everything else is done for all records at once.
+    data, size = cursor.data, len(cursor.data)
+    starts = np.empty(cursor.count, np.int64)
+    unpack = _COUNT.unpack_from
+    start = _COUNT.size
+    for i in range(cursor.count):
+        if start + _POINT_BYTES > size:
+            raise cursor.truncated()
+        starts[i] = start
+        track_length = unpack(data, start + _POINT_BYTES - _COUNT.size)[0]
+        start += _POINT_BYTES + _TRACK_ELEMENT_BYTES * track_length
+    if start > size:
+        raise cursor.truncated()
+    cursor.offset = start
+    cursor.finish()
+    # An array view with one overlapping record per byte; the records at ``starts`` are picked.
+    record = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    everywhere: np.ndarray = np.ndarray(
+        max(0, size - record.itemsize + 1), record, data, strides=(1,)
+    )
+    records = everywhere[starts]
+    return records["xyz"], records["rgb"]
+
+
+def write_model(
+    folder: Path,
+    cameras: Mapping[int, ColmapCamera],
+    images: Sequence[ColmapImage],
+    points: PointRecords,
+) -> None:
+    """Write cameras.bin, images.bin and points3D.bin; the arguments are those of `write_model`."""
+    model_numbers = {name: number for number, (name, _) in enumerate(CAMERA_MODELS)}
+    camera_records = [
+        _CAMERA_HEAD.pack(key, model_numbers[camera.model], camera.width, camera.height)
+        + struct.pack(f"<{len(camera.params)}d", *camera.params)
+        for key, camera in cameras.items()
+    ]
+    image_records = [
+        _IMAGE_HEAD.pack(number, *image.pose, image.camera_id)
+        + image.name.encode("utf-8", errors="surrogateescape")
+        + b"\0"
+        + _COUNT.pack(0)  # no observations
+        for number, image in enumerate(images, 1)
+    ]
+    rows = zip(points.xyz.tolist(), points.rgb.tolist(), points.tracks, strict=True)
+    point_records = [
+        struct.pack("<Q3d3BdQ", number, *xyz, *rgb, 0.0, len(track))
+        + b"".join(struct.pack("<II", *pair) for pair in track)
+        for number, (xyz, rgb, track) in enumerate(rows, 1)
+    ]
+    _write(folder / "cameras.bin", camera_records)
+    _write(folder / "images.bin", image_records)
+    _write(folder / "points3D.bin", point_records)
+
+
+def _write(path: Path, records: list[bytes]) -> None:
+    path.write_bytes(_COUNT.pack(len(records)) + b"".join(records))

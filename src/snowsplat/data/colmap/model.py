@@ -1,0 +1,100 @@
+"""Reading and writing a sparse COLMAP model, binary or text.
+
+The format: https://colmap.github.io/format.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.data.colmap import binary as binary_files
+from snowsplat.data.colmap import text as text_files
+from snowsplat.data.colmap.types import ColmapCamera, ColmapImage, ColmapModel, PointRecords
+from snowsplat.data.dataset import Points, usable_points
+from snowsplat.util.errors import UserError
+
+
+def model_is_text(folder: Path) -> bool | None:
+    """Whether the model in a folder is text (True) or binary (False); None if there is no model."""
+    for is_text, suffix in ((False, ".bin"), (True, ".txt")):
+        if all((folder / (name + suffix)).is_file() for name in ("cameras", "images")):
+            return is_text
+    return None
+
+
+def count_images(folder: Path) -> int:
+    """Number of registered images of the model in a folder; 0 if a file is damaged.
+
+    Of a binary model, only the head of ``images.bin`` is read.
+    """
+    if not model_is_text(folder):
+        return binary_files.count_images(folder / "images.bin")
+    try:
+        return len(text_files.read_images(folder / "images.txt"))
+    except UserError:
+        return 0
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Read cameras and images of the model in a folder; images are sorted by name.
+
+    Raises:
+        UserError: there is no model, or a file is damaged. The message names the file.
+    """
+    is_text = model_is_text(folder)
+    if is_text is None:
+        raise UserError(f"{folder}: no COLMAP model here (cameras and images, .bin or .txt)")
+    if is_text:
+        cameras = text_files.read_cameras(folder / "cameras.txt")
+        images = text_files.read_images(folder / "images.txt")
+    else:
+        cameras = binary_files.read_cameras(folder / "cameras.bin")
+        images = binary_files.read_images(folder / "images.bin")
+    return ColmapModel(folder, is_text, cameras, sorted(images, key=lambda image: image.name))
+
+
+def read_points(folder: Path) -> Points | None:
+    """Read the 3D points of the model in a folder; None if it has none.
+
+    `usable_points` removes points that are not finite or implausibly far away.
+
+    Raises:
+        UserError: a file is damaged.
+    """
+    path = folder / "points3D.bin"
+    if path.is_file():
+        return usable_points(path, *binary_files.read_points(path))
+    path = folder / "points3D.txt"
+    if path.is_file():
+        return usable_points(path, *text_files.read_points(path))
+    return None
+
+
+def write_model(
+    folder: Path,
+    cameras: Mapping[int, ColmapCamera],
+    images: Sequence[ColmapImage],
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    tracks: Sequence[Sequence[tuple[int, int]]] | None = None,
+    *,
+    text: bool = False,
+) -> None:
+    """Write a sparse model: the files cameras, images and points3D, as .bin or .txt.
+
+    Args:
+        folder: where to write; created if missing.
+        cameras: by camera id.
+        images: get the ids 1, 2, … in this order. They are written without observations.
+        xyz: (P, 3) float, point positions in the world frame.
+        rgb: (P, 3) uint8.
+        tracks: per point, the pairs (image id, observation index) that observe it; None: no tracks.
+        text: write .txt files.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    points = PointRecords(xyz, rgb, [()] * len(xyz) if tracks is None else tracks)
+    write = text_files.write_model if text else binary_files.write_model
+    write(folder, cameras, images, points)

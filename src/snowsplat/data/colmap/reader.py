@@ -1,0 +1,172 @@
+"""The COLMAP reader: a folder with a COLMAP model and images -> posed images and points.
+
+COLMAP's conventions are those of `Camera`: OpenCV axes, cam_from_world, pixel centres at one half.
+No conversion is needed.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from snowsplat.data.colmap.model import count_images, model_is_text, read_model, read_points
+from snowsplat.data.colmap.types import ColmapCamera, ColmapImage, ColmapModel
+from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
+from snowsplat.data.points_ply import read_points as read_points_ply
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import inside, is_file, quoted
+
+logger = logging.getLogger(__name__)
+
+# Number of focal lengths, one (f, cx, cy) or two (fx, fy, cx, cy), of each camera model that is a
+# pinhole camera if all parameters after the principal point are 0.
+_FOCAL_LENGTHS = {
+    "SIMPLE_PINHOLE": 1,
+    "PINHOLE": 2,
+    "SIMPLE_RADIAL": 1,
+    "RADIAL": 1,
+    "OPENCV": 2,
+    "FULL_OPENCV": 2,
+}
+
+
+def find_models(parent: Path) -> list[Path]:
+    """The folders that hold a COLMAP model: ``parent`` and its direct subfolders.
+
+    They are sorted by their number of images, the largest first.
+    """
+    if not parent.is_dir():
+        return []
+    folders = [*sorted(p for p in parent.iterdir() if p.is_dir()), parent]
+    models = [folder for folder in folders if model_is_text(folder) is not None]
+    return sorted(models, key=lambda folder: -count_images(folder))  # stable for equal counts
+
+
+def read_colmap(
+    root: Path, models: list[Path], images: str
+) -> tuple[list[PosedImage], Points | None, str]:
+    """Read the first of ``models``: posed images that are on disk, points, and a description.
+
+    Args:
+        root: the folder of the dataset.
+        models: folders of models inside ``root``, from `find_models`.
+        images: name of the folder of images inside ``root``.
+
+    Raises:
+        UserError: damaged files, distorted cameras, or no images.
+    """
+    folder = models[0]
+    name = folder.relative_to(root).as_posix()
+    if len(models) > 1:
+        _warn_of_other_models(root, models)
+    model = read_model(folder)
+    if not model.images:
+        raise UserError(f"{folder}: the COLMAP model has no images; run COLMAP again")
+    posed = _images_on_disk(root, root / images, model)
+    points = read_points(folder)
+    ply = folder / "points3D.ply"
+    if points is None and ply.is_file():
+        points = usable_points(ply, *read_points_ply(ply))
+    if points is None:
+        logger.warning("%s: the model has no points; training starts from random ones", folder)
+    return posed, points, f"COLMAP model {name} ({'text' if model.text else 'binary'})"
+
+
+def _warn_of_other_models(root: Path, models: Sequence[Path]) -> None:
+    largest, *others = [(m.relative_to(root).as_posix(), count_images(m)) for m in models]
+    logger.warning(
+        "%s: COLMAP made %d separate models; using the largest, %s (%d images), not %s",
+        root,
+        len(models),
+        *largest,
+        ", ".join(f"{name} ({count})" for name, count in others),
+    )
+
+
+def _images_on_disk(root: Path, folder: Path, model: ColmapModel) -> list[PosedImage]:
+    """The images of a model whose files are in ``folder``; warns of those that are missing."""
+    if not folder.is_dir():
+        found = sorted(p.name for p in root.iterdir() if p.is_dir())
+        raise UserError(
+            f"{folder}: no such folder of images; set images to the right one"
+            + (f" (existing folders: {', '.join(found)})" if found else "")
+        )
+    posed, missing = [], []
+    for image in model.images:
+        if inside(folder, image.name) is None:
+            raise UserError(
+                f"{model.folder}: names the image {quoted(image.name)}, which is not in {folder}; "
+                "run COLMAP again, with the images in one folder"
+            )
+        if not is_file(folder / image.name):
+            missing.append(image.name)
+            continue
+        camera = posed_camera(model, image)
+        mask = _find_mask(root / "masks", image.name)
+        posed.append(PosedImage(safe_name(image.name), camera, folder, image.name, mask))
+    if not posed:
+        raise UserError(
+            f"{folder}: has none of the {len(missing)} images of the model (the first is "
+            f"{quoted(missing[0])}); set images to the right folder"
+        )
+    if missing:
+        logger.warning(
+            "%s: %d of %d images are missing (the first is %r); skipped",
+            folder,
+            len(missing),
+            len(model.images),
+            missing[0][:80],
+        )
+    return posed
+
+
+def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
+    """The camera of an image, with its pose in float64.
+
+    Raises:
+        UserError: the camera is missing, distorted, or damaged.
+    """
+    colmap = model.cameras.get(image.camera_id)
+    if colmap is None:
+        raise UserError(
+            f"{model.folder}: image {image.name[:80]} has camera {image.camera_id}, which the "
+            "model does not contain; copy the model again"
+        )
+    fx, fy, cx, cy = _pinhole(model.folder, colmap)
+    quat, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
+    if not (0.5 < float(quat.norm()) < 2.0 and float(translation.abs().max()) < 1e15):
+        raise UserError(
+            f"{model.folder}: the pose of image {image.name[:80]} is damaged; copy the model again"
+        )
+    pose = torch.cat([rotation_from_quat(quat), translation[:, None]], 1)
+    return Camera(colmap.width, colmap.height, fx, fy, cx, cy, pose)
+
+
+def _pinhole(folder: Path, camera: ColmapCamera) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels."""
+    focal_lengths = _FOCAL_LENGTHS.get(camera.model)
+    if focal_lengths is None or any(camera.params[focal_lengths + 2 :]):
+        raise UserError(
+            f"{folder}: its cameras have lens distortion (model {camera.model[:40]}), but "
+            "Gaussians are rendered without; undistort the images first: put them into NEW/input "
+            "and the model into NEW/distorted/sparse/0, run snowsplat sfm -s NEW --skip-matching, "
+            "then use NEW"
+        )
+    f, (cx, cy) = camera.params[:focal_lengths], camera.params[focal_lengths : focal_lengths + 2]
+    if not all(map(math.isfinite, (*f, cx, cy))) or min(f) <= 0 or max(*f, abs(cx), abs(cy)) > 1e9:
+        raise UserError(f"{folder}: the intrinsics of a camera are damaged; copy the model again")
+    return f[0], f[-1], cx, cy
+
+
+def _find_mask(folder: Path, name: str) -> Path | None:
+    """``IMG.jpg.png``, as COLMAP names the mask of ``IMG.jpg``, or ``IMG.png``."""
+    for candidate in (f"{name}.png", str(Path(name).with_suffix(".png"))):
+        if is_file(folder / candidate):
+            return folder / candidate
+    return None

@@ -1,0 +1,176 @@
+"""COLMAP's text files: cameras.txt, images.txt, points3D.txt."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.data.colmap.types import (
+    CAMERA_MODELS,
+    ColmapCamera,
+    ColmapImage,
+    PointRecords,
+    check_count,
+    checked_camera,
+    damaged,
+    unreadable,
+)
+from snowsplat.util.files import shown
+
+logger = logging.getLogger(__name__)
+
+# A camera has at most 4 + 12 words. More are not split, to limit the memory for a damaged line.
+_MAX_CAMERA_WORDS = 20
+# Lines of points3D.txt that are parsed at once.
+_LINES_PER_BLOCK = 50_000
+# Characters of a long line whose words are counted at once.
+_CHARACTERS_PER_BLOCK = 1 << 20
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """The lines of a text file, without comments."""
+    try:
+        with open(path, encoding="utf-8", errors="surrogateescape") as file:
+            for line in file:
+                if not line.startswith("#"):
+                    yield line.strip()
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def _count_words(line: str) -> int:
+    """Number of words in a line, block by block: `str.split` takes 60 bytes of memory per word."""
+    count = 0
+    for start in range(0, len(line), _CHARACTERS_PER_BLOCK):
+        block = line[start : start + _CHARACTERS_PER_BLOCK]
+        continues_word = start > 0 and not line[start - 1].isspace() and not block[0].isspace()
+        count += len(block.split()) - continues_word
+    return count
+
+
+def _warn_if_fewer(path: Path, kind: str, count: int) -> None:
+    # COLMAP writes the number into a comment. It may be outdated if somebody edited the file, so
+    # a difference is only a warning.
+    with open(path, encoding="utf-8", errors="replace") as file:
+        head = file.read(1000)
+    promised = re.search(rf"^#.*Number of {kind}: (\d{{1,12}})\b", head, re.MULTILINE)
+    if promised and int(promised[1]) > count:
+        logger.warning(
+            "%s: has %d %s, but its comment promises %s; the file may be truncated",
+            path,
+            count,
+            kind,
+            promised[1],
+        )
+
+
+def read_cameras(path: Path) -> dict[int, ColmapCamera]:
+    """Read a cameras.txt: cameras by id.
+
+    Raises:
+        UserError: the file is unreadable or damaged.
+    """
+    counts = dict(CAMERA_MODELS)
+    cameras = {}
+    for line in filter(None, _lines(path)):
+        words = line.split(maxsplit=_MAX_CAMERA_WORDS)
+        try:
+            camera_id, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+            params = tuple(float(word) for word in words[4:])
+        except (ValueError, IndexError):
+            raise damaged(path, f"not a camera: line {shown(line[:60])!r}") from None
+        if len(params) != counts.get(model, len(params)):
+            raise damaged(path, f"{len(params)} parameters for camera model {model[:40]}")
+        cameras[camera_id] = checked_camera(path, model, width, height, params)
+        check_count(path, "cameras", len(cameras))
+    _warn_if_fewer(path, "cameras", len(cameras))
+    return cameras
+
+
+def read_images(path: Path) -> list[ColmapImage]:
+    """Read an images.txt, in the order of the file. Observations are skipped.
+
+    Raises:
+        UserError: the file is unreadable or damaged.
+    """
+    images = []
+    lines = _lines(path)
+    for line in filter(None, lines):
+        words = line.split(maxsplit=9)
+        try:
+            pose = tuple(float(word) for word in words[1:8])
+            image = ColmapImage(words[9], int(words[8]), pose)
+        except (ValueError, IndexError):
+            raise damaged(path, f"not an image: line {shown(line[:60])!r}") from None
+        images.append(image)
+        check_count(path, "images", len(images))
+        # Each image has a second line: x, y and point id of each observation. It may be empty.
+        observations = next(lines, "")
+        if _count_words(observations) % 3:
+            name = image.name[:80]
+            raise damaged(path, f"the line after image {name} should hold its observations")
+    _warn_if_fewer(path, "images", len(images))
+    return images
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a points3D.txt: positions (P, 3) float64 and colours (P, 3) uint8.
+
+    Raises:
+        UserError: the file is unreadable or damaged.
+    """
+    # Rows end with tracks of different lengths. numpy's reader is fast, but it would split the
+    # complete track into words, so it gets only the columns that are used.
+    lines = (" ".join(line.split(maxsplit=8)[:8]) for line in _lines(path) if line)
+    xyz, rgb = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
+    while block := list(islice(lines, _LINES_PER_BLOCK)):
+        try:
+            values = np.loadtxt(
+                block, np.float64, comments=None, usecols=(1, 2, 3, 4, 5, 6, 7), ndmin=2
+            )
+        except (ValueError, IndexError) as error:
+            raise damaged(path, f"not points ({' '.join(str(error).split())[:90]})") from None
+        colours = values[:, 3:6]
+        if not ((colours >= 0) & (colours <= 255)).all():
+            raise damaged(path, "a colour is outside 0..255")
+        xyz.append(values[:, :3].copy())
+        rgb.append(colours.astype(np.uint8))
+    _warn_if_fewer(path, "points", sum(map(len, xyz)))
+    return np.concatenate(xyz), np.concatenate(rgb)
+
+
+def write_model(
+    folder: Path,
+    cameras: Mapping[int, ColmapCamera],
+    images: Sequence[ColmapImage],
+    points: PointRecords,
+) -> None:
+    """Write cameras.txt, images.txt and points3D.txt; the arguments are those of `write_model`."""
+    # repr() of a float is the shortest text that reads back as the same number.
+    camera_lines = [
+        " ".join(map(str, (key, camera.model, camera.width, camera.height, *camera.params)))
+        for key, camera in cameras.items()
+    ]
+    image_lines = [
+        " ".join(map(str, (number, *image.pose, image.camera_id, image.name)))
+        + "\n"  # the line of observations, empty
+        for number, image in enumerate(images, 1)
+    ]
+    rows = zip(points.xyz.tolist(), points.rgb.tolist(), points.tracks, strict=True)
+    point_lines = [
+        " ".join(map(str, (number, *xyz, *rgb, 0.0, *sum(track, ()))))
+        for number, (xyz, rgb, track) in enumerate(rows, 1)
+    ]
+    _write(folder / "cameras.txt", "cameras", camera_lines)
+    _write(folder / "images.txt", "images", image_lines)
+    _write(folder / "points3D.txt", "points", point_lines)
+
+
+def _write(path: Path, kind: str, lines: list[str]) -> None:
+    text = "\n".join([f"# Number of {kind}: {len(lines)}", *lines, ""])
+    path.write_text(text, encoding="utf-8")

@@ -1,0 +1,92 @@
+"""The records of a COLMAP model, and the checks that binary and text files share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.util.errors import UserError
+
+#: Name and number of parameters of each camera model; the index is its number in binary files.
+CAMERA_MODELS = (
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+)
+
+# Width or height of a camera in pixels. A larger value means a damaged file.
+_MAX_SIDE = 1_000_000
+# Largest number of images, and of cameras. Each record takes about 400 bytes of memory.
+_MAX_RECORDS = 200_000
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """Intrinsics shared by one or more images."""
+
+    model: str  # a name in `CAMERA_MODELS`
+    width: int  # pixels
+    height: int  # pixels
+    params: tuple[float, ...]  # in COLMAP's order for ``model``; focal lengths and centre in pixels
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """A registered image: its file name, its camera and its pose."""
+
+    name: str  # relative to the image folder
+    camera_id: int
+    pose: tuple[float, ...]  # cam_from_world: quaternion (w, x, y, z), then translation (x, y, z)
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Cameras and images of a sparse model. `read_points` reads its points."""
+
+    folder: Path
+    text: bool  # read from .txt files, not from .bin
+    cameras: Mapping[int, ColmapCamera]  # by camera id
+    images: Sequence[ColmapImage]  # sorted by name
+
+
+@dataclass(frozen=True)
+class PointRecords:
+    """The 3D points of a model, as needed for writing. Point ids are 1, 2, …"""
+
+    xyz: np.ndarray  # (P, 3) float, world frame
+    rgb: np.ndarray  # (P, 3) uint8
+    tracks: Sequence[Sequence[tuple[int, int]]]  # per point: pairs (image id, observation index)
+
+
+def damaged(path: Path, problem: str) -> UserError:
+    """The error for a file that does not follow the format."""
+    return UserError(f"{path}: damaged: {problem}; copy the file again or run COLMAP again")
+
+
+def unreadable(path: Path, error: OSError) -> UserError:
+    """The error for a file that the system cannot read."""
+    return UserError(f"{path}: cannot be read ({error.strerror or error})")
+
+
+def check_count(path: Path, kind: str, count: int) -> None:
+    """Raise `UserError` if a file has too many cameras or images."""
+    if count > _MAX_RECORDS:
+        raise UserError(f"{path}: more than {_MAX_RECORDS:,} {kind}, which is not supported")
+
+
+def checked_camera(path: Path, model: str, width: int, height: int, params: tuple) -> ColmapCamera:
+    """A camera whose image size is plausible; otherwise raise `UserError`."""
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
+        raise damaged(path, f"a camera has the size {width}x{height}")
+    return ColmapCamera(model, width, height, params)
