@@ -39,13 +39,13 @@ def commands() -> list[str]:
 def test_command_is_understood(command):
     program, *arguments = shlex.split(command)
     assert program == "snowsplat"
-    assert type(cli._parse(arguments)) is cli.VERBS[arguments[0]]
+    assert type(cli.parse(arguments)) is cli.load_subcommand(arguments[0])
 
 
 def test_flags_named_exist(capsys):
-    for verb in cli.VERBS:
+    for name in cli.SUBCOMMANDS:
         with pytest.raises(SystemExit):
-            cli._parse([verb, "--help"])
+            cli.parse([name, "--help"])
     known = capsys.readouterr().out
     for flag in set(re.findall(r"`(-[-a-zA-Z_]+)", README)):
         assert flag.replace("_", "-") in known, flag

@@ -1,5 +1,6 @@
-"""The frame of the command line: help, mistakes, exit codes, and how soon it answers."""
+"""The frame of the command line: help, mistakes, exit codes, and which modules it imports."""
 
+import inspect
 import logging
 import os
 import subprocess
@@ -13,35 +14,66 @@ from snowsplat.cli import main as module
 from .conftest import ENVIRONMENT
 
 
-def test_help_of_the_command_and_of_each_verb_teaches(run):
+@pytest.fixture
+def replace_run(monkeypatch):
+    """``replace_run(function)``: what `snowsplat info` runs instead."""
+    return lambda function: monkeypatch.setattr(module.load_subcommand("info"), "run", function)
+
+
+def test_help_lists_the_subcommands_and_each_has_its_own(run):
     result = run()
     assert result.code == 0
-    for verb in module.VERBS:
-        assert f"snowsplat {verb}" in result.out
-        own = run(verb, "--help")
+    for name, summary in module.SUBCOMMANDS.items():
+        assert f"snowsplat {name}" in result.out
+        assert " ".join(summary.split()[:4]) in result.out
+        assert inspect.getdoc(module.load_subcommand(name)).splitlines()[0] == summary
+        own = run(name, "--help")
         assert own.code == 0
-        assert f"  snowsplat {verb} " in own.out  # an example, on its own line
+        assert f"  snowsplat {name} " in own.out  # an example, on its own line
         assert "Examples:" in own.out
-        assert "None" not in own.out  # how tyro shows what it was not told
+        assert "None" not in own.out  # tyro's text for a default that it was not given
 
 
-def test_help_and_mistakes_need_no_torch():
+def imported_by(*arguments: object) -> set[str]:
+    """The heavy modules that a command imports, and all modules of subcommands."""
     code = (
         "import sys\nfrom snowsplat.cli.main import main\n"
         "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
-        "assert not {'torch', 'numpy', 'PIL'} & set(sys.modules), 'heavy imports'\n"
+        "print(*sys.modules, file=sys.stderr)"
     )
-    for arguments in (["train", "--help"], ["train", "--iterations", "many"], ["train"], ["info"]):
-        command = [sys.executable, "-c", code, *arguments]
-        result = subprocess.run(
-            command, env={"PYTHONPATH": ":".join(sys.path)}, capture_output=True, text=True
-        )
-        assert result.returncode == 0, result.stderr
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    modules = set(done.stderr.splitlines()[-1].split())
+    subcommands = {f"snowsplat.cli.{name}" for name in module.SUBCOMMANDS}
+    return modules & ({"torch", "numpy", "PIL"} | subcommands)
+
+
+def test_help_and_mistakes_import_neither_torch_nor_other_subcommands():
+    assert imported_by("--help") == set()
+    assert imported_by("trian") == set()
+    assert imported_by("info") == {"snowsplat.cli.info"}
+    for arguments in (["train", "--help"], ["train", "--iterations", "many"], ["train"]):
+        assert not {"torch", "numpy", "PIL"} & imported_by(*arguments)
+
+
+def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):
+    assert "trian: unknown subcommand; did you mean train?" in refused("trian")
+    assert "did you mean sfm?" in refused("captur")  # a former name, still accepted
+    assert "choose from make, sfm, train" in refused("xyz")
+
+
+def test_a_misplaced_flag_is_found_in_its_subcommand(run):
+    assert "snowsplat train --help" in run("--iterations", "3").err
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [["trian"], ["train", "--iteratoins", "3"], ["train", "x", "-o", "y", "--recipe", "none"]],
+    [["train", "--iteratoins", "3"], ["train", "x", "-o", "y", "--recipe", "none"]],
 )
 def test_mistakes_in_the_flags(run, arguments):
     result = run(*arguments)
@@ -56,13 +88,13 @@ def test_completion_is_printed(run):
     assert "--max-gaussians" in result.out
 
 
-def test_errors_of_the_system_and_warnings_are_one_line(monkeypatch, refused, run):
+def test_errors_of_the_system_and_warnings_are_one_line(replace_run, run):
     def full_disk(self):
         warnings.warn("something\nodd", stacklevel=1)
         logging.getLogger("snowsplat.data").info("took the\nlarger one")
         raise OSError(28, "No space left on device", "out/scene.ply")
 
-    monkeypatch.setattr(module.VERBS["info"], "run", full_disk)
+    replace_run(full_disk)
     result = run("info", "x")
     assert result.code == 2
     assert result.err.splitlines() == [
@@ -74,18 +106,18 @@ def test_errors_of_the_system_and_warnings_are_one_line(monkeypatch, refused, ru
     def interrupted(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module.VERBS["info"], "run", interrupted)
+    replace_run(interrupted)
     assert run("info", "x").code == 130
 
     def defect(self):
         raise AssertionError("a defect keeps its traceback")
 
-    monkeypatch.setattr(module.VERBS["info"], "run", defect)
+    replace_run(defect)
     with pytest.raises(AssertionError, match="traceback"):
         run("info", "x")
 
 
-def test_no_memory_is_one_line_that_says_what_helps(monkeypatch, refused):
+def test_no_memory_is_one_line_that_says_what_helps(replace_run, refused):
     import torch
 
     def torch_allocates(self):
@@ -98,13 +130,13 @@ def test_no_memory_is_one_line_that_says_what_helps(monkeypatch, refused):
         raise MemoryError
 
     for fails in (torch_allocates, a_gpu_is_full, python_allocates):
-        monkeypatch.setattr(module.VERBS["info"], "run", fails)
+        replace_run(fails)
         assert "out of memory; train with --memory" in refused("info", "x")
 
     def another(self):
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr(module.VERBS["info"], "run", another)
+    replace_run(another)
     with pytest.raises(RuntimeError, match="a defect"):
         module.main(["info", "x"])
 

@@ -50,8 +50,8 @@ def _import_all() -> None:
 
     # After zlib: its own would take the place of Python's.
     importlib.import_module("pycolmap")
-    for verb in snowsplat.cli.main.VERBS:
-        snowsplat.cli.main._parse([verb])
+    for name in snowsplat.cli.main.SUBCOMMANDS:
+        snowsplat.cli.main.parse([name])
 
 
 def _kill_at(at: int | None, delay: float, watched: list[str], changes: list[int]) -> None:

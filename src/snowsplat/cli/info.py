@@ -24,7 +24,7 @@ _PERCENTILES = (1, 50, 99)
 
 @dataclass
 class Info:
-    """Tell what a scene, a point cloud, a dataset, a checkpoint or an output folder holds.
+    """Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.
 
     Examples:
       snowsplat info out/garden

@@ -1,42 +1,44 @@
-"""The command `snowsplat`: finds the verb, runs it, turns errors into a line and an exit code.
+"""The command `snowsplat`: selects the subcommand, runs it, and reports errors.
 
-Exit codes: 0 done; 2 a mistake in the flags or the input, told in one line on stderr; 130 stopped
-by Ctrl-C, all that was reached is saved; 141 the reader of our output has gone. Anything else is a
-defect of the program, with its traceback.
+Exit codes: 0 success; 2 an error in the flags or the input, reported as one line on stderr;
+130 interrupted by Ctrl-C, with all finished results saved; 141 the reader of the output has closed
+it. Any other failure is a defect of the program and shows a traceback.
 """
 
+import difflib
 import inspect
 import logging
 import os
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import make_dataclass
+from importlib import import_module
 from typing import Annotated, Any, Union
 
 import tyro
 
-from snowsplat.cli.convert import Convert
-from snowsplat.cli.evaluate import Evaluate
-from snowsplat.cli.info import Info
-from snowsplat.cli.make import Make
-from snowsplat.cli.render import Render
-from snowsplat.cli.sfm import Sfm
-from snowsplat.cli.train import Train
-from snowsplat.cli.view import View
-from snowsplat.cli.watch import Watch
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import printable
 
-VERBS: dict[str, Any] = {
-    "make": Make,
-    "sfm": Sfm,
-    "train": Train,
-    "evaluate": Evaluate,
-    "render": Render,
-    "view": View,
-    "watch": Watch,
-    "convert": Convert,
-    "info": Info,
+#: The subcommands with the first line of their docstrings. The subcommand ``train`` is the
+#: dataclass ``Train`` in the module ``snowsplat.cli.train``, which is imported when it is called.
+SUBCOMMANDS = {
+    "make": "Make a scene from photos or a video: cameras, training, pictures, in one command.",
+    "sfm": (
+        "Find out where photos were taken from: what training needs, from a folder or a video."
+    ),
+    "train": "Train a scene from photos whose cameras are known (COLMAP, or transforms.json).",
+    "evaluate": (
+        "Measure a scene on the photos that were held out: PSNR, SSIM and, with weights, LPIPS."
+    ),
+    "render": "Render a scene from the cameras of its photos, beside the photos; or a film of it.",
+    "view": "Fly through a finished scene in the browser; Ctrl-C ends it.",
+    "watch": "Look at the scene of a training in a browser, with its cameras and photos.",
+    "convert": (
+        "Write a scene in another format; or cut, thinned out, turned, put together with others."
+    ),
+    "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }
 
 # Former names of subcommands, still accepted but not listed.
@@ -47,39 +49,42 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, s
   snowsplat make PHOTOS                     photos or a video -> a scene: all of what follows
   snowsplat sfm PHOTOS -o DATASET           photos or a video -> photos with known cameras
   snowsplat train DATASET -o OUT --eval     photos with known cameras -> a scene in OUT
-  snowsplat evaluate OUT                    PSNR, SSIM of the photos held out
-  snowsplat render OUT                      pictures of the scene beside the photos
+  snowsplat evaluate OUT                    PSNR and SSIM on the held-out photos
+  snowsplat render OUT                      images of the scene next to the photos
   snowsplat view FILE|OUT                   fly through a scene in the browser
-  snowsplat watch OUT                       a scene with its photos, also while it is trained
-  snowsplat convert SCENE [MORE …] FILE     another format; cut, thinned out, turned, merged
-  snowsplat info ANYTHING                   what is in a scene, a dataset, an output folder
+  snowsplat watch OUT                       a scene with its photos, also during training
+  snowsplat convert SCENE [MORE …] FILE     another format; crop, decimate, rotate, merge
+  snowsplat info PATH                       contents of a scene, a dataset, an output folder
 
-Each has its own help: snowsplat train --help
+Each subcommand has its own help: snowsplat train --help
 
-For completion in the shell, put this into a file that it reads:
+For shell completion, add this line to your shell's startup file:
   eval "$(snowsplat --tyro-print-completion bash)"    (or zsh)"""
 
 
 _OUT_OF_MEMORY = (
-    "out of memory; train with --memory and a smaller number, or make photos smaller, -r 2"
+    "out of memory; train with --memory and a smaller number, or use smaller photos, -r 2"
 )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with ``argv`` (those of the process by default); gives its exit code."""
+    """Run the command with the arguments ``argv`` (default: ``sys.argv[1:]``).
+
+    Returns the exit code.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    _say_notes_and_warnings_in_one_line()
+    _report_log_and_warnings_as_lines()
     try:
-        return int(_parse(arguments or ["--help"]).run())
+        return int(parse(arguments or ["--help"]).run())
     except SettingError as error:
         return _fail(f"--{error.setting.replace('_', '-')}: {error.problem}", 2)
     except UserError as error:
         return _fail(str(error), 2)
     except KeyboardInterrupt:
         return _fail("stopped by Ctrl-C", 130)
-    except BrokenPipeError:  # the reader of our output has gone, as `| head` does
+    except BrokenPipeError:  # the reader of the output has closed it, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141  # as of all that end by it: a training has not come to its end
+        return 141  # 128 + SIGPIPE, as for other programs: the run is not complete
     except MemoryError:
         return _fail(_OUT_OF_MEMORY, 2)
     except RuntimeError as error:
@@ -91,55 +96,88 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(f"{where}{error.strerror or error}", 2)
 
 
-def _parse(arguments: list[str]) -> Any:
-    """The verb's dataclass. Leaves the process, as argparse does, after help or with a mistake."""
-    arguments = [_FORMER_NAMES.get(arguments[0], arguments[0]), *arguments[1:]]
-    choices = []
-    for name, verb in VERBS.items():
-        # The list of verbs shows what each does, its own help also how to use it.
-        text = inspect.cleandoc(verb.__doc__ or "")
-        shown = text if arguments[0] == name else text.splitlines()[0]
-        choices.append(Annotated[verb, tyro.conf.subcommand(name, description=shown)])
-    union: Any = Union[tuple(choices)]  # noqa: UP007 (made at run time)
+def parse(arguments: Sequence[str]) -> Any:
+    """Parse the arguments into the dataclass of their subcommand.
+
+    Exits the process, as argparse does, after printing a help text or an error in the flags.
+
+    Raises:
+        UserError: an unknown subcommand.
+    """
+    name, *rest = arguments
+    name = _FORMER_NAMES.get(name, name)
+    if name not in SUBCOMMANDS and not name.startswith("-"):
+        raise UserError(_unknown_subcommand(name))
+    union: Any = Union[tuple(_choices(name))]  # noqa: UP007 (made at run time)
     return tyro.cli(
         union,
         prog="snowsplat",
         description=DESCRIPTION,
-        args=arguments,
+        args=[name, *rest],
         config=(tyro.conf.FlagCreatePairsOff,),
     )
 
 
+def _choices(called: str) -> list[Any]:
+    """What tyro chooses from: the subcommand ``called``, and the others without their flags.
+
+    Importing and analysing all of them would take longer than all the rest of a help text. Only
+    completion scripts and suggestions for a misplaced flag need the flags of all.
+    """
+    load_all = called.startswith("-") and called not in ("-h", "--help")
+    choices = []
+    for name, summary in SUBCOMMANDS.items():
+        load = load_all or name == called
+        kind = load_subcommand(name) if load else make_dataclass(name.capitalize(), [])
+        text = inspect.cleandoc(kind.__doc__ or "") if name == called else summary
+        choices.append(Annotated[kind, tyro.conf.subcommand(name, description=text)])
+    return choices
+
+
+def load_subcommand(name: str) -> Any:
+    """Import the dataclass of a subcommand."""
+    return getattr(import_module(f"snowsplat.cli.{name}"), name.capitalize())
+
+
+def _unknown_subcommand(name: str) -> str:
+    similar = difflib.get_close_matches(name, [*SUBCOMMANDS, *_FORMER_NAMES], 1)
+    if similar:
+        hint = f"did you mean {_FORMER_NAMES.get(similar[0], similar[0])}?"
+    else:
+        hint = f"choose from {', '.join(SUBCOMMANDS)}"
+    return f"{name}: unknown subcommand; {hint} (snowsplat --help describes all of them)"
+
+
 def _is_out_of_memory(error: RuntimeError) -> bool:
-    """Whether torch says so, of a GPU or of the computer; it has a class for the first alone."""
-    words = str(error)
-    return any(said in words for said in ("out of memory", "not enough memory", "allocate memory"))
+    """Whether torch ran out of memory; it has an exception class for GPU memory only."""
+    text = str(error)
+    return any(part in text for part in ("out of memory", "not enough memory", "allocate memory"))
 
 
 def _fail(message: str, code: int) -> int:
-    _tell(message)
+    _print_error(message)
     return code
 
 
-def _tell(message: str) -> None:
+def _print_error(message: str) -> None:
     print("snowsplat:", printable(" ".join(message.split())), file=sys.stderr)
 
 
-class _Notes(logging.Handler):
-    """What the program logs, as lines of the same kind."""
+class _LogHandler(logging.Handler):
+    """Prints log records in the same form as errors."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        _tell(record.getMessage())
+        _print_error(record.getMessage())
 
 
-def _say_notes_and_warnings_in_one_line() -> None:
+def _report_log_and_warnings_as_lines() -> None:
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        _tell(f"warning: {message}")
+        _print_error(f"warning: {message}")
 
     warnings.showwarning = show
-    # Of a damaged photo Pillow notes each word that it could not read; we say once what it costs.
+    # Pillow warns about each unreadable tag of a damaged photo; snowsplat reports its effect once.
     warnings.filterwarnings("ignore", module=r"PIL\.")
     logger = logging.getLogger("snowsplat")
     if not logger.handlers:
-        logger.addHandler(_Notes())
+        logger.addHandler(_LogHandler())
         logger.setLevel(logging.INFO)
