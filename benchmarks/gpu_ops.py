@@ -50,7 +50,7 @@ def every_op(
                 say(f"training: {count} Gaussians, {width}x{height}, in order: {in_order}")
                 with sums_in_order(in_order):
                     # Too little room at first: lists that are cut off.
-                    step = Step(scene, device, room=max(1, count // 2))
+                    step = Step(scene, device, capacity=max(1, count // 2))
                     assert math.isfinite(step.run())
                     assert math.isfinite(step.run())
     say("ops: a sort of several blocks")

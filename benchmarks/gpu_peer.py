@@ -107,7 +107,7 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
         peer.gradient(photo)
         optimizer.step()
 
-    room = step.trainer._room
+    capacity = step.trainer._capacity
     parameters = {
         name: p.clone().requires_grad_() for name, p in step.trainer.gaussians.parameters().items()
     }
@@ -119,7 +119,7 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
         splats = ops.project(
             **parameters, cam_from_world=camera.cam_from_world, **view, sh_degree=3
         )
-        image, _, _ = ops.rasterize(splats, camera.width, camera.height, room=room)
+        image, _, _ = ops.rasterize(splats, camera.width, camera.height, capacity=capacity)
         ops.photometric_loss(image, photo).backward()
 
     pairs: dict[str, tuple[Callable[[], Any], Callable[[], Any]]] = {
@@ -143,7 +143,7 @@ def _our_image(step: Step) -> Tensor:
 
     camera = step.camera
     splats = project(step.trainer.gaussians, camera)
-    return ops.rasterize(splats, camera.width, camera.height, room=step.trainer._room)[0]
+    return ops.rasterize(splats, camera.width, camera.height, capacity=step.trainer._capacity)[0]
 
 
 def _each(work: Callable[[], object], repeats: int) -> float:

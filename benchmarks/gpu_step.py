@@ -60,8 +60,8 @@ def sums_in_order(wanted: bool) -> Iterator[None]:
 class Step:
     """The step of one workload, on a device."""
 
-    def __init__(self, scene: Workload, device: torch.device, room: int | None = None) -> None:
-        """``room``: for instances, to begin with; None: the trainer's guess."""
+    def __init__(self, scene: Workload, device: torch.device, capacity: int | None = None) -> None:
+        """``capacity``: initial capacity in instances; None uses the trainer's estimate."""
         camera = scene.camera
         source = ImageSource(Path("not read"), camera.width, camera.height)
         points = Points(torch.rand(8, 3), torch.zeros(8, 3, dtype=torch.uint8))
@@ -82,8 +82,10 @@ class Step:
             generator=torch.Generator(),
             device=device,
         )
-        instances = 4 * len(gaussians) if room is None else room
-        trainer._room = ops.Room(instances, torch.zeros(1, dtype=torch.int64, device=device))
+        instances = 4 * len(gaussians) if capacity is None else capacity
+        trainer._capacity = ops.Capacity(
+            instances, torch.zeros(1, dtype=torch.int64, device=device)
+        )
         self.camera = camera.to(device)
         self.background = torch.zeros(3, device=device)
         self.photo = LoadedImage(self._planes())
@@ -104,10 +106,10 @@ class Step:
         trainer = self.trainer
         while True:
             self.queue()
-            loss, needed, *_ = trainer._readback.wait()
-            if needed <= trainer._room.instances:
+            loss, required, *_ = trainer._readback.wait()
+            if required <= trainer._capacity.instances:
                 return loss
-            trainer._room = replace(trainer._room, instances=int(1.3 * needed))
+            trainer._capacity = replace(trainer._capacity, instances=int(1.3 * required))
 
     @torch.no_grad()
     def counts(self) -> dict[str, int]:
@@ -118,7 +120,7 @@ class Step:
         return {
             "gaussians": len(gaussians),
             "seen": int((splats.ids >= 0).sum()),
-            "instances": int(self.trainer._room.needed),
+            "instances": int(self.trainer._capacity.required),
             "pairs": int(ops.count_blended(splats, camera.width, camera.height).double().sum()),
             "width": camera.width,
             "height": camera.height,

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from snowsplat import Gaussians, load_dataset, ops, write_gaussians
-from snowsplat.ops import native, reference
+from snowsplat.ops import native, rasterizer, reference
 from snowsplat.ops.cuda.launches import KERNELS, launch_by
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
@@ -345,11 +345,11 @@ def test_every_op_and_kernel_is_in_the_program_of_the_sanitizer(gpu_modules, mon
     # This one is for more tiles than the emulation does in a moment.
     assert set(KERNELS) - {name.removesuffix("_f64") for name in launched} == {"tiles_start_u32"}
 
-    step = gpu_step.Step(gpu_ops.random_scene(60, 40, 30), torch.device("cpu"), room=7)
+    step = gpu_step.Step(gpu_ops.random_scene(60, 40, 30), torch.device("cpu"), capacity=7)
     photo, gaussians = step.photo.planes.clone(), step.trainer.gaussians.clone()
     losses = [step.run(), step.run()]
     assert losses[0] == losses[1] > 0  # it stays as it is
-    assert step.trainer._room.instances > 7
+    assert step.trainer._capacity.instances > 7
     assert torch.equal(photo, step.photo.planes)
     for name, parameter in gaussians.parameters().items():
         torch.testing.assert_close(parameter, step.trainer.gaussians.parameters()[name])
@@ -702,7 +702,7 @@ def test_the_parts_that_measure_run(fake_gpu, capsys, tmp_path):
     for name in ("project: cull", "blend backward", "Adam", "whole step"):
         assert f"| {name} | " in page
     assert "| reduce | " in page
-    assert ops.rasterize.__globals__["TILE"] == gpu_floor.TILE
+    assert rasterizer.TILE == gpu_floor.TILE
 
 
 @pytest.mark.emulated

@@ -280,7 +280,7 @@ def check_adam(variant: Variant, leaf: Scene, ids: Tensor, cotangent: Tensor) ->
     """The gradients that the fused step uses are those of `project`, in its first moments."""
     params = {name: p.detach().clone() for name, p in leaf.params.items()}
     m, v = ({name: torch.zeros_like(p) for name, p in params.items()} for _ in range(2))
-    held = torch.zeros(6, dtype=torch.int32)
+    nonfinite_rows = torch.zeros(6, dtype=torch.int32)
     variant.ops.adam_step(
         params,
         m,
@@ -290,7 +290,7 @@ def check_adam(variant: Variant, leaf: Scene, ids: Tensor, cotangent: Tensor) ->
         leaf.cam_from_world.detach(),
         lr=dict.fromkeys(PARAMETERS, 1e-3),
         step=1,
-        held=held,
+        nonfinite_rows=nonfinite_rows,
         **leaf.view,
     )
     for i, name in enumerate(PARAMETERS):
@@ -300,7 +300,8 @@ def check_adam(variant: Variant, leaf: Scene, ids: Tensor, cotangent: Tensor) ->
             assert tensor.isfinite().all(), f"{name} is not finite after a step"
         large = grad.abs() > _LARGEST_GRADIENT[variant.dtype]
         too_large = int(large.nonzero()[:, 0].unique().numel())
-        assert held[i] <= too_large, f"{held[i]} rows of {name} held, {too_large} have a reason"
+        skipped = int(nonfinite_rows[i])
+        assert skipped <= too_large, f"{skipped} rows of {name} skipped, {too_large} have a reason"
         error = (m[name] - 0.1 * grad).abs() - variant.backward * _of_rows(grad)
         # Kernels take numbers for zero that are too small to have all of their digits.
         assert (error[~large] <= torch.finfo(variant.dtype).tiny).all(), f"the moment of {name}"

@@ -291,7 +291,7 @@ def test_no_gradient_gets_into_what_it_breaks(
     for packed_grad in (grad, torch.where(grad.abs() < 1e9, grad, 0.0)):
         state = scene.to(variant.dtype, requires_grad=False)
         m, v = ({n: torch.zeros_like(p) for n, p in state.params.items()} for _ in range(2))
-        held = torch.ones(6, dtype=torch.int32)
+        nonfinite_rows = torch.ones(6, dtype=torch.int32)
         broken = packed_grad is grad
         state.params["opacity_logits"].grad = extra if broken else torch.zeros_like(extra)
         variant.ops.adam_step(
@@ -304,14 +304,14 @@ def test_no_gradient_gets_into_what_it_breaks(
             lr=dict.fromkeys(m, 1e-3),
             step=1,
             visible_only=visible_only,
-            held=held,
+            nonfinite_rows=nonfinite_rows,
             **state.view,
         )
         for tensors in (state.params, m, v):
             assert_finite(dict(tensors))
         results.append((state.params, m, v))
         # Added to what was there; a colour is of the direction, hence of the mean, too.
-        assert held.tolist() == ([2, 1, 1, 3, 2, 2] if broken else [1] * 6)
+        assert nonfinite_rows.tolist() == ([2, 1, 1, 3, 2, 2] if broken else [1] * 6)
     rows = ids[torch.tensor([3, 8, 20])].long()
     others = torch.ones(130, dtype=torch.bool)
     others[rows] = False

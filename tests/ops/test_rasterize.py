@@ -354,28 +354,28 @@ def test_native_is_the_twin_with_sums_in_order(
 
 
 @pytest.mark.parametrize("in_order", [False, True])
-def test_room(native: Variant, in_order: bool, request: pytest.FixtureRequest) -> None:
+def test_capacity(native: Variant, in_order: bool, request: pytest.FixtureRequest) -> None:
     """What fits is the same; of what does not, a part, and nothing beyond the memory set aside."""
     if in_order:
         request.getfixturevalue("sums_in_order")
     splats = random_splats(6, 200, 40, 33)
 
-    def blended(room: ops.Room | None) -> list[Tensor]:
+    def blended(capacity: ops.Capacity | None) -> list[Tensor]:
         leaf = leaf_splats(splats, native.dtype)
-        image, alpha, depth = native.ops.rasterize(leaf, 40, 33, with_depth=True, room=room)
+        image, alpha, depth = native.ops.rasterize(leaf, 40, 33, with_depth=True, capacity=capacity)
         (image.square().sum() + alpha.sum() + depth.sum()).backward()
         assert leaf.packed.grad is not None
         return [image, alpha, depth, leaf.packed.grad]
 
-    ample = ops.Room(5000, torch.zeros(1, dtype=torch.int64))
+    ample = ops.Capacity(5000, torch.zeros(1, dtype=torch.int64))
     for got, expected in zip(blended(ample), blended(None), strict=True):
         assert_close(got, expected, native.forward)
-    needed = int(ample.needed)
+    needed = int(ample.required)
     assert 200 < needed < 5000
     for instances in (needed, needed - 1, needed // 2, 1):
-        cramped = ops.Room(instances, torch.zeros(1, dtype=torch.int64))
+        cramped = ops.Capacity(instances, torch.zeros(1, dtype=torch.int64))
         assert all(tensor.isfinite().all() for tensor in blended(cramped))
-        assert int(cramped.needed) == needed
+        assert int(cramped.required) == needed
 
 
 def test_native_is_the_twin_for_tiny_splats(native: Variant) -> None:

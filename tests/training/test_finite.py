@@ -24,7 +24,7 @@ from snowsplat.util.errors import UserError
 
 from ..ops.engines import launcher
 from .test_trainer import BUSY, BUSY_MCMC, CALM, dataset
-from .test_trainer_gpu import with_room
+from .test_trainer_gpu import with_capacity
 
 __all__ = ["dataset"]  # a fixture
 
@@ -49,7 +49,7 @@ def begun(
         monkeypatch.setitem(LAUNCHERS, "cpu", launcher(request.param))
 
     def begin(config: TrainConfig) -> Trainer:
-        trainer = with_room(Trainer(dataset, config), 100_000)
+        trainer = with_capacity(Trainer(dataset, config), 100_000)
         trainer.run(until=2)
         return trainer
 

@@ -33,8 +33,8 @@ def losses(trainer: Trainer, steps: int = STEPS) -> Tensor:
     return torch.tensor([trainer.step_once() for _ in range(steps)], dtype=torch.float64)
 
 
-def with_room(trainer: Trainer, instances: int) -> Trainer:
-    trainer._room = ops.Room(instances, torch.zeros(1, dtype=torch.int64))
+def with_capacity(trainer: Trainer, instances: int) -> Trainer:
+    trainer._capacity = ops.Capacity(instances, torch.zeros(1, dtype=torch.int64))
     return trainer
 
 
@@ -46,12 +46,12 @@ def test_the_kernels_of_a_gpu_train_as_those_of_the_cpu(
     """Too little room at first: the steps that do not fit are taken again, and nothing differs."""
     expected = losses(Trainer(dataset, config))
     monkeypatch.setitem(LAUNCHERS, "cpu", launcher("emulated"))
-    ample = with_room(Trainer(dataset, config), 100_000)
+    ample = with_capacity(Trainer(dataset, config), 100_000)
     found = losses(ample)
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=0)
-    narrow = with_room(Trainer(dataset, config), 3)
+    narrow = with_capacity(Trainer(dataset, config), 3)
     assert torch.equal(losses(narrow), found)
-    assert narrow._room.instances > 3
+    assert narrow._capacity.instances > 3
     monkeypatch.undo()
     for name, parameter in narrow.gaussians.parameters().items():
         assert torch.equal(parameter, ample.gaussians.parameters()[name]), name
@@ -62,7 +62,7 @@ def test_a_loss_that_is_not_finite_changes_nothing(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(LAUNCHERS, "cpu", launcher("emulated"))
-    trainer = with_room(Trainer(dataset, CALM), 100_000)
+    trainer = with_capacity(Trainer(dataset, CALM), 100_000)
     trainer.step_once()
     trainer._background = torch.full((3,), torch.nan)
     before = trainer.gaussians.clone()
@@ -119,8 +119,8 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
             moments.update({name: there(moment) for name, moment in moments.items()})
         for name, statistic in trainer._density.state_tensors().items():
             setattr(trainer._density, name, there(statistic))
-        trainer._room = ops.Room(5000, there(torch.zeros(1, dtype=torch.int64)))
-        trainer._optimizer.held = there(trainer._optimizer.held)
+        trainer._capacity = ops.Capacity(5000, there(torch.zeros(1, dtype=torch.int64)))
+        trainer._optimizer.nonfinite_rows = there(trainer._optimizer.nonfinite_rows)
         trainer._readback = Readback(8, torch.device("cpu"))
         camera = replace(camera, cam_from_world=there(camera.cam_from_world))
         photo = LoadedImage(there(photo.planes), there(photo.mask))

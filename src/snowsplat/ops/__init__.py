@@ -4,18 +4,18 @@
 """
 
 from snowsplat.ops.adam import adam_step
-from snowsplat.ops.capacity import Room
+from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.devices import default_device, resolve_device
 from snowsplat.ops.native import get_num_threads, set_num_threads
-from snowsplat.ops.neighbours import neighbours
+from snowsplat.ops.nearest_neighbours import neighbours
 from snowsplat.ops.photometric import photometric_loss, ssim
-from snowsplat.ops.project import project
-from snowsplat.ops.rasterize import count_blended, rasterize
+from snowsplat.ops.projection import project
+from snowsplat.ops.rasterizer import count_blended, rasterize
 from snowsplat.ops.splats import Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
 
 __all__ = [
-    "Room",
+    "Capacity",
     "Splats2D",
     "accumulate_screen_statistics",
     "adam_step",

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.project import camera_args, check_parameters
+from snowsplat.ops.projection import camera_args, check_parameters
 from snowsplat.ops.splats import packed_width
 
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
@@ -37,7 +37,7 @@ def adam_step(
     eps: float = 1e-15,
     visible_only: bool = False,
     valid: Tensor | None = None,
-    held: Tensor | None = None,
+    nonfinite_rows: Tensor | None = None,
 ) -> None:
     """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
 
@@ -53,11 +53,11 @@ def adam_step(
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
 
-    valid: (1,) bool; where it is False nothing changes. It says so from the device, so that nobody
-        has to wait for what decides it. None: always.
-    held: (6,) int32, in the order of the parameters; None: nobody asks. A number that the step
-        would make infinite or NaN keeps its value and moments, and here their rows are counted:
-        added to what is there. So no gradient, however broken, gets into the parameters.
+    valid: (1,) bool on the device; False skips the step, without the CPU having to wait for the
+        value. None means True.
+    nonfinite_rows: (6,) int32 counts, in the order of the parameters; None disables counting. A
+        value that the step would make infinite or NaN keeps its value and moments, and the rows
+        with such values are added to the counts. No non-finite gradient reaches the parameters.
 
     Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
     p −= lr · m̂ / √(v̂ + eps²) (Kingma & Ba 2015, with ε inside the root).
@@ -83,12 +83,13 @@ def adam_step(
         raise ValueError(
             f"adam_step: ids must be torch.int32 on {means.device}, got {ids.dtype} on {ids.device}"
         )
-    if held is not None:
-        fits = held.shape == (len(PARAMETERS),) and held.dtype == torch.int32
-        if not (fits and held.device == means.device and held.is_contiguous()):
+    if nonfinite_rows is not None:
+        fits = nonfinite_rows.shape == (len(PARAMETERS),) and nonfinite_rows.dtype == torch.int32
+        if not (fits and nonfinite_rows.device == means.device and nonfinite_rows.is_contiguous()):
             raise ValueError(
-                f"adam_step: held must be (6,) torch.int32 on {means.device}, "
-                f"got {tuple(held.shape)} {held.dtype} on {held.device}"
+                f"adam_step: nonfinite_rows must be (6,) torch.int32 on {means.device}, "
+                f"got {tuple(nonfinite_rows.shape)} {nonfinite_rows.dtype} "
+                f"on {nonfinite_rows.device}"
             )
     if step < 1:
         raise ValueError(f"adam_step: step counts from 1, got {step}")
@@ -118,7 +119,7 @@ def adam_step(
         float(eps),
         visible_only,
         valid,
-        held,
+        nonfinite_rows,
     )
     if done < 0:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""`Room`: memory set aside on a GPU before it is known how much will be needed."""
+"""`Capacity`: memory allocated on a GPU before the amount that a frame requires is known."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from torch import Tensor
 
 
 @dataclass
-class Room:
-    """Room for the instances of a frame: the pairs of a splat and a tile that it touches.
+class Capacity:
+    """The number of instances, pairs of a splat and a tile that it touches, that a frame may have.
 
-    Blending has to know their number, and the CPU would have to wait for a GPU to count them. With
-    a Room it sets memory aside for `instances` of them and goes on; the GPU writes what it needed
-    into `needed`, (1,) int64. Where that is more, image and gradients are those of a part of the
-    splats: the frame has to be made again with more room. On the CPU there is always enough.
+    Rasterizing needs memory for every instance, but their number is counted on the GPU, and reading
+    it back would make the CPU wait. With a capacity, memory for `instances` of them is allocated
+    without waiting, and the GPU writes the number that the frame requires into `required`,
+    (1,) int64. If `required` exceeds `instances`, only some of the splats are rasterized: the image
+    and the gradients are wrong, and the frame has to be repeated with a larger capacity. On the
+    CPU the memory always suffices and `instances` is ignored.
     """
 
     instances: int
-    needed: Tensor
+    required: Tensor

@@ -1,4 +1,4 @@
-"""`Readback`: figures of a device on their way to the CPU, while the device goes on."""
+"""`Readback`: copies values from a device to the CPU while the device continues to work."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from torch import Tensor
 
 
 class Readback:
-    """Carries numbers from a device to the CPU behind the work that is queued there already.
+    """An asynchronous copy of a few numbers from a device to the CPU.
 
-    `post` queues the copy; `wait` waits for it, not for what was queued afterwards: between the two
-    a GPU can be given the rest of a step. On the CPU both are immediate.
+    `start` queues the copy; `wait` waits until it is done, but not for work that was queued after
+    it: between the two, the rest of a step can be queued on a GPU. On the CPU both are immediate.
     """
 
     def __init__(self, count: int, device: torch.device) -> None:
-        """``count``: how many float64 numbers go at a time."""
+        """``count``: the number of float64 values of each copy."""
         on_gpu = device.type == "cuda"
-        self._numbers = torch.zeros(count, dtype=torch.float64, pin_memory=on_gpu)
-        self._arrived = torch.cuda.Event() if on_gpu else None
+        self._values = torch.zeros(count, dtype=torch.float64, pin_memory=on_gpu)
+        self._copied = torch.cuda.Event() if on_gpu else None
         self._device = device
 
-    def post(self, *numbers: Tensor) -> None:
-        """``numbers``: tensors on the device, with ``count`` elements together."""
-        gathered = torch.cat([number.detach().double().reshape(-1) for number in numbers])
-        self._numbers.copy_(gathered, non_blocking=True)
-        if self._arrived is not None:
-            self._arrived.record(torch.cuda.current_stream(self._device))
+    def start(self, *values: Tensor) -> None:
+        """Queues a copy of ``values``, tensors on the device with ``count`` elements in total."""
+        gathered = torch.cat([value.detach().double().reshape(-1) for value in values])
+        self._values.copy_(gathered, non_blocking=True)
+        if self._copied is not None:
+            self._copied.record(torch.cuda.current_stream(self._device))
 
     def wait(self) -> list[float]:
-        """What was posted last."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        return self._numbers.tolist()
+        """The values of the last copy."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        return self._values.tolist()

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from snowsplat.ops.capacity import Room
+from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.splats import Splats2D
 
 LOW_PASS = 0.3  # pixels²: every splat is blurred by it, so that none slips between pixel centres
@@ -223,14 +223,14 @@ def rasterize(
     background: Tensor | None = None,
     *,
     with_depth: bool = False,
-    room: Room | None = None,
+    capacity: Capacity | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
 
     Returns image (H, W, C) of planar storage, alpha (H, W) and depth (H, W) or None. With T the
     light that the splats in front let through, image = Σ T α c + T_end · background,
     alpha = 1 − T_end, depth = Σ T α z (not divided by alpha). Conics must be positive definite.
-    There is always room.
+    `capacity` is ignored: the memory always suffices.
     """
     order = torch.argsort(splats.depths.detach(), stable=True)
     splats = Splats2D(splats.packed[order], None, splats.channels)
@@ -425,7 +425,7 @@ def adam_step(
     eps: float = 1e-15,
     visible_only: bool = False,
     valid: Tensor | None = None,
-    held: Tensor | None = None,
+    nonfinite_rows: Tensor | None = None,
 ) -> None:
     """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
 
@@ -437,8 +437,8 @@ def adam_step(
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
     valid: (1,) bool; where it is False nothing changes.
-    held: (6,) int32, to which rows are added, a count a parameter, with numbers that the step would
-        make infinite or NaN: those keep their values and moments.
+    nonfinite_rows: (6,) int32 counts, one per parameter. Values that the step would make infinite
+        or NaN keep their value and moments, and the rows with such values are added to the counts.
 
     Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
     p −= lr · m̂ / √(v̂ + eps²), where the paper has √v̂ + eps. The two agree for v̂ ≫ eps² and at
@@ -472,8 +472,9 @@ def adam_step(
         if name == "sh_rest":
             taken[:, (sh_degree + 1) ** 2 - 1 :] = False
         broken = taken & ~(v.isfinite() & stepped.isfinite())
-        if held is not None:
-            held[i] += broken.reshape(len(p), -1).any(dim=1).sum() if broken.numel() else 0
+        if nonfinite_rows is not None:
+            rows_of = broken.reshape(len(p), -1) if broken.numel() else broken.new_zeros(0, 1)
+            nonfinite_rows[i] += rows_of.any(dim=1).sum()
         taken &= ~broken
         p.copy_(torch.where(taken, stepped, p))
         exp_avg[name].copy_(torch.where(taken, m, exp_avg[name]))

@@ -73,16 +73,17 @@ def check_parameters(step: int, gaussians: Gaussians) -> None:
         raise Diverged(f"Gaussians are not finite at step {step}, their {_named(found)}; {_BEGIN}")
 
 
-def check_updates(step: int, held: Sequence[float], gaussians: Gaussians) -> None:
-    """``held``: how many rows of each parameter a step left as they were; `ops.adam_step` counts.
+def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussians) -> None:
+    """``nonfinite_rows``: rows that a step skipped, per parameter; `ops.adam_step` counts them.
 
     Raises:
         Diverged: any.
     """
-    if not any(held):
+    if not any(nonfinite_rows):
         return
     check_parameters(step, gaussians)
-    counts = {name: int(n) for name, n in zip(gaussians.parameters(), held, strict=True) if n}
+    rows = zip(gaussians.parameters(), nonfinite_rows, strict=True)
+    counts = {name: int(n) for name, n in rows if n}
     raise Diverged(
         f"the gradient of Gaussians is not finite at step {step}, or leads there, that of their "
         f"{_named(counts)}, and was not taken; {_ADVICE}"

@@ -61,8 +61,8 @@ class LearningRates:
 class Adam:
     """The moments of every parameter, in the rows' order, and the rates of the coming step.
 
-    ``held`` (6,) int32 counts, a parameter each in their order, the rows of which a step left
-    something out, as it was not finite (`ops.adam_step`); it grows until `load_state`.
+    ``nonfinite_rows`` (6,) int32 counts the rows that steps skipped because they were not finite,
+    per parameter (`ops.adam_step`); it is reset by `load_state`.
 
     It does not own the Gaussians. Whoever changes their rows (density control) makes the same
     change here with `select`, so that row i of every moment belongs to Gaussian i.
@@ -85,7 +85,9 @@ class Adam:
         parameters = gaussians.parameters()
         self.exp_avg = {name: torch.zeros_like(p) for name, p in parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in parameters.items()}
-        self.held = torch.zeros(len(parameters), dtype=torch.int32, device=gaussians.means.device)
+        self.nonfinite_rows = torch.zeros(
+            len(parameters), dtype=torch.int32, device=gaussians.means.device
+        )
 
     def rates_at(self, step: int) -> dict[str, float]:
         """Learning rate by parameter at ``step``, counted from 1."""
@@ -126,7 +128,7 @@ class Adam:
             step=step,
             visible_only=self.visible_only,
             valid=valid,
-            held=self.held,
+            nonfinite_rows=self.nonfinite_rows,
         )
         for parameter in parameters.values():
             parameter.grad = None
@@ -155,7 +157,7 @@ class Adam:
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Take over (copy) what `state_tensors` gave."""
-        self.held.zero_()
+        self.nonfinite_rows.zero_()
         for name, average in self.exp_avg.items():
             for moments, key in ((self.exp_avg, "exp_avg"), (self.exp_avg_sq, "exp_avg_sq")):
                 moments[name] = tensors[f"{key}.{name}"].to(average.device, copy=True)

@@ -114,8 +114,8 @@ class Trainer:
         )
         # The CPU makes the room that it needs; a GPU is told how much there is: a guess at first.
         enough = sys.maxsize if self.device.type == "cpu" else 4 * len(self.gaussians)
-        self._room = ops.Room(enough, torch.zeros(1, dtype=torch.int64, device=self.device))
-        self._readback = Readback(2 + len(self._optimizer.held), self.device)
+        self._capacity = ops.Capacity(enough, torch.zeros(1, dtype=torch.int64, device=self.device))
+        self._readback = Readback(2 + len(self._optimizer.nonfinite_rows), self.device)
 
     def run(
         self, on_progress: Callable[[Progress], None] | None = None, until: int | None = None
@@ -137,7 +137,7 @@ class Trainer:
                     count = len(self.gaussians)
                     on_progress(Progress(self.step, loss, count, iterations, downscale, metrics))
                 let_interrupt()
-        health.check_updates(self.step, self._optimizer.held.tolist(), self.gaussians)
+        health.check_updates(self.step, self._optimizer.nonfinite_rows.tolist(), self.gaussians)
 
     @torch.no_grad()
     def step_once(self) -> float:
@@ -163,13 +163,15 @@ class Trainer:
             while True:
                 self._queue_step(step, camera, photo, background)
                 # All of the step is queued by now: a GPU works on it while this waits for the loss.
-                loss, needed, *held = self._readback.wait()
-                enough = needed <= self._room.instances
-                if needed > 0.9 * self._room.instances:
-                    self._room = replace(self._room, instances=int(1.3 * needed))
+                loss, required, *nonfinite_rows = self._readback.wait()
+                enough = required <= self._capacity.instances
+                if required > 0.9 * self._capacity.instances:
+                    self._capacity = replace(self._capacity, instances=int(1.3 * required))
                 if enough:
                     break
-            health.check_updates(self.step, held, self.gaussians)  # a GPU tells it a step later
+            health.check_updates(
+                self.step, nonfinite_rows, self.gaussians
+            )  # on a GPU, a step later
             health.check_loss(step, loss, self.gaussians, view, photo)
             self.step = step
             self.within_step = False
@@ -187,11 +189,11 @@ class Trainer:
         size = camera.width, camera.height
         with torch.enable_grad():  # of the splats; the optimiser carries it on to the Gaussians
             splats.packed.requires_grad_()
-            image, _, _ = ops.rasterize(splats, *size, background, room=self._room)
+            image, _, _ = ops.rasterize(splats, *size, background, capacity=self._capacity)
             loss = view_loss(image, photo, background, self.config.ssim_weight)
-            self._readback.post(loss, self._room.needed, self._optimizer.held)
-            valid = loss.detach().isfinite() & (self._room.needed <= self._room.instances)
-            valid &= ~self._optimizer.held.any()
+            self._readback.start(loss, self._capacity.required, self._optimizer.nonfinite_rows)
+            valid = loss.detach().isfinite() & (self._capacity.required <= self._capacity.instances)
+            valid &= ~self._optimizer.nonfinite_rows.any()
             loss.backward()
         self._density.after_backward(step, self.gaussians, splats, *size, valid)
         self._optimizer.step(self.gaussians, splats, camera, sh_degree, step, valid)

@@ -23,7 +23,7 @@ def adam_step(
     run: Run, suffix: str, n: int, m: int, ids: Tensor, grad_packed: Tensor, *args: Any
 ) -> int:
     view, tensors = args[:_VIEW], list(args[_VIEW : _VIEW + 6 * _TENSOR])
-    step, beta1, beta2, eps, visible_only, valid, held = args[_VIEW + 6 * _TENSOR :]
+    step, beta1, beta2, eps, visible_only, valid, nonfinite_rows = args[_VIEW + 6 * _TENSOR :]
     rates = slice(_TENSOR - 1, None, _TENSOR)
     tensors[rates] = [rate / (1 - beta1**step) for rate in tensors[rates]]
     splat_of = ids  # of `project`: a row for each Gaussian, −1 where it is not seen
@@ -44,7 +44,7 @@ def adam_step(
         eps * eps,
         visible_only,
         valid,
-        held,
+        nonfinite_rows,
     )
     return 0
 

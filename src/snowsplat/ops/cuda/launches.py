@@ -14,17 +14,17 @@ from collections.abc import Callable, Sequence
 
 from snowsplat.ops.cuda import (
     adam,
-    blending,
     driver,
-    neighbours,
+    nearest_neighbours,
     photometric,
     projection,
+    rasterizer,
     sorting,
     tiling,
 )
 from snowsplat.ops.cuda.kernels import Argument, Kernel
 
-_PARTS = (projection, adam, sorting, tiling, blending, photometric, neighbours)
+_PARTS = (projection, adam, sorting, tiling, rasterizer, photometric, nearest_neighbours)
 KERNELS: dict[str, Kernel] = {n: k for part in _PARTS for n, k in part.KERNELS.items()}
 SEQUENCES: dict[str, Callable[..., int]] = {
     name: sequence for part in _PARTS for name, sequence in part.SEQUENCES.items()

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from snowsplat.ops import scratch
-from snowsplat.ops.capacity import Room
+from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
@@ -28,7 +28,7 @@ def rasterize(
     background: Tensor | None = None,
     *,
     with_depth: bool = False,
-    room: Room | None = None,
+    capacity: Capacity | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
 
@@ -39,8 +39,8 @@ def rasterize(
     than 1e-4 of the light (Kerbl et al. 2023, section 6). Gradients flow to every column of
     `splats.packed` but the radii, and to `background`.
 
-    `room` spares waiting for a GPU. On a GPU gradients are summed with atomics, in no fixed order,
-    unless `torch.use_deterministic_algorithms` asks for the same bits every time.
+    With `capacity` the CPU does not wait for a GPU to count instances. On a GPU gradients are
+    summed with atomics, in no fixed order, unless `torch.use_deterministic_algorithms` is set.
 
     Raises ValueError where shapes, dtypes or devices do not fit.
     """
@@ -50,7 +50,9 @@ def rasterize(
     if background is None:
         background = packed.new_zeros(channels)
     check_tensor("rasterize", "background", background, (channels,), packed)
-    planes, alpha = _Rasterize.apply(packed, background, width, height, channels, with_depth, room)
+    planes, alpha = _Rasterize.apply(
+        packed, background, width, height, channels, with_depth, capacity
+    )
     depth = planes[channels] if with_depth else None
     return planes[:channels].permute(1, 2, 0), alpha, depth
 
@@ -76,7 +78,7 @@ class _Frame:
     """The splats of a frame sorted into tiles: what blending needs, forward and backward."""
 
     def __init__(
-        self, packed: Tensor, width: int, height: int, columns: Tensor, room: Room | None
+        self, packed: Tensor, width: int, height: int, columns: Tensor, capacity: Capacity | None
     ) -> None:
         count, stride = packed.shape
         device = packed.device
@@ -110,14 +112,14 @@ class _Frame:
         workspace = empty(ask("tiles_workspace_bytes", count, self.tiles, parts), torch.uint8)
         self.tile_start = empty(self.tiles + 1)
         binning = (order, packed, stride, self.splats[3], tiles_x, tiles_y, parts, workspace)
-        room = room or Room(-1, torch.empty(1, dtype=torch.int64, device=device))
+        capacity = capacity or Capacity(-1, torch.empty(1, dtype=torch.int64, device=device))
         self.instances = launch(
             variant("tiles_count", packed),
             count,
             *binning,
             self.tile_start,
-            room.instances,
-            room.needed,
+            capacity.instances,
+            capacity.required,
         )
         self.instance_splat = empty(self.instances)
         self.instance_slot = empty(self.instances) if self.ordered_sums else None
@@ -177,7 +179,7 @@ class _Rasterize(torch.autograd.Function):
         height: int,
         channels: int,
         with_depth: bool,
-        room: Room | None,
+        capacity: Capacity | None,
     ) -> tuple[Tensor, Tensor]:
         packed = packed.detach().contiguous()
         groups = _channel_groups(channels, with_depth, packed.device)
@@ -185,7 +187,7 @@ class _Rasterize(torch.autograd.Function):
         behind = torch.cat([background.detach(), packed.new_zeros(1)])  # nothing is behind depth
         planes = scratch.empty((count, height, width), packed.dtype, packed.device)
         alpha = scratch.empty((height, width), packed.dtype, packed.device)
-        frame = _Frame(packed, width, height, groups[0][1], room)
+        frame = _Frame(packed, width, height, groups[0][1], capacity)
         for first, columns in groups:
             if first > 0:
                 frame.recolor(columns)
