@@ -1,4 +1,4 @@
-"""Where the scene is, from the cameras alone."""
+"""The box around a scene, from cameras and from points."""
 
 import math
 
@@ -19,7 +19,7 @@ def camera(position, target) -> Camera:
 
 
 def ring(radius, centre, aim):
-    """12 cameras in a ring, each looking ``aim`` of the way to the centre (negative: outward)."""
+    """12 cameras in a ring that look at the centre (``aim`` = 1) or outwards (−1)."""
     cameras = []
     for i in range(12):
         angle = i * math.pi / 6
@@ -32,11 +32,11 @@ def ring(radius, centre, aim):
 def test_cameras_around_an_object():
     low, high = scene_bounds(ring(4.0, (10.0, 0.0, -3.0), 1.0))
     assert torch.allclose((low + high) / 2, torch.tensor([10.0, 0.0, -3.0]), atol=1e-5)
-    half = 0.9 * 4.0 * 200 / 555.5  # Blender's cameras: 1.3 around a scene of ±1.3
+    half = 0.9 * 4.0 * 200 / 555.5  # Blender's cameras: 1.3, the known size of those scenes
     assert torch.allclose(high - low, torch.full((3,), 2 * half), atol=1e-5)
 
 
-def test_cameras_that_look_outward_have_the_scene_around_them():
+def test_cameras_that_look_outwards_are_inside_the_box():
     low, high = scene_bounds(ring(1.0, (5.0, 5.0, 0.0), -1.0))
     assert torch.allclose((low + high) / 2, torch.tensor([5.0, 5.0, 0.0]), atol=1e-4)
     assert (high - low).min() > 4
@@ -51,7 +51,7 @@ def test_parallel_cameras_have_the_scene_in_front(count):
     assert low[0] < (count - 1) / 2 < high[0]
 
 
-def test_points_come_first_but_not_the_farthest():
+def test_points_determine_the_box_without_outliers():
     points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
     points[0] = 1e6
     low, high = scene_bounds(ring(4.0, (0.0, 0.0, 0.0), 1.0), points)
@@ -60,5 +60,5 @@ def test_points_come_first_but_not_the_farthest():
 
 
 def test_no_cameras():
-    with pytest.raises(ValueError, match="needs a camera"):
+    with pytest.raises(ValueError, match="needs at least one camera"):
         scene_bounds([])

@@ -197,13 +197,13 @@ def test_a_count_larger_than_the_file_allocates_nothing(dataset_copy, file, coun
 
 @pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_damaged_files_raise_one_line_errors(dataset_copy, refusals, kind, name):
+def test_damaged_files_raise_one_line_errors(dataset_copy, count_rejected, kind, name):
     folder = dataset_copy(kind)
     path = folder / "sparse/0" / (name + kind.replace("colmap-", "."))
-    refused = refusals(path, lambda: load_dataset(folder))
+    rejected = count_rejected(path, lambda: load_dataset(folder))
     # Truncation is always detected, except in a text file of points that is empty or ends between
     # two lines.
-    assert refused >= (20 if kind == "colmap-bin" else 5)
+    assert rejected >= (20 if kind == "colmap-bin" else 5)
 
 
 def test_a_text_file_shorter_than_its_comment_promises(dataset_copy, caplog):

@@ -1,4 +1,4 @@
-"""Decoding, scaling, alpha, and the loader's cache: always the same pixels, within the budget."""
+"""Decoding, scaling, alpha, and the cache of the loader: same pixels, within the budget."""
 
 import threading
 
@@ -54,7 +54,7 @@ def test_downscale_is_the_mean_of_a_box(views, factor):
 
 
 def test_downscale_of_sizes_that_do_not_divide():
-    """A ramp stays a ramp, at the positions that intrinsics scaled by each axis' ratio say."""
+    """A ramp stays a ramp, at the positions that the scaled intrinsics predict."""
     ramp = np.tile(np.linspace(0, 250, 51).astype(np.uint8), (3, 33, 1))
     small = resize_area(ramp, 12, 8)
     assert small.shape == (3, 8, 12)
@@ -71,7 +71,7 @@ def rgba(tmp_path):
     return make_view(tmp_path / "a.png", pixels)
 
 
-def test_alpha_is_kept_or_composed(tmp_path):
+def test_alpha_is_kept_or_composited(tmp_path):
     view = rgba(tmp_path)
     with ImageLoader([view]) as loader:
         image = loader.get(view)
@@ -81,10 +81,10 @@ def test_alpha_is_kept_or_composed(tmp_path):
         expected = torch.tensor([0.2 * 200 / 255, 0.8, 0.0])
         assert torch.allclose(over[7, 0], expected, atol=1e-6)
     with ImageLoader([view], background=(0, 1, 0)) as loader:
-        composed = loader.get(view)
-    assert composed.planes.shape == (3, 8, 8)
-    assert composed.rgb[7, 0].tolist() == [40, 204, 0]
-    assert composed.rgb[7, 7].tolist() == [0, 255, 0]
+        composited = loader.get(view)
+    assert composited.planes.shape == (3, 8, 8)
+    assert composited.rgb[7, 0].tolist() == [40, 204, 0]
+    assert composited.rgb[7, 7].tolist() == [0, 255, 0]
 
 
 def test_downscale_and_background_commute(tmp_path):
@@ -97,7 +97,7 @@ def test_downscale_and_background_commute(tmp_path):
     assert (later - before).abs().max() <= 1.1
 
 
-def test_alpha_that_is_opaque_everywhere_is_dropped(tmp_path):
+def test_alpha_of_an_opaque_image_is_dropped(tmp_path):
     view = make_view(tmp_path / "a.png", np.full((4, 4, 4), 255, np.uint8))
     assert load_image(view.image).shape == (3, 4, 4)
 
@@ -122,7 +122,7 @@ def test_sixteen_bit_grey_is_scaled(tmp_path):
     assert load_image(ImageSource(tmp_path / "a.png", 4, 4)).unique().tolist() == [100]
 
 
-def test_masks_shrink_to_what_is_wholly_inside(views, tmp_path):
+def test_a_downscaled_mask_keeps_only_pixels_that_are_fully_inside(views, tmp_path):
     mask = np.zeros((16, 20), np.uint8)
     mask[:, :7] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
@@ -132,7 +132,7 @@ def test_masks_shrink_to_what_is_wholly_inside(views, tmp_path):
         assert loader.get(view, 2).mask.sum() == 3 * 8
 
 
-def test_a_budget_for_two_images_gives_the_same_pixels(views):
+def test_a_budget_for_two_images_returns_the_same_pixels(views):
     one = 3 * 16 * 20
     order = [views[i] for i in torch.randperm(10).tolist() * 3]
     with ImageLoader(views, budget_bytes=2 * one, threads=3) as loader:
@@ -143,14 +143,14 @@ def test_a_budget_for_two_images_gives_the_same_pixels(views):
                 assert loader.cached_bytes <= 2 * one
 
 
-def test_a_budget_of_nothing_still_works(views):
+def test_a_budget_of_zero_works(views):
     with ImageLoader(views, budget_bytes=0) as loader:
         loader.prefetch(views)
         for view in views:
             assert torch.equal(loader.get(view).rgb, stored(view))
 
 
-def test_what_fits_is_decoded_once(views, monkeypatch):
+def test_images_within_the_budget_are_decoded_once(views, monkeypatch):
     decoded = []
     lock = threading.Lock()
 
@@ -165,14 +165,14 @@ def test_what_fits_is_decoded_once(views, monkeypatch):
             loader.prefetch(reversed(views))
             for view in reversed(views):
                 loader.get(view)
-        for view in views:  # smaller ones come from those that are there
+        for view in views:  # smaller versions are made from the cached images
             loader.get(view, 2)
         assert loader.cached_bytes == 10 * 3 * (16 * 20 + 8 * 10)
     assert sorted(decoded) == [f"{i}.png" for i in range(10)]
 
 
 def test_prefetching_stays_within_half_of_the_budget(views):
-    one = 4 * 16 * 20  # what an image may take, alpha counted
+    one = 4 * 16 * 20  # largest size of an image in bytes, with alpha
     with ImageLoader(views, budget_bytes=6 * one, threads=2) as loader:
         loader.prefetch(views)
         for future in list(loader._running.values()):
@@ -182,14 +182,14 @@ def test_prefetching_stays_within_half_of_the_budget(views):
             assert torch.equal(loader.get(view).rgb, stored(view))
 
 
-def test_asking_in_another_order_than_announced(views):
+def test_requests_in_another_order_than_prefetched(views):
     with ImageLoader(views, threads=2, budget_bytes=3000) as loader:
         loader.prefetch(views)
         for view in [*views[::-1], *views]:
             assert torch.equal(loader.get(view).rgb, stored(view))
 
 
-def test_damaged_images_are_reported_when_asked_for(views):
+def test_damaged_images_raise_when_requested(views):
     path = views[4].image.path
     path.write_bytes(path.read_bytes()[:-200])
     with ImageLoader(views) as loader:
@@ -203,20 +203,20 @@ def test_damaged_images_are_reported_when_asked_for(views):
 
 @pytest.mark.filterwarnings("ignore:::PIL")
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif"])
-def test_any_damage_is_a_user_error(tmp_path, refusals, suffix):
+def test_damaged_files_raise_user_errors(tmp_path, count_rejected, suffix):
     random = np.random.default_rng(0)
     pixels = random.integers(0, 256, (16, 20, 3)).astype(np.uint8)
     view = make_view(tmp_path / f"a{suffix}", pixels)
-    assert refusals(view.image.path, lambda: load_image(view.image)) > 0
+    assert count_rejected(view.image.path, lambda: load_image(view.image)) > 0
 
 
-def test_an_image_that_vanished(views):
+def test_a_deleted_image(views):
     views[0].image.path.unlink()
     with ImageLoader(views) as loader, pytest.raises(UserError, match="no such image"):
         loader.get(views[0])
 
 
-def test_downscales_other_than_the_three_are_refused(views):
+def test_other_downscale_factors_are_rejected(views):
     with ImageLoader(views) as loader, pytest.raises(ValueError, match="1, 2 or 4"):
         loader.get(views[0], 3)
 

@@ -1,4 +1,4 @@
-"""What load_dataset decides whatever the reader: sizes, smaller copies, splits, bad images."""
+"""`load_dataset`, independent of the format: sizes, smaller copies, splits, damaged images."""
 
 import logging
 import shutil
@@ -20,7 +20,7 @@ def resize_folder(source, target, size):
             image.resize(size).save(target / path.name)
 
 
-def test_every_eighth_by_name_is_held_out(pristine):
+def test_every_eighth_image_by_name_is_held_out(pristine):
     dataset = load_dataset(pristine["colmap-bin"])
     assert [view.name for view in dataset.test] == ["view_00.png", "view_08.png"]
     assert [view.name for view in dataset.train] == [f"view_0{i}.png" for i in range(1, 8)]
@@ -29,7 +29,7 @@ def test_every_eighth_by_name_is_held_out(pristine):
     assert (len(everything.train), len(everything.test)) == (9, 0)
 
 
-def test_extent_is_that_of_the_training_cameras(pristine):
+def test_extent_is_computed_from_the_training_cameras(pristine):
     dataset = load_dataset(pristine["colmap-bin"])
     centres = torch.stack([view.camera.position for view in dataset.train])
     farthest = (centres - centres.mean(0)).norm(dim=1).max()
@@ -49,7 +49,7 @@ def test_lists_of_test_images(pristine, tmp_path):
         load_dataset(pristine["colmap-txt"], test_list=tmp_path / "absent.txt")
 
 
-def test_nothing_left_to_train_on(pristine):
+def test_no_image_is_left_for_training(pristine):
     with pytest.raises(UserError, match="all 9 images are held out"):
         load_dataset(pristine["colmap-bin"], hold_out=1)
 
@@ -70,8 +70,8 @@ def test_resolution_at_decode(pristine, resolution, size):
 
 
 @pytest.mark.parametrize("resolution", [0, -2, 3, 8])
-def test_resolutions_that_make_no_sense(pristine, resolution):
-    with pytest.raises(UserError, match=f"resolution of {resolution} makes"):
+def test_invalid_resolutions(pristine, resolution):
+    with pytest.raises(UserError, match=f"resolution: {resolution} (is not valid|makes images)"):
         load_dataset(pristine["colmap-bin"], resolution=resolution)
 
 
@@ -82,11 +82,11 @@ def large_source(tmp_path_factory):
 
 @pytest.fixture
 def large(large_source, tmp_path):
-    """A dataset whose images are large enough to divide, to change."""
+    """A dataset that a test may change; its images are large enough to divide."""
     return shutil.copytree(large_source, tmp_path / "large")
 
 
-def test_dividing_makes_intrinsics_follow_the_rounded_size(large):
+def test_intrinsics_are_scaled_to_the_rounded_size(large):
     view = load_dataset(large, resolution=2).train[0]
     full = load_dataset(large).train[0]
     assert (view.camera.width, view.camera.height) == (38, 32)
@@ -100,32 +100,32 @@ def test_folders_of_smaller_copies_are_used(large):
     view = load_dataset(large, resolution=2).train[0]
     assert view.image.path.parent.name == "images_2"
     assert (view.camera.width, view.camera.height) == (37, 32)
-    # By their own name too, and then divided further.
+    # The folder can also be selected by name, and then be divided further.
     view = load_dataset(large, images="images_2").train[0]
     assert (view.camera.width, view.camera.height) == (37, 32)
     view = load_dataset(large, images="images_2", resolution=2).train[0]
     assert (view.camera.width, view.camera.height) == (18, 16)
 
 
-@pytest.mark.parametrize("trouble", ["absent", "not 1/2"])
-def test_folders_of_smaller_copies_that_do_not_fit_are_not_used(large, caplog, trouble):
-    resize_folder(large / "images", large / "images_2", (75, 64) if "not" in trouble else (37, 32))
-    if trouble == "absent":
+@pytest.mark.parametrize("problem", ["is missing", "is not 1/2"])
+def test_folders_of_smaller_copies_that_do_not_fit_are_not_used(large, caplog, problem):
+    resize_folder(large / "images", large / "images_2", (75, 64) if "not" in problem else (37, 32))
+    if problem == "is missing":
         (large / "images_2/view_01.png").unlink()
     with caplog.at_level(logging.WARNING):
         view = load_dataset(large, resolution=2).train[0]
     assert view.image.path.parent.name == "images"
     assert view.camera.width == 38
-    assert trouble in caplog.text
+    assert problem in caplog.text
 
 
-def test_images_that_are_all_a_whole_number_smaller(large, caplog):
-    """As some datasets are passed around: the poses' images were twice as large."""
+def test_images_that_are_all_smaller_by_the_same_integer_factor(large, caplog):
+    """Some datasets are distributed without the large images that the poses belong to."""
     resize_folder(large / "images", large / "images", (38, 32))
     with caplog.at_level(logging.WARNING):
         view = load_dataset(large).train[0]
     assert (view.camera.width, view.camera.height) == (38, 32)
-    assert "1/2 of their cameras' size" in caplog.text
+    assert "1/2 of the size of their cameras" in caplog.text
 
 
 @pytest.mark.parametrize("size", [(74, 64), (64, 75), (150, 128), (50, 43), (38, 32)])
@@ -155,7 +155,8 @@ def test_exif_orientation_is_applied_only_if_the_size_proves_it(dataset_copy):
     view = next(v for v in load_dataset(folder).train if v.name == "view_01.png")
     with ImageLoader([view]) as loader:
         assert loader.get(view).rgb[0, 0, 0] > 150  # as stored, not upside down
-    # 24 wide as stored, its left half bright: turned clockwise it fits, and that is the upper half.
+    # As stored, the image is 24 wide and its left half is bright. Rotated clockwise, it fits the
+    # camera and its upper half is bright.
     jpeg_with_orientation(path.with_suffix(".jpg"), pixels.transpose(1, 0, 2).copy(), 6)
     path.with_suffix(".jpg").rename(path)
     view = next(v for v in load_dataset(folder).train if v.name == "view_01.png")
@@ -179,17 +180,17 @@ def test_masks_beside_the_images(dataset_copy):
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])
-def test_a_file_that_is_no_image_is_found_before_training(dataset_copy, content):
+def test_a_file_that_is_not_an_image_is_rejected_when_loading(dataset_copy, content):
     folder = dataset_copy("colmap-bin")
     (folder / "images/view_04.png").write_bytes(content)
     with pytest.raises(UserError, match="view_04.png: cannot be decoded"):
         load_dataset(folder)
 
 
-def test_folders_that_are_no_datasets(tmp_path):
+def test_paths_that_are_not_datasets(tmp_path):
     with pytest.raises(UserError, match="no such folder"):
         load_dataset(tmp_path / "absent")
-    with pytest.raises(UserError, match="no camera poses here"):
+    with pytest.raises(UserError, match="no camera poses here.*snowsplat sfm"):
         load_dataset(tmp_path)
     (tmp_path / "file").write_text("x")
     with pytest.raises(UserError, match="not a dataset"):

@@ -1,4 +1,4 @@
-"""Point clouds as PLY: round trip, colours absent or of a floating type."""
+"""Point clouds as PLY files: round trip, no colours, floating-point colours."""
 
 import numpy as np
 import pytest
@@ -32,5 +32,5 @@ def test_points_without_colour_or_with_float_colour(tmp_path):
     path.write_text(head + colors + "end_header\n1 2 3 0 0.5 2.0\n")
     assert read_points(path)[1].tolist() == [[0, 128, 255]]
     path.write_text(head.replace("property float z\n", "") + "end_header\n1 2\n")
-    with pytest.raises(UserError, match="not of points"):
+    with pytest.raises(UserError, match="not a point cloud"):
         read_points(path)

@@ -1,4 +1,4 @@
-"""Real datasets, beside the project: what is known of them, and that poses fit pixels."""
+"""Real datasets outside the project: their known contents, and that poses match the images."""
 
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def test_contents(name, train, test, size, points):
 
 
 def colour_errors(view, points, image, shifts):
-    """Median difference of colour between points and the pixels they fall on, shifted so far."""
+    """For each shift in pixels: the median colour difference of points and shifted pixels."""
     pixels, depth = view.camera.project(points.xyz.double())
     size = torch.tensor([view.camera.width, view.camera.height])
     errors = []
@@ -56,8 +56,8 @@ def colour_errors(view, points, image, shifts):
 
 @pytest.mark.parametrize("name", ["fox", "fox_small", "fern", "kitchen25"])
 @pytest.mark.parametrize("resolution", [1, 2])
-def test_points_fall_on_pixels_of_their_colour(name, resolution):
-    """On the very pixels: a shift by two of the photo's pixels, to any side, is already worse."""
+def test_points_project_to_pixels_of_their_colour(name, resolution):
+    """A shift by two pixels of the original photo, in any direction, increases the error."""
     dataset = load(name, resolution=resolution, hold_out=None)
     views = dataset.train[::8]
     near, far = 2 / resolution, views[0].camera.width / 10
@@ -68,8 +68,8 @@ def test_points_fall_on_pixels_of_their_colour(name, resolution):
     assert errors[0] < 0.7 * errors[5]
 
 
-def test_lego_fills_the_middle_of_its_transparent_images():
-    """Poses from transforms.json: what is opaque is where a box around the model projects."""
+def test_lego_is_in_the_middle_of_its_transparent_images():
+    """The opaque pixels are where the poses of transforms.json project a box around the model."""
     dataset = load("lego400")
     corners = torch.cartesian_prod(*[torch.tensor([-0.7, 0.7], dtype=torch.float64)] * 3)
     view = dataset.train[0]

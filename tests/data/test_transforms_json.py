@@ -1,4 +1,4 @@
-"""transforms.json in its three spellings: intrinsics, axes, names, splits, points, damage."""
+"""The variants of transforms.json: intrinsics, axes, names, splits, points, damaged files."""
 
 import json
 import logging
@@ -14,13 +14,13 @@ from snowsplat.data.points_ply import write_points
 from snowsplat.util.errors import UserError
 
 F64 = torch.float64
-# In OpenGL's axes the camera at (1, 2, 3) looks along −z of the world, its up is the world's y.
+# In OpenGL's axes: a camera at (1, 2, 3) that looks along −z of the world; up is the world's +y.
 UPRIGHT = [[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 
 
 @pytest.fixture
 def scene(tmp_path):
-    """A function that writes transforms.json with some frames, and the images 40×30 it names."""
+    """A function that writes a transforms.json with these frames, and its images, 40×30."""
 
     def write(common, frames, file="transforms.json", existing=None):
         for number, frame in enumerate(frames):
@@ -47,7 +47,7 @@ def test_axes_are_converted(scene):
     ahead = torch.tensor([[1.0, 2, 2], [1.1, 2.2, 2]], dtype=F64)
     pixels, depth = camera.project(ahead)
     assert torch.allclose(depth, torch.ones(2, dtype=F64))
-    # Right in the world is right in the picture, up in the world is up: towards row 0.
+    # World +x is to the right in the image, and world +y is up, towards row 0.
     expected = torch.tensor([[20.0, 15], [20 + 50 * 0.1, 15 - 50 * 0.2]], dtype=F64)
     assert torch.allclose(pixels, expected)
 
@@ -68,7 +68,7 @@ FIELD = 2 * math.atan(0.4)  # 40 pixels at a focal length of 50
         ({"fl_x": 100.0, "cx": 41.0, "w": 80, "h": 60}, (50, 50, 20.5, 15)),
     ],
 )
-def test_intrinsics_in_all_spellings(scene, common, expected):
+def test_all_variants_of_intrinsics(scene, common, expected):
     camera = camera_of(common, {}, scene)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(expected)
     assert (camera.width, camera.height) == (40, 30)
@@ -82,14 +82,14 @@ def test_a_frame_overrides_the_file(scene):
 @pytest.mark.parametrize(
     ("common", "message"),
     [
-        ({"fl_x": 50, "k1": 0.1}, r"distorted \(k1 = 0.1\).*snowsplat sfm"),
-        ({"fl_x": 50, "p2": -0.001}, "distorted.*snowsplat sfm"),
+        ({"fl_x": 50, "k1": 0.1}, r"distortion \(k1 = 0.1\).*snowsplat sfm"),
+        ({"fl_x": 50, "p2": -0.001}, "distortion.*snowsplat sfm"),
         ({"fl_x": 50, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE.*snowsplat sfm"),
         ({"fl_x": 50, "is_fisheye": True}, "fisheye.*snowsplat sfm"),
         ({}, "no focal length"),
         ({"fl_x": "wide"}, "fl_x should be a number"),
-        ({"fl_x": 0}, "focal lengths of 0"),
-        ({"fl_x": float("nan")}, "makes no sense"),
+        ({"fl_x": 0}, "focal lengths 0"),
+        ({"fl_x": float("nan")}, "fl_x is nan, which is not valid"),
         ({"camera_angle_x": 3.5}, "field of view"),
         ({"fl_x": 50, "w": 64, "h": 48}, "is 40x30, but its camera is 64x48"),
     ],
@@ -105,12 +105,12 @@ def test_cameras_that_cannot_be_used(scene, common, message):
         ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], "4 rows of 4"),
         ("none", "4 rows of 4"),
         ([[float("inf")] * 4] * 4, "4 rows of 4"),
-        ([[0, 0, 0, 1]] * 4, "no rotation"),
-        ([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "no rotation"),
+        ([[0, 0, 0, 1]] * 4, "not a rotation"),
+        ([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "not a rotation"),
         ([[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "mirrors"),
     ],
 )
-def test_matrices_that_are_no_poses(scene, matrix, message):
+def test_matrices_that_are_not_poses(scene, matrix, message):
     with pytest.raises(UserError, match=message):
         camera_of({"fl_x": 50}, {"transform_matrix": matrix}, scene)
 
@@ -130,7 +130,7 @@ def test_missing_frames_are_skipped_and_counted(scene, caplog):
     assert [view.name for view in dataset.train] == ["images/1.png"]
     assert "2 of 3 images are missing (the first is 'images/0.png')" in caplog.text
     (folder / "images/1.png").unlink()
-    with pytest.raises(UserError, match="none of its 3 images is there"):
+    with pytest.raises(UserError, match="all of its 3 images are missing"):
         load_dataset(folder)
 
 
@@ -153,10 +153,10 @@ def test_blender_splits(dataset_copy):
     assert [view.name for view in dataset.test] == ["test/r_0.png", "test/r_8.png"]
     assert len(dataset.train) == 7
     assert dataset.points is None
-    # Training on all takes the test split too, every other list of names overrides.
+    # hold_out=None also trains on the test split; test_list replaces the split.
     assert len(load_dataset(folder, hold_out=None).train) == 9
     assert [view.name for view in load_dataset(folder, test_list=["r_3"]).test] == ["train/r_3.png"]
-    # Without a test split (or its images) the rule by number holds.
+    # Without a test split, hold_out applies.
     (folder / "transforms_test.json").unlink()
     assert [v.name for v in load_dataset(folder, hold_out=4).test] == [
         "train/r_1.png",
@@ -164,13 +164,13 @@ def test_blender_splits(dataset_copy):
     ]
 
 
-def test_blender_validation_split_stands_in_for_a_missing_test_split(dataset_copy):
+def test_blender_validation_split_replaces_a_missing_test_split(dataset_copy):
     folder = dataset_copy("blender")
     (folder / "transforms_test.json").rename(folder / "transforms_val.json")
     assert len(load_dataset(folder).test) == 2
 
 
-def test_alpha_is_honoured(dataset_copy):
+def test_alpha_is_used(dataset_copy):
     view = load_dataset(dataset_copy("blender")).train[0]
     with ImageLoader([view]) as loader:
         image = loader.get(view)
@@ -181,7 +181,7 @@ def test_alpha_is_honoured(dataset_copy):
     assert torch.allclose(corner, torch.tensor([0.2, 0.4, 1.0]))
 
 
-def test_splits_named_by_nerfstudio(scene):
+def test_splits_of_nerfstudio(scene):
     names = [f"images/{i}.png" for i in range(4)]
     lists = {"train_filenames": names[:3], "test_filenames": names[3:]}
     folder = scene({"fl_x": 50, **lists}, [{} for _ in names])
@@ -196,14 +196,14 @@ def test_points_of_ply_file_path(scene, tmp_path):
     assert points.rgb.tolist() == [[1, 2, 3]]
 
 
-def test_missing_ply_is_told(scene, caplog):
+def test_a_missing_ply_file_is_reported(scene, caplog):
     with caplog.at_level(logging.WARNING):
         dataset = load_dataset(scene({"fl_x": 50, "ply_file_path": "cloud.ply"}, [{}, {}]))
     assert dataset.points is None
-    assert "cloud.ply: the points it should begin with are missing" in caplog.text
+    assert "cloud.ply: the point cloud (ply_file_path) is missing" in caplog.text
 
 
-def test_points_of_the_model_that_nerfstudio_began_with(scene, dataset_copy, tmp_path):
+def test_points_of_the_colmap_model_of_nerfstudio(scene, dataset_copy, tmp_path):
     source = load_dataset(dataset_copy("colmap-bin")).points
     transform = [[0.0, 1, 0, 5], [1, 0, 0, 6], [0, 0, -1, 7]]
     folder = scene({"fl_x": 50, "applied_transform": transform}, [{}, {}])
@@ -233,13 +233,13 @@ def test_masks(scene, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "not a whole JSON file"),
-        ("[" * 100_000, "not a whole JSON file"),
+        ("", "not a complete JSON file"),
+        ("[" * 100_000, "not a complete JSON file"),
         ("[1]", "no list of frames"),
         ('{"frames": 3}', "no list of frames"),
         ('{"frames": []}', "it has no frames"),
-        ('{"frames": [{}]}', "frame 0 has no file_path"),
-        ('{"frames": [4]}', "frame 0 has no file_path"),
+        ('{"frames": [{}]}', "frame 0: no file_path"),
+        ('{"frames": [4]}', "frame 0: no file_path"),
     ],
 )
 def test_files_of_another_kind(tmp_path, text, message):
@@ -249,10 +249,10 @@ def test_files_of_another_kind(tmp_path, text, message):
 
 
 def test_the_same_image_twice(scene):
-    with pytest.raises(UserError, match="as another one has"):
+    with pytest.raises(UserError, match="also belongs to another frame"):
         load_dataset(scene({"fl_x": 50}, [{"file_path": "a.png"}, {"file_path": "./a.png"}]))
 
 
-def test_damaged_files_are_one_line(dataset_copy, refusals):
+def test_damaged_files_raise_one_line_errors(dataset_copy, count_rejected):
     folder = dataset_copy("blender")
-    assert refusals(folder / "transforms_train.json", lambda: load_dataset(folder)) >= 20
+    assert count_rejected(folder / "transforms_train.json", lambda: load_dataset(folder)) >= 20

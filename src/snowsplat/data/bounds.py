@@ -1,4 +1,4 @@
-"""Where a scene is, for datasets that come without points (and a sober box for those with)."""
+"""An axis-aligned box around a scene, from its points or, without points, from its cameras."""
 
 from collections.abc import Sequence
 
@@ -8,28 +8,42 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 
-#: The cube's half side, as a share of what the median camera sees at the distance of its centre.
-#: With it the synthetic Blender scenes get ±1.3, the cube in which they are known to lie.
+# Half the side of the cube, relative to half the visible width of the median camera at the
+# distance of the cube's centre. With this value the cube of the synthetic Blender scenes is ±1.3,
+# which is their known size.
 _SHARE_OF_VIEW = 0.9
+# A cube whose distance or size cannot be measured is placed with this many scene extents.
+_GUESSED_EXTENTS = 5.0
+# The scene extent is 1.1 × the largest distance of a camera from the mean; see `scene_extent`.
+_EXTENT_FACTOR = 1.1
+# Fewer points than this are not used.
+_MIN_POINTS = 100
+# Below this smallest eigenvalue, all optical axes are within about two degrees of each other.
+_PARALLEL_AXES = 1e-3
 
 
 def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Tensor:
-    """Low and high corner (2, 3) float32 of an axis-aligned box of the scene, world frame.
+    """Lower and upper corner, (2, 3) float32, of an axis-aligned box in the world frame.
 
-    With points: the box of them without the outermost 1% at each side.
+    With at least 100 points, the box spans their 1% to 99% quantiles along each axis.
 
-    Without: a cube about the point nearest to all optical axes (least squares), as large as the
-    median camera sees there. Two kinds of dataset have no such point. Cameras that look the same
-    way: the cube is set in front of them, five extents away, which is a guess, since nothing
-    tells the distance. Cameras that look apart, from within: the cube is set around them, five
-    extents to each side.
+    Otherwise it is a cube around the point nearest to all optical axes (least squares). Its size
+    is what the median camera sees at that distance. Two kinds of datasets have no such point:
+
+    - The cameras look in the same direction. The cube is placed five scene extents in front of
+      them. This is a guess, because the distance is unknown.
+    - The cameras look outwards. The cube is centred on them and reaches five extents to each side.
+
+    Args:
+        cameras: at least one.
+        points: (P, 3) in the world frame, or None.
 
     Raises:
-        ValueError: no cameras.
+        ValueError: there are no cameras.
     """
     if not cameras:
-        raise ValueError("scene_bounds needs a camera")
-    if points is not None and len(points) >= 100:
+        raise ValueError("scene_bounds needs at least one camera")
+    if points is not None and len(points) >= _MIN_POINTS:
         low, high = np.quantile(points.detach().cpu().numpy(), (0.01, 0.99), axis=0)
         return torch.from_numpy(np.stack([low, high])).to(torch.float32)
 
@@ -41,11 +55,11 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
     middle = centres.mean(0)
     spread = float((centres - middle).norm(dim=1).max()) or 1.0
 
-    # Minimise the sum over cameras of |(I − d dᵀ)(p − c)|². Its matrix is singular along a
-    # direction that all axes share; 1e-3 is axes within about two degrees of each other.
+    # Find the point p that minimises the sum over cameras of |(I − d dᵀ)(p − c)|², with centre c
+    # and optical axis d. The matrix of this system is singular if all axes are parallel.
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     system = across.mean(0)
-    if float(torch.linalg.eigvalsh(system)[0]) > 1e-3:
+    if float(torch.linalg.eigvalsh(system)[0]) > _PARALLEL_AXES:
         centre = torch.linalg.solve(system, (across @ centres[:, :, None]).mean(0)[:, 0])
         depths = ((centre - centres) * axes).sum(1)
         if float((depths > 0).double().mean()) > 0.5:
@@ -54,14 +68,14 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
 
     direction = axes.mean(0)
     if float(direction.norm()) > 0.5:
-        distance = 5.0 * 1.1 * spread
+        distance = _GUESSED_EXTENTS * _EXTENT_FACTOR * spread
         centre = middle + direction / direction.norm() * distance
         return _cube(centre, _SHARE_OF_VIEW * distance * float(tangent))
-    return _cube(middle, 5.0 * 1.1 * spread)
+    return _cube(middle, _GUESSED_EXTENTS * _EXTENT_FACTOR * spread)
 
 
 def _half_view(camera: Camera) -> float:
-    """Tangent of half the smaller field of view."""
+    """The tangent of half the smaller field of view."""
     return 0.5 * min(camera.width / camera.fx, camera.height / camera.fy)
 
 

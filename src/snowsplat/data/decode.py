@@ -1,6 +1,6 @@
-"""One image file: its header, its pixels as planes, its smaller copies.
+"""Decoding an image file: its header, its pixels as planes, and scaling down.
 
-Everything here is a pure function of the file, so it may run in any thread and at any time.
+All functions are pure functions of the file, so they may run in any thread.
 """
 
 from __future__ import annotations
@@ -18,102 +18,110 @@ from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
-# What photographs come as (a phone's MPO counts as JPEG). Pillow also knows formats that start
-# other programs.
+# Formats of photos (Pillow opens the MPO files of phones as JPEG). Other formats are excluded,
+# because Pillow starts external programs for some of them.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
-_BAND_PIXELS = 1 << 20  # what is held at a time while pixels are rearranged
-#: The endings that are tried where a dataset names its images without one.
+# Pixels are converted in bands of this size, to limit the memory for temporary arrays.
+_BAND_PIXELS = 1 << 20
+#: Suffixes that are tried if a dataset names its images without a suffix.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 _EXIF_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
 class ImageSource:
-    """An image that stays on disk until it is wanted, and the size it is then brought to.
+    """An image file that is not decoded yet, and the size to which it will be scaled.
 
-    ``turn``: apply the orientation that the camera noted in the file. Off unless the sizes prove
-    that the pose was made for the turned picture: COLMAP poses are made for the pixels as stored.
-    ``stored``: how many pixels are decoded for it; 0: not known, as many as are wanted.
+    COLMAP estimates poses for the pixels as stored, so ``apply_orientation`` is set only if the
+    image size proves that the pose belongs to the rotated image.
     """
 
     path: Path
-    width: int
-    height: int
-    turn: bool = False
-    stored: int = 0
+    width: int  # pixels, after scaling
+    height: int  # pixels, after scaling
+    apply_orientation: bool = False  # apply the EXIF orientation
+    stored: int = 0  # pixels in the file; 0 if unknown, then width × height is assumed
 
 
 @dataclass(frozen=True)
 class LoadedImage:
-    """A decoded image: 8-bit planes. Colours of transparent images are multiplied by alpha."""
+    """A decoded image as 8-bit planes. Colours of transparent images are premultiplied."""
 
     planes: Tensor  # (3, H, W) uint8 RGB, or (4, H, W) RGBA, premultiplied
-    mask: Tensor | None = None  # (H, W) bool: False where the image does not count
+    mask: Tensor | None = None  # (H, W) bool: False for pixels to ignore
 
     @property
     def rgb(self) -> Tensor:
-        """(H, W, 3) uint8, planar in memory. Premultiplied where there is alpha; see `over`."""
+        """(H, W, 3) uint8, planar in memory; premultiplied if the image has alpha."""
         return self.planes[:3].permute(1, 2, 0)
 
     @property
     def alpha(self) -> Tensor | None:
-        """(H, W) uint8, or None for an opaque image."""
+        """(H, W) uint8; None for an opaque image."""
         return self.planes[3] if self.planes.shape[0] == 4 else None
 
     def over(self, background: Tensor) -> Tensor:
-        """(H, W, 3) float32 in 0..1, planar in memory: the image over a background colour (3,)."""
+        """The image composited over ``background``: (H, W, 3) float32 in 0..1, planar in memory.
+
+        Args:
+            background: (3,) RGB in 0..1.
+        """
         planes = self.planes.to(torch.float32) / 255.0
         if planes.shape[0] == 4:
             planes = planes[:3] + (1.0 - planes[3]) * background.to(torch.float32)[:, None, None]
         return planes.permute(1, 2, 0)
 
     def to(self, device: torch.device) -> LoadedImage:
-        """On another device; no copy where it is there already."""
+        """This image on ``device``; not copied if it is already there."""
         mask = None if self.mask is None else self.mask.to(device)
         return LoadedImage(self.planes.to(device), mask)
 
     @property
     def nbytes(self) -> int:
+        """Memory of planes and mask in bytes."""
         return self.planes.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
 
 @dataclass(frozen=True)
 class Header:
-    """What an image file says of itself without being decoded."""
+    """The properties of an image file that are known without decoding it."""
 
     width: int  # pixels, as stored
-    height: int
-    sideways: bool  # its EXIF orientation exchanges width and height
+    height: int  # pixels, as stored
+    sideways: bool  # the EXIF orientation swaps width and height
 
 
 def read_header(path: Path) -> Header:
-    """Size and orientation of an image file; cheap.
+    """Read the size and orientation of an image file, without decoding it.
 
     Raises:
-        UserError: absent, or not an image that can be read.
+        UserError: the file is missing or is not a readable image.
     """
     try:
         with open_image(path, _FORMATS, header_only=True) as image:
-            # Where a PNG has no such note up front, getexif() would decode all of it to find one.
-            noted = "exif" in image.info or image.format == "TIFF"
-            orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if noted else 1
+            # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
+            has_exif = "exif" in image.info or image.format == "TIFF"
+            orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if has_exif else 1
             return Header(image.width, image.height, sideways=orientation in (5, 6, 7, 8))
-    except Exception as error:  # Pillow's parsers raise anything on damaged files
+    except Exception as error:  # Pillow raises many kinds of exceptions for damaged files
         raise _unreadable(path, error) from None
 
 
 def load_image(source: ImageSource, background: Sequence[float] | None = None) -> Tensor:
-    """Decode to planes (3, H, W) uint8, or (4, H, W) premultiplied RGBA.
+    """Decode an image to (3, H, W) uint8 RGB, or to (4, H, W) uint8 premultiplied RGBA.
 
-    Four planes come only from an image that is somewhere transparent, and only if no ``background``
-    (three numbers in 0..1) is given to compose it over.
+    The result has four planes only if a pixel is transparent and ``background`` is None.
+
+    Args:
+        source: the file and the size of the result.
+        background: RGB in 0..1. A transparent image is composited over it.
 
     Raises:
-        UserError: absent, damaged, or not an image.
+        UserError: the file is missing, damaged, or not an image.
     """
     try:
         with open_image(source.path, _FORMATS) as opened:
-            image = ImageOps.exif_transpose(opened) if source.turn else opened
+            image = ImageOps.exif_transpose(opened) if source.apply_orientation else opened
             planes = _planes(image)
     except Exception as error:  # as above
         raise _unreadable(source.path, error) from None
@@ -123,18 +131,21 @@ def load_image(source: ImageSource, background: Sequence[float] | None = None) -
 
 
 def load_mask(source: ImageSource) -> Tensor:
-    """Decode a mask to (H, W) bool: True where it is rather white than black; transparent is black.
+    """Decode a mask to (H, W) bool: True where its largest channel is 128 or more.
 
-    Raises as `load_image`.
+    Transparent pixels count as black.
+
+    Raises:
+        UserError: as `load_image`.
     """
     planes = load_image(source, background=(0.0, 0.0, 0.0))
     return planes.amax(0) >= 128
 
 
 def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:
-    """Box filter: the size is divided by ``factor`` and rounded down (at least 1 pixel).
+    """Scale down with a box filter; the size is divided by ``factor`` and rounded down, minimum 1.
 
-    A pixel of the mask stays True where all that it covers are.
+    A pixel of the mask is True if all pixels that it covers are True.
     """
     if factor == 1:
         return image
@@ -149,10 +160,10 @@ def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:
 
 
 def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
-    """(C, H, W) uint8 to (C, height, width): each pixel is the mean of the area that it covers.
+    """Scale down (C, H, W) uint8 to (C, height, width): each pixel is the mean of its area.
 
-    Exact for any ratio, so that intrinsics scaled by each axis' ratio fit the result exactly.
-    Meant for making smaller.
+    Areas are exact for any ratio, so intrinsics that are scaled by the ratio of each axis match
+    the result exactly.
     """
     old_height, old_width = planes.shape[1:]
     if (old_width, old_height) == (width, height):
@@ -168,7 +179,7 @@ def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:
-    """(H, W) to (H, count): means over equal, fractional, stretches of each row."""
+    """(H, W) to (H, count): means over equal intervals of each row, with fractional borders."""
     size = values.shape[1]
     edges = np.arange(count + 1) * (size / count)
     whole = np.minimum(edges.astype(np.int64), size - 1)
@@ -177,7 +188,7 @@ def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:
     rows = max(1, _BAND_PIXELS // size)
     for top in range(0, len(values), rows):
         band = values[top : top + rows].astype(np.float64)
-        # The integral from 0 to each edge, of the row as a step function.
+        # Each row is a step function. This is its integral from 0 to each pixel border.
         integral = np.zeros((len(band), size + 1))
         np.cumsum(band, axis=1, out=integral[:, 1:])
         at_edges = integral[:, whole] + part * band[:, whole]
@@ -186,12 +197,12 @@ def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _planes(image: Image.Image) -> np.ndarray:
-    """(3, H, W) or (4, H, W) uint8, alpha not multiplied."""
-    if image.mode.startswith("I"):  # 16-bit grey, which convert() would clip rather than scale
+    """(3, H, W) or (4, H, W) uint8, not premultiplied."""
+    if image.mode.startswith("I"):  # 16-bit grey; convert() would clip it instead of scaling it
         grey = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255).astype(np.uint8)
         return np.repeat(grey[None], 3, axis=0)
     if image.mode == "F":
-        raise ValueError("floating-point pixels")
+        raise ValueError("floating-point pixels are not supported")
     transparent = image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
     mode = "RGBA" if transparent else "RGB"
     planes: np.ndarray = np.empty((len(mode), image.height, image.width), np.uint8)
@@ -205,9 +216,9 @@ def _planes(image: Image.Image) -> np.ndarray:
 
 
 def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.ndarray:
-    """(4, H, W) straight RGBA to (4, H, W) premultiplied, or to (3, H, W) over the background.
+    """Premultiplied RGBA (4, H, W), or RGB (3, H, W) over the background, from straight RGBA.
 
-    Changes ``planes``.
+    Modifies ``planes``.
     """
     rows = max(1, _BAND_PIXELS // planes.shape[2])
     for top in range(0, planes.shape[1], rows):
@@ -225,7 +236,7 @@ def _unreadable(path: Path, error: Exception) -> UserError:
     if not is_file(path):
         return UserError(f"{path}: no such image")
     if isinstance(error, PermissionError):
-        return UserError(f"{path}: may not be read (permissions)")
+        return UserError(f"{path}: no permission to read it")
     return UserError(
         f"{path}: cannot be decoded ({reason_of(error)}); replace the file or remove it"
     )

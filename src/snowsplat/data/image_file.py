@@ -1,4 +1,4 @@
-"""Opening an image file that anybody may have made: what would take too long is refused before."""
+"""Opening image files from untrusted sources; files that would take too long are rejected."""
 
 from __future__ import annotations
 
@@ -9,31 +9,47 @@ from typing import BinaryIO
 
 from PIL import Image
 
-#: The largest image that is read; its size is known before it is decoded. Pillow's own limit, which
-#: is enough for the backs of the largest cameras (151 million) and the sides of any JPEG.
-MOST_PIXELS, LONGEST_SIDE = 178_956_970, 65_535
+#: The largest number of pixels of an image: Pillow's own limit. The largest camera backs have 151
+#: million. The size is known before the image is decoded.
+MOST_PIXELS = 178_956_970
+#: The largest width or height: that of the JPEG format.
+LONGEST_SIDE = 65_535
+#: The reason in the error for a larger image.
 TOO_LARGE = (
     f"more than {MOST_PIXELS // 1_000_000} million pixels, or {LONGEST_SIDE:,} a side; make it "
     "smaller"
 )
-# A tile of a TIFF may be larger than the image; a scan of a JPEG costs time for each pixel, and few
-# bytes. Both are far above what any program writes for an image of that size.
-_MOST_TILE_PIXELS, _MOST_SCANNED_PIXELS = 1 << 22, 3_000_000_000
-# Of a JPEG or PNG, and bytes before the pixels of a JPEG, where phones put whole photos. Pillow
-# takes microseconds for each of the first, and may take one for each of the others.
-_MOST_SEGMENTS, _LONGEST_HEADER = 100_000, 8 << 20
-# What begins a segment of a JPEG; those that this leaves out have no length, and are in the data of
-# a scan, or (TEM, 01) passed over by decoders.
-_MARKER, _SCAN, _END = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]"), b"\xff\xda", b"\xff\xd9"
-_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+# Pixels in a tile of a TIFF. A tile may be larger than the image, but programs do not write tiles
+# that are much larger.
+_MOST_TILE_PIXELS = 1 << 22
+# Pixels times scans of a JPEG. A scan has few bytes, but it takes time for each pixel of the image.
+# No program writes as many scans for an image of that size.
+_MOST_SCANNED_PIXELS = 3_000_000_000
+# Segments of a JPEG or chunks of a PNG. Pillow takes microseconds for each of them.
+_MOST_SEGMENTS = 100_000
+# Bytes before the pixels of a JPEG. Phones store complete photos there. Pillow may take a
+# microsecond per byte.
+_LONGEST_HEADER = 8 << 20
+# The marker at the start of a JPEG segment. The excluded markers have no length: they are part of
+# the data of a scan, or decoders skip them (TEM, 0x01).
+_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
+_SCAN = b"\xff\xda"  # start of a scan
+_END = b"\xff\xd9"  # end of the image
+_JPEG = b"\xff\xd8"  # the first bytes of a JPEG
+_PNG = b"\x89PNG\r\n\x1a\n"  # the first bytes of a PNG
 
 
 def open_image(path: Path, formats: Sequence[str], *, header_only: bool = False) -> Image.Image:
-    """An image file whose pixels are not yet read; with ``header_only`` they must not be.
+    """Open an image file without decoding its pixels.
+
+    Args:
+        path: the file.
+        formats: the formats to accept, by Pillow's names.
+        header_only: the caller does not decode the pixels, so the scans of a JPEG are not checked.
 
     Raises:
-        ValueError: larger than `MOST_PIXELS` or `LONGEST_SIDE`, or made to do harm. And whatever
-            Pillow raises on damaged files.
+        ValueError: larger than `MOST_PIXELS` or `LONGEST_SIDE`, or malicious.
+        Exception: anything that Pillow raises for a damaged file.
     """
     with open(path, "rb") as file:
         _check_header(file)
@@ -49,7 +65,7 @@ def open_image(path: Path, formats: Sequence[str], *, header_only: bool = False)
 
 
 def reason_of(error: Exception) -> str:
-    """Why an image cannot be read, in a few words, from what Pillow or `open_image` raised."""
+    """A short reason why an image cannot be read, from an error of Pillow or `open_image`."""
     if isinstance(error, Image.UnidentifiedImageError):
         return "not an image of a known format"
     if isinstance(error, Image.DecompressionBombError):
@@ -63,24 +79,27 @@ def _check_header(file: BinaryIO) -> None:
     start = file.read(len(_PNG))
     if start == _PNG:
         for _ in range(_MOST_SEGMENTS):
-            head = file.read(8)  # length and name of a chunk, whose checksum comes after it
+            head = file.read(8)  # length and name of a chunk; 4 bytes of checksum follow its data
             if len(head) < 8 or head[4:] == b"IEND":
                 return
             file.seek(int.from_bytes(head[:4], "big") + 4, 1)
-        raise ValueError("absurdly many chunks")
+        raise ValueError("too many chunks")
     if start.startswith(_JPEG):
         header = start + file.read(_LONGEST_HEADER)
         if len(header) > _LONGEST_HEADER and _SCAN not in _segments(header):
-            raise ValueError("absurdly much before its pixels")
+            raise ValueError("too many bytes before its pixels")
 
 
 def _check(image: Image.Image) -> None:
     width, height = image.size
     if width * height > MOST_PIXELS or max(width, height) > LONGEST_SIDE:
         raise ValueError(TOO_LARGE)
-    # Decoders in Python take a second for a million pixels; one of them trusts any skip it reads.
+    # Pillow's decoders in Python take a second per million pixels, and one of them does not check
+    # the offsets in the file.
     if any(tile[0] in Image.DECODERS for tile in getattr(image, "tile", ())):
-        raise ValueError(f"a {image.format} of a kind that is slow to read; save it as PNG")
+        raise ValueError(
+            f"an uncommon kind of {image.format}, which is slow to read; save it as PNG"
+        )
     if image.format == "TIFF":
         tags = getattr(image, "tag_v2", {})
         sides = [tags.get(tag, 1) for tag in (322, 323)]
@@ -93,11 +112,11 @@ def _check(image: Image.Image) -> None:
 def _check_scans(image: Image.Image, path: Path) -> None:
     scans = sum(marker == _SCAN for marker in _segments(path.read_bytes()))
     if scans * image.width * image.height > _MOST_SCANNED_PIXELS:
-        raise ValueError(f"{scans} scans of all its pixels")
+        raise ValueError(f"too many scans ({scans}) for its size")
 
 
 def _segments(data: bytes) -> Iterator[bytes]:
-    """The markers of a JPEG, up to its end."""
+    """The markers of a JPEG's segments, up to the end of the image."""
     at = len(_JPEG)
     for _ in range(_MOST_SEGMENTS):
         marker = _MARKER.search(data, at)
@@ -105,4 +124,4 @@ def _segments(data: bytes) -> Iterator[bytes]:
             return
         yield marker[0]
         at = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
-    raise ValueError("absurdly many segments")
+    raise ValueError("too many segments")

@@ -1,7 +1,7 @@
-"""Images for training: decoded ahead in background threads, kept as far as a memory budget goes.
+"""Images for training: decoded ahead in background threads and cached within a memory budget.
 
-What `ImageLoader.get` returns depends on the files alone, never on which thread was first or on
-what was kept: a cache miss decodes the same bytes again.
+The result of `ImageLoader.get` depends only on the files, not on the order of threads or on the
+content of the cache: after a cache miss, the same file is decoded again.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ import torch
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import ImageSource, LoadedImage, box_downscale, load_image, load_mask
 
-#: Threads that decode ahead.
+#: Default number of threads that decode ahead.
 DECODERS = min(4, os.cpu_count() or 1)
 
-_Key = tuple[ImageSource, ImageSource | None, int]
+_Key = tuple[ImageSource, ImageSource | None, int]  # image, mask, downscale factor
 
 
 class ImageLoader:
-    """Decoded images of views, least recently used ones dropped when the budget is full.
+    """A cache of decoded images; the least recently used images are removed when it is full.
 
-        loader = ImageLoader(capture.train, background=(1, 1, 1))
-        loader.prefetch(order)              # the views in the order in which they will be asked for
+        loader = ImageLoader(dataset.train, background=(1, 1, 1))
+        loader.prefetch(order)              # the views in the order of the following calls of get
         for view in order:
             target = loader.get(view).rgb   # (H, W, 3) uint8
 
     Args:
-        views: those that will be asked for; any other view is served too.
-        level: the downscale (1, 2 or 4) that is meant where a call names none.
-        background: colour in 0..1 to compose transparent images over; None keeps their alpha.
-        budget_bytes: memory for decoded images; None takes half of what is available now.
-        device: where they are kept, and what `get` gives them on.
-        threads: that decode ahead; None takes `DECODERS`.
+        views: the views that are expected; `get` also accepts other views.
+        level: the default downscale factor: 1, 2 or 4.
+        background: RGB in 0..1. Transparent images are composited over it; None keeps their alpha.
+        budget_bytes: memory for decoded images; None uses half of the memory available now.
+        device: where images are stored and returned; None is the CPU.
+        threads: number of threads that decode ahead; None uses `DECODERS`.
     """
 
     def __init__(
@@ -62,30 +62,36 @@ class ImageLoader:
         self._threads = threads or DECODERS
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="snowsplat-images")
         self._lock = threading.RLock()
-        self._cache: OrderedDict[_Key, LoadedImage] = OrderedDict()  # oldest use first
+        self._cache: OrderedDict[_Key, LoadedImage] = OrderedDict()  # least recently used first
         self._cached_bytes = 0
-        self._queue: deque[_Key] = deque()  # to be decoded ahead
+        self._queue: deque[_Key] = deque()  # to decode ahead
         self._running: dict[_Key, Future[LoadedImage]] = {}
-        self._ahead: dict[_Key, int] = {}  # decoded or being decoded, not yet asked for: bytes
-        self._pumping = False
+        self._ahead: dict[_Key, int] = {}  # bytes of images decoded ahead and not yet requested
+        self._submitting = False
 
     def prefetch(self, order: Iterable[View], downscale: int | None = None) -> None:
-        """Decode in the background what is asked for next, in this order; replaces the last.
+        """Start decoding these views in the background, in this order.
 
-        Only as far ahead as half of the budget, so that nothing is dropped before its use. A file
-        that cannot be decoded is reported by the `get` that asks for it.
+        It replaces the order of the last call. Images that are decoded ahead use at most half of
+        the budget, so that none is removed before its use. If a file cannot be decoded, the `get`
+        that requests it raises the error.
         """
         with self._lock:
             self._queue = deque(self._key(view, downscale) for view in order)
             wanted = set(self._queue)
             self._ahead = {key: size for key, size in self._ahead.items() if key in wanted}
-            self._pump()
+            self._submit_queued()
 
     def get(self, view: View, downscale: int | None = None) -> LoadedImage:
-        """The image of a view, its sizes divided by ``downscale`` and rounded down.
+        """The image of a view; its size is divided by ``downscale`` and rounded down.
+
+        Args:
+            view: the view.
+            downscale: 1, 2 or 4; None uses ``level``.
 
         Raises:
-            UserError: the file is absent, damaged, or not an image.
+            UserError: the file is missing, damaged, or not an image.
+            ValueError: ``downscale`` is not 1, 2 or 4.
         """
         key = self._key(view, downscale)
         with self._lock:
@@ -95,24 +101,24 @@ class ImageLoader:
             image = self._cache.get(key)
             if image is not None:
                 self._cache.move_to_end(key)
-                self._pump()
+                self._submit_queued()
                 return image
             running = self._running.get(key)
-        # In the caller's own thread unless it is under way already: not behind others in the queue.
+        # If no thread decodes it yet, decode it in this thread instead of waiting for the queue.
         image = running.result() if running is not None else self._decode(key)
         with self._lock:
-            self._keep(key, image)
-            self._pump()
+            self._store(key, image)
+            self._submit_queued()
         return image
 
     @property
     def cached_bytes(self) -> int:
-        """Bytes of decoded images held now."""
-        with self._lock:  # not between an image that comes and those that go for it
+        """Bytes of decoded images in the cache."""
+        with self._lock:  # `_store` exceeds the budget for a moment
             return self._cached_bytes
 
     def close(self) -> None:
-        """Stop decoding ahead and forget the images."""
+        """Stop decoding ahead and empty the cache."""
         with self._lock:
             self._queue.clear()
             self._cache.clear()
@@ -128,7 +134,7 @@ class ImageLoader:
     def _key(self, view: View, factor: int | None) -> _Key:
         factor = self.level if factor is None else factor
         if factor not in (1, 2, 4):
-            raise ValueError(f"downscale is 1, 2 or 4, not {factor}")
+            raise ValueError(f"downscale must be 1, 2 or 4, not {factor}")
         return view.image, view.mask, factor
 
     def _decode(self, key: _Key) -> LoadedImage:
@@ -140,7 +146,11 @@ class ImageLoader:
             image = LoadedImage(planes, None if mask is None else load_mask(mask))
         return box_downscale(image, factor).to(self._device)
 
-    def _keep(self, key: _Key, image: LoadedImage) -> None:
+    def _store(self, key: _Key, image: LoadedImage) -> None:
+        """Add an image to the cache and remove others until the budget holds. Needs the lock.
+
+        Images that were decoded ahead and not yet requested are removed last.
+        """
         if key not in self._cache:
             self._cached_bytes += image.nbytes
         self._cache[key] = image
@@ -149,11 +159,11 @@ class ImageLoader:
             oldest = next((k for k in self._cache if k not in self._ahead), next(iter(self._cache)))
             self._cached_bytes -= self._cache.pop(oldest).nbytes
 
-    def _pump(self) -> None:
-        """Start decoding as much of the queue as threads and budget allow. Holds the lock."""
-        if self._pumping:  # called back by an image that was ready at once
+    def _submit_queued(self) -> None:
+        """Start decoding as much of the queue as threads and budget allow. Needs the lock."""
+        if self._submitting:  # add_done_callback below calls back at once if the image is ready
             return
-        self._pumping = True
+        self._submitting = True
         while self._queue and len(self._running) < 2 * self._threads:
             key = self._queue[0]
             if key not in self._cache and key not in self._running:
@@ -162,21 +172,21 @@ class ImageLoader:
                     break
                 try:
                     future = self._pool.submit(self._decode, key)
-                except RuntimeError:  # closed, or the program is ending: nothing will be asked for
+                except RuntimeError:  # the loader is closed, or the program is ending
                     self._queue.clear()
                     break
                 self._ahead[key] = size
                 self._running[key] = future
                 future.add_done_callback(partial(self._finished, key))
             self._queue.popleft()
-        self._pumping = False
+        self._submitting = False
 
     def _finished(self, key: _Key, future: Future[LoadedImage]) -> None:
         with self._lock:
             self._running.pop(key, None)
             if not future.cancelled() and future.exception() is None:
-                self._keep(key, future.result())
-            self._pump()
+                self._store(key, future.result())
+            self._submit_queued()
 
 
 def _estimated_bytes(key: _Key) -> int:
@@ -186,13 +196,15 @@ def _estimated_bytes(key: _Key) -> int:
 
 
 def available_memory(device: torch.device | None = None) -> int:
-    """Bytes that this process may still take: of a GPU, or (default) of the computer.
+    """Bytes of memory that this process can still allocate.
 
-    There without swapping; the container's limit counts.
+    Args:
+        device: a CUDA device for its free memory. Otherwise it is the memory of the computer,
+            without swapping, limited by the control group of the process (container).
     """
     if device is not None and device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
-    available = 4 << 30  # where nothing tells
+    available = 4 << 30  # if the system does not report it
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         available = next(int(s.split()[1]) for s in lines if s.startswith("MemAvailable:")) << 10
@@ -208,7 +220,7 @@ def available_memory(device: torch.device | None = None) -> int:
     ):
         try:
             left = int(Path(limit).read_text()) - int(Path(used).read_text())
-        except (OSError, ValueError):  # no such limit ("max")
+        except (OSError, ValueError):  # no control group, or no limit ("max")
             continue
         available = min(available, max(left, 0))
     return available

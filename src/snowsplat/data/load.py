@@ -1,4 +1,4 @@
-"""A folder -> Dataset: which reader, which file of each image, at which size, in which split."""
+"""A folder -> `Dataset`: selects the reader, and the file, size and split of each image."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from pathlib import Path
 from snowsplat.data.colmap import find_models, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
-from snowsplat.data.transforms_json import find_transforms, read_nerf
+from snowsplat.data.transforms_json import find_transforms, read_transforms
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file, quoted
 
 logger = logging.getLogger(__name__)
 
+# Values of ``resolution`` that divide the image size; any other value is a width.
 _DIVISORS = (1, 2, 4, 8)
-_SMALLEST_SIDE = 16  # pixels; below it is a mistake in -r
+# Pixels. A resolution that makes smaller images is a mistake.
+_SMALLEST_SIDE = 16
+# The largest ratio between the size of a camera and the size of its image file.
 _LARGEST_FACTOR = 16
 
 
@@ -30,23 +33,24 @@ def load_dataset(
     hold_out: int | None = 8,
     test_list: Path | str | Sequence[str] | None = None,
 ) -> Dataset:
-    """Read a posed dataset; images stay on disk, but the headers of all are checked.
-
-    ``path`` is a folder with a COLMAP model (``sparse/0`` …, binary or text) and images, a folder
-    with ``transforms.json`` or ``transforms_train.json``, or such a file.
+    """Read a dataset of posed images. Image headers are checked; pixels are not decoded.
 
     Args:
+        path: a folder with a COLMAP model (``sparse/0`` …, binary or text) and images; a folder
+            with ``transforms.json`` or ``transforms_train.json``; or such a JSON file.
         images: name of the folder of images.
-        resolution: 1, 2, 4 or 8 divide the size of the images (``images_2`` … are used where they
-            are whole); any other number is the width in pixels to bring wider images to; None
-            or −1 takes them as they are.
-        hold_out: every so many-th image, in the order of names, beginning with the first, is held
-            out for testing; splits that the dataset itself brings come first. None trains on all.
-        test_list: the names of the images to hold out instead, or a text file of one a line.
+        resolution: 1, 2, 4 or 8 divides the image size; the folders ``images_2`` … are used if
+            they are complete. Any other number is a width in pixels to which wider images are
+            scaled down. None or −1 keeps the size.
+        hold_out: every ``hold_out``-th image is held out for testing, starting with the first in
+            the order of names. The dataset's own split, if any, has priority. None trains on all
+            images.
+        test_list: names of the test images, or a text file with one name per line. It replaces
+            ``hold_out`` and the dataset's own split.
 
     Raises:
-        UserError: no dataset there; files that are damaged; cameras with lens distortion; images
-            that are absent, damaged, or of another size than their cameras.
+        UserError: ``path`` is not a dataset; a file is damaged; a camera has lens distortion; an
+            image is missing, damaged, or does not have the size of its camera.
     """
     root = Path(path)
     posed, points, description = _read(root, images)
@@ -58,18 +62,18 @@ def load_dataset(
         key=lambda view: view.name,
     )
     if len({view.name for view in views}) < len(views):
-        twice = next(name for name, n in Counter(view.name for view in views).items() if n > 1)
-        raise UserError(f"{root}: has two images named {twice}; remove one")
-    tested = _test_names(posed, hold_out, test_list)
-    train = [view for view in views if view.name not in tested]
+        repeated = next(name for name, n in Counter(view.name for view in views).items() if n > 1)
+        raise UserError(f"{root}: has two images named {repeated}; remove one")
+    test_names = _test_names(posed, hold_out, test_list)
+    train = [view for view in views if view.name not in test_names]
     if not train:
         raise UserError(
-            f"{root}: all {len(views)} images are held out for testing, and none is left to train "
-            "on; hold out fewer or none"
+            f"{root}: all {len(views)} images are held out for testing, so no image is left for "
+            "training; hold out fewer or none"
         )
     return Dataset(
         train=train,
-        test=[view for view in views if view.name in tested],
+        test=[view for view in views if view.name in test_names],
         points=points,
         extent=scene_extent([view.camera for view in train]),
         description=description,
@@ -85,17 +89,17 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
     if models:
         return read_colmap(root, models, images)
     if transforms:
-        return read_nerf(transforms, images)
+        return read_transforms(transforms, images)
     if root.is_file():
-        raise UserError(f"{root}: not a dataset; give its folder, or a transforms.json")
+        raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
     raise UserError(
-        f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); photos "
-        "alone need their poses computed first, e.g. by COLMAP"
+        f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
+        "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET"
     )
 
 
 def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> list[PosedImage]:
-    """The same images from ``images_2`` … if such folders are asked for and hold every image."""
+    """The same images from ``images_2`` …, if the resolution matches and all images are there."""
     if resolution not in _DIVISORS[1:]:
         return posed
     smaller = []
@@ -109,10 +113,10 @@ def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> lis
         if found is None or not _is_divided(image.path, folder / found, resolution):
             if folder.is_dir():
                 logger.warning(
-                    "%s: %s there is %s; scaling the large images instead",
+                    "%s: not used, because %s %s; the large images are scaled instead",
                     folder,
                     image.file,
-                    "absent" if found is None else f"not 1/{resolution} of the large one",
+                    "is missing" if found is None else f"is not 1/{resolution} of the large image",
                 )
             return posed
         smaller.append(dataclasses.replace(image, folder=folder, file=found, divided=resolution))
@@ -125,70 +129,72 @@ def _is_divided(large: Path, small: Path, factor: int) -> bool:
 
 
 def _is_close(large: int, small: int, factor: int) -> bool:
-    # Sizes that do not divide are rounded up or down, as the tool that made the copy pleased.
+    # Sizes that are not divisible are rounded up by some tools and down by others.
     return abs(small - large / factor) < 1
 
 
 def _file_sizes(posed: list[PosedImage], headers: list[Header]) -> list[tuple[int, int, bool]]:
-    """Width and height of each file, and whether it has to be turned, checked against its camera.
+    """Width and height of each file, and whether to apply its EXIF orientation.
 
-    A folder of images may be a smaller copy of those the poses were made from (``images_4``, or
-    datasets that are passed around without the large ones): then the intrinsics are scaled. It
-    has to be a whole number of times smaller, and the same for all images of a folder.
+    The sizes are checked against the cameras. A folder of images may be a smaller copy of the
+    images that the poses were estimated from (for example ``images_4``, or a dataset that is
+    distributed without the large images). Then the intrinsics are scaled later. The factor must be
+    an integer and the same for all images of a folder.
     """
-    found = [_shrunk_by(image, header) for image, header in zip(posed, headers, strict=True)]
-    usual: dict[Path, int] = {}
+    found = [_shrink_factor(image, header) for image, header in zip(posed, headers, strict=True)]
+    usual: dict[Path, int] = {}  # the most frequent factor in each folder
     for folder in {image.folder for image in posed}:
         factors = [f for i, (f, _) in zip(posed, found, strict=True) if i.folder == folder and f]
         if factors:
             usual[folder] = Counter(sorted(factors)).most_common(1)[0][0]
     sizes = []
-    for image, header, (factor, turn) in zip(posed, headers, found, strict=True):
+    for image, header, (factor, sideways) in zip(posed, headers, found, strict=True):
         if factor is None or factor != usual[image.folder]:
             camera = image.camera
             raise UserError(
                 f"{image.path}: is {header.width}x{header.height}, but its camera is "
-                f"{camera.width}x{camera.height}; use the images that the poses were made from, or "
-                "all of them scaled by 1/2, 1/4 or 1/8"
+                f"{camera.width}x{camera.height}; use the images that the poses were estimated "
+                "from, or all of them scaled by 1/2, 1/4 or 1/8"
             )
-        size = (header.height, header.width) if turn else (header.width, header.height)
-        sizes.append((*size, turn))
+        size = (header.height, header.width) if sideways else (header.width, header.height)
+        sizes.append((*size, sideways))
     for folder, factor in usual.items():
         if factor > 1 and not folder.name.endswith(f"_{factor}"):
             logger.warning(
-                "%s: images are 1/%d of their cameras' size; scaled to it", folder, factor
+                "%s: the images are 1/%d of the size of their cameras; the cameras are scaled",
+                folder,
+                factor,
             )
     return sizes
 
 
-def _shrunk_by(image: PosedImage, header: Header) -> tuple[int | None, bool]:
-    """How many times smaller than its camera a file is, None if it is no such thing; and its turn.
+def _shrink_factor(image: PosedImage, header: Header) -> tuple[int | None, bool]:
+    """How many times smaller than its camera a file is, and whether to apply its orientation.
 
-    Pixels are taken as stored, which is what COLMAP does, unless they fit the camera only when
-    turned as the file's EXIF orientation says.
+    The factor is None if the size of the file does not match the camera. Like COLMAP, this ignores
+    the EXIF orientation, unless the image matches its camera only with the orientation applied.
     """
     camera = image.camera
-    turns = (False, True) if header.sideways else (False,)
-    for turn in turns:
-        width, height = (header.height, header.width) if turn else (header.width, header.height)
+    for sideways in (False, True) if header.sideways else (False,):
+        width, height = (header.height, header.width) if sideways else (header.width, header.height)
         factor = max(1, round(camera.width / width))
         exact = factor == 1 and (width, height) == (camera.width, camera.height)
         close = _is_close(camera.width, width, factor) and _is_close(camera.height, height, factor)
         if exact or (1 < factor <= _LARGEST_FACTOR and close):
-            return factor, turn
+            return factor, sideways
     return None, False
 
 
 def _view(
     image: PosedImage, header: Header, size: tuple[int, int, bool], resolution: int | None
 ) -> View:
-    width, height, turn = size
+    width, height, sideways = size
     width, height = _final_size(image, width, height, resolution)
     mask = None
     if image.mask is not None:
-        mask = ImageSource(image.mask, width, height, turn)
+        mask = ImageSource(image.mask, width, height, sideways)
         _check_mask(image, header, read_header(image.mask))
-    source = ImageSource(image.path, width, height, turn, header.width * header.height)
+    source = ImageSource(image.path, width, height, sideways, header.width * header.height)
     return View(image.name, image.camera.scaled(width, height), source, mask)
 
 
@@ -198,7 +204,7 @@ def _final_size(
     if resolution is None or resolution == -1:
         return width, height
     if resolution < 1:
-        raise UserError(f"a resolution of {resolution} makes no sense; use 1, 2, 4, 8 or a width")
+        raise UserError(f"resolution: {resolution} is not valid; use 1, 2, 4, 8 or a width")
     if resolution in _DIVISORS:
         divisor = resolution / image.divided
     else:
@@ -206,8 +212,8 @@ def _final_size(
     new_width, new_height = max(1, round(width / divisor)), max(1, round(height / divisor))
     if divisor > 1 and min(new_width, new_height) < _SMALLEST_SIDE:
         raise UserError(
-            f"a resolution of {resolution} makes images of {new_width}x{new_height} pixels; use 1, "
-            "2, 4 or 8 to divide their size, or a larger width"
+            f"resolution: {resolution} makes images of {new_width}x{new_height} pixels; use 1, 2, "
+            "4 or 8 to divide their size, or a larger width"
         )
     return new_width, new_height
 
@@ -217,7 +223,7 @@ def _check_mask(image: PosedImage, header: Header, mask: Header) -> None:
     if (mask.width, mask.height) not in fits:
         raise UserError(
             f"{image.mask}: the mask is {mask.width}x{mask.height}, but its image is "
-            f"{header.width}x{header.height}; make it as large"
+            f"{header.width}x{header.height}; resize the mask"
         )
 
 
@@ -237,11 +243,11 @@ def _test_names(
 
 
 def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]:
-    """Names may be whole, without their folder, or without their ending, as long as it is clear."""
+    """The image names in a test list; folder and suffix may be omitted if the rest is unique."""
     if isinstance(test_list, str | Path):
         try:
             if Path(test_list).exists() and not is_file(Path(test_list)):
-                raise ValueError("no file")
+                raise ValueError("not a file")
             lines = Path(test_list).read_text(encoding="utf-8").splitlines()
         except (OSError, ValueError) as error:
             raise UserError(
@@ -254,7 +260,7 @@ def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]
         file = name.rpartition("/")[2]
         for short in {name, name.rpartition(".")[0], file, file.rpartition(".")[0]}:
             known.setdefault(short, set()).add(name)
-    tested = set()
+    listed = set()
     for line in filter(None, (line.strip() for line in lines)):
         matches = {line} if line in names else known.get(line, set())
         if len(matches) != 1:
@@ -262,5 +268,5 @@ def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]
                 "is the name of several images" if matches else "is not an image of the dataset"
             )
             raise UserError(f"the list of test images: {quoted(line)} {problem}")
-        tested |= matches
-    return tested
+        listed |= matches
+    return listed

@@ -1,4 +1,4 @@
-"""Coloured point clouds as PLY files, read and written."""
+"""Reading and writing coloured point clouds as PLY files."""
 
 from pathlib import Path
 
@@ -17,8 +17,10 @@ _POINT = np.dtype([(name, "<f4") for name in _POSITION + _NORMAL] + [(name, "u1"
 def write_points(path: Path | str, xyz: np.ndarray, rgb: np.ndarray) -> None:
     """Write a point cloud atomically: ``xyz`` (P, 3) float, ``rgb`` (P, 3) uint8.
 
+    The normals (nx, ny, nz) are 0.
+
     Raises:
-        OSError: the folder is absent or not writable, or the disk is full.
+        OSError: the folder is missing or not writable, or the disk is full.
     """
     rows = np.zeros(len(xyz), _POINT)
     for column, name in enumerate(_POSITION):
@@ -34,16 +36,16 @@ def write_points(path: Path | str, xyz: np.ndarray, rgb: np.ndarray) -> None:
 
 
 def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
-    """Read a point cloud: xyz (P, 3) float32 and rgb (P, 3) uint8 (grey if it has none).
+    """Read a point cloud: xyz (P, 3) float32 and rgb (P, 3) uint8.
 
-    Colours of a floating type are taken as 0 to 1.
+    Floating-point colours are expected in 0..1. Without colours, all points are grey (128).
 
     Raises:
-        UserError: absent, damaged, too short, or without x, y, z.
+        UserError: the file is missing, damaged, truncated, or has no columns x, y, z.
     """
     table = open_table(path)
     if not all(name in table.columns for name in _POSITION):
-        raise UserError(f"{path}: a PLY file, but not of points: it has no x, y, z")
+        raise UserError(f"{path}: not a point cloud; the PLY file needs columns x, y, z")
     xyz = np.empty((table.count, 3), np.float32)
     rgb = np.full((table.count, 3), 128, np.uint8)
     colors = [name for name in _RGB if name in table.columns]

@@ -1,13 +1,16 @@
-"""transforms.json and its relatives -> posed images and points.
+"""transforms.json and similar files -> posed images and points.
 
-One family of files with three spellings. Blender's synthetic scenes: ``transforms_train.json``,
-``_test``, ``_val``, with ``camera_angle_x`` and names without ending. instant-ngp:
-``transforms.json`` with ``fl_x``, ``cx``, ``w`` … in pixels. nerfstudio: the same, where each
-frame may have its own, and ``ply_file_path``, ``mask_path``, ``train_filenames``. Specification:
-https://docs.nerf.studio/quickstart/data_conventions.html
+Three variants of the format are supported:
 
-All give world_from_cam in OpenGL axes (x right, y up, z backward); here it becomes cam_from_world
-in OpenCV axes. Worlds are taken as they are, neither centred nor scaled.
+- Synthetic Blender scenes: ``transforms_train.json``, ``transforms_test.json`` and
+  ``transforms_val.json`` with ``camera_angle_x``; image names have no suffix.
+- instant-ngp: ``transforms.json`` with intrinsics in pixels (``fl_x``, ``cx``, ``w`` …).
+- nerfstudio: as instant-ngp, but each frame may have its own intrinsics, and there may be
+  ``ply_file_path``, ``mask_path`` and ``train_filenames``. Specification:
+  https://docs.nerf.studio/quickstart/data_conventions.html
+
+All variants store world_from_cam in OpenGL axes (x right, y up, z backward). It is converted to
+cam_from_world in OpenCV axes. The world frame is neither centred nor scaled.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
-# From OpenGL's camera axes to OpenCV's and back.
+# Converts OpenGL's camera axes to OpenCV's; it is its own inverse.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 _Json = dict[str, Any]
@@ -43,26 +46,30 @@ _Split = Literal["train", "test"]
 
 
 def find_transforms(root: Path) -> list[Path]:
-    """The files that describe a dataset in ``root``, or [] (``root`` may be such a file itself)."""
+    """The transforms files of a dataset: [training, test], [all images], or [] if there are none.
+
+    ``root`` is a folder or a JSON file.
+    """
     if root.is_file():
         return [root] if root.suffix.lower() == ".json" else []
     train, test, val = (root / f"transforms_{split}.json" for split in ("train", "test", "val"))
     if train.is_file():
-        # Where there is a test split, the validation split is for tuning and belongs to neither.
+        # The validation split replaces a missing test split; otherwise it is not used.
         return [train, *[path for path in (test, val) if path.is_file()][:1]]
-    whole = root / "transforms.json"
-    return [whole] if whole.is_file() else []
+    single = root / "transforms.json"
+    return [single] if single.is_file() else []
 
 
-def read_nerf(files: list[Path], images: str) -> tuple[list[PosedImage], Points | None, str]:
-    """Posed images that are on disk, points, and a description.
+def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], Points | None, str]:
+    """Read posed images that are on disk, points, and a description.
 
     Args:
-        files: from `find_transforms`: one, or training and test.
-        images: another name for the folder ``images``, as with COLMAP; "images" changes nothing.
+        files: from `find_transforms`.
+        images: a folder to use instead of ``images``, for example ``images_4``.
 
     Raises:
-        UserError: files that are damaged or not of this kind, distorted cameras, no images.
+        UserError: a file is damaged or of another kind, a camera is distorted, or no image is
+            there.
     """
     posed: dict[str, PosedImage] = {}
     missing: list[str] = []
@@ -78,32 +85,23 @@ def read_nerf(files: list[Path], images: str) -> tuple[list[PosedImage], Points 
         for number, frame in enumerate(scene["frames"]):
             where = f"{path}: frame {number}"
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-                raise UserError(f"{where} has no file_path; export the file again")
+                raise UserError(f"{where}: no file_path; export the file again")
             frame_count += 1
             file = _find_file(where, path.parent, frame["file_path"], images)
             if file is None:
                 missing.append(frame["file_path"][:80])
                 continue
-            values = ChainMap(frame, scene)
-            _check_model(where, values)
-            camera = _camera(where, values, path.parent / file)
-            name = safe_name(file)
-            first, slash, _ = file.partition("/")
-            folder = path.parent / first if first and slash else (path.parent / file).parent
-            if name in posed:
-                raise UserError(f"{where} has the image {file}, as another one has; remove one")
-            posed[name] = PosedImage(
-                name,
-                camera,
-                folder,
-                (path.parent / file).relative_to(folder).as_posix(),
-                _mask(where, path.parent, frame),
-                split or splits.get(safe_name(frame["file_path"])),
-            )
+            image_split = split or splits.get(safe_name(frame["file_path"]))
+            image = _posed_image(where, path.parent, file, ChainMap(frame, scene), image_split)
+            if image.name in posed:
+                raise UserError(
+                    f"{where}: the image {file} also belongs to another frame; remove one of them"
+                )
+            posed[image.name] = image
     shown = " + ".join(path.name for path in files)
     if not posed:
         problem = (
-            f"none of its {frame_count} images is there" if frame_count else "it has no frames"
+            f"all of its {frame_count} images are missing" if frame_count else "it has no frames"
         )
         hint = f" (the first is {missing[0]!r})" if missing else ""
         raise UserError(f"{files[0]}: {problem}{hint}; check where the images are")
@@ -118,6 +116,24 @@ def read_nerf(files: list[Path], images: str) -> tuple[list[PosedImage], Points 
     return list(posed.values()), _points(files[0].parent, first_scene), shown
 
 
+def _posed_image(
+    where: str, root: Path, file: str, values: ChainMap[str, Any], split: _Split | None
+) -> PosedImage:
+    """The image ``root / file`` of a frame; ``values`` as in `_camera`."""
+    _check_model(where, values)
+    camera = _camera(where, values, root / file)
+    first, slash, _ = file.partition("/")
+    folder = root / first if first and slash else (root / file).parent
+    return PosedImage(
+        safe_name(file),
+        camera,
+        folder,
+        (root / file).relative_to(folder).as_posix(),
+        _mask(where, root, values.maps[0]),  # masks belong to frames, not to files
+        split,
+    )
+
+
 def _read_json(path: Path) -> _Json:
     try:
         scene = read_json(path)
@@ -125,7 +141,7 @@ def _read_json(path: Path) -> _Json:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
     except ValueError as error:  # not JSON, or not even text
         raise UserError(
-            f"{path}: not a whole JSON file ({str(error)[:80]}); copy it again"
+            f"{path}: not a complete JSON file ({str(error)[:80]}); copy it again"
         ) from None
     if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
         raise UserError(f"{path}: has no list of frames, so it does not describe a dataset")
@@ -137,13 +153,13 @@ def _check_model(where: str, values: Mapping[str, Any]) -> None:
     if model not in _PINHOLE_MODELS or values.get("is_fisheye"):
         kind = model if model not in _PINHOLE_MODELS else "fisheye"
         raise UserError(
-            f"{where}: its camera model is {kind[:40]}, but Gaussians need pinhole cameras; "
-            "make a dataset of the photos anew: snowsplat sfm PHOTOS -o DATASET"
+            f"{where}: the camera model is {kind[:40]}, but Gaussians need pinhole cameras; "
+            "make a new dataset from the photos: snowsplat sfm PHOTOS -o DATASET"
         )
 
 
 def _named_splits(scene: _Json) -> dict[str, _Split]:
-    """nerfstudio's own lists of files, by `safe_name`."""
+    """The split of each image in nerfstudio's lists of files; keys are from `safe_name`."""
     splits: dict[str, _Split] = {}
     for key in ("val_filenames", "test_filenames", "train_filenames"):
         names = scene.get(key)
@@ -152,21 +168,21 @@ def _named_splits(scene: _Json) -> dict[str, _Split]:
     return splits
 
 
-def _at_home(where: str, root: Path, name: str) -> Path:
-    """``root / name``, where the name does not lead out of the folder ``root``."""
+def _path_inside(where: str, root: Path, name: str) -> Path:
+    """``root / name``; raises `UserError` if that is outside the folder ``root``."""
     path = inside(root, name.replace("\\", "/"))
     if path is None:
         raise UserError(
-            f"{where} names {quoted(name)}, which is not in the folder of the file; copy it there "
-            "and name it from there"
+            f"{where}: {quoted(name)} is not in the folder of the JSON file; copy it there and use "
+            "a relative path"
         )
     return path
 
 
 def _find_file(where: str, root: Path, name: str, images: str) -> str | None:
-    """The image that a frame names, as a path from ``root``; None if it is absent."""
+    """The path of a frame's image relative to ``root``; None if it is missing."""
     name = name.replace("\\", "/").removeprefix("./")
-    _at_home(where, root, name)  # what is left of ".//x" is no longer relative
+    _path_inside(where, root, name)  # after removeprefix: ".//x" has become the absolute path "/x"
     if images != "images" and name.startswith("images/"):
         name = f"{images}/{name.removeprefix('images/')}"
     for suffix in ("", *IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES)):
@@ -175,14 +191,14 @@ def _find_file(where: str, root: Path, name: str, images: str) -> str | None:
     return None
 
 
-def _mask(where: str, root: Path, frame: _Json) -> Path | None:
+def _mask(where: str, root: Path, frame: Mapping[str, Any]) -> Path | None:
     name = frame.get("mask_path")
     if not isinstance(name, str) or not name:
         return None
-    path = _at_home(where, root, name)
+    path = _path_inside(where, root, name)
     if not is_file(path):
         raise UserError(
-            f"{where} names the mask {path}, which is absent; add it or remove its entry"
+            f"{where}: the mask {path} is missing; add it or remove its entry from the file"
         )
     return path
 
@@ -193,33 +209,42 @@ def _number(where: str, values: Mapping[str, Any], key: str) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise UserError(f"{where}: {key} should be a number, not {quoted(value)}")
-    if not abs(value) < 1e9:  # not a number, or a damaged one
-        raise UserError(f"{where}: {key} is {str(value)[:40]}, which makes no sense")
+    if not abs(value) < 1e9:  # NaN, or damaged
+        raise UserError(f"{where}: {key} is {str(value)[:40]}, which is not valid; correct it")
     return float(value)
 
 
 def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
-    """The camera of a frame; ``values`` are the file's, overridden by the frame's own."""
+    """The camera of a frame.
+
+    Args:
+        where: the start of error messages.
+        values: the entries of the frame and, for those that it lacks, of the file.
+        image: the image file, which provides the size if ``values`` has none.
+    """
     distortion = {key: _number(where, values, key) for key in _DISTORTION}
     if any(distortion.values()):
         shown = ", ".join(f"{key} = {value:g}" for key, value in distortion.items() if value)
         raise UserError(
-            f"{where}: the lens is distorted ({shown}), and Gaussians are drawn without; "
-            "make a dataset of the photos anew: snowsplat sfm PHOTOS -o DATASET"
+            f"{where}: the camera has lens distortion ({shown}), but Gaussians are rendered "
+            "without; make a new dataset from the photos: snowsplat sfm PHOTOS -o DATASET"
         )
     width, height = _number(where, values, "w"), _number(where, values, "h")
     if width is None or height is None:
         header = read_header(image)
         width, height = header.width, header.height
     if width < 1 or height < 1:
-        raise UserError(f"{where}: an image size of {width:g}x{height:g} makes no sense")
+        raise UserError(f"{where}: the image size {width:g}x{height:g} is not valid; correct it")
     width, height = round(width), round(height)
     fx, fy = _focal(where, values, "x", width), _focal(where, values, "y", height)
-    fx, fy = fy if fx is None else fx, fx if fy is None else fy  # square pixels if one is told
+    # Pixels are square if there is only one focal length.
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
-        raise UserError(f"{where}: has no focal length (fl_x or camera_angle_x); export it again")
+        raise UserError(f"{where}: no focal length (fl_x or camera_angle_x); export it again")
     if fx <= 0 or fy <= 0:
-        raise UserError(f"{where}: focal lengths of {fx:g} and {fy:g} pixels make no sense")
+        raise UserError(
+            f"{where}: the focal lengths {fx:g} and {fy:g} pixels are not valid; correct them"
+        )
     cx, cy = _number(where, values, "cx"), _number(where, values, "cy")
     return Camera(
         width,
@@ -233,7 +258,10 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
 
 
 def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
-    """Focal length in pixels along an axis, from any of its spellings."""
+    """Focal length in pixels along an axis ("x" or "y"), or None.
+
+    It is read from ``fl_x``, ``camera_angle_x`` (radians) or ``x_fov`` (degrees).
+    """
     pixels = _number(where, values, f"fl_{axis}")
     if pixels is not None:
         return pixels
@@ -244,26 +272,28 @@ def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float
     if angle is None:
         return None
     if not 0 < angle < math.pi:
-        raise UserError(f"{where}: a field of view of {math.degrees(angle):g}° makes no sense")
+        raise UserError(
+            f"{where}: the field of view {math.degrees(angle):g}° is not valid; correct it"
+        )
     return 0.5 * size / math.tan(0.5 * angle)
 
 
 def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
-    """cam_from_world (3, 4) float64, OpenCV axes, of a frame's transform_matrix."""
+    """cam_from_world (3, 4) float64, OpenCV axes, from the transform_matrix of a frame."""
     try:
         matrix = np.array(frame["transform_matrix"], np.float64)
     except (KeyError, TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < 1e15).all():
-        raise UserError(f"{where}: transform_matrix should be 4 rows of 4 numbers; export it again")
+        raise UserError(f"{where}: transform_matrix must be 4 rows of 4 numbers; export it again")
     axes = matrix[:3, :3]
-    # A scaled camera object gives a scaled matrix; only its directions matter. Rounding of
-    # exporters is mended by the nearest rotation, anything worse is no rotation.
+    # A scaled camera object in Blender has a scaled matrix; only the directions are used. The
+    # nearest rotation corrects rounding errors of exporters. Larger differences are an error.
     scale = np.cbrt(abs(np.linalg.det(axes)))
     u, _, vt = np.linalg.svd(axes / scale if scale > 1e-9 else np.zeros((3, 3)))
     rotation = u @ vt
     if scale <= 1e-9 or np.abs(rotation * scale - axes).max() > 1e-2 * scale:
-        raise UserError(f"{where}: transform_matrix holds no rotation; export it again")
+        raise UserError(f"{where}: transform_matrix is not a rotation; export it again")
     if np.linalg.det(rotation) < 0:
         raise UserError(f"{where}: transform_matrix mirrors the world; export it again")
     world_from_cam = np.concatenate([rotation @ _FLIP, matrix[:3, 3:]], axis=1)
@@ -271,20 +301,20 @@ def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
 
 
 def _points(root: Path, scene: _Json) -> Points | None:
-    """The point cloud that belongs to a dataset, in the frame of its poses.
+    """The point cloud of a dataset, in the world frame of its poses; None if there is none.
 
-    ``ply_file_path`` is in that frame. So is ``points3d.ply`` beside Blender scenes. nerfstudio
-    keeps the COLMAP model it began with, and notes in ``applied_transform`` what it did to it
-    since.
+    ``ply_file_path`` is in that frame, and so is the ``points3d.ply`` of a Blender scene.
+    nerfstudio stores the original COLMAP model, and in ``applied_transform`` and ``applied_scale``
+    the similarity from the frame of that model to the frame of the poses.
     """
     named = scene.get("ply_file_path")
     path = root / "points3d.ply"
     if isinstance(named, str):
-        path = _at_home(f"{root}: ply_file_path", root, named)
+        path = _path_inside(f"{root}: ply_file_path", root, named)
     if is_file(path):
         return usable_points(path, *read_points_ply(path))
     if isinstance(named, str):
-        logger.warning("%s: the points it should begin with are missing", path)
+        logger.warning("%s: the point cloud (ply_file_path) is missing", path)
     models = find_models(root / "colmap" / "sparse")
     points = read_points(models[0]) if models and "applied_transform" in scene else None
     if points is None:
@@ -294,6 +324,6 @@ def _points(root: Path, scene: _Json) -> Points | None:
         scale = float(scene.get("applied_scale", 1.0))
         xyz = transform_points(transform, points.xyz.to(torch.float64)) * scale
     except (TypeError, ValueError, IndexError, RuntimeError, OverflowError):
-        logger.warning("%s: applied_transform makes no sense; COLMAP's points are left out", root)
+        logger.warning("%s: applied_transform is not valid; COLMAP's points are not used", root)
         return None
     return usable_points(models[0], xyz.numpy(), points.rgb.numpy())
