@@ -1,0 +1,203 @@
+"""The mutants of a Python file: copies of it with one small fault each.
+
+mutmut's operators make the faults (``mutmut.mutation.mutators``). mutmut's own runner is not used:
+it leaves out decorated functions, defaults of dataclasses and constants of modules, which is where
+the numbers of a paper stand.
+"""
+
+from __future__ import annotations
+
+import ast
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import libcst as cst
+import libcst.matchers as m
+from libcst.metadata import (
+    ByteSpanPositionProvider,
+    MetadataWrapper,
+    ParentNodeProvider,
+    PositionProvider,
+)
+from mutmut.mutation import mutators
+
+#: Never mutated. Annotations and imports do nothing, or break the file at once. What a `raise`
+#: holds is the text of a message: a test checks that an error is raised, not how it reads.
+_SKIPPED = (cst.Annotation, cst.Decorator, cst.Import, cst.ImportFrom, cst.Raise, cst.Assert)
+#: Calls whose arguments are not removed or replaced: each such call would fail.
+_WHOLE_CALLS = {"len", "isinstance", "range", "super", "zip"}
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One fault in one file.
+
+    Attributes:
+        file: the file, relative to the package.
+        line: where the fault begins, from 1.
+        lines: the lines of which a test must execute one to be able to notice the fault; None for
+            code outside of functions, which is executed by the import.
+        was, becomes: the changed lines before and after, without indentation.
+        source: the whole file with the fault.
+    """
+
+    file: str
+    line: int
+    lines: range | None
+    was: str
+    becomes: str
+    source: bytes
+
+    def diff(self) -> str:
+        """The fault as a person reads it."""
+        lines = [f"{self.file}:{self.line}"]
+        lines += [f"  - {line}" for line in self.was.splitlines()]
+        lines += [f"  + {line}" for line in self.becomes.splitlines()]
+        return "\n".join(lines)
+
+
+def _smaller_number(node: cst.Float) -> Iterator[cst.Float]:
+    """1.6 → 1.5: mutmut adds 1, which a test of a small constant notices too easily."""
+    if node.evaluated_value:
+        yield node.with_changes(value=repr(node.evaluated_value * 0.9375))
+
+
+def _no_statement(node: cst.Expr) -> Iterator[cst.BaseSmallStatement]:
+    """``f(x)`` → ``pass``: a call for its effect alone."""
+    if isinstance(node.value, cst.Call):
+        yield cst.Pass()
+
+
+def _arguments(node: cst.Call) -> Iterator[cst.Call]:
+    """Not ``device=``: without it a tensor is on the CPU, where the tests run."""
+    devices = [arg for arg in node.args if arg.keyword and arg.keyword.value == "device"]
+    for changed in mutators.operator_arg_removal(node):
+        if all(arg in changed.args for arg in devices):
+            yield changed
+
+
+def _string(node: cst.BaseString) -> Iterator[cst.BaseString]:
+    """Of mutmut's three changed strings the first, which adds letters; the others change case."""
+    yield from list(mutators.operator_string(node))[:1]
+
+
+_REPLACED = {mutators.operator_string: _string, mutators.operator_arg_removal: _arguments}
+_OPERATORS = [
+    *((kind, _REPLACED.get(operator, operator)) for kind, operator in mutators.mutation_operators),
+    (cst.Float, _smaller_number),
+    (cst.Expr, _no_statement),
+]
+
+
+def mutants_of(file: str, source: bytes) -> list[Mutant]:
+    """All mutants of ``source`` that parse and differ from it and from each other."""
+    visitor = _Visitor()
+    wrapper = MetadataWrapper(cst.parse_module(source))
+    wrapper.visit(visitor)
+    found: dict[bytes, Mutant] = {}
+    for node, changed in visitor.changes:
+        mutated = _mutated(source, wrapper, node, changed)
+        if mutated not in found and mutated != source and _parses(mutated):
+            line, was, becomes = _changed_lines(source, mutated)
+            lines = _executed_lines(wrapper, node)
+            found[mutated] = Mutant(file, line, lines, was, becomes, mutated)
+    return list(found.values())
+
+
+def _parses(source: bytes) -> bool:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            ast.parse(source)
+    except SyntaxError:
+        return False
+    return True
+
+
+class _Visitor(cst.CSTVisitor):
+    """Collects the nodes with what may stand in their place."""
+
+    METADATA_DEPENDENCIES = (PositionProvider, ByteSpanPositionProvider, ParentNodeProvider)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.changes: list[tuple[cst.CSTNode, cst.CSTNode]] = []
+
+    def on_visit(self, node: cst.CSTNode) -> bool:
+        if isinstance(node, _SKIPPED) or _is_docstring(node) or _asks_for_device(node):
+            return False
+        whole = isinstance(node, cst.Call) and getattr(node.func, "value", None) in _WHOLE_CALLS
+        for kind, operator in _OPERATORS:
+            if isinstance(node, kind) and not whole:
+                self.changes += [(node, changed) for changed in operator(node)]
+        return True
+
+
+def _is_docstring(node: cst.CSTNode) -> bool:
+    return isinstance(node, cst.Expr) and isinstance(
+        node.value, cst.SimpleString | cst.ConcatenatedString
+    )
+
+
+def _asks_for_device(node: cst.CSTNode) -> bool:
+    """``x.device.type == "cpu"``: of its two answers the tests see one."""
+    return m.matches(
+        node,
+        m.Comparison(
+            left=m.Attribute(
+                attr=m.Name("type"),
+                value=m.Name("device") | m.Attribute(attr=m.Name("device")),
+            )
+        ),
+    )
+
+
+def _mutated(
+    source: bytes, wrapper: MetadataWrapper, node: cst.CSTNode, changed: cst.CSTNode
+) -> bytes:
+    """The file with ``changed`` in the place of ``node``."""
+    span = wrapper.resolve(ByteSpanPositionProvider).get(node)
+    if span is not None:
+        end = span.start + span.length
+        code = wrapper.module.code_for_node(node).strip().encode()
+        if code and source[span.start : end] == code:
+            text = wrapper.module.code_for_node(changed).strip().encode()
+            return source[: span.start] + text + source[end:]
+    # The span is not the code of the node (parentheses, lines that take their indentation from
+    # around it): slower.
+    return cst.ensure_type(wrapper.module.deep_replace(node, changed), cst.Module).bytes
+
+
+def _changed_lines(before: bytes, after: bytes) -> tuple[int, str, str]:
+    """The first line, from 1, that differs, and the lines that differ, before and after."""
+    was, becomes = before.decode().splitlines(), after.decode().splitlines()
+    shorter = min(len(was), len(becomes))
+    first = next((i for i in range(shorter) if was[i] != becomes[i]), shorter)
+    same = range(shorter - first)
+    last = next((i for i in same if was[-1 - i] != becomes[-1 - i]), shorter - first)
+    was, becomes = was[first : len(was) - last], becomes[first : len(becomes) - last]
+    return first + 1, _stripped(was), _stripped(becomes)
+
+
+def _stripped(lines: list[str]) -> str:
+    return "\n".join(line.strip() for line in lines)
+
+
+def _executed_lines(wrapper: MetadataWrapper, node: cst.CSTNode) -> range | None:
+    """See `Mutant.lines`: those of the node and of the simple statement around it."""
+    positions = wrapper.resolve(PositionProvider)
+    parents = wrapper.resolve(ParentNodeProvider)
+    statement: cst.CSTNode | None = None
+    inner = node
+    while (parent := parents.get(inner)) is not None:
+        if isinstance(inner, cst.BaseSmallStatement) and statement is None:
+            statement = inner
+        if isinstance(parent, cst.FunctionDef):
+            # Defaults are evaluated by the import.
+            if inner is not parent.body:
+                return None
+            spans = [positions[n] for n in (node, statement) if n is not None and n in positions]
+            return range(min(s.start.line for s in spans), max(s.end.line for s in spans) + 1)
+        inner = parent
+    return None
