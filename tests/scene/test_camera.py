@@ -1,4 +1,4 @@
-"""The camera's conventions: where points fall, what scaling keeps."""
+"""The conventions of `Camera`: projection, scaling, gradients of the pose."""
 
 import pytest
 import torch
@@ -24,13 +24,13 @@ def test_position_and_inverse(camera):
     assert torch.allclose(there_and_back + camera.cam_from_world[:, 3], torch.ones(3, dtype=F64))
 
 
-def test_the_point_looked_at_falls_on_the_principal_point(camera):
+def test_the_target_projects_to_the_principal_point(camera):
     position, depth = camera.project(torch.zeros(1, 3, dtype=F64))
     assert torch.allclose(position, torch.tensor([[320.25, 241.5]], dtype=F64))
     assert torch.allclose(depth, torch.tensor([14.0**0.5], dtype=F64))
 
 
-def test_scaling_moves_projections_with_the_pixels(camera):
+def test_scaling_scales_projections(camera):
     points = torch.randn(20, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
     small = camera.scaled(320, 241)
     ratio = torch.tensor([320 / 641, 241 / 480], dtype=F64)
@@ -38,7 +38,7 @@ def test_scaling_moves_projections_with_the_pixels(camera):
     assert (camera.downscaled(4).width, camera.downscaled(4).height) == (160, 120)
 
 
-def test_pose_gradient_reaches_through(camera):
+def test_position_is_differentiable(camera):
     pose = camera.cam_from_world.clone().requires_grad_()
     Camera(8, 8, 10.0, 10.0, 4.0, 4.0, pose).position.sum().backward()
     assert pose.grad is not None
@@ -46,7 +46,7 @@ def test_pose_gradient_reaches_through(camera):
 
 
 @pytest.mark.parametrize("wrong", [{"width": 0}, {"fx": 0.0}, {"fy": float("nan")}])
-def test_nonsense_is_refused(camera, wrong):
+def test_invalid_values_are_rejected(camera, wrong):
     fields = {name: getattr(camera, name) for name in Camera.__dataclass_fields__}
     with pytest.raises(ValueError, match="camera needs"):
         Camera(**{**fields, **wrong})

@@ -1,4 +1,4 @@
-"""Lists of cameras: back and forth, and what is refused."""
+"""Camera lists: round trip, and invalid files."""
 
 import json
 
@@ -17,7 +17,7 @@ def camera(x: float) -> Camera:
     return Camera(64, 48, 55.0, 56.0, 32.0, 24.0, look_at(position, 0 * up, up))
 
 
-def test_there_and_back(tmp_path):
+def test_round_trip(tmp_path):
     cameras = [camera(0.0), camera(2.5)]
     write_cameras(tmp_path / "list.json", [("a", cameras[0]), ("b <c>", cameras[1])])
     names, read = read_cameras(tmp_path / "list.json")
@@ -27,7 +27,7 @@ def test_there_and_back(tmp_path):
         torch.testing.assert_close(one.cam_from_world, other.cam_from_world)
 
 
-def test_refused(tmp_path):
+def test_invalid_lists_are_rejected(tmp_path):
     path = tmp_path / "list.json"
     with pytest.raises(UserError, match="no such file"):
         read_cameras(path)
@@ -36,7 +36,7 @@ def test_refused(tmp_path):
         read_cameras(path)
     for content in ("{}", "[]", "3"):
         path.write_text(content)
-        with pytest.raises(UserError, match="is no list of cameras"):
+        with pytest.raises(UserError, match="not a camera list"):
             read_cameras(path)
     write_cameras(path, [("a", camera(0.0))])
     whole = json.loads(path.read_text())[0]

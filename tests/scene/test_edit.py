@@ -1,4 +1,4 @@
-"""Editing: the scene is the same thing, elsewhere; what is dropped is what was asked for."""
+"""Editing: transformed scenes look the same; crop, decimate and merge select the right rows."""
 
 import math
 
@@ -37,7 +37,7 @@ def random_similarity(seed: int) -> Similarity:
 
 
 def colors(gaussians: Gaussians, directions: torch.Tensor) -> torch.Tensor:
-    """(N, M, 3) as seen along directions (M, 3), before the clamp."""
+    """(N, M, 3) colours along directions (M, 3), before they are clamped."""
     basis = reference.sh_basis(directions, gaussians.sh_degree)
     coefficients = torch.cat([gaussians.sh_dc, gaussians.sh_rest], 1)
     return 0.5 + torch.einsum("mk,nkc->nmc", basis, coefficients)
@@ -45,7 +45,7 @@ def colors(gaussians: Gaussians, directions: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_colours_turn_with_the_scene(degree, seed):
+def test_colours_rotate_with_the_scene(degree, seed):
     gaussians, similarity = random_gaussians(20, degree), random_similarity(seed)
     moved = edit.transform(gaussians, similarity)
     directions = torch.nn.functional.normalize(
@@ -61,15 +61,15 @@ def test_sh_rotations_are_orthogonal_and_compose():
     for (one, two), both in zip(pairs, edit.sh_rotation(a @ b, 3), strict=True):
         torch.testing.assert_close(one @ one.T, torch.eye(len(one)).double(), rtol=0, atol=1e-12)
         torch.testing.assert_close(one @ two, both, rtol=0, atol=1e-12)
-    # About z, a quarter turn takes x to y: of degree 1, whose order is (-y, z, -x).
+    # A quarter turn around z maps x to y. The order of the functions of degree 1 is (-y, z, -x).
     quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     expected = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).double()
     torch.testing.assert_close(edit.sh_rotation(quarter, 1)[0], expected, rtol=0, atol=1e-12)
 
 
-def test_covariances_turn_and_grow_with_the_scene():
+def test_covariances_rotate_and_scale_with_the_scene():
     gaussians, similarity = random_gaussians(30, 1), random_similarity(2)
-    gaussians.quats[3] = 0.0  # stands for no rotation
+    gaussians.quats[3] = 0.0  # means the identity
 
     def covariances(of: Gaussians) -> torch.Tensor:
         axes = rotation_from_quat(of.quats) * of.scales[:, None, :]
@@ -94,7 +94,8 @@ def test_a_moved_scene_renders_the_same_from_a_moved_camera():
     before = render(gaussians, camera).image
     after = render(edit.transform(gaussians, similarity), moved_camera).image
     assert float(before.std()) > 0.05
-    # What is left is the low-pass filter of the renderer: pixels, which no similarity changes.
+    # The tolerance is for the low-pass filter of the renderer. Its size is in pixels, so the
+    # similarity does not scale it.
     torch.testing.assert_close(after, before, rtol=0, atol=2e-3)
 
 
@@ -107,7 +108,7 @@ def test_crop():
     torch.testing.assert_close(kept.sh_rest, gaussians.sh_rest[inside])
 
 
-def test_decimate_keeps_what_is_large_and_opaque():
+def test_decimate_keeps_large_and_opaque_gaussians():
     gaussians = random_gaussians(100, 2)
     gaussians.opacity_logits[:] = -3.0
     gaussians.opacity_logits[[7, 50]] = 3.0
@@ -128,7 +129,7 @@ def test_merge_raises_the_degree():
     assert len(edit.merge([low])) == 3
 
 
-def test_sh_degree_changes_what_is_beyond_it_only():
+def test_with_sh_degree_changes_only_higher_coefficients():
     gaussians = random_gaussians(5, 2)
     for degree in range(4):
         changed = edit.with_sh_degree(gaussians, degree)
@@ -139,7 +140,7 @@ def test_sh_degree_changes_what_is_beyond_it_only():
     assert len(edit.with_sh_degree(gaussians.select(torch.zeros(0).long()), 3)) == 0
 
 
-def test_nothing_and_a_half_turn():
+def test_transform_of_no_gaussians_and_rotation_by_half_a_turn():
     none = random_gaussians(0, 3)
     assert len(edit.transform(none, random_similarity(1))) == 0
     half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))

@@ -1,4 +1,4 @@
-"""The model: activations, sets, and where scenes begin."""
+"""`Gaussians`: activations, selecting and joining rows, initialisation."""
 
 import math
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ def test_activations():
     g.sh_dc[0, 0] = torch.tensor([0.5, 0.0, -0.5]) / SH_C0
     torch.testing.assert_close(g.scales[0], torch.tensor([1.0, 2.0, math.exp(-1.0)]))
     torch.testing.assert_close(g.rotations[0], torch.tensor([0.6, 0.0, 0.8, 0.0]))
-    assert g.rotations[1].isfinite().all()  # a zero quaternion is no NaN
+    assert g.rotations[1].isfinite().all()  # also for a zero quaternion
     torch.testing.assert_close(g.opacities, torch.tensor([0.75, 0.5]))
     torch.testing.assert_close(g.base_colors[0], torch.tensor([1.0, 0.5, 0.0]))
 
@@ -39,7 +39,7 @@ def test_sh_degree(rest, degree):
 
 
 @pytest.mark.parametrize("position", range(6))
-def test_shapes_and_dtypes_that_do_not_fit(position):
+def test_shapes_and_dtypes_that_do_not_match(position):
     for wrong in (torch.zeros(3, 2), torch.zeros(4, 3), torch.zeros(5, 7, 3), torch.zeros(())):
         tensors = zeros(5)
         tensors[position] = wrong
@@ -74,8 +74,8 @@ def test_select_append_cat():
     assert g.detach().means.data_ptr() == g.means.data_ptr() != g.clone().means.data_ptr()
 
 
-def test_from_points_takes_colour_and_spacing():
-    # Corners of a unit square: two neighbours at 1, one at sqrt(2).
+def test_from_points_uses_colour_and_spacing():
+    # The corners of a unit square. Each has two neighbours at distance 1 and one at sqrt(2).
     xyz = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     rgb = torch.tensor([[0, 128, 255]] * 4, dtype=torch.uint8)
     g = Gaussians.from_points(Points(xyz, rgb), sh_degree=2, initial_opacity=0.1)
@@ -98,7 +98,7 @@ def test_fewer_points_than_neighbours(n):
     assert g.log_scales.isfinite().all()
 
 
-def test_points_that_coincide_have_a_size_and_none_is_an_error():
+def test_coincident_points_have_a_size_and_no_points_is_an_error():
     xyz = torch.cat([torch.zeros(5, 3), torch.rand(20, 3)])
     g = Gaussians.from_points(Points(xyz, torch.zeros(25, 3, dtype=torch.uint8)))
     assert g.log_scales.isfinite().all()

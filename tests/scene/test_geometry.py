@@ -27,7 +27,7 @@ def random_quats(n: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(n, 4, generator=torch.Generator().manual_seed(seed), dtype=F64)
 
 
-def test_quarter_turn_about_z_takes_x_to_y():
+def test_quarter_turn_around_z_maps_x_to_y():
     half = math.pi / 4
     rotation = rotation_from_quat(torch.tensor([math.cos(half), 0, 0, math.sin(half)], dtype=F64))
     assert torch.allclose(
@@ -56,7 +56,7 @@ def test_quaternion_round_trip():
     "axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, -1], [1, 2, 3]]
 )
 @pytest.mark.parametrize("angle", [0.0, 1e-9, math.pi - 1e-9, math.pi])
-def test_round_trip_of_rotations_near_none_and_half_turns(axis, angle):
+def test_round_trip_of_rotations_near_0_and_180_degrees(axis, angle):
     direction = torch.tensor(axis, dtype=F64)
     direction = direction / direction.norm()
     quat = torch.cat(
@@ -77,7 +77,7 @@ def test_zero_quaternion_is_the_identity_with_finite_gradient():
 def test_gradients():
     quats = random_quats(4, 1).requires_grad_()
     assert torch.autograd.gradcheck(rotation_from_quat, quats)
-    # The inverse too, near half turns and in general.
+    # Also the gradient of the inverse: for random rotations, and near rotations by 180°.
     near_half_turns = torch.eye(4, dtype=F64)[1:] + 0.01
     for start in (quats.detach(), near_half_turns):
         assert torch.autograd.gradcheck(
@@ -100,7 +100,7 @@ def test_rigid_inverse_and_composition():
     assert torch.allclose(compose_rigid(invert_rigid(a_from_b), a_from_b), identity, atol=1e-12)
 
 
-def test_look_at_puts_the_target_ahead_and_up_above():
+def test_look_at_has_the_target_in_front_and_up_upwards():
     position = torch.tensor([3.0, -2.0, 1.0], dtype=F64)
     target = torch.tensor([0.5, 0.5, 0.0], dtype=F64)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
@@ -115,7 +115,7 @@ def test_look_at_puts_the_target_ahead_and_up_above():
     assert torch.allclose(torch.linalg.det(pose[:, :3]), torch.ones((), dtype=F64))
 
 
-def test_look_at_along_up_and_onto_itself():
+def test_look_at_along_up_and_at_its_own_position():
     up = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
     pose = look_at(5 * up, 0 * up, up)
     assert torch.allclose(pose[:, :3] @ pose[:, :3].T, torch.eye(3, dtype=F64))
@@ -132,7 +132,7 @@ def similarity() -> Similarity:
     return Similarity(2.5, rotation, torch.tensor([1.0, -2.0, 3.0], dtype=F64))
 
 
-def test_similarity_scales_then_turns_then_moves():
+def test_similarity_scales_then_rotates_then_translates():
     quarter_about_z = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=F64)
     new_from_old = Similarity(2.0, quarter_about_z, torch.tensor([10.0, 0, 0], dtype=F64))
     points = torch.tensor([[1.0, 0, 0], [0, 1, 5]], dtype=F64)
@@ -149,7 +149,7 @@ def test_similarity_and_its_inverse_cancel():
     assert torch.equal(Similarity.identity().apply(points), points)
 
 
-def test_similarity_leaves_what_cameras_see_as_it_is():
+def test_similarity_does_not_change_what_cameras_see():
     poses, points, there = rigid(4), random_points(6, 5), similarity()
     moved = there.apply_to_poses(poses)
     in_camera = transform_points(poses, points)
@@ -159,7 +159,7 @@ def test_similarity_leaves_what_cameras_see_as_it_is():
     assert torch.allclose(invert_rigid(moved)[:, :, 3], there.apply(centres))
 
 
-def test_similarity_survives_json():
+def test_similarity_json_round_trip():
     there = similarity()
     back = Similarity.from_json(json.loads(json.dumps(there.to_json())))
     assert back.scale == there.scale
@@ -177,15 +177,15 @@ def test_similarity_survives_json():
         (1.0, torch.eye(4), torch.zeros(3), r"\(3, 3\)"),
     ],
 )
-def test_what_is_no_similarity_is_refused(scale, rotation, translation, message):
+def test_invalid_similarities_are_rejected(scale, rotation, translation, message):
     with pytest.raises(ValueError, match=message):
         Similarity(scale, rotation, translation)
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_similarity_is_found_from_pairs(flat):
+def test_similarity_from_exact_pairs(flat):
     source, there = random_points(12), similarity()
-    if flat:  # four photos on a table top: one singular value is 0
+    if flat:  # all points in a plane: one singular value is 0
         source[:, 2] = 0
     found = similarity_from_points(source, there.apply(source))
     assert found.scale == pytest.approx(there.scale)
@@ -193,7 +193,7 @@ def test_similarity_is_found_from_pairs(flat):
     assert torch.allclose(found.translation, there.translation)
 
 
-def test_similarity_of_noisy_pairs_is_the_best_one():
+def test_similarity_of_noisy_pairs_minimises_the_error():
     source = random_points(30)
     target = similarity().apply(source) + 0.1 * random_points(30, 1)
 
@@ -217,7 +217,7 @@ def test_similarity_is_never_a_reflection():
     assert float(torch.linalg.det(found.rotation)) == pytest.approx(1)
 
 
-def test_similarity_of_too_little_is_refused():
+def test_underdetermined_similarities_are_rejected():
     points = random_points(5)
     with pytest.raises(ValueError, match="three"):
         similarity_from_points(points[:2], points[:2])
@@ -232,7 +232,7 @@ def test_similarity_of_too_little_is_refused():
 
 
 def interleaved(cell: tuple[int, int, int]) -> int:
-    """The Morton code by its definition, one bit at a time."""
+    """The Morton code from its definition, one bit at a time."""
     return sum(
         ((cell[axis] >> bit) & 1) << (3 * bit + axis)
         for bit in range(MORTON_BITS)
@@ -240,14 +240,14 @@ def interleaved(cell: tuple[int, int, int]) -> int:
     )
 
 
-def test_morton_order_is_that_of_the_interleaved_bits():
+def test_morton_order_sorts_by_interleaved_bits():
     side = 2**MORTON_BITS - 1
     cells = list(itertools.product((0, 1, 5, 2**20, side), repeat=3))
     order = morton_order(torch.tensor(cells, dtype=torch.float64))
     assert [cells[i] for i in order] == sorted(cells, key=interleaved)
 
 
-def test_morton_order_keeps_neighbours_together_beside_a_stray_point():
+def test_morton_order_keeps_neighbours_together_despite_an_outlier():
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(4000, 3, generator=generator)
     points[17] = torch.tensor([1000.0, -1000.0, 500.0])
@@ -259,6 +259,6 @@ def test_morton_order_keeps_neighbours_together_beside_a_stray_point():
     assert steps < 0.2 * shuffled
 
 
-def test_morton_order_of_equal_points_and_of_none():
+def test_morton_order_of_equal_points_and_of_no_points():
     assert torch.equal(morton_order(torch.ones(5, 3)), torch.arange(5))
     assert len(morton_order(torch.empty(0, 3))) == 0

@@ -1,4 +1,4 @@
-"""Where a viewer starts."""
+"""The initial view of a viewer."""
 
 import math
 
@@ -15,17 +15,17 @@ def test_view_of_a_camera():
     position = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
     target = torch.tensor([1.0, -2.0, 8.0], dtype=torch.float64)
     pose = look_at(position, target, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
-    start = view_of_camera(Camera(100, 300, 150.0, 150.0, 50.0, 150.0, pose), 2.0)
-    assert start.position == pytest.approx((1, -2, 3))
-    assert start.target == pytest.approx((1, -2, 5))
-    assert start.fov == pytest.approx(90.0)  # of the longer side
+    view = view_of_camera(Camera(100, 300, 150.0, 150.0, 50.0, 150.0, pose), 2.0)
+    assert view.position == pytest.approx((1, -2, 3))
+    assert view.target == pytest.approx((1, -2, 5))
+    assert view.fov == pytest.approx(90.0)  # of the longer side
 
 
-def test_a_usual_window_shows_the_whole_photo():
+def test_a_usual_window_shows_the_complete_photo():
     pose = torch.eye(3, 4, dtype=torch.float64)
     for width, height, whole in ((300, 300, 1.6), (400, 300, 1.6), (480, 300, 1.6), (600, 300, 2)):
-        start = view_of_camera(Camera(width, height, 300.0, 300.0, 1.0, 1.0, pose), 2.0)
-        assert math.tan(math.radians(start.fov / 2)) == pytest.approx(0.5 * whole)
+        view = view_of_camera(Camera(width, height, 300.0, 300.0, 1.0, 1.0, pose), 2.0)
+        assert math.tan(math.radians(view.fov / 2)) == pytest.approx(0.5 * whole)
 
 
 def balls(means: torch.Tensor, opacity_logit: float = 3.0) -> Gaussians:
@@ -37,22 +37,22 @@ def balls(means: torch.Tensor, opacity_logit: float = 3.0) -> Gaussians:
     )
 
 
-def test_overview_is_of_the_thing_not_of_what_is_far_behind():
+def test_overview_shows_the_object_and_not_the_background():
     generator = torch.Generator().manual_seed(0)
     thing = torch.randn(3000, 3, generator=generator) * 0.1 + torch.tensor([5.0, 6.0, 7.0])
     sky = torch.randn(500, 3, generator=generator) * 1000
     haze = balls(torch.randn(9000, 3, generator=generator) * 50, opacity_logit=-5.0)
     broken = balls(torch.full((5, 3), float("nan")))
     scene = Gaussians.cat([balls(thing), balls(sky), haze, broken])
-    start = overview(scene)
-    assert math.dist(start.target, (5, 6, 7)) < 0.1
-    assert 0.3 < math.dist(start.position, start.target) < 3
-    assert start.position[2] < 7  # before it
-    assert start.position[1] < 6  # above it: y points down
+    view = overview(scene)
+    assert math.dist(view.target, (5, 6, 7)) < 0.1
+    assert 0.3 < math.dist(view.position, view.target) < 3
+    assert view.position[2] < 7  # in front of it
+    assert view.position[1] < 6  # above it: y points down
 
 
 @pytest.mark.parametrize("n", [0, 1])
-def test_overview_of_next_to_nothing(n):
-    start = overview(balls(torch.ones(n, 3)))
-    assert all(map(math.isfinite, (*start.position, *start.target)))
-    assert start.position != start.target
+def test_overview_of_no_or_one_gaussian(n):
+    view = overview(balls(torch.ones(n, 3)))
+    assert all(map(math.isfinite, (*view.position, *view.target)))
+    assert view.position != view.target

@@ -1,4 +1,4 @@
-"""Up, from how cameras are held; with whole models: tests/sfm/test_orient.py."""
+"""The up direction from synthetic cameras. For complete models see tests/sfm/test_orient.py."""
 
 import math
 
@@ -13,7 +13,10 @@ UP = torch.nn.functional.normalize(torch.tensor([0.2, -0.9, 0.3], dtype=torch.fl
 
 
 def rotations(pitch: float, roll: float, sector: float) -> np.ndarray:
-    """Cameras around a point, that look down by ``pitch`` and are rolled at random."""
+    """30 cameras on an arc of ``sector`` radians around a point.
+
+    They look down by ``pitch``; their roll is random with the standard deviation ``roll``.
+    """
     random = np.random.default_rng(0)
     east = torch.linalg.cross(UP, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
     east = east / east.norm()
@@ -29,17 +32,17 @@ def rotations(pitch: float, roll: float, sector: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pitch", [0.0, 0.5, 1.0])
-def test_cameras_all_around_look_down_together(pitch):
+def test_cameras_on_a_circle_look_down(pitch):
     up = up_direction(rotations(pitch, 0.0, 6.0))
     assert float(up @ UP.numpy()) > math.cos(math.radians(0.5))
 
 
-def test_a_part_of_the_circle_and_hands_that_shake():
+def test_cameras_on_an_arc_with_random_roll():
     up = up_direction(rotations(0.3, math.radians(3), 2.0))
     assert float(up @ UP.numpy()) > math.cos(math.radians(3))
 
 
-def test_photos_held_sideways_have_little_say():
+def test_photos_rolled_by_90_degrees_have_little_weight():
     some = rotations(0.3, math.radians(2), 6.0)
     some[::4] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ some[::4]
     assert float(up_direction(some) @ UP.numpy()) > math.cos(math.radians(3))

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from snowsplat.scene.geometry import Similarity, invert_rigid, look_at, rotation_from_quat
-from snowsplat.sfm.orient import VIEWING_DISTANCE, orientation
+from snowsplat.scene.orientation import VIEWING_DISTANCE
+from snowsplat.sfm.orient import orientation
 
 F64 = torch.float64
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=F64)

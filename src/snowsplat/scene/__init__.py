@@ -1,1 +1,1 @@
-"""Cameras, Gaussians, and operations on a scene."""
+"""Cameras, Gaussians, rendering, and operations on a scene."""

@@ -15,20 +15,20 @@ from snowsplat.scene.geometry import invert_rigid, transform_points
 class Camera:
     """A pinhole camera and its pose.
 
-    A point x_cam = R x_world + t in front of it (z > 0) falls on (fx·x/z + cx, fy·y/z + cy), in
-    pixels from the upper left corner of the picture: pixel (i, j) of column i and row j has its
-    centre at (i + 0.5, j + 0.5). This is COLMAP's convention too.
+    A point x_cam = R x_world + t in front of the camera (z > 0) projects to
+    (fx·x/z + cx, fy·y/z + cy), in pixels from the upper left corner of the image. The centre of the
+    pixel in column i and row j is at (i + 0.5, j + 0.5). This is also COLMAP's convention.
 
     Raises:
-        ValueError: sizes or focal lengths that are not positive, a pose that is not (3, 4).
+        ValueError: a size or focal length is not positive, or the shape of the pose is not (3, 4).
     """
 
     width: int  # pixels
-    height: int
+    height: int  # pixels
     fx: float  # pixels
-    fy: float
-    cx: float
-    cy: float
+    fy: float  # pixels
+    cx: float  # pixels
+    cy: float  # pixels
     cam_from_world: Tensor  # (3, 4) float64, [R | t]; may require grad
 
     def __post_init__(self) -> None:
@@ -40,7 +40,7 @@ class Camera:
             raise ValueError(f"cam_from_world is (3, 4), not {tuple(self.cam_from_world.shape)}")
 
     def is_finite(self) -> bool:
-        """Whether all of it is, in the single precision of kernels."""
+        """Whether intrinsics and pose are finite in float32, the precision of the kernels."""
         pose = self.cam_from_world.detach().reshape(-1).tolist()
         return all(abs(n) < 1e38 for n in (self.fx, self.fy, self.cx, self.cy, *pose))
 
@@ -51,11 +51,11 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """(3,) the camera's centre, world frame."""
+        """(3,): the camera centre in the world frame."""
         return self.world_from_cam[:, 3]
 
     def scaled(self, width: int, height: int) -> Camera:
-        """The same view at another image size: intrinsics scaled by each axis' own ratio."""
+        """The same view at another image size: intrinsics are scaled by the ratio of each axis."""
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(
             self,
@@ -68,17 +68,17 @@ class Camera:
         )
 
     def to(self, device: torch.device) -> Camera:
-        """With its pose on a device, where rendering there finds it."""
+        """This camera with its pose on ``device``, as rendering on that device needs it."""
         return dataclasses.replace(self, cam_from_world=self.cam_from_world.to(device))
 
     def downscaled(self, factor: int) -> Camera:
-        """The camera of the image that `ImageLoader.get` gives at ``downscale=factor``."""
+        """The camera of the image that `ImageLoader.get` returns with ``downscale=factor``."""
         return self.scaled(max(1, self.width // factor), max(1, self.height // factor))
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """World points (P, 3) -> pixel positions (P, 2) and depths (P,), the camera's z.
+        """Project world points (P, 3) to pixel positions (P, 2) and depths (P,), the camera's z.
 
-        Positions mean nothing where the depth is not positive.
+        The position of a point is meaningless if its depth is not positive.
         """
         x_cam = transform_points(self.cam_from_world.to(points.dtype), points)
         depth = x_cam[:, 2]

@@ -1,7 +1,7 @@
-"""Lists of cameras as JSON, as the reference's `cameras.json` has them.
+"""Camera lists in the JSON format of `cameras.json`, as 3D Gaussian Splatting programs use it.
 
-Position and rotation are those of world_from_cam, in OpenCV axes; sizes and focal lengths are in
-pixels. The principal point is not in it: it is taken as the middle of the picture.
+Position and rotation are those of world_from_cam, in OpenCV axes. Sizes and focal lengths are in
+pixels. The format does not store the principal point; readers use the middle of the image.
 """
 
 from __future__ import annotations
@@ -18,18 +18,26 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import read_json
 
-_LARGEST = 100_000  # pixels along a side
-# What single precision can still reckon with: focal lengths in pixels, world units.
-_LEAST_FOCAL, _MOST_FOCAL, _FARTHEST = 1e-3, 1e9, 1e15
+# Largest width or height in pixels.
+_MAX_SIDE = 100_000
+# Limits of focal lengths in pixels and of coordinates in world units. Computations in float32 are
+# finite within these limits.
+_MIN_FOCAL = 1e-3
+_MAX_FOCAL = 1e9
+_MAX_COORDINATE = 1e15
 
 
 def write_cameras(path: Path, cameras: Iterable[tuple[str, Camera]]) -> None:
-    """Write names and cameras, atomically."""
+    """Write names and cameras atomically.
+
+    Raises:
+        OSError: the folder is missing or not writable, or the disk is full.
+    """
     write_json(path, entries_of(cameras))
 
 
 def entries_of(cameras: Iterable[tuple[str, Camera]]) -> list[dict[str, Any]]:
-    """What stands in such a file: JSON values."""
+    """The JSON values of a camera list."""
     entries = []
     for i, (name, camera) in enumerate(cameras):
         pose = camera.world_from_cam.detach()
@@ -49,19 +57,19 @@ def entries_of(cameras: Iterable[tuple[str, Camera]]) -> list[dict[str, Any]]:
 
 
 def read_cameras(path: Path) -> tuple[list[str], list[Camera]]:
-    """Names and cameras, in the order of the file.
+    """Read names and cameras, in the order of the file.
 
     Raises:
-        UserError: absent, damaged, or none in it.
+        UserError: the file is missing, damaged, or has no cameras.
     """
     try:
         entries = read_json(path)
     except FileNotFoundError:
-        raise UserError(f"{path}: no such file; name a list of cameras (JSON)") from None
+        raise UserError(f"{path}: no such file; use a camera list (JSON)") from None
     except (ValueError, OSError):
-        raise UserError(f"{path}: cannot be read as JSON; name a list of cameras") from None
+        raise UserError(f"{path}: cannot be read as JSON; use a camera list") from None
     if not isinstance(entries, list) or not entries:
-        raise UserError(f"{path}: is no list of cameras; it should be as an OUT/cameras.json is")
+        raise UserError(f"{path}: not a camera list; expected the format of cameras.json")
     names, cameras = [], []
     for i, entry in enumerate(entries):
         try:
@@ -70,7 +78,7 @@ def read_cameras(path: Path) -> tuple[list[str], list[Camera]]:
         except (KeyError, TypeError, ValueError, OverflowError, RuntimeError):
             raise UserError(
                 f"{path}: camera {i} is damaged; it needs width, height, fx, fy, position and "
-                "rotation, as in an OUT/cameras.json"
+                "rotation, in the format of cameras.json"
             ) from None
     return names, cameras
 
@@ -80,14 +88,15 @@ def _camera(entry: dict[str, Any]) -> Camera:
     position = torch.tensor(entry["position"], dtype=torch.float64).reshape(3)
     rotation = torch.tensor(entry["rotation"], dtype=torch.float64).reshape(3, 3)
     error = rotation @ rotation.T - torch.eye(3, dtype=torch.float64)
-    is_one = float(error.abs().max()) < 1e-3 and float(torch.linalg.det(rotation)) > 0
+    is_rotation = float(error.abs().max()) < 1e-3 and float(torch.linalg.det(rotation)) > 0
     fx, fy = float(entry["fx"]), float(entry["fy"])
-    if not (is_one and float(position.abs().max()) < _FARTHEST):
-        raise ValueError("not a rotation, or absurdly far")
-    if not (min(fx, fy) >= _LEAST_FOCAL and max(fx, fy) <= _MOST_FOCAL):
-        raise ValueError("no focal lengths")
-    if max(width, height) > _LARGEST:
+    if not (is_rotation and float(position.abs().max()) < _MAX_COORDINATE):
+        raise ValueError("not a rotation, or a position too far away")
+    if not (min(fx, fy) >= _MIN_FOCAL and max(fx, fy) <= _MAX_FOCAL):
+        raise ValueError("invalid focal lengths")
+    if max(width, height) > _MAX_SIDE:
         raise ValueError("too large")
-    rotation = rotation_from_quat(quat_from_rotation(rotation))  # exactly one, from rounded numbers
+    # The file has rounded numbers; this makes the matrix exactly orthonormal.
+    rotation = rotation_from_quat(quat_from_rotation(rotation))
     pose = torch.cat([rotation.T, -(rotation.T @ position)[:, None]], 1)
     return Camera(width, height, fx, fy, width / 2, height / 2, pose)

@@ -1,7 +1,6 @@
-"""The scene: N Gaussians, their parameters as they are optimised, and their activations.
+"""The scene: N Gaussians, their optimised parameters, and their activations.
 
-This holds numbers only. It owns no optimiser and no density control: those take a `Gaussians` and
-give back another.
+`Gaussians` holds only data. Optimisers and density control take a `Gaussians` and return another.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ SH_REST_COUNTS = (0, 3, 8, 15)
 
 
 class ColoredPoints(Protocol):
-    """What `Gaussians.from_points` needs of a point cloud (`snowsplat.data.Points` is one)."""
+    """The point cloud that `Gaussians.from_points` needs, for example `snowsplat.data.Points`."""
 
     xyz: Tensor  # (P, 3) float32, world
     rgb: Tensor  # (P, 3) uint8
@@ -32,7 +31,7 @@ class ColoredPoints(Protocol):
 
 @dataclass
 class Gaussians:
-    """N anisotropic Gaussians in the world frame, all tensors of one floating dtype on one device.
+    """N anisotropic Gaussians in the world frame. All tensors share a floating dtype and a device.
 
     ==================  ===========  ======================================================
     means               (N, 3)       centres, in world units
@@ -40,11 +39,11 @@ class Gaussians:
     quats               (N, 4)       rotation, wxyz; need not be normalised
     opacity_logits      (N,)         opacity = sigmoid(logit)
     sh_dc               (N, 1, 3)    constant SH coefficient of each colour channel
-    sh_rest             (N, K, 3)    the others, K = (degree + 1)² − 1: 0, 3, 8 or 15
+    sh_rest             (N, K, 3)    other SH coefficients, K = (degree + 1)² − 1: 0, 3, 8, 15
     ==================  ===========  ======================================================
 
     Raises:
-        ValueError: shapes, dtypes or devices that do not fit together.
+        ValueError: shapes, dtypes or devices do not match.
     """
 
     means: Tensor
@@ -58,9 +57,7 @@ class Gaussians:
         n = self.means.shape[0] if self.means.ndim else 0
         rest = self.sh_rest.shape[1] if self.sh_rest.ndim == 3 else 0
         if rest not in SH_REST_COUNTS:
-            raise ValueError(
-                f"sh_rest holds {rest} coefficients a channel; 0, 3, 8 or 15 are possible"
-            )
+            raise ValueError(f"sh_rest has {rest} coefficients per channel; expected 0, 3, 8 or 15")
         expected = {
             "means": (n, 3),
             "log_scales": (n, 3),
@@ -112,12 +109,12 @@ class Gaussians:
 
     @property
     def base_colors(self) -> Tensor:
-        """(N, 3) colour without its view-dependent part, 0.5 + C0 · sh_dc; not clamped."""
+        """(N, 3) colour without the view-dependent part: 0.5 + C0 · sh_dc, not clamped."""
         return 0.5 + SH_C0 * self.sh_dc[:, 0]
 
     @property
     def sh_degree(self) -> int:
-        """0 to 3: the degree that ``sh_rest`` has room for."""
+        """0 to 3: the SH degree, from the size of ``sh_rest``."""
         return SH_REST_COUNTS.index(self.sh_rest.shape[1])
 
     # Sets of Gaussians
@@ -139,46 +136,52 @@ class Gaussians:
         return self.map(lambda tensor: take_rows(tensor, index))
 
     def select_(self, index: Tensor) -> None:
-        """`select` in place, a tensor at a time: memory never holds two of all."""
+        """`select` in place, one tensor at a time, so that only one tensor is copied at once."""
         for name in tuple(self.parameters()):
             setattr(self, name, take_rows(getattr(self, name), index))
 
     def append(self, other: Gaussians) -> Gaussians:
-        """This set's rows, then the other's."""
+        """The rows of this set, then those of ``other``."""
         return Gaussians.cat([self, other])
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """Rows of all ``parts`` (at least one, all of one SH degree) in order."""
+        """The rows of all ``parts`` in order. There is at least one part; SH degrees are equal."""
         columns = zip(*(part.parameters().values() for part in parts), strict=True)
         return Gaussians(*(torch.cat(column) for column in columns))
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Gaussians:
-        """On another device or in another dtype; no copy where nothing changes."""
+        """These Gaussians on ``device`` and with ``dtype``; tensors are copied only if needed."""
         return self.map(lambda tensor: tensor.to(device=device, dtype=dtype))
 
     def detach(self) -> Gaussians:
-        """The same storage, cut from the autograd graph."""
+        """The same storage, detached from the autograd graph."""
         return self.map(Tensor.detach)
 
     def clone(self) -> Gaussians:
+        """A copy of all tensors."""
         return self.map(Tensor.clone)
 
-    # Where scenes begin
+    # Initialisation
 
     @staticmethod
     def from_points(
         points: ColoredPoints, sh_degree: int = 3, initial_opacity: float = 0.1
     ) -> Gaussians:
-        """One round Gaussian a point, as in the paper (section 5.1).
+        """One isotropic Gaussian per point, as in the paper (section 5.1).
 
-        The standard deviation is the mean distance to the three nearest other points, the colour is
-        the point's from every side, the rotation is the identity.
+        The standard deviation is the mean distance to the three nearest other points. The colour is
+        that of the point and does not depend on the view. The rotation is the identity.
+
+        Args:
+            points: at least one.
+            sh_degree: 0 to 3.
+            initial_opacity: in (0, 1).
 
         Raises:
-            ValueError: no points at all.
+            ValueError: there are no points.
         """
         means = points.xyz.to(torch.float32).contiguous()
         n = means.shape[0]
@@ -203,7 +206,15 @@ class Gaussians:
         sh_degree: int = 3,
         initial_opacity: float = 0.1,
     ) -> Gaussians:
-        """Random colours and places in the box ``bounds`` (2, 3), its low and its high corner."""
+        """``n`` Gaussians with random colours and positions, initialised as in `from_points`.
+
+        Args:
+            bounds: (2, 3) lower and upper corner of the box of positions.
+            n: number of Gaussians, at least 1.
+            generator: random numbers, on the CPU.
+            sh_degree: 0 to 3.
+            initial_opacity: in (0, 1).
+        """
         low, high = bounds.to(torch.float32)
         xyz = low + (high - low) * torch.rand(n, 3, generator=generator)
         rgb = torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
@@ -217,12 +228,12 @@ class _RandomPoints:
 
 
 def _spacing(points: Tensor) -> Tensor:
-    """(N,) mean distance of each point to its 3 nearest others (fewer where there are fewer)."""
+    """(N,) mean distance of each point to its 3 nearest other points (to all if fewer exist)."""
     k = min(3, points.shape[0] - 1)
     if k == 0:
         return points.new_ones(1)
     spacing = ops.neighbours(points, k=k).mean(dim=1)
-    # Points that coincide would start as Gaussians of no size, whose logarithm is -inf. The floor
-    # is relative to the cloud, so that the unit of length of the dataset does not matter.
+    # Coincident points would become Gaussians of size 0, whose logarithm is -inf. The minimum is
+    # relative to the point cloud, so it does not depend on the unit of length.
     floor = 1e-3 * float(spacing.median())
     return spacing.clamp_min(floor if floor > 0.0 else 1e-6)

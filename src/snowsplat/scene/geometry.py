@@ -1,9 +1,9 @@
 """Rotations and rigid transforms on tensors: batched, any floating dtype, differentiable.
 
-A rigid transform ``a_from_b`` is a (..., 3, 4) matrix [R | t] with x_a = R x_b + t; names compose
+A rigid transform ``a_from_b`` is a (..., 3, 4) matrix [R | t] with x_a = R x_b + t. Names compose
 like units: ``compose_rigid(a_from_b, b_from_c)`` is ``a_from_c``. Quaternions are wxyz (Hamilton).
-`Similarity` also changes the unit of length: it takes one world frame to another. `morton_order`
-sorts points so that neighbours in space are neighbours in memory.
+A `Similarity` also scales; it maps one world frame to another. `morton_order` sorts points so that
+neighbours in space become neighbours in memory.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def rotation_from_quat(quats: Tensor) -> Tensor:
     The zero quaternion gives the identity.
     """
     w, x, y, z = quats.unbind(-1)
-    # R = I + s·[…] with s = 2/|q|²: no square root, whose gradient at 0 is not finite.
+    # R = I + s·[…] with s = 2/|q|². A square root is avoided: its gradient at 0 is not finite.
     norm2 = (quats * quats).sum(-1)
     s = torch.where(norm2 > 0, 2.0 / torch.where(norm2 > 0, norm2, 1.0), 0.0)
     rows = [
@@ -43,9 +43,9 @@ def rotation_from_quat(quats: Tensor) -> Tensor:
 def quat_from_rotation(rotations: Tensor) -> Tensor:
     """Unit quaternions wxyz (..., 4), w >= 0, of rotation matrices (..., 3, 3).
 
-    The entries of 4 q qᵀ are sums of entries of R, and each row of it is a multiple of q. The row
-    with the largest diagonal entry is far from zero for every rotation, so the result and its
-    gradient are well conditioned everywhere, half turns included.
+    Each entry of the matrix 4 q qᵀ is a sum of entries of R, and each of its rows is a multiple of
+    q. The row with the largest diagonal entry is far from zero for every rotation. So the result
+    and its gradient are well conditioned everywhere, including rotations by 180°.
     """
     r = rotations.flatten(-2)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = r.unbind(-1)
@@ -85,8 +85,9 @@ def transform_points(a_from_b: Tensor, points: Tensor) -> Tensor:
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """``cam_from_world`` (..., 3, 4) of a camera at ``position`` that looks at ``target``.
 
-    OpenCV axes: x right, y down, z forward; ``up`` (world) points to the picture's upper edge. All
-    arguments are (..., 3). Where ``up`` is along the line of sight, another up direction is taken.
+    The camera has OpenCV axes (x right, y down, z forward), and ``up`` points to the upper edge of
+    the image. All arguments are (..., 3) in the world frame. If ``up`` is parallel to the viewing
+    direction, another up direction is chosen.
 
     Raises:
         ValueError: position and target are the same point.
@@ -98,7 +99,7 @@ def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     forward = forward / distance
     up = up.expand_as(forward)
     right = torch.linalg.cross(forward, up)
-    # Any axis that is not along the line of sight does: the one in which forward is smallest.
+    # If `up` is parallel to `forward`, use the coordinate axis in which `forward` is smallest.
     spare = torch.zeros_like(forward).scatter(-1, forward.abs().argmin(-1, keepdim=True), 1.0)
     degenerate = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm(dim=-1, keepdim=True)
     right = torch.where(degenerate, torch.linalg.cross(forward, spare), right)
@@ -110,10 +111,10 @@ def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """A change of the world frame, old to new: x_new = scale · R · x_old + t.
+    """A transform from an old to a new world frame: x_new = scale · R · x_old + t.
 
     Raises:
-        ValueError: shapes that are not these, a scale that is not positive, or an R that is no
+        ValueError: the shapes do not match, the scale is not positive and finite, or R is not a
             rotation.
     """
 
@@ -124,10 +125,12 @@ class Similarity:
     def __post_init__(self) -> None:
         shapes = tuple(self.rotation.shape), tuple(self.translation.shape)
         if shapes != ((3, 3), (3,)):
-            raise ValueError(f"a similarity has (3, 3) and (3,), not {shapes[0]} and {shapes[1]}")
+            raise ValueError(
+                f"a similarity needs shapes (3, 3) and (3,), not {shapes[0]} and {shapes[1]}"
+            )
         if not 0 < self.scale < math.inf:
-            raise ValueError(f"the scale of a similarity is positive, not {self.scale}")
-        # In place of the fields as given, so that all arithmetic below is in double precision.
+            raise ValueError(f"the scale of a similarity must be positive, not {self.scale}")
+        # Convert the fields, so that all computations below are in double precision.
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", self.rotation.to(torch.float64))
         object.__setattr__(self, "translation", self.translation.to(torch.float64))
@@ -137,24 +140,24 @@ class Similarity:
 
     @classmethod
     def identity(cls) -> Similarity:
-        """The change that changes nothing."""
+        """The identity."""
         return cls(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
     def inverse(self) -> Similarity:
-        """New to old."""
+        """The transform from the new to the old frame."""
         back = self.rotation.T / self.scale
         return Similarity(1.0 / self.scale, self.rotation.T, -back @ self.translation)
 
     def apply(self, points: Tensor) -> Tensor:
-        """Points (..., 3) of the old frame, in the new one."""
+        """Transform points (..., 3) from the old to the new frame."""
         scaled = self.scale * self.rotation.to(points.dtype)
         return points @ scaled.T + self.translation.to(points.dtype)
 
     def apply_to_poses(self, cam_from_old: Tensor) -> Tensor:
-        """``cam_from_new`` (..., 3, 4) of rigid poses ``cam_from_old`` (..., 3, 4).
+        """Rigid poses ``cam_from_new`` (..., 3, 4) from rigid poses ``cam_from_old`` (..., 3, 4).
 
-        Rigid again: the unit of length of the cameras' own frames becomes the new one, so depths
-        grow by ``scale`` and every picture stays the same.
+        The camera frames also get the new unit of length. So depths are multiplied by ``scale``,
+        and the images do not change.
         """
         rotation = cam_from_old[..., :3] @ self.rotation.to(cam_from_old.dtype).T
         shift = rotation @ self.translation.to(cam_from_old.dtype)
@@ -162,7 +165,7 @@ class Similarity:
         return torch.cat([rotation, translation[..., None]], -1)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers and lists; `from_json` reads them back exactly."""
+        """Numbers and lists for JSON; `from_json` restores them exactly."""
         return {
             "scale": self.scale,
             "rotation": self.rotation.tolist(),
@@ -181,31 +184,30 @@ class Similarity:
 
 
 def similarity_from_points(source: Tensor, target: Tensor) -> Similarity:
-    """The similarity that takes points ``source`` (N, 3) closest to ``target`` (N, 3).
+    """The similarity that maps points ``source`` (N, 3) to ``target`` (N, 3) by least squares.
 
-    Least squares over all pairs, in closed form: S. Umeyama, "Least-squares estimation of
-    transformation parameters between two point patterns", PAMI 13(4), 1991. Reflections are never
-    returned.
+    The closed-form solution of S. Umeyama, "Least-squares estimation of transformation parameters
+    between two point patterns", PAMI 13(4), 1991. The result is never a reflection.
 
     Raises:
-        ValueError: fewer than three pairs, values that are not finite, or points that all lie on
-            one line (any turn about it would do).
+        ValueError: there are fewer than three pairs, a value is not finite, or all points are on
+            one line, so the rotation around that line is undetermined.
     """
     if source.ndim != 2 or source.shape[1] != 3 or source.shape != target.shape:
         shapes = f"{tuple(source.shape)} and {tuple(target.shape)}"
-        raise ValueError(f"points to align are (N, 3) and (N, 3), not {shapes}")
+        raise ValueError(f"points to align must be (N, 3) and (N, 3), not {shapes}")
     if len(source) < 3:
-        raise ValueError(f"{len(source)} pairs of points do not tell a similarity; it takes three")
+        raise ValueError(f"a similarity needs three pairs of points, not {len(source)}")
     source, target = source.to(torch.float64), target.to(torch.float64)
     if not bool(torch.isfinite(source).all() and torch.isfinite(target).all()):
         raise ValueError("points to align are not finite")
     source_mean, target_mean = source.mean(0), target.mean(0)
     x, y = source - source_mean, target - target_mean
     for points in (x, y):
-        # What is narrower than 1e-7 of its length is rounding.
+        # A width below 1e-7 of the length is caused by rounding.
         widths = torch.linalg.svdvals(points)
         if not float(widths[1]) > 1e-7 * float(widths[0]):
-            raise ValueError("points to align all lie on one line, which leaves a turn about it")
+            raise ValueError("points to align are all on one line; the rotation is undetermined")
     u, singular, vt = torch.linalg.svd(y.T @ x / len(x))
     signs = torch.ones(3, dtype=torch.float64)
     signs[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vt))
@@ -214,18 +216,21 @@ def similarity_from_points(source: Tensor, target: Tensor) -> Similarity:
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
-#: Bits an axis: three axes fill 63 bits of an int64. So fine a grid survives stray Gaussians: with
-#: one at a thousand times the scene's size, two thousand cells an axis remain for the scene.
+#: Bits per axis of a Morton code; three axes use 63 bits of an int64. The fine grid tolerates
+#: outliers: if one Gaussian is at a thousand times the size of the scene, the scene still has two
+#: thousand cells per axis.
 MORTON_BITS = 21
 
 
 def morton_order(points: Tensor) -> Tensor:
-    """(N,) int64: the permutation that sorts finite ``points`` (N, 3) along a Morton (Z-order)
-    curve.
+    """The permutation (N,) int64 that sorts ``points`` along a Morton (Z-order) curve.
 
-    Neighbours in space become neighbours in memory, so that a view sees runs of rows, which is kind
-    to the caches in projection and in the optimiser step (8% of a whole iteration at 200,000
-    Gaussians). Equal codes keep their order: the result is a function of the points alone.
+    Neighbours in space become neighbours in memory, so a view sees runs of consecutive rows. This
+    improves cache use in projection and in the optimiser step (8% of an iteration at 200,000
+    Gaussians). Points with equal codes keep their order, so the result depends only on the points.
+
+    Args:
+        points: (N, 3), finite.
     """
     if len(points) == 0:
         return torch.empty(0, dtype=torch.int64, device=points.device)
@@ -237,7 +242,7 @@ def morton_order(points: Tensor) -> Tensor:
 
 
 def _spread(values: Tensor) -> Tensor:
-    """Move bit i of 21-bit integers to bit 3i, halving the groups of bits that stay together."""
+    """Move bit i of 21-bit integers to bit 3i. Each step halves the groups of adjacent bits."""
     masks = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3)
     for shift, mask in zip((32, 16, 8, 4), masks, strict=True):
         values = (values | values << shift) & mask

@@ -1,4 +1,4 @@
-"""Where a viewer of a scene starts."""
+"""The initial view of a scene in a viewer."""
 
 from __future__ import annotations
 
@@ -11,41 +11,44 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 
-_WINDOW = 1.6  # the usual ratio of a window's sides
-_OVERVIEW_FOV = 60.0  # degrees
-_FAR = 2.5  # times the distance within which half of a scene lies: background
-_ROWS_SAMPLED = 100_000  # enough for medians
+# The usual aspect ratio of a browser window.
+_WINDOW_ASPECT = 1.6
+# Field of view of `overview` along the longer side of the window, in degrees.
+_OVERVIEW_FOV = 60.0
+# The overview shows at most this many times the radius that contains half of the scene. What is
+# farther away is considered background.
+_BACKGROUND_RATIO = 2.5
+# Number of Gaussians that are used for medians and quantiles.
+_ROWS_SAMPLED = 100_000
 
 
 @dataclass(frozen=True)
-class StartView:
-    """A place to stand (world), the point looked at and turned around, and how wide one sees.
-
-    ``fov`` is in degrees, along the longer side of the window. Up is −y.
-    """
+class InitialView:
+    """Position and target of a viewer's camera in the world frame. Up is −y."""
 
     position: tuple[float, float, float]
-    target: tuple[float, float, float]
-    fov: float
+    target: tuple[float, float, float]  # the viewer looks at this point and orbits it
+    fov: float  # degrees, along the longer side of the window
 
 
-def view_of_camera(camera: Camera, depth: float) -> StartView:
-    """From where a photo was taken, to what lies ``depth`` (world units) along its axis.
+def view_of_camera(camera: Camera, depth: float) -> InitialView:
+    """The view of a photo. The target is ``depth`` world units along the optical axis.
 
-    A usual window shows the whole photo if that is not upright; of an upright one its middle, since
-    on both sides of it there is what the photos may not have seen.
+    A window of the usual aspect ratio shows the complete photo if the photo is in landscape format.
+    Of a portrait photo it shows the middle. The complete photo would need a wider view, and the
+    photos may not cover what is at its sides.
     """
     pose = camera.world_from_cam
     short, long = sorted((0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy))
-    fov = math.degrees(2.0 * math.atan(max(long, _WINDOW * short)))
-    return StartView(_point(pose[:, 3]), _point(pose[:, 3] + depth * pose[:, 2]), fov)
+    fov = math.degrees(2.0 * math.atan(max(long, _WINDOW_ASPECT * short)))
+    return InitialView(_point(pose[:, 3]), _point(pose[:, 3] + depth * pose[:, 2]), fov)
 
 
-def overview(gaussians: Gaussians) -> StartView:
-    """From the front and a little above, the middle of the Gaussians in sight: without cameras.
+def overview(gaussians: Gaussians) -> InitialView:
+    """A view of the middle of the scene from the front and slightly above; needs no cameras.
 
-    Nearly all that is opaque fits into a usual window, unless half of it is much nearer to its
-    middle: a far background does not send the start away from the thing in front of it.
+    The view contains 95% of the opaque Gaussians, unless half of them are much closer to the
+    middle. Then the distant ones are background, and the view shows the object in front of them.
     """
     means = gaussians.means.detach()
     finite = means.isfinite().all(1)
@@ -58,12 +61,12 @@ def overview(gaussians: Gaussians) -> StartView:
         half, most = (
             (seen - middle).norm(dim=1).quantile(torch.tensor([0.5, 0.95]).double()).tolist()
         )
-        radius = max(min(most, _FAR * half), 1e-6)
-    # In the height of a window wider than high.
-    distance = _WINDOW * radius / math.tan(math.radians(_OVERVIEW_FOV / 2))
+        radius = max(min(most, _BACKGROUND_RATIO * half), 1e-6)
+    # The radius must fit into the height of a window in landscape format.
+    distance = _WINDOW_ASPECT * radius / math.tan(math.radians(_OVERVIEW_FOV / 2))
     direction = torch.tensor([0.0, -0.35, -1.0], dtype=torch.float64)
     position = middle + distance * direction / direction.norm()
-    return StartView(_point(position), _point(middle), _OVERVIEW_FOV)
+    return InitialView(_point(position), _point(middle), _OVERVIEW_FOV)
 
 
 def _point(values: Tensor) -> tuple[float, float, float]:

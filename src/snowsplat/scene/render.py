@@ -1,4 +1,4 @@
-"""`render`: what a camera sees of the Gaussians."""
+"""`render`: Gaussians and a camera -> an image."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from snowsplat.scene.gaussians import Gaussians
 
 @dataclass
 class RenderOutput:
-    """image (H, W, 3) linear in [0, ∞), alpha (H, W) in [0, 1], depth (H, W) or None, the splats.
+    """A rendered image.
 
-    The depth is Σ T α z, in world units and not divided by alpha: divide where alpha > 0 to get the
-    expected depth of what is there. The image has planar storage (`permute` of (3, H, W)).
+    The depth is Σ T α z. It is not divided by alpha: depth / alpha is the expected depth where
+    alpha > 0.
     """
 
-    image: Tensor
-    alpha: Tensor
-    depth: Tensor | None
+    image: Tensor  # (H, W, 3) in [0, ∞); planar storage (`permute` of (3, H, W))
+    alpha: Tensor  # (H, W) in [0, 1]
+    depth: Tensor | None  # (H, W), world units
     splats: Splats2D
 
 
 def project(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) -> Splats2D:
-    """The 2D splats of the Gaussians in the camera's image: the first half of `render`."""
+    """The 2D splats of the Gaussians in the image of the camera: the first half of `render`."""
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     return ops.project(
         gaussians.means,
@@ -55,10 +55,17 @@ def render(
     *,
     with_depth: bool = False,
 ) -> RenderOutput:
-    """Renders the Gaussians from a camera over a background colour (3,), default black.
+    """Render the Gaussians from a camera.
 
-    `sh_degree` limits the view dependence (default: all that the Gaussians have). Differentiable
-    with respect to every parameter of the Gaussians, `camera.cam_from_world` and `background`.
+    Differentiable with respect to all parameters of the Gaussians, ``camera.cam_from_world`` and
+    ``background``.
+
+    Args:
+        gaussians: N Gaussians in the world frame.
+        camera: the camera.
+        background: (3,) RGB; None is black.
+        sh_degree: the largest SH degree to use; None uses all degrees of the Gaussians.
+        with_depth: also return the depth.
     """
     splats = project(gaussians, camera, sh_degree)
     if background is not None:

@@ -14,15 +14,11 @@ import numpy as np
 import torch
 
 from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.orientation import up_direction
+from snowsplat.scene.orientation import VIEWING_DISTANCE, up_direction
 
 if TYPE_CHECKING:
     import pycolmap
 
-#: What the median distance from a camera to the points it sees becomes. A unit is then about a
-#: metre for things and rooms photographed by hand, as viewers take it: for their near planes, for
-#: the speed of walking, and in VR.
-VIEWING_DISTANCE = 3.0
 
 _POINTS_SAMPLED = 5000  # enough for medians
 

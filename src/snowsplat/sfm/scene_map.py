@@ -12,7 +12,7 @@ from html import escape
 
 import numpy as np
 
-from snowsplat.sfm.orient import VIEWING_DISTANCE
+from snowsplat.scene.orientation import VIEWING_DISTANCE
 
 _WIDTH, _HEIGHT = 520, 400  # the larger view fits into it; in units of the drawing
 _MARGIN = 16

@@ -11,7 +11,7 @@ import torch
 from snowsplat.formats.compressed_ply import read_compressed_ply
 from snowsplat.pipeline.convert import read_gaussians, write_gaussians
 from snowsplat.scene.gaussians import SH_C0, Gaussians
-from snowsplat.scene.initial_view import StartView
+from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web import html
 
@@ -32,7 +32,7 @@ def three_balls() -> Gaussians:
     )
 
 
-FRONT = StartView((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), 60.0)
+FRONT = InitialView((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), 60.0)
 
 
 def test_the_scene_is_in_it(tmp_path):

@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from snowsplat.scene.initial_view import StartView
+from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web import page as viewer_page
 from snowsplat.viewer.web.page import asset, content_policy, page, settings, whole_page
@@ -23,7 +23,7 @@ def bootstrap_of(text: str) -> dict:
 
 def test_settings_are_in_the_viewers_frame():
     """It turns scenes half round about z."""
-    made = settings(StartView((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 50.0), (0.1, 0.2, 0.3))
+    made = settings(InitialView((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 50.0), (0.1, 0.2, 0.3))
     (camera,) = made["cameras"]
     expected = {"position": [-1.0, -2.0, 3.0], "target": [-4.0, -5.0, 6.0], "fov": 50.0}
     assert camera["initial"] == expected

@@ -15,7 +15,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
-from snowsplat.scene.initial_view import StartView
+from snowsplat.scene.initial_view import InitialView
 from snowsplat.scene.render import render
 from snowsplat.viewer.web.scene import ready, site
 from snowsplat.viewer.web.server import StaticServer
@@ -26,7 +26,7 @@ WIDTH, HEIGHT = 480, 360
 LOADED = "!!window.app"  # the viewer sets it after its first whole picture
 
 
-def camera_of(start: StartView) -> Camera:
+def camera_of(start: InitialView) -> Camera:
     """The viewer's camera in a window wider than high: level, with −y up."""
     position, target = (
         torch.tensor(p, dtype=torch.float64) for p in (start.position, start.target)
@@ -36,7 +36,7 @@ def camera_of(start: StartView) -> Camera:
     return Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, pose)
 
 
-def wide(camera: Camera, start: StartView) -> Camera:
+def wide(camera: Camera, start: InitialView) -> Camera:
     """A camera's pose, with the window and the angle of the start."""
     like = camera_of(start)
     return dataclasses.replace(like, cam_from_world=camera.cam_from_world)

@@ -12,7 +12,7 @@ from pathlib import Path
 from snowsplat.formats import Format, register_format
 from snowsplat.formats.compressed_ply import compressed_ply
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.initial_view import StartView, overview
+from snowsplat.scene.initial_view import InitialView, overview
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_text
 from snowsplat.viewer.web.page import settings, whole_page
@@ -41,7 +41,7 @@ _SCENE = """        <script type="text/plain" id="scene">{scene}</script>
         </script>"""
 
 
-def write_html(path: Path | str, gaussians: Gaussians, start: StartView | None = None) -> None:
+def write_html(path: Path | str, gaussians: Gaussians, start: InitialView | None = None) -> None:
     """Write the page atomically; it starts at ``start``, else where most of the scene is in view.
 
     Raises:

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from snowsplat.scene.initial_view import StartView
+from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 
 _FOLDER = Path(__file__).parent / "_viewer"
@@ -41,7 +41,7 @@ def asset(name: str) -> str:
         ) from None
 
 
-def settings(start: StartView, background: Sequence[float]) -> dict[str, Any]:
+def settings(start: InitialView, background: Sequence[float]) -> dict[str, Any]:
     """What the viewer takes as settings: where it starts, and a background colour in 0..1."""
     off = {"enabled": False}
     return {

@@ -14,10 +14,9 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.initial_view import StartView, overview, view_of_camera
-from snowsplat.scene.orientation import up_direction
+from snowsplat.scene.initial_view import InitialView, overview, view_of_camera
+from snowsplat.scene.orientation import VIEWING_DISTANCE, up_direction
 from snowsplat.scene.render import render
-from snowsplat.sfm.orient import VIEWING_DISTANCE
 from snowsplat.viewer.web.page import asset, content_policy, page, settings
 from snowsplat.viewer.web.server import ServedFile
 
@@ -47,7 +46,7 @@ def site(
     return files, {"Content-Security-Policy": policy}
 
 
-def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[Gaussians, StartView]:
+def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[Gaussians, InitialView]:
     """The scene in a frame that suits the viewer, and where one starts in that frame.
 
     The viewer takes −y for up, and walks some units a second. So where the cameras tell that
