@@ -107,7 +107,7 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
         peer.gradient(photo)
         optimizer.step()
 
-    capacity = step.trainer._capacity
+    capacity = step.trainer._runner.capacity
     parameters = {
         name: p.clone().requires_grad_() for name, p in step.trainer.gaussians.parameters().items()
     }
@@ -143,7 +143,9 @@ def _our_image(step: Step) -> Tensor:
 
     camera = step.camera
     splats = project(step.trainer.gaussians, camera)
-    return ops.rasterize(splats, camera.width, camera.height, capacity=step.trainer._capacity)[0]
+    return ops.rasterize(
+        splats, camera.width, camera.height, capacity=step.trainer._runner.capacity
+    )[0]
 
 
 def _each(work: Callable[[], object], repeats: int) -> float:

@@ -28,7 +28,9 @@ from snowsplat.ops.native import LAUNCHERS
 from snowsplat.scene.render import project, render
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.density import AdaptiveDensity
-from snowsplat.training.optim import Adam, LearningRates
+from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.optim import Adam
+from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.trainer import Trainer
 
 GPU = torch.device("cuda")
@@ -78,14 +80,14 @@ class Step:
             len(gaussians),
             schedule=trainer.schedule,
             extent=EXTENT,
-            random_start=False,
+            random_init=False,
             generator=torch.Generator(),
             device=device,
         )
-        instances = 4 * len(gaussians) if capacity is None else capacity
-        trainer._capacity = ops.Capacity(
-            instances, torch.zeros(1, dtype=torch.int64, device=device)
-        )
+        trainer._runner = StepRunner(len(gaussians), device)
+        if capacity is not None:
+            trainer._runner.capacity.instances = capacity
+        self.view = view
         self.camera = camera.to(device)
         self.background = torch.zeros(3, device=device)
         self.photo = LoadedImage(self._planes())
@@ -99,17 +101,16 @@ class Step:
 
     @torch.no_grad()
     def queue(self) -> None:
-        self.trainer._queue_step(STEP, self.camera, self.photo, self.background)
+        self.trainer._optimize(STEP, self.camera, self.photo, self.background)
 
     def run(self) -> float:
-        """A whole step, with room enough; its loss."""
-        trainer = self.trainer
-        while True:
-            self.queue()
-            loss, required, *_ = trainer._readback.wait()
-            if required <= trainer._capacity.instances:
-                return loss
-            trainer._capacity = replace(trainer._capacity, instances=int(1.3 * required))
+        """A complete step, repeated until the capacity suffices; returns its loss."""
+        gaussians = self.trainer.gaussians
+        return self.trainer._runner.run(self.queue, STEP, gaussians, self.view, self.photo)
+
+    def wait(self) -> None:
+        """Wait for the loss of the step that was queued last."""
+        self.trainer._runner._readback.wait()
 
     @torch.no_grad()
     def counts(self) -> dict[str, int]:
@@ -120,7 +121,7 @@ class Step:
         return {
             "gaussians": len(gaussians),
             "seen": int((splats.ids >= 0).sum()),
-            "instances": int(self.trainer._capacity.required),
+            "instances": int(self.trainer._runner.capacity.required),
             "pairs": int(ops.count_blended(splats, camera.width, camera.height).double().sum()),
             "width": camera.width,
             "height": camera.height,
@@ -248,7 +249,7 @@ def step_times(step: Step, repeats: int) -> dict[str, float]:
         before = time.perf_counter()
         step.queue()
         host.append(1e3 * (time.perf_counter() - before))
-        step.trainer._readback.wait()
+        step.wait()
     torch.cuda.synchronize()
     wall = 1e3 * (time.perf_counter() - begin) / repeats
     return {"host": statistics.median(host), "gpu": gpu, "wall": wall}

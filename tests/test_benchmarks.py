@@ -349,7 +349,7 @@ def test_every_op_and_kernel_is_in_the_program_of_the_sanitizer(gpu_modules, mon
     photo, gaussians = step.photo.planes.clone(), step.trainer.gaussians.clone()
     losses = [step.run(), step.run()]
     assert losses[0] == losses[1] > 0  # it stays as it is
-    assert step.trainer._capacity.instances > 7
+    assert step.trainer._runner.capacity.instances > 7
     assert torch.equal(photo, step.photo.planes)
     for name, parameter in gaussians.parameters().items():
         torch.testing.assert_close(parameter, step.trainer.gaussians.parameters()[name])

@@ -194,16 +194,16 @@ def test_a_second_ctrl_c_saves_no_half_step(run, dataset, tmp_path, monkeypatch)
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     flags = ("--recipe", "mcmc", *QUICK, "--checkpoint-every", 10)
     assert run("train", dataset, "-o", whole, *flags).code == 0
-    queue_step = Trainer._queue_step
+    optimize = Trainer._optimize
 
     def press_twice(trainer: Trainer, step: int, *rest: object) -> None:
-        queue_step(trainer, step, *rest)
+        optimize(trainer, step, *rest)
         if step == 25:
             os.kill(os.getpid(), signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as pressing:
-        pressing.setattr(Trainer, "_queue_step", press_twice)
+        pressing.setattr(Trainer, "_optimize", press_twice)
         result = run("train", dataset, "-o", stopped, *flags)
     assert (result.code, result.err) == (130, "snowsplat: stopped by Ctrl-C\n")
     newest = stopped / "checkpoints/step_000020.safetensors"
@@ -398,7 +398,7 @@ def test_divergence_names_the_last_good_checkpoint(refused, run, dataset, tmp_pa
     # The rate grows 60-fold a step, until single precision has no number for it.
     rates = ["--lr-means-final", 1e40, "--lr-means-steps", 25]
     line = refused("train", dataset, "-o", out, *QUICK, *rates, "--checkpoint-every", 3, "-q")
-    diverged = int(re.search(r"not finite at step (\d+), .* means \(", line)[1])
+    diverged = int(re.search(r"step (\d+): non-finite .* means \(", line)[1])
     step = diverged // 3 * 3
     path = out / "checkpoints" / f"step_{step:06d}.safetensors"
     assert f"the last good checkpoint is {path}, --resume --iterations {step} " in line

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.optim import Adam, LearningRates
+from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule
 
 

@@ -1,4 +1,4 @@
-"""The training loop on a tiny scene: it learns, repeats and resumes to the bit, and stops well."""
+"""The training loop on a tiny scene: it learns, repeats and resumes bitwise, and stops cleanly."""
 
 import math
 import os
@@ -21,7 +21,7 @@ from snowsplat.scene.render import render
 from snowsplat.training import checkpoint
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
-from snowsplat.training.optim import LearningRates
+from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.trainer import Progress, Trainer
 from snowsplat.util.errors import UserError
@@ -64,7 +64,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset(views[1:], views[:1], Points(xyz, rgb), extent=3.5)
 
 
-#: Everything happens within 60 steps: densification, coarse to fine, higher degrees.
+#: 60 steps with densification, coarse to fine, and increasing SH degrees.
 BUSY = TrainConfig(
     iterations=60,
     background="random",
@@ -104,7 +104,7 @@ def assert_identical(a: Gaussians, b: Gaussians) -> None:
 
 
 def test_it_learns_and_is_the_same_training_in_float64(dataset, monkeypatch):
-    """300 steps with the native ops, and with the twin in double precision: one loss curve."""
+    """300 steps with the native ops and with the reference in double precision: the same losses."""
 
     def losses(trainer: Trainer) -> torch.Tensor:
         return torch.tensor([trainer.step_once() for _ in range(300)], dtype=torch.float64)
@@ -122,16 +122,16 @@ def test_it_learns_and_is_the_same_training_in_float64(dataset, monkeypatch):
         moments.update({name: moment.double() for name, moment in moments.items()})
     for name in ("project", "rasterize", "photometric_loss", "adam_step"):
         monkeypatch.setattr(ops, name, getattr(reference, name))
-    twin = losses(exact)
-    torch.testing.assert_close(native[:30], twin[:30], rtol=1e-3, atol=0)
-    # Rounding errors grow as the training goes on, so only the course is the same in the end.
-    torch.testing.assert_close(native, twin, rtol=0.1, atol=0)
-    assert float(native[-50:].mean()) == pytest.approx(float(twin[-50:].mean()), rel=0.02)
+    expected = losses(exact)
+    torch.testing.assert_close(native[:30], expected[:30], rtol=1e-3, atol=0)
+    # Rounding errors grow during training, so only the trend is the same at the end.
+    torch.testing.assert_close(native, expected, rtol=0.1, atol=0)
+    assert float(native[-50:].mean()) == pytest.approx(float(expected[-50:].mean()), rel=0.02)
 
 
 @pytest.mark.isa
 @pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
-def test_any_number_of_threads_gives_the_same_bits(dataset, config):
+def test_the_number_of_threads_does_not_change_a_bit(dataset, config):
     torch_threads, ops_threads = torch.get_num_threads(), ops.get_num_threads()
     try:
         scenes = []
@@ -139,7 +139,7 @@ def test_any_number_of_threads_gives_the_same_bits(dataset, config):
             torch.set_num_threads(threads)
             ops.set_num_threads(threads)
             scenes.append(trained(dataset, config))
-            assert torch.get_num_threads() == threads  # as it was before
+            assert torch.get_num_threads() == threads  # restored
     finally:
         torch.set_num_threads(torch_threads)
         ops.set_num_threads(ops_threads)
@@ -154,8 +154,8 @@ def test_another_seed_gives_another_scene(dataset):
 
 @pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
 @pytest.mark.parametrize("stop", [30, 37])
-def test_resume_goes_on_to_the_same_bits(dataset, config, stop, tmp_path):
-    """From a step that is about to densify (30), and from one in between."""
+def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
+    """Before a step that densifies (30), and before one that does not."""
     whole = trained(dataset, config)
     first = Trainer(dataset, config)
     first.run(until=stop)
@@ -168,9 +168,7 @@ def test_resume_goes_on_to_the_same_bits(dataset, config, stop, tmp_path):
 
 
 @pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
-def test_a_stretched_training_comes_to_its_end_and_resumes_to_the_same_bits(
-    dataset, config, tmp_path
-):
+def test_a_stretched_training_completes_its_schedule_and_resumes_bitwise(dataset, config, tmp_path):
     """60 steps become 90 after step 20, and 45 after step 40."""
     rates = LearningRates(means_steps=1.0)
     config = replace(config, coarse_to_fine=(0.2, 0.5), learning_rates=rates)
@@ -198,7 +196,7 @@ def test_a_stretched_training_comes_to_its_end_and_resumes_to_the_same_bits(
     assert_identical(second.gaussians, first.gaussians)
 
 
-def test_a_checkpoint_of_something_else_is_refused(dataset):
+def test_a_checkpoint_of_another_configuration_is_rejected(dataset):
     state = Trainer(dataset, BUSY).state_tensors()
     for other in (BUSY_MCMC, replace(BUSY, sh_degree=1)):
         with pytest.raises(UserError, match="another dataset or recipe"):
@@ -210,8 +208,8 @@ def test_a_checkpoint_of_something_else_is_refused(dataset):
         Trainer(fewer, BUSY).load_state(trainer.state_tensors())
 
 
-def test_a_checkpoint_whose_tensors_do_not_fit_each_other_is_refused(dataset):
-    """The kernels take one number of rows for all: more would be read than there is."""
+def test_a_checkpoint_of_inconsistent_tensors_is_rejected(dataset):
+    """The kernels take one number of rows for all tensors and would read out of bounds."""
     trainer = Trainer(dataset, BUSY)
     trainer.run(until=1)
     whole = trainer.state_tensors()
@@ -233,7 +231,7 @@ def test_a_checkpoint_whose_tensors_do_not_fit_each_other_is_refused(dataset):
 
 
 def test_refinement_waits_for_the_next_step(dataset):
-    """What is evaluated and saved after step 20, which densifies, is the scene before that."""
+    """Step 20 densifies; the scene after it is evaluated and saved without that."""
     counts = []
     Trainer(dataset, BUSY).run(lambda progress: counts.append(progress.gaussians), until=21)
     assert counts[19] == counts[10]
@@ -250,7 +248,7 @@ def test_the_cap_is_never_exceeded(dataset, config, cap):
     assert counts[0] == min(cap, COUNT)
 
 
-def test_a_dataset_without_points_starts_at_random(dataset):
+def test_a_dataset_without_points_starts_from_random_points(dataset):
     config = replace(CALM, initial_points=300)
     trainer = Trainer(replace(dataset, points=None), config)
     assert len(trainer.gaussians) == 300
@@ -282,7 +280,7 @@ def test_ctrl_c_waits_for_the_end_of_the_step(dataset, monkeypatch):
     photometric_loss = ops.photometric_loss
 
     def interrupted(*args):
-        if trainer.step == 12:  # in the middle of step 13
+        if trainer.step == 12:  # within step 13
             os.kill(os.getpid(), signal.SIGINT)
         return photometric_loss(*args)
 
@@ -291,16 +289,16 @@ def test_ctrl_c_waits_for_the_end_of_the_step(dataset, monkeypatch):
         trainer.run()
     assert trainer.step == 13
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    trainer.run()  # and it could go on as if nothing had been
+    trainer.run()  # continues as if there had been no interrupt
     monkeypatch.undo()
     assert_identical(trainer.gaussians, trained(dataset, BUSY))
 
 
-def test_divergence_is_one_clear_line_with_the_step(dataset):
+def test_divergence_names_the_step(dataset):
     trainer = Trainer(dataset, CALM)
     trainer.run(until=3)
     trainer.gaussians.sh_dc[:] = torch.inf
-    with pytest.raises(UserError, match=r"at step 4, .*sh_dc \(40\)"):
+    with pytest.raises(UserError, match=r"^step 4, .*sh_dc \(40 rows\)"):
         trainer.run()
     assert trainer.step == 3
 

@@ -1,4 +1,4 @@
-"""Training on a GPU: its kernels on the CPU, tensors that are not there, and, with one, on it."""
+"""Training on a GPU: its kernels emulated on the CPU, fake GPU tensors, and a GPU if present."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from snowsplat.data.decode import LoadedImage
 from snowsplat.ops.cuda.kernels import Argument, Kernel
 from snowsplat.ops.cuda.launches import launch_by
 from snowsplat.ops.native import LAUNCHERS
-from snowsplat.ops.readback import Readback
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.trainer import Trainer
 
@@ -34,7 +33,7 @@ def losses(trainer: Trainer, steps: int = STEPS) -> Tensor:
 
 
 def with_capacity(trainer: Trainer, instances: int) -> Trainer:
-    trainer._capacity = ops.Capacity(instances, torch.zeros(1, dtype=torch.int64))
+    trainer._runner.capacity.instances = instances
     return trainer
 
 
@@ -43,7 +42,7 @@ def with_capacity(trainer: Trainer, instances: int) -> Trainer:
 def test_the_kernels_of_a_gpu_train_as_those_of_the_cpu(
     dataset: Dataset, config: TrainConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Too little room at first: the steps that do not fit are taken again, and nothing differs."""
+    """Steps whose capacity is too small are repeated, and the result is identical."""
     expected = losses(Trainer(dataset, config))
     monkeypatch.setitem(LAUNCHERS, "cpu", launcher("emulated"))
     ample = with_capacity(Trainer(dataset, config), 100_000)
@@ -51,7 +50,7 @@ def test_the_kernels_of_a_gpu_train_as_those_of_the_cpu(
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=0)
     narrow = with_capacity(Trainer(dataset, config), 3)
     assert torch.equal(losses(narrow), found)
-    assert narrow._capacity.instances > 3
+    assert narrow._runner.capacity.instances > 3
     monkeypatch.undo()
     for name, parameter in narrow.gaussians.parameters().items():
         assert torch.equal(parameter, ample.gaussians.parameters()[name]), name
@@ -66,14 +65,14 @@ def test_a_loss_that_is_not_finite_changes_nothing(
     trainer.step_once()
     trainer._background = torch.full((3,), torch.nan)
     before = trainer.gaussians.clone()
-    with pytest.raises(Exception, match="the loss is nan at step 2"):
+    with pytest.raises(Exception, match="step 2, photo .*: the loss is nan"):
         trainer.step_once()
     for name, parameter in trainer.gaussians.parameters().items():
         assert torch.equal(parameter, before.parameters()[name]), name
 
 
 def backward_by_hand(loss: Tensor) -> None:
-    """`loss.backward()` along a chain, by this thread: autograd's own for a GPU want to see it."""
+    """`loss.backward()` along a chain, in this thread: autograd's GPU threads need a real GPU."""
     node, grads = loss.grad_fn, [torch.ones_like(loss)]
     while "AccumulateGrad" not in type(node).__name__:
         by_us = getattr(node, "_forward_cls", None)
@@ -94,7 +93,7 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
     deterministic: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With tensors that have a device but no memory: to look at a value of theirs is an error."""
+    """With fake tensors, which have a device but no values: reading one is an error."""
     seen: list[str] = []
 
     def record(kernel: Kernel, name: str, blocks: int, args: Sequence[Argument]) -> None:
@@ -111,22 +110,22 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
     monkeypatch.setattr(Tensor, "backward", backward_by_hand)
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
 
-        def there(value: Any) -> Any:
+        def on_device(value: Any) -> Any:
             return mode.from_tensor(value).to("cuda") if isinstance(value, Tensor) else value
 
-        trainer.gaussians = trainer.gaussians.map(there)
+        trainer.gaussians = trainer.gaussians.map(on_device)
         for moments in (trainer._optimizer.exp_avg, trainer._optimizer.exp_avg_sq):
-            moments.update({name: there(moment) for name, moment in moments.items()})
+            moments.update({name: on_device(moment) for name, moment in moments.items()})
         for name, statistic in trainer._density.state_tensors().items():
-            setattr(trainer._density, name, there(statistic))
-        trainer._capacity = ops.Capacity(5000, there(torch.zeros(1, dtype=torch.int64)))
-        trainer._optimizer.nonfinite_rows = there(trainer._optimizer.nonfinite_rows)
-        trainer._readback = Readback(8, torch.device("cpu"))
-        camera = replace(camera, cam_from_world=there(camera.cam_from_world))
-        photo = LoadedImage(there(photo.planes), there(photo.mask))
+            setattr(trainer._density, name, on_device(statistic))
+        runner = trainer._runner
+        runner.capacity = ops.Capacity(5000, on_device(torch.zeros(1, dtype=torch.int64)))
+        runner._nonfinite_rows = on_device(runner._nonfinite_rows)
+        camera = replace(camera, cam_from_world=on_device(camera.cam_from_world))
+        photo = LoadedImage(on_device(photo.planes), on_device(photo.mask))
         torch.use_deterministic_algorithms(deterministic)
         try:
-            trainer._queue_step(1, camera, photo, there(torch.zeros(3)))
+            trainer._optimize(1, camera, photo, on_device(torch.zeros(3)))
         finally:
             torch.use_deterministic_algorithms(False)
     order = ["project_fwd", "tiles_", "blend_fwd", "photometric", "blend_bwd", "adam_"]
@@ -143,7 +142,7 @@ def test_training_on_a_gpu(dataset: Dataset, config: TrainConfig) -> None:
     config = replace(config, background="black")
     expected = losses(Trainer(dataset, config), 9)  # before the first densification
     trainer = Trainer(dataset, config, device=device)
-    # The noise of MCMC is drawn elsewhere, so that only the course is the same.
+    # A GPU draws other noise for MCMC, so only the trend is the same.
     tolerance = 2e-3 if config is not BUSY_MCMC else 0.2
     torch.testing.assert_close(losses(trainer, 9), expected, rtol=tolerance, atol=0)
     trainer.run()

@@ -62,7 +62,7 @@ def save(
         OSError: the folder is not writable, or the disk is full. Older checkpoints are as they
         were.
     """
-    check_finite(f"the state of step {step}", tensors, "older checkpoints are as they were")
+    check_finite(f"the state of step {step}", tensors, "older checkpoints are unchanged")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"step_{step:06d}.safetensors"

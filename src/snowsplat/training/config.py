@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
 from snowsplat.training.density import AdaptiveDensity, DensityConfig, McmcDensity
-from snowsplat.training.optim import LearningRates
+from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import from_json

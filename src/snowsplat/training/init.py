@@ -1,4 +1,4 @@
-"""The Gaussians that a training begins with."""
+"""`initial_gaussians`: initialization, from the points of the dataset or at random."""
 
 from __future__ import annotations
 
@@ -13,32 +13,39 @@ from snowsplat.training.config import TrainConfig
 from snowsplat.training.finite import check_finite
 
 
-def first_scene(
+def initial_gaussians(
     dataset: Dataset, config: TrainConfig, generator: torch.Generator, device: torch.device
 ) -> Gaussians:
-    """One Gaussian a point: those of the dataset, or random ones; no more than the cap.
+    """One Gaussian per point of the dataset, or random ones, at most ``density.max_gaussians``.
+
+    Section 5.1 of the paper: isotropic, with the mean distance to the three nearest neighbours as
+    scale (times ``config.initial_scale``), the colour of the point, and ``config.initial_opacity``.
+    The rows are in Morton order.
+
+    Args:
+        generator: on the CPU; draws random points, or which points are used if there are too many.
 
     Raises:
-        UserError: points that are so far apart that single precision has no Gaussians for them.
+        UserError: points so far apart that single precision cannot represent their Gaussians.
     """
     points = dataset.points
-    cap = config.density.max_gaussians or math.inf
+    limit = config.density.max_gaussians or math.inf
     if points is None:
-        count = int(min(config.initial_points, cap))
+        count = int(min(config.initial_points, limit))
         gaussians = Gaussians.random_in_bounds(
             dataset.bounds, count, generator, config.sh_degree, config.initial_opacity
         )
     else:
-        if len(points) > cap:
-            chosen = torch.randperm(len(points), generator=generator)[: int(cap)]
+        if len(points) > limit:
+            chosen = torch.randperm(len(points), generator=generator)[: int(limit)]
             points = Points(points.xyz[chosen], points.rgb[chosen])
         points = points.to(device)
         gaussians = Gaussians.from_points(points, config.sh_degree, config.initial_opacity)
     gaussians = gaussians.to(device)
     gaussians.log_scales += math.log(config.initial_scale)
     check_finite(
-        "what the points of the dataset make",
+        "the points of the dataset",
         gaussians.parameters(),
-        "remove the points that are absurdly far from the others",
+        "remove points that are extremely far from the others",
     )
     return gaussians.select(morton_order(gaussians.means))

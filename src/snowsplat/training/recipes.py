@@ -14,7 +14,7 @@ from typing import Any
 
 from snowsplat.training.config import TrainConfig, changed
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
-from snowsplat.training.optim import LearningRates
+from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.util.errors import UserError
 
 

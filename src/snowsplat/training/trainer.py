@@ -1,42 +1,51 @@
-"""Training: Algorithm 1 of the paper. A `Capture` goes in, `Gaussians` come out."""
+"""`Trainer`: Algorithm 1 of the paper. A `Dataset` goes in, `Gaussians` come out."""
 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from snowsplat import ops
 from snowsplat.data.dataset import Dataset, View
 from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
-from snowsplat.ops.readback import Readback
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
-from snowsplat.training import finite as health
 from snowsplat.training.config import TrainConfig
-from snowsplat.training.init import first_scene
+from snowsplat.training.finite import check_state
+from snowsplat.training.init import initial_gaussians
 from snowsplat.training.losses import view_loss
 from snowsplat.training.optim import Adam
+from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import interrupts_between_steps, single_threaded
 
 __all__ = ["Progress", "TrainConfig", "Trainer"]
 
-#: Views whose images are decoded ahead of their step.
+#: Photos are decoded by other threads this many views ahead of their step.
 LOOKAHEAD = 16
+
+#: One random generator for each kind of choice, so that more choices of one kind do not change the
+#: others. The names and their order are part of the checkpoint format and of what a seed means.
+GENERATORS = ("start", "views", "background", "density")
+
+#: Background colours by name; "random" is drawn in each step.
+FIXED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What `Trainer.run` reports after each step."""
+    """What `Trainer.run` reports after each step.
+
+    ``downscale`` is the factor by which the photos of the step were reduced, ``metrics`` the
+    evaluation of the test views at ``test_iterations``.
+    """
 
     step: int
     loss: float
@@ -47,15 +56,19 @@ class Progress:
 
 
 class Trainer:
-    """One training of one dataset.
+    """Trains Gaussians on a dataset.
 
         trainer = Trainer(dataset, TrainConfig(iterations=7000))
         trainer.run()
         trainer.gaussians
 
-    Between two steps everything is in `state_tensors`: a trainer that loads them goes on bitwise as
-    this one would have. Between two steps ``schedule`` may be stretched, too. ``within_step``: an
-    error or a second Ctrl-C has ended a step in its middle, and the state is not to be kept.
+    Between two steps, `state_tensors` is the complete state: a trainer that loads it continues
+    bitwise as this one would have. ``schedule`` may be stretched between two steps.
+
+    Attributes:
+        gaussians: the scene after ``step`` steps, on ``device``.
+        within_step: an error or a second Ctrl-C ended a step in the middle; the state is
+            inconsistent and must not be saved.
     """
 
     def __init__(
@@ -65,11 +78,13 @@ class Trainer:
         schedule: Schedule | None = None,
         device: torch.device | None = None,
     ) -> None:
-        """``schedule``: of a training that goes on and was stretched, or ``config.iterations``.
-        ``device``: to train on; default: the CPU.
+        """
+        Args:
+            schedule: of a resumed training; default: ``config.iterations`` steps.
+            device: to train on; default: the CPU.
 
         Raises:
-            UserError: a dataset without training views, or with points that lead nowhere.
+            UserError: the dataset has no training views, or points that cannot be represented.
         """
         if not dataset.train:
             raise UserError("the dataset has no training views; check its folder and its split")
@@ -79,13 +94,12 @@ class Trainer:
         self.schedule = schedule or Schedule(config.iterations)
         self.step = 0
         self.within_step = False
-        # One generator for each kind of choice, so that one kind does not disturb another.
         self._generators = {
             name: torch.Generator().manual_seed(4 * config.seed + i)
-            for i, name in enumerate(("start", "views", "background", "density"))
+            for i, name in enumerate(GENERATORS)
         }
-        self._order: list[int] = []  # the views to come
-        fixed = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}.get(config.background)
+        self._order: list[int] = []  # indices of the views of the next steps
+        fixed = FIXED_BACKGROUNDS.get(config.background)
         self.device = device or torch.device("cpu")
         self._cameras = [view.camera.to(self.device) for view in dataset.train]
         self._background = None if fixed is None else torch.tensor(fixed, device=self.device)
@@ -96,7 +110,9 @@ class Trainer:
             device=self.device,
         )
         with single_threaded():
-            self.gaussians = first_scene(dataset, config, self._generators["start"], self.device)
+            self.gaussians = initial_gaussians(
+                dataset, config, self._generators["start"], self.device
+            )
         self._optimizer = Adam(
             self.gaussians,
             config.learning_rates,
@@ -108,24 +124,21 @@ class Trainer:
             len(self.gaussians),
             schedule=self.schedule,
             extent=dataset.extent,
-            random_start=dataset.points is None,
+            random_init=dataset.points is None,
             generator=self._generators["density"],
             device=self.device,
         )
-        # The CPU makes the room that it needs; a GPU is told how much there is: a guess at first.
-        enough = sys.maxsize if self.device.type == "cpu" else 4 * len(self.gaussians)
-        self._capacity = ops.Capacity(enough, torch.zeros(1, dtype=torch.int64, device=self.device))
-        self._readback = Readback(2 + len(self._optimizer.nonfinite_rows), self.device)
+        self._runner = StepRunner(len(self.gaussians), self.device)
 
     def run(
         self, on_progress: Callable[[Progress], None] | None = None, until: int | None = None
     ) -> None:
-        """Step on to step ``until`` (default: the last one), with a report after each.
+        """Run the steps up to ``until`` (default: the last one), with a report after each.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C, after the step that it fell into: the state is whole. The
-                second one comes at once: see ``within_step``.
-            Diverged: loss, gradients or parameters are no longer finite; the step is named.
+            KeyboardInterrupt: Ctrl-C, after the step during which it was pressed: the state is
+                consistent. A second Ctrl-C interrupts immediately, see ``within_step``.
+            Diverged: the loss, gradients or parameters are no longer finite; names the step.
         """
         last = math.inf if until is None else until
         with interrupts_between_steps() as let_interrupt:
@@ -137,75 +150,56 @@ class Trainer:
                     count = len(self.gaussians)
                     on_progress(Progress(self.step, loss, count, iterations, downscale, metrics))
                 let_interrupt()
-        health.check_updates(self.step, self._optimizer.nonfinite_rows.tolist(), self.gaussians)
+        self._runner.finish(self.step, self.gaussians)
 
     @torch.no_grad()
     def step_once(self) -> float:
-        """One iteration of Algorithm 1; gives its loss.
+        """One iteration of Algorithm 1; returns its loss.
 
         Raises:
-            Diverged: the loss is not finite, or the update of the step before was not.
+            Diverged: the loss is not finite, or the update of the previous step was not.
         """
         self.within_step = True
         with single_threaded():
-            # The refinement that ends an iteration of the paper waits for the next one to begin, so
-            # that nothing evaluates or saves a scene that was cloned or reset a moment ago.
+            # The refinement that ends an iteration of the paper is done at the beginning of the
+            # next one: a scene that was just cloned or reset is never evaluated or saved.
             if self.step > 0:
                 self.gaussians = self._density.after_step(
                     self.step, self.gaussians, self._optimizer
                 )
             step = self.step + 1
             view, camera, photo = self._next_view(step)
-            background = self._background
-            if background is None:
-                background = torch.rand(3, generator=self._generators["background"])
-                background = background.to(self.device, non_blocking=True)
-            while True:
-                self._queue_step(step, camera, photo, background)
-                # All of the step is queued by now: a GPU works on it while this waits for the loss.
-                loss, required, *nonfinite_rows = self._readback.wait()
-                enough = required <= self._capacity.instances
-                if required > 0.9 * self._capacity.instances:
-                    self._capacity = replace(self._capacity, instances=int(1.3 * required))
-                if enough:
-                    break
-            health.check_updates(
-                self.step, nonfinite_rows, self.gaussians
-            )  # on a GPU, a step later
-            health.check_loss(step, loss, self.gaussians, view, photo)
-            self.step = step
-            self.within_step = False
-            return loss
+            background = self._next_background()
+            loss = self._runner.run(
+                lambda: self._optimize(step, camera, photo, background),
+                step,
+                self.gaussians,
+                view,
+                photo,
+            )
+        self.step = step
+        self.within_step = False
+        return loss
 
-    def _queue_step(
-        self, step: int, camera: Camera, photo: LoadedImage, background: Tensor
-    ) -> None:
-        """One iteration, from the splats to the new parameters; nothing here waits for a GPU.
-
-        Nothing changes where ``valid`` is False; `_readback` tells why.
-        """
+    def _optimize(self, step: int, camera: Camera, photo: LoadedImage, background: Tensor) -> None:
+        """Rasterize, compare with the photo, and update the Gaussians."""
         sh_degree = self.config.sh_degree_at(step)
         splats = project(self.gaussians, camera, sh_degree)
-        size = camera.width, camera.height
-        with torch.enable_grad():  # of the splats; the optimiser carries it on to the Gaussians
-            splats.packed.requires_grad_()
-            image, _, _ = ops.rasterize(splats, *size, background, capacity=self._capacity)
+        with torch.enable_grad():  # from the splats on; the optimizer differentiates the projection
+            image = self._runner.rasterize(splats, camera, background)
             loss = view_loss(image, photo, background, self.config.ssim_weight)
-            self._readback.start(loss, self._capacity.required, self._optimizer.nonfinite_rows)
-            valid = loss.detach().isfinite() & (self._capacity.required <= self._capacity.instances)
-            valid &= ~self._optimizer.nonfinite_rows.any()
-            loss.backward()
-        self._density.after_backward(step, self.gaussians, splats, *size, valid)
-        self._optimizer.step(self.gaussians, splats, camera, sh_degree, step, valid)
+        gradient = self._runner.backward(loss, splats, camera, sh_degree)
+        self._density.after_backward(step, self.gaussians, gradient)
+        self._optimizer.step(self.gaussians, gradient, step)
 
     def evaluate(self) -> Evaluation:
-        """Figures of the test views as the scene is now; a random background counts as black."""
+        """Metrics of the test views in the current state; a random background counts as black."""
         background = (0.0, 0.0, 0.0) if self._background is None else self._background.tolist()
         with single_threaded():
             return evaluate_views(self.gaussians, self.dataset.test, background=background)
 
     def _next_view(self, step: int) -> tuple[View, Camera, LoadedImage]:
-        """The next of endlessly shuffled views; its camera and photo at this step's resolution."""
+        """The next view in shuffled order, with camera and photo at the step's resolution."""
         downscale = self._downscale(step)
         if len(self._order) <= LOOKAHEAD:
             while len(self._order) <= LOOKAHEAD:
@@ -218,6 +212,13 @@ class Trainer:
         view, camera = self.dataset.train[i], self._cameras[i].downscaled(downscale)
         return view, camera, self._images.get(view, downscale)
 
+    def _next_background(self) -> Tensor:
+        """(3,) on the device: the fixed colour, or a random one."""
+        if self._background is not None:
+            return self._background
+        color = torch.rand(3, generator=self._generators["background"])
+        return color.to(self.device, non_blocking=True)
+
     def _downscale(self, step: int) -> int:
         return self.config.downscale_at(step, self.schedule)
 
@@ -225,7 +226,7 @@ class Trainer:
         self._images.prefetch([self.dataset.train[i] for i in self._order], downscale)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """All that the steps to come depend on, beside dataset, config, schedule. Not copied."""
+        """Everything the next steps depend on besides dataset, config and schedule. Not copied."""
         parts = {
             "gaussians": self.gaussians.parameters(),
             "optimizer": self._optimizer.state_tensors(),
@@ -237,25 +238,28 @@ class Trainer:
         return tensors | {"step": torch.tensor(self.step), "order": order}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Take over (copy) what `state_tensors` gave in a trainer whose dataset, config and
-        schedule are equal.
+        """Copy what `state_tensors` returned in a trainer of equal dataset, config and schedule.
 
         Raises:
-            UserError: it is of another density control, SH degree or dataset, or not finite.
+            UserError: the state has another density control, SH degree or dataset, or is not
+                finite.
         """
-        health.check_state(self.state_tensors(), tensors, len(self.dataset.train))
+        check_state(self.state_tensors(), tensors, len(self.dataset.train))
 
         def part(of: str) -> dict[str, Tensor]:
             return {n[len(of) :]: t for n, t in tensors.items() if n.startswith(of)}
 
         self.gaussians = Gaussians(**part("gaussians.")).clone().to(self.device)
         self._optimizer.load_state(part("optimizer."))
+        self._runner.reset()
         self._density.load_state(part("density."))
         for name, random in self._generators.items():
             try:
                 random.set_state(tensors[f"random.{name}"])
-            except RuntimeError:  # torch knows what can be one
-                raise UserError("the checkpoint is damaged; go on from an earlier one") from None
+            except RuntimeError:  # torch checks that the state is possible
+                raise UserError(
+                    f"the checkpoint: random state {name!r} is damaged; resume from an earlier one"
+                ) from None
         self.step = int(tensors["step"])
         self.within_step = False
         self._order = tensors["order"].tolist()

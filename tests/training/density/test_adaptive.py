@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from snowsplat.ops.splats import Splats2D
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.training.density.adaptive import (
@@ -14,8 +15,10 @@ from snowsplat.training.density.adaptive import (
     AdaptiveDensity,
     AdaptiveDensityControl,
 )
-from snowsplat.training.optim import Adam, LearningRates
+from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.view_gradient import ViewGradient
 
 EXTENT = 10.0  # with percent_dense = 0.01: clone up to a scale of 0.1, split beyond
 
@@ -40,13 +43,13 @@ def names(gaussians: Gaussians) -> list[int]:
 
 
 def set_up(
-    gaussians: Gaussians, iterations: int = 30_000, random_start: bool = False, **knobs: object
+    gaussians: Gaussians, iterations: int = 30_000, random_init: bool = False, **settings: object
 ) -> tuple[AdaptiveDensityControl, Adam]:
-    control = AdaptiveDensity(**knobs).control(  # type: ignore[arg-type]
+    control = AdaptiveDensity(**settings).control(  # type: ignore[arg-type]
         len(gaussians),
         schedule=Schedule(iterations),
         extent=EXTENT,
-        random_start=random_start,
+        random_init=random_init,
         generator=torch.Generator().manual_seed(0),
     )
     adam = Adam(gaussians, LearningRates(), schedule=Schedule(30_000), extent=EXTENT)
@@ -60,8 +63,14 @@ def seen(control: AdaptiveDensityControl, grads: list[float]) -> None:
     control.grad_sum, control.views = torch.tensor(grads), torch.ones(len(grads))
 
 
-def view(ids: list[int], grad: list[list[float]], radii: list[float] | None = None) -> Splats2D:
-    """Splats with the position gradient of one backward pass."""
+def view(
+    ids: list[int],
+    grad: list[list[float]],
+    size: tuple[int, int] = (10, 10),
+    radii: list[float] | None = None,
+    valid: bool | None = None,
+) -> ViewGradient:
+    """The position gradient of one backward pass, in an image of ``size``."""
     n = len(ids)
     ones = torch.ones(n)
     splats = Splats2D.pack(
@@ -75,14 +84,15 @@ def view(ids: list[int], grad: list[list[float]], radii: list[float] | None = No
     )
     splats.packed.grad = torch.zeros_like(splats.packed)
     splats.packed.grad[:, :2] = torch.tensor(grad)
-    return splats
+    camera = Camera(*size, 10.0, 10.0, size[0] / 2, size[1] / 2, torch.eye(3, 4).double())
+    return ViewGradient(splats, camera, 0, None if valid is None else torch.tensor([valid]))
 
 
 def test_statistic_is_the_mean_over_views_in_half_image_sizes():
     gaussians = gaussians_of([0.05] * 4)
     control, _ = set_up(gaussians)
-    control.after_backward(1, gaussians, view([0, 2], [[3e-6, 0.0], [0.0, 4e-6]]), 200, 100)
-    control.after_backward(2, gaussians, view([2, 3], [[3e-6, 4e-6], [1e-6, 0.0]]), 100, 50)
+    control.after_backward(1, gaussians, view([0, 2], [[3e-6, 0.0], [0.0, 4e-6]], (200, 100)))
+    control.after_backward(2, gaussians, view([2, 3], [[3e-6, 4e-6], [1e-6, 0.0]], (100, 50)))
     # Gaussian 2: 4e-6 · 50 in the first view; (3e-6 · 50, 4e-6 · 25) in the second, at half the
     # size.
     expected = [3e-4, 0.0, 2e-4 + math.hypot(1.5e-4, 1e-4), 5e-5]
@@ -93,7 +103,7 @@ def test_statistic_is_the_mean_over_views_in_half_image_sizes():
 def test_statistics_end_with_densification():
     gaussians = gaussians_of([0.05])
     control, _ = set_up(gaussians, densify_until=10)
-    control.after_backward(11, gaussians, view([0], [[1.0, 1.0]]), 10, 10)
+    control.after_backward(11, gaussians, view([0], [[1.0, 1.0]]))
     assert not control.views.any()
 
 
@@ -162,9 +172,9 @@ def test_transparent_ones_are_removed():
 
 
 def test_size_pruning_waits_for_the_first_reset():
-    def refined(step: int, **knobs: object) -> list[int]:
+    def refined(step: int, **settings: object) -> list[int]:
         gaussians = gaussians_of([0.05, 1.1, 0.05])
-        control, adam = set_up(gaussians, **knobs)
+        control, adam = set_up(gaussians, **settings)
         control.max_radii[2] = 21.0
         return names(control.after_step(step, gaussians, adam))
 
@@ -204,15 +214,15 @@ def test_opacity_reset_and_its_moments():
 
 
 def test_when_opacity_is_reset():
-    def resets(steps: range, **knobs: object) -> list[int]:
-        control, _ = set_up(gaussians_of([0.05]), **knobs)
+    def resets(steps: range, **settings: object) -> list[int]:
+        control, _ = set_up(gaussians_of([0.05]), **settings)
         return [step for step in steps if control._resets_at(step)]
 
     every_hundred = range(0, 30_001, 100)
     assert resets(every_hundred[1:]) == [3000, 6000, 9000, 12_000]
-    assert resets(every_hundred[1:], random_start=True)[:2] == [500, 3000]
-    assert resets(every_hundred[1:], random_start=True, reset_random_start=False)[0] == 3000
-    assert resets(every_hundred[1:], random_start=True, iterations=900) == []
+    assert resets(every_hundred[1:], random_init=True)[:2] == [500, 3000]
+    assert resets(every_hundred[1:], random_init=True, reset_random_start=False)[0] == 3000
+    assert resets(every_hundred[1:], random_init=True, iterations=900) == []
     assert resets(every_hundred[1:], densify_until=6400) == [3000]
     assert resets(every_hundred[1:], opacity_reset_interval=0) == []
 

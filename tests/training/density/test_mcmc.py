@@ -6,11 +6,14 @@ import pytest
 import torch
 
 from snowsplat.ops.splats import Splats2D
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.training.density.mcmc import McmcDensity, McmcDensityControl, shared_opacity
-from snowsplat.training.optim import Adam, LearningRates
+from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.view_gradient import ViewGradient
 from snowsplat.util.errors import SettingError
 
 
@@ -26,12 +29,12 @@ def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
     )
 
 
-def set_up(gaussians: Gaussians, **knobs: object) -> tuple[McmcDensityControl, Adam]:
-    control = McmcDensity(**knobs).control(  # type: ignore[arg-type]
+def set_up(gaussians: Gaussians, **settings: object) -> tuple[McmcDensityControl, Adam]:
+    control = McmcDensity(**settings).control(  # type: ignore[arg-type]
         len(gaussians),
         schedule=Schedule(30_000),
         extent=1.0,
-        random_start=False,
+        random_init=False,
         generator=torch.Generator().manual_seed(0),
     )
     adam = Adam(gaussians, LearningRates(means_steps=1.0), schedule=Schedule(30_000), extent=1.0)
@@ -153,8 +156,10 @@ def test_noise_follows_the_covariance_of_transparent_gaussians():
 def test_regularisers_are_the_gradients_of_mean_opacity_and_scale():
     gaussians = some_gaussians(7)
     control, _ = set_up(gaussians, opacity_regularizer=0.02, scale_regularizer=0.03)
-    splats = Splats2D(torch.zeros(0, 16), None, 3)
-    control.after_backward(1, gaussians, splats, 10, 10)
+    camera = Camera(10, 10, 10.0, 10.0, 5.0, 5.0, torch.eye(3, 4).double())
+    control.after_backward(
+        1, gaussians, ViewGradient(Splats2D(torch.zeros(0, 16), None, 3), camera, 0)
+    )
     leaves = gaussians.clone()
     leaves.opacity_logits.requires_grad_()
     leaves.log_scales.requires_grad_()

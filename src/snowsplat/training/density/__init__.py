@@ -1,9 +1,9 @@
-"""Density control: where Gaussians are added and taken away during training.
+"""Density control: adds and removes Gaussians during training.
 
-A variant is a file with two dataclasses: its knobs (frozen; part of `TrainConfig`), whose
-``control`` method makes its state, which follows the `DensityControl` protocol below. The trainer
-knows only these two. `AdaptiveDensity` is the paper's method, `McmcDensity` that of Kheradmand et
-al. 2024.
+A method is a module with two dataclasses: its settings (frozen; part of `TrainConfig`), whose
+``control`` method creates its state, which follows the `DensityControl` protocol. The trainer knows
+only these two. `AdaptiveDensity` is the paper's method, `McmcDensity` that of Kheradmand et al.
+2024.
 """
 
 from __future__ import annotations
@@ -13,62 +13,54 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.density.adaptive import AdaptiveDensity
 from snowsplat.training.density.mcmc import McmcDensity
 from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule, When
+from snowsplat.training.view_gradient import ViewGradient
 
 __all__ = ["AdaptiveDensity", "DensityConfig", "DensityControl", "McmcDensity"]
 
 
 class DensityControl(Protocol):
-    """The state of a density control: statistics in the rows' order, and two hooks."""
+    """The state of a density control: statistics in the order of the rows, and two hooks."""
 
-    def after_backward(
-        self,
-        step: int,
-        gaussians: Gaussians,
-        splats: Splats2D,
-        width: int,
-        height: int,
-        valid: Tensor | None = None,
-    ) -> None:
-        """Before the optimiser: gather statistics of ``splats.packed.grad``, or add regularisers.
+    def after_backward(self, step: int, gaussians: Gaussians, gradient: ViewGradient) -> None:
+        """Before the optimizer: accumulate statistics, or add the gradients of regularizers.
 
-        ``width`` and ``height`` (pixels) are those of this step's image, coarse or fine. The
-        gradient of a regulariser goes to ``.grad`` of the parameters. ``valid``: as of
-        `ops.adam_step`, (1,) bool on the device; where it is False the step will not count.
+        Statistics are accumulated by `ViewGradient.add_statistics`, which changes nothing if the
+        step turns out to be invalid. The gradient of a regularizer is assigned to ``.grad`` of the
+        parameters, which the optimizer adds and clears. On a GPU nothing here may wait for it.
         """
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
-        """After the optimiser: refine. Gives the Gaussians to go on with, maybe the same ones.
+        """After the optimizer: refine. Returns the Gaussians to continue with, possibly the same.
 
-        The trainer calls this as late as it can, at the beginning of step + 1, so that what is
-        evaluated and saved between two steps is never a scene that was just cloned or reset.
+        The trainer calls this as late as possible, at the beginning of step + 1, so that a scene
+        that was just cloned or reset is never evaluated or saved.
 
         Raises:
-            Diverged: where it refines, parameters that are not finite.
+            Diverged: the parameters are not finite at a step that refines.
         """
         ...
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """Statistics, by name, for a checkpoint."""
+        """Statistics, by name, for a checkpoint. Not copied."""
         ...
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Take over what `state_tensors` gave."""
+        """Copy what `state_tensors` returned."""
 
 
 class DensityConfig(Protocol):
-    """The knobs of a density control: a dataclass."""
+    """The settings of a density control: a dataclass."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def max_gaussians(self) -> int:
-        """Hard cap of their number; 0 is none. The initial ones keep to it too."""
+        """Limit of the number of Gaussians, including the initial ones; 0 is no limit."""
         ...
 
     @property
@@ -92,13 +84,17 @@ class DensityConfig(Protocol):
         *,
         schedule: Schedule,
         extent: float,
-        random_start: bool,
+        random_init: bool,
         generator: torch.Generator,
         device: torch.device | None = None,
     ) -> DensityControl:
-        """Fresh state for ``count`` Gaussians in a scene of ``extent`` world units.
+        """The initial state.
 
-        ``random_start``: they are random points, not those of a dataset. ``generator``: of the CPU.
-        ``device``: where the Gaussians are; default: the CPU.
+        Args:
+            count: number of Gaussians.
+            extent: of the scene, in world units.
+            random_init: whether training starts from random points, not those of a dataset.
+            generator: on the CPU.
+            device: of the Gaussians; default: the CPU.
         """
         ...

@@ -1,0 +1,50 @@
+"""`LearningRates`: Adam's learning rates, and the schedule of the one of the positions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+from snowsplat.training.step_schedule import Schedule, When
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rate for each parameter; the defaults are the paper's.
+
+    Attributes:
+        means: at the first step, in units of the scene's extent.
+        means_final: at ``means_steps`` and after it; log-linear between the two.
+        means_steps: an int is that step, a float that fraction of all iterations.
+        log_scales, quats, opacity_logits, sh_dc, sh_rest: constant.
+    """
+
+    means: float = 1.6e-4
+    means_final: float = 1.6e-6
+    means_steps: When = 30_000
+    log_scales: float = 5e-3
+    quats: float = 1e-3
+    opacity_logits: float = 0.05
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 2.5e-3 / 20
+
+    def scaled(self, factor: float) -> LearningRates:
+        """All rates except ``means_final`` times ``factor``, for short trainings."""
+        rates = [f.name for f in fields(self) if f.name not in ("means_final", "means_steps")]
+        return replace(self, **{name: factor * getattr(self, name) for name in rates})
+
+    def at(self, step: int, schedule: Schedule, extent: float) -> dict[str, float]:
+        """Learning rate by parameter at ``step``; that of the means in world units.
+
+        means(t) = extent · means^(1 − t) · means_final^t, t = step / means_steps, at most 1.
+        """
+        t = schedule.share(step, self.means_steps)
+        means = math.exp((1.0 - t) * math.log(self.means) + t * math.log(self.means_final))
+        return {
+            "means": means * extent,
+            "log_scales": self.log_scales,
+            "quats": self.quats,
+            "opacity_logits": self.opacity_logits,
+            "sh_dc": self.sh_dc,
+            "sh_rest": self.sh_rest,
+        }

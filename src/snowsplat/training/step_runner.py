@@ -1,0 +1,147 @@
+"""`StepRunner`: runs a training step on a GPU without waiting for the GPU within the step.
+
+The CPU only queues the work of a GPU, which executes it later. Waiting for one of its results in
+the middle of a step would leave the GPU idle until the CPU has queued the rest. But a step depends
+on three results:
+
+- The rasterizer needs memory for its instances (pairs of a splat and a tile that it touches), and
+  their number is counted on the GPU. Memory for an estimated number is allocated: the *capacity*.
+- A loss that is not finite must not change anything.
+- Values whose update is not finite are skipped and counted (`ops.adam_step`). The next step must
+  not change anything: training stops there.
+
+All three are combined, on the device, in one bool: whether the step is *valid*. The operations that
+change the state of the training read it there (`ViewGradient`), and do nothing if it is False. The
+CPU reads the three numbers back after it has queued the complete step, while the GPU still works on
+the backward pass. It then repeats a step whose capacity was too small, or raises `Diverged`.
+
+On the CPU every operation is complete when it returns, memory always suffices, and the same code
+runs: the only difference is the initial capacity.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.data.dataset import View
+from snowsplat.data.decode import LoadedImage
+from snowsplat.ops.adam import PARAMETERS
+from snowsplat.ops.capacity import Capacity
+from snowsplat.ops.readback import Readback
+from snowsplat.ops.splats import Splats2D
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training import finite
+from snowsplat.training.view_gradient import ViewGradient
+
+#: Initial capacity, in instances per Gaussian: a visible Gaussian has about seven, and a view shows
+#: only a part of the scene. A capacity that is too small costs one repeated step.
+INITIAL_INSTANCES_PER_GAUSSIAN = 4
+#: The capacity grows when a step uses more than this fraction of it, before a view exceeds it: the
+#: requirement changes little from step to step, but differs between views.
+GROW_ABOVE = 0.9
+#: A new capacity is this multiple of the required instances: enough for one densification, which
+#: adds up to about a quarter of the Gaussians.
+GROWTH = 1.3
+
+
+class StepRunner:
+    """Runs training steps: capacity, validity, read-back, repetition and `Diverged`.
+
+    def optimize() -> None:
+        splats = project(gaussians, camera, sh_degree)
+        with torch.enable_grad():
+            image = runner.rasterize(splats, camera, background)
+            loss = view_loss(image, photo, background, ssim_weight)
+        gradient = runner.backward(loss, splats, camera, sh_degree)
+        density.after_backward(step, gaussians, gradient)
+        optimizer.step(gaussians, gradient, step)
+
+    loss = runner.run(optimize, step, gaussians, view, photo)
+    """
+
+    def __init__(self, gaussians: int, device: torch.device) -> None:
+        """``gaussians``: their initial number, from which the initial capacity is estimated."""
+        # The CPU allocates what a frame requires, and ignores the capacity.
+        on_cpu = device.type == "cpu"
+        instances = sys.maxsize if on_cpu else INITIAL_INSTANCES_PER_GAUSSIAN * gaussians
+        self.capacity = Capacity(instances, torch.zeros(1, dtype=torch.int64, device=device))
+        self._nonfinite_rows = torch.zeros(len(PARAMETERS), dtype=torch.int32, device=device)
+        self._readback = Readback(2 + len(PARAMETERS), device)
+
+    def rasterize(self, splats: Splats2D, camera: Camera, background: Tensor) -> Tensor:
+        """Rasterize with the current capacity; gradients flow to ``splats.packed``.
+
+        Args:
+            background: (3,) colour in 0..1.
+
+        Returns:
+            (H, W, 3) image.
+        """
+        splats.packed.requires_grad_()
+        size = camera.width, camera.height
+        image, _, _ = ops.rasterize(splats, *size, background, capacity=self.capacity)
+        return image
+
+    def backward(
+        self, loss: Tensor, splats: Splats2D, camera: Camera, sh_degree: int
+    ) -> ViewGradient:
+        """Start the read-back, then run the backward pass from ``loss`` () to the splats."""
+        required, instances = self.capacity.required, self.capacity.instances
+        self._readback.start(loss, required, self._nonfinite_rows)
+        valid = loss.detach().isfinite() & (required <= instances)
+        valid &= ~self._nonfinite_rows.any()
+        loss.backward()
+        return ViewGradient(splats, camera, sh_degree, valid, self._nonfinite_rows)
+
+    def run(
+        self,
+        optimize: Callable[[], None],
+        step: int,
+        gaussians: Gaussians,
+        view: View,
+        photo: LoadedImage,
+    ) -> float:
+        """Run one step, and repeat it with more capacity if that was too small.
+
+        Args:
+            optimize: queues the step, through `rasterize` and `backward`.
+            step, gaussians, view, photo: named in an error.
+
+        Returns:
+            The loss.
+
+        Raises:
+            Diverged: the loss is not finite, or the update of the previous step was not.
+        """
+        while True:
+            optimize()
+            # The complete step is queued: a GPU works on it while the CPU waits for the loss.
+            loss, required, *nonfinite_rows = self._readback.wait()
+            instances = self.capacity.instances
+            if required > GROW_ABOVE * instances:
+                self.capacity = replace(self.capacity, instances=int(GROWTH * required))
+            if required <= instances:
+                break
+        # The counts were copied before this step's update: they are those of the previous steps.
+        finite.check_updates(step - 1, nonfinite_rows, gaussians)
+        finite.check_loss(step, loss, gaussians, view, photo)
+        return loss
+
+    def finish(self, step: int, gaussians: Gaussians) -> None:
+        """Wait for the device, and check the update of ``step``, the last one that was run.
+
+        Raises:
+            Diverged: it was not finite.
+        """
+        finite.check_updates(step, self._nonfinite_rows.tolist(), gaussians)
+
+    def reset(self) -> None:
+        """Forget rows that earlier steps skipped: the state of the training was replaced."""
+        self._nonfinite_rows.zero_()

@@ -1,0 +1,54 @@
+"""`ViewGradient`: the gradient of the loss of one view, as the backward pass leaves it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.ops.splats import Splats2D
+from snowsplat.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class ViewGradient:
+    """∂L/∂splats of one view. Density control and the optimiser read a step from this object.
+
+    On a GPU it is not known yet whether the step is valid when they do (see `StepRunner`). The
+    answer stays on the device, in ``valid``, and the two operations that change the state of the
+    training read it there: `add_statistics`, for density control, and `ops.adam_step`, for `Adam`.
+    An invalid step changes nothing, and no caller has to handle it.
+
+    Attributes:
+        splats: from `scene.render.project`; the gradient is ``splats.packed.grad``.
+        camera: of the view, at the resolution of the step. Through it the gradient continues from
+            the splats to the parameters of the Gaussians.
+        sh_degree: degree of the spherical harmonics used by this step.
+        valid: (1,) bool on the device; None is True.
+        nonfinite_rows: (6,) int32 on the device, see `ops.adam_step`; None disables counting.
+    """
+
+    splats: Splats2D
+    camera: Camera
+    sh_degree: int
+    valid: Tensor | None = None
+    nonfinite_rows: Tensor | None = None
+
+    def add_statistics(
+        self, norm_sum: Tensor, views: Tensor, max_radii: Tensor | None = None
+    ) -> None:
+        """Add this view to per-Gaussian statistics, in place: `ops.accumulate_screen_statistics`.
+
+        At the rows of visible Gaussians: norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|,
+        views (N,) += 1, and max_radii (N,) = max(max_radii, 3σ radius in pixels) unless None.
+        """
+        ops.accumulate_screen_statistics(
+            self.splats,
+            self.camera.width,
+            self.camera.height,
+            norm_sum,
+            views,
+            max_radii,
+            self.valid,
+        )
