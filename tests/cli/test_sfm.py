@@ -90,13 +90,13 @@ def test_the_same_again_does_nothing_and_a_changed_photo_is_noticed(
     assert times(out) == before
 
     again = run("sfm", mine, "-o", out, *QUICK, "--resize")
-    assert "images: done again (changed: resize)" in again.out
+    assert "images: repeated (changed: resize)" in again.out
     assert again.out.count("done before") == 2
 
     last = max(mine.iterdir())
     last.unlink()
     again = run("sfm", mine, "-o", out, *QUICK, "--resize")
-    assert "photos: done again (changed: input)" in again.out
+    assert "photos: repeated (changed: input)" in again.out
     assert not (out / "input" / last.name).exists()
     assert not (out / "images" / last.name).exists()
 
@@ -135,7 +135,7 @@ def test_a_folder_that_is_taken_is_left_alone(captured, refused, photos, tmp_pat
     assert "is a file" in refused("sfm", photos, "-o", taken / "mine.txt")
     before = times(captured)
     line = refused("sfm", *sorted(photos.iterdir())[:3], "-o", captured)
-    assert "holds a dataset of" in line
+    assert "holds a dataset made from" in line
     assert times(captured) == before
     assert [path.name for path in taken.iterdir()] == ["mine.txt"]
 

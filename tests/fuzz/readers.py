@@ -37,7 +37,7 @@ from snowsplat.formats.spz_container import unpack
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.sfm import pipeline as capture_folder
+from snowsplat.sfm import dataset_folder
 from snowsplat.sfm.ingest import clip, mask_files, photo_files, video
 from snowsplat.sfm.ingest.inputs import Gathered
 from snowsplat.sfm.ingest.photo import Photo
@@ -435,18 +435,18 @@ _PHOTO = Photo("a.jpg", "a.jpg", 80, 60, "g", None, 70.5, (1.0, 2.0, 3.0), False
 
 
 def _make_stages(folder: Path) -> None:
-    stages = Stages(folder / "capture.json", capture_folder.STAGES)
+    stages = Stages(folder / "capture.json", dataset_folder.STAGES)
     stages.about = {"inputs": ["x"]}
     gathered = asdict(Gathered([_PHOTO], [("b.jpg", "is black")]))
     stages.run("photos", {"size": None}, [folder], lambda: gathered)
 
 
 def _read_stages(folder: Path) -> Any:
-    stages = Stages(folder / "capture.json", capture_folder.STAGES)
+    stages = Stages(folder / "capture.json", dataset_folder.STAGES)
     done = stages.run(
         "photos", {"size": None}, [folder], lambda: asdict(Gathered([_PHOTO], [])), lambda _: None
     )
-    return capture_folder._photos(folder, done.result)
+    return dataset_folder._photos(folder, done.result)
 
 
 def _make_lpips(folder: Path) -> None:

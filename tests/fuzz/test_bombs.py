@@ -26,7 +26,7 @@ from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.spz_container import Header, pack
 from snowsplat.pipeline.output_folder import OutputFolder
 from snowsplat.scene.camera_json import read_cameras
-from snowsplat.sfm import pipeline as capture_folder
+from snowsplat.sfm import dataset_folder
 from snowsplat.sfm.colmap.result import describe_model
 from snowsplat.sfm.ingest import photo_files
 from snowsplat.sfm.ingest.clip import is_video, read_clip
@@ -497,7 +497,7 @@ def test_json_of_any_kind(tmp_path, refused, text):
     path.write_text(text)
     (out / "config.json").write_text(text)
     refused(lambda: read_cameras(path))
-    refused(lambda: Stages(path, capture_folder.STAGES))
+    refused(lambda: Stages(path, dataset_folder.STAGES))
     refused(lambda: load_dataset(path))
     refused(lambda: OutputFolder(out).settings())
     empty = guarded(lambda: History.read(path, 9), tmp_path, path.stat().st_size)

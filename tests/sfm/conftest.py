@@ -1,4 +1,4 @@
-"""COLMAP models of known cameras and points, as SfM would find them."""
+"""COLMAP models of known cameras and points, in the form that SfM returns."""
 
 from collections.abc import Callable, Sequence
 
@@ -14,10 +14,10 @@ def make_model(
     cameras: Sequence[pycolmap.Camera] | None = None,
     names: Sequence[str] | None = None,
 ) -> pycolmap.Reconstruction:
-    """A model in which every camera sees every point that falls into its picture.
+    """A model in which every camera sees every point that is inside its image.
 
-    ``poses`` (N, 3, 4) are cam_from_world, ``points`` (P, 3). Photo i is taken with camera
-    i modulo their number.
+    ``poses`` (N, 3, 4) are cam_from_world, ``points`` (P, 3). Photo i uses camera i modulo the
+    number of cameras.
     """
     if cameras is None:
         simple = pycolmap.CameraModelId.SIMPLE_PINHOLE

@@ -1,4 +1,4 @@
-"""Photos and videos to gather: a textured wall, seen from places side by side."""
+"""Photos and videos as inputs of the tests: a textured wall, seen from positions side by side."""
 
 from fractions import Fraction
 
@@ -10,10 +10,10 @@ WIDTH, HEIGHT = 320, 240
 
 
 def wall(offset=0, width=WIDTH, height=HEIGHT, seed=0) -> np.ndarray:
-    """(height, width, 3) uint8: blotches of all sizes in all colours, moved left by ``offset``.
+    """(height, width, 3) uint8: blobs of many sizes and colours, shifted left by ``offset``.
 
-    The upper left corner has a white square and the rest of the left edge is dark, so that turns
-    and mirrors show.
+    The upper left corner has a white square and the rest of the left edge is dark, so that
+    rotations and reflections are detected.
     """
     random = np.random.default_rng(seed)
     total = np.zeros((height, 3 * width, 3))
@@ -34,21 +34,21 @@ def photo(offset=0, **options) -> Image.Image:
 
 
 def blurred(picture: np.ndarray, radius: float) -> np.ndarray:
-    """By a Gaussian."""
+    """``picture`` blurred by a Gaussian of this radius in pixels."""
     return np.asarray(Image.fromarray(picture).filter(ImageFilter.GaussianBlur(radius)))
 
 
 def exif(tags=None, details=None, gps=None) -> Image.Exif:
-    """Notes of a camera: of the picture, of the exposure, of the place."""
-    notes = Image.Exif()
-    notes.update(tags or {})
-    notes.get_ifd(0x8769).update(details or {})
-    notes.get_ifd(0x8825).update(gps or {})
-    return notes
+    """EXIF data of a photo, by tag: main tags, exposure details, GPS."""
+    data = Image.Exif()
+    data.update(tags or {})
+    data.get_ifd(0x8769).update(details or {})
+    data.get_ifd(0x8825).update(gps or {})
+    return data
 
 
 def write_photos(folder, count=3, ending="jpg"):
-    """``0.jpg`` … in a new folder, which it gives."""
+    """Write ``0.jpg`` … to a new folder; returns the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for i in range(count):
         photo(20 * i).save(folder / f"{i}.{ending}", quality=95)
@@ -56,7 +56,7 @@ def write_photos(folder, count=3, ending="jpg"):
 
 
 def write_video(path, pictures, rate=10, rotation=None, codec="libx264", times=None, aspect=None):
-    """Encode (H, W, 3) uint8 pictures; ``times`` (in 1/1000 s) make it of variable rate."""
+    """Encode (H, W, 3) uint8 images; with ``times`` (in 1/1000 s) the frame rate is variable."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=rate)
         stream.height, stream.width = pictures[0].shape[:2]
@@ -78,6 +78,6 @@ def write_video(path, pictures, rate=10, rotation=None, codec="libx264", times=N
 
 
 def pan(count, step=8, **options) -> list[np.ndarray]:
-    """Pictures of a camera that moves sideways."""
+    """Images of a camera that moves sideways by ``step`` pixels per image."""
     large = np.asarray(wall(0, width=WIDTH + step * count, **options))
     return [np.ascontiguousarray(large[:, step * i : step * i + WIDTH]) for i in range(count)]

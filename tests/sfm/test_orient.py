@@ -1,4 +1,4 @@
-"""Up, heading, middle and scale, for the ways in which people photograph, in any SfM frame."""
+"""Orientation, centre and scale for typical ways of taking photos, in an arbitrary SfM frame."""
 
 import math
 from pathlib import Path
@@ -20,7 +20,7 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=F64)
 
 
-# Any frame: what SfM gives is turned, moved and scaled by chance.
+# An arbitrary frame, as SfM returns one.
 SFM = Similarity(
     0.37, rotation_from_quat(normal(4, seed=5)), torch.tensor([4.0, 5.0, -6.0], dtype=F64)
 )
@@ -43,7 +43,7 @@ def ring(count: int, height: float, arc: float = 360.0) -> torch.Tensor:
 
 
 def oriented(model_of, poses: torch.Tensor, points: torch.Tensor) -> Similarity:
-    """``scene_from_true``: how the found scene lies in the true one, which has y down."""
+    """``scene_from_true``: the estimated scene frame relative to the true one, which has y down."""
     model = model_of(SFM.apply_to_poses(poses), SFM.apply(points))
     found = orientation(model)
     rotation = found.rotation @ SFM.rotation
@@ -52,22 +52,22 @@ def oriented(model_of, poses: torch.Tensor, points: torch.Tensor) -> Similarity:
 
 
 def tilt(similarity: Similarity) -> float:
-    """Degrees between true and found up."""
+    """Angle in degrees between the true and the estimated up direction."""
     return math.degrees(math.acos(min(1.0, float(similarity.rotation[1, 1]))))
 
 
 @pytest.mark.parametrize("height", [0.0, 1.5, 6.0])
-def test_a_ring_around_a_thing(model_of, height):
+def test_a_ring_around_an_object(model_of, height):
     centres = ring(24, height)
     found = oriented(model_of, cameras_at(centres, 0 * UP), 0.4 * normal(300, 3))
     assert tilt(found) < 0.01
-    assert found.translation.norm() < 0.05  # the thing is in the middle
+    assert found.translation.norm() < 0.05  # the object is at the centre
     distance = found.apply(centres).norm(dim=1)
     assert torch.allclose(distance, torch.full_like(distance, VIEWING_DISTANCE), rtol=0.03)
     assert found.rotation[2, 2] == pytest.approx(1)  # the first camera looks along +z
 
 
-def test_part_of_a_ring_from_above_is_not_taken_for_level(model_of):
+def test_photos_from_above_are_not_mistaken_for_level_ones(model_of):
     centres = ring(20, 4.0, arc=80)
     poses = rolled(cameras_at(centres, 0 * UP), 3 * normal(20))
     assert tilt(oriented(model_of, poses, 0.4 * normal(300, 3))) < 2.5
@@ -81,19 +81,19 @@ def test_some_rolled_photos_change_little(model_of, roll):
     assert tilt(oriented(model_of, poses, 0.4 * normal(300, 3))) < 1.5
 
 
-def test_a_wall(model_of):
+def test_photos_of_a_wall(model_of):
     grid = torch.cartesian_prod(torch.linspace(-1, 1, 5), torch.linspace(-0.6, 0.6, 4)).double()
     centres = torch.cat([grid, -5 + 0 * grid[:, :1]], 1)
     poses = rolled(cameras_at(centres, centres + torch.tensor([0, 0, 1.0])), normal(20))
     wall = normal(400, 3) * torch.tensor([2, 1.5, 0.1])
     found = oriented(model_of, poses, wall)
     assert tilt(found) < 1.5
-    assert found.rotation[2, 2] > 0.999  # they look along +z
+    assert found.rotation[2, 2] > 0.999  # the cameras look along +z
     assert found.apply(wall).median(0).values.norm() < 0.3
     assert found.apply(centres)[:, 2].median() == pytest.approx(-VIEWING_DISTANCE, rel=0.15)
 
 
-def test_a_room_from_its_middle(model_of):
+def test_a_room_seen_from_its_centre(model_of):
     outward = ring(30, 0.5) / 4
     poses = rolled(cameras_at(0.3 * outward, 2 * outward + 0.2 * normal(30, 3)), 3 * normal(30))
     directions = normal(2000, 3)
@@ -104,12 +104,12 @@ def test_a_room_from_its_middle(model_of):
     assert 0.5 * VIEWING_DISTANCE < 4 * found.scale < 1.5 * VIEWING_DISTANCE
 
 
-def test_a_map_from_the_air(model_of):
+def test_aerial_photos_looking_straight_down(model_of):
     grid = torch.cartesian_prod(torch.arange(5), torch.arange(4)).double()
     centres = torch.stack([grid[:, 0] - 2, -10 + 0 * grid[:, 0], grid[:, 1] - 1.5], 1)
     straight_down = cameras_at(centres, centres - UP)
     ground = normal(500, 3) * torch.tensor([4, 0.1, 4])
-    # Flown in lanes to and fro, and turned every way.
+    # Parallel lanes in alternating directions, then random rotations.
     turns = 360 * torch.rand(30, 20, dtype=F64, generator=torch.Generator().manual_seed(0))
     for degrees in (180 * (grid[:, 0] % 2), *turns):
         found = oriented(model_of, rolled(straight_down, degrees), ground)
@@ -117,25 +117,25 @@ def test_a_map_from_the_air(model_of):
         assert found.apply(ground).median(0).values.norm() < 0.5
 
 
-def test_a_walk_ahead(model_of):
+def test_a_forward_walk(model_of):
     centres = torch.stack([torch.zeros(20), torch.zeros(20), torch.arange(20) * 0.5], 1).double()
     wobble = 0.1 * normal(20, 3)
     poses = rolled(cameras_at(centres, centres + torch.tensor([0, 0, 1.0]) + wobble), normal(20))
     points = normal(800, 3, seed=2) * torch.tensor([2, 1, 4]) + torch.tensor([0, 0, 10.0])
     found = oriented(model_of, poses, points)
-    assert tilt(found) < 6  # all look the same way, so their common pitch is taken for level
+    assert tilt(found) < 6  # one viewing direction: a common pitch cannot be detected
     assert found.rotation[2, 2] > 0.99
     assert found.apply(points).median(0).values.norm() < 1
 
 
-def test_without_points_cameras_tell_the_scale(model_of):
+def test_without_points_the_camera_positions_determine_the_scale(model_of):
     found = oriented(model_of, cameras_at(ring(12, 1.0), 0 * UP), torch.zeros(0, 3, dtype=F64))
     assert tilt(found) < 0.01
     assert found.translation.norm() < 0.05
     assert 0.3 * VIEWING_DISTANCE < 4 * found.scale < 3 * VIEWING_DISTANCE
 
 
-def test_one_camera_and_none(model_of):
+def test_one_camera_and_no_camera(model_of):
     points = torch.tensor([0, 0, 4.0]) + 0.3 * normal(50, 3)
     pose = cameras_at(torch.zeros(1, 3, dtype=F64), torch.tensor([0, 0, 1.0], dtype=F64))
     found = oriented(model_of, pose, points)
@@ -144,14 +144,14 @@ def test_one_camera_and_none(model_of):
         orientation(model_of(pose[:0], points[:0]))
 
 
-def test_same_every_time(model_of):
+def test_the_result_is_deterministic(model_of):
     poses, points = cameras_at(ring(12, 1.0), 0 * UP), 0.4 * normal(100, 3)
     one, two = (orientation(model_of(poses, points)).to_json() for _ in range(2))
     assert one == two
 
 
 @pytest.mark.parametrize("name", ["fox", "fern", "kitchen25"])
-def test_real_datasets_stand_upright(name):
+def test_real_datasets_are_upright(name):
     folder = CAPTURES / name / "sparse" / "0"
     if not folder.is_dir():
         pytest.skip(f"no real dataset at ../shared/captures/{name}")
@@ -161,10 +161,10 @@ def test_real_datasets_stand_upright(name):
         [torch.from_numpy(image.cam_from_world().matrix()) for image in model.images.values()]
     )
     moved = found.apply_to_poses(poses)
-    # Photos are level: the x axis of most lies within 6 degrees of the horizontal, y points down.
+    # Photos are level: for most, x is within 6 degrees of the horizontal, and y points down.
     assert moved[:, 0, 1].abs().median() < 0.1
     assert moved[:, 1, 1].median() > 0.5
-    # The first thing one sees from the cameras on the whole is ahead, and so is the middle.
+    # The origin is in front of nearly all cameras.
     depth = moved[:, 2, 3]
     assert (depth > 0).double().mean() > 0.9
     assert invert_rigid(moved)[:, :, 3].norm(dim=1).median() == pytest.approx(3, rel=0.5)

@@ -1,4 +1,4 @@
-"""The pinhole camera of a lens: sound for every calibration that may come up."""
+"""The pinhole camera of a lens is valid for every calibration that SfM may return."""
 
 import numpy as np
 import pycolmap
@@ -19,7 +19,7 @@ def lens(model: str, params: list[float], width: int = 320, height: int = 240) -
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_no_blank_borders_and_as_large_as_colmap_makes_it(name):
+def test_no_blank_borders_and_the_same_size_as_colmap(name):
     camera = lens(*LENSES[name])
     pinhole = pinhole_of(camera)
     assert pinhole.nodes.min() > -1
@@ -31,7 +31,7 @@ def test_no_blank_borders_and_as_large_as_colmap_makes_it(name):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_nodes_are_where_the_lens_puts_them(name):
+def test_nodes_are_the_distorted_positions(name):
     camera = lens(*LENSES[name])
     pinhole = pinhole_of(camera)
     fx, fy, cx, cy = pinhole.params
@@ -50,7 +50,7 @@ def test_nodes_are_where_the_lens_puts_them(name):
         ("RADIAL", [260.0, 161.0, 122.0, 0.0, 0.0], (260.0, 260.0, 161.0, 122.0)),
     ],
 )
-def test_without_distortion_the_camera_stays_as_it_is(model, params, expected):
+def test_a_camera_without_distortion_is_unchanged(model, params, expected):
     pinhole = pinhole_of(lens(model, params))
     assert pinhole.nodes is None
     assert (pinhole.width, pinhole.height) == (320, 240)
@@ -64,22 +64,22 @@ def test_a_fisheye_without_coefficients_is_no_pinhole():
 @pytest.mark.parametrize(
     ("model", "params"),
     [
-        # Polynomials that turn back within the picture.
+        # Polynomials that turn back inside the image.
         ("SIMPLE_RADIAL", [250.0, 160.0, 120.0, -0.6]),
         ("FULL_OPENCV", [250.0, 250.0, 160.0, 120.0, 0.1, 0.1, 0.0, 0.0, 0.1, -2.0, 0.0, 0.0]),
     ],
 )
-def test_what_is_folded_is_cropped(model, params):
+def test_a_folded_image_is_cropped(model, params):
     pinhole = pinhole_of(lens(model, params))
     assert pinhole.cropped
     assert pinhole.width >= 64
-    # Left to right in the photo is left to right in the picture, all the way; and so downwards.
+    # The map is monotonic in both directions.
     assert (np.diff(pinhole.nodes[..., 0], axis=1) > 0).all()
     assert (np.diff(pinhole.nodes[..., 1], axis=0) > 0).all()
     assert pinhole.nodes.min() > -1
 
 
 @pytest.mark.parametrize("strength", [-30.0, 300.0])
-def test_nonsense_is_refused(strength):
-    with pytest.raises(ValueError, match="next to nothing"):
+def test_an_absurd_distortion_is_rejected(strength):
+    with pytest.raises(ValueError, match="less than a fifth"):
         pinhole_of(lens("SIMPLE_RADIAL", [250.0, 160.0, 120.0, strength]))

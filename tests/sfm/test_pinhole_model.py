@@ -1,4 +1,4 @@
-"""The model of the undistorted images sees what that of the photos saw, in another frame."""
+"""The undistorted model projects points to the undistorted positions, in the scene's frame."""
 
 import numpy as np
 import pycolmap
@@ -24,7 +24,7 @@ def opencv(strength: float) -> pycolmap.Camera:
 
 @pytest.fixture
 def found(model_of) -> pycolmap.Reconstruction:
-    """Two lenses, four photos, as SfM finds them."""
+    """The result of SfM: two lenses, four photos."""
     up = torch.tensor([0, -1.0, 0], dtype=F64)
     centres = torch.tensor([[-1.0, 0, -4], [-0.3, 0.2, -4], [0.4, 0, -4], [1, -0.2, -4]]).double()
     poses = torch.stack([look_at(centre, 0 * up, up) for centre in centres])
@@ -38,7 +38,7 @@ def written(model: pycolmap.Reconstruction, folder) -> pycolmap.Reconstruction:
     return pycolmap.Reconstruction(folder / "sparse" / "0")
 
 
-def test_keypoints_are_where_the_moved_points_fall(found, tmp_path):
+def test_keypoints_match_the_projected_points(found, tmp_path):
     before = {number: point.xyz.copy() for number, point in found.points3D.items()}
     after = written(found, tmp_path)
     assert after.num_points3D() == len(before)
@@ -52,10 +52,10 @@ def test_keypoints_are_where_the_moved_points_fall(found, tmp_path):
         if p.has_point3D()
     ]
     assert len(errors) > 400
-    assert max(errors) < 1e-3  # pixels; the keypoints were exact
+    assert max(errors) < 1e-3  # pixels; the original keypoints are exact
 
 
-def test_an_older_model_is_replaced_whole(found, tmp_path):
+def test_an_older_model_is_replaced_completely(found, tmp_path):
     (tmp_path / "sparse" / "0").mkdir(parents=True)
     (tmp_path / "sparse" / "1").mkdir()
     (tmp_path / "sparse" / "0" / "images.txt").write_text("old")
@@ -66,8 +66,8 @@ def test_an_older_model_is_replaced_whole(found, tmp_path):
     assert not {"1", "images.txt"} & names
 
 
-def test_keypoints_beyond_the_lens_model_are_numbers_all_the_same(found, tmp_path):
-    camera = opencv(-0.9)  # turns back inside of the picture
+def test_keypoints_without_an_undistorted_position_are_finite(found, tmp_path):
+    camera = opencv(-0.9)  # the polynomial turns back inside the image
     corner = np.array([[1.0, 1.0]])
     assert not np.isfinite(camera.cam_from_img(corner)).all()
     found.cameras[1].params = camera.params

@@ -1,4 +1,4 @@
-"""The page about a dataset: whole, alone, well-formed, whatever the names are."""
+"""capture_report.html is complete, self-contained and well-formed, for any file names."""
 
 import base64
 import io
@@ -77,15 +77,15 @@ def facts(**sfm: Any) -> dict[str, Any]:
     }
 
 
-def words(page: Path) -> str:
+def visible_text(page: Path) -> str:
     return " ".join("".join(ET.parse(page).getroot().find("body").itertext()).split())
 
 
-def test_page_is_well_formed_and_needs_nothing_else(dataset):
+def test_page_is_well_formed_and_self_contained(dataset):
     page = write_report(dataset, facts())
     assert page == dataset / "capture_report.html"
     text = page.read_text(encoding="utf-8")
-    ET.fromstring(text)  # strict: it is XML too
+    ET.fromstring(text)  # strict: the page is XML, too
     HTMLParser().feed(text)
     sources = re.findall(r'(?:src|href)="([^"]*)"', text)
     assert sources
@@ -94,8 +94,8 @@ def test_page_is_well_formed_and_needs_nothing_else(dataset):
     assert "url(" not in text
 
 
-def test_page_tells_what_came_of_it(dataset):
-    told = words(write_report(dataset, facts()))
+def test_page_reports_the_results(dataset):
+    shown = visible_text(write_report(dataset, facts()))
     for expected in (
         "mon <château>",
         "30 of 31 photos",
@@ -116,7 +116,7 @@ def test_page_tells_what_came_of_it(dataset):
         "158 × 118",
         "snowsplat train '",
     ):
-        assert expected in told
+        assert expected in shown
 
 
 def test_all_cameras_appear_in_both_drawings(dataset):
@@ -140,21 +140,23 @@ def test_thumbnails_are_small_images(dataset):
     assert (dataset / "capture_report.html").stat().st_size < 600_000
 
 
-def test_trouble_is_told(dataset):
-    told = words(write_report(dataset, facts(sub_models=[30, 12, 4], reprojection_error=2.5)))
-    assert "fall into 3 parts" in told
-    assert "30, 12, 4 photos" in told
-    assert "reprojection error is high" in told
-    calm = words(write_report(dataset, facts(unregistered={})))
-    assert "All 30 photos have their place." in calm
-    assert "parts" not in calm
-    assert "error is high" not in calm
+def test_problems_are_reported(dataset):
+    shown = visible_text(
+        write_report(dataset, facts(sub_models=[30, 12, 4], reprojection_error=2.5))
+    )
+    assert "form 3 separate groups" in shown
+    assert "30, 12, 4 photos" in shown
+    assert "reprojection error is high" in shown
+    without_problems = visible_text(write_report(dataset, facts(unregistered={})))
+    assert "The poses of all 30 photos were found." in without_problems
+    assert "groups" not in without_problems
+    assert "error is high" not in without_problems
 
 
-def test_long_lists_are_cut_and_odd_names_survive(dataset):
+def test_long_lists_are_shortened_and_any_name_is_accepted(dataset):
     lost = {f"p{i}\udcff\x07.jpg": "blurred" for i in range(900)}
     page = write_report(dataset, facts(unregistered=lost, reprojection_error=None))
-    told = words(page)
-    assert "p199" in told
-    assert "p200" not in told
-    assert "and 701 more" in told  # one of them was not read at all
+    shown = visible_text(page)
+    assert "p199" in shown
+    assert "p200" not in shown
+    assert "and 701 more" in shown  # one of them is a photo that could not be decoded

@@ -1,4 +1,4 @@
-"""Taking lens distortion out, against an analytic picture: no shift, no shade, little blur."""
+"""Undistortion compared with an analytic image: no shift, no change of brightness, little blur."""
 
 import numpy as np
 import pycolmap
@@ -25,11 +25,11 @@ def as_camera(pinhole: Pinhole) -> pycolmap.Camera:
 
 
 def photograph(camera: pycolmap.Camera, pitch: float, channels: int = 3) -> np.ndarray:
-    """(H, W, C) in 0..255: waves on a plane in front of the camera, ``pitch`` radians a unit."""
+    """(H, W, C) in 0..255: sine waves on a plane at z = 1, of ``pitch`` radians per unit."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = camera.cam_from_img(np.stack([x, y], -1).reshape(-1, 2))
-    turns = np.arange(channels) * 1.1 + 0.3
-    waves = np.sin(pitch * (rays[:, :1] * np.cos(turns) + rays[:, 1:] * np.sin(turns)) + turns)
+    phases = np.arange(channels) * 1.1 + 0.3
+    waves = np.sin(pitch * (rays[:, :1] * np.cos(phases) + rays[:, 1:] * np.sin(phases)) + phases)
     return (127.5 + 100 * waves).reshape(camera.height, camera.width, channels)
 
 
@@ -38,10 +38,10 @@ def to_image(values: np.ndarray) -> Image.Image:
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_a_photo_becomes_what_a_pinhole_camera_would_have_taken(name):
+def test_a_photo_becomes_that_of_the_pinhole_camera(name):
     camera = lens(*LENSES[name])
     pinhole = pinhole_of(camera)
-    # Some 14 pixels a wave; a fisheye makes them much shorter towards its rim.
+    # About 14 pixels per wave; the waves of a fisheye are much shorter near its border.
     pitch = 30 if name == "fisheye" else 110
     made = np.asarray(undistort_image(to_image(photograph(camera, pitch)), pinhole), np.float64)
     true = photograph(as_camera(pinhole), pitch)
@@ -50,7 +50,7 @@ def test_a_photo_becomes_what_a_pinhole_camera_would_have_taken(name):
     difference = (made - true)[inner]
     assert np.sqrt((difference**2).mean()) < 0.5  # bilinear sampling: 1.0 to 1.5
     assert abs(difference.mean()) < 0.02
-    # The displacement between the two, by least squares from the gradient: no shift of any part.
+    # Displacement by least squares from the gradient, in 3 × 3 parts: none is shifted.
     gradient_y, gradient_x = np.gradient(true, axis=(0, 1))
     for rows in np.array_split(np.arange(3, true.shape[0] - 3), 3):
         for columns in np.array_split(np.arange(3, true.shape[1] - 3), 3):
@@ -60,7 +60,7 @@ def test_a_photo_becomes_what_a_pinhole_camera_would_have_taken(name):
             assert np.abs(shift).max() < 0.02  # pixels
 
 
-def test_colours_of_what_is_transparent_do_not_bleed():
+def test_colours_of_transparent_pixels_do_not_bleed():
     camera = lens(*LENSES["barrel"])
     pixels = np.zeros((240, 320, 4), np.uint8)
     pixels[..., 1] = 255  # transparent green …
@@ -73,16 +73,16 @@ def test_colours_of_what_is_transparent_do_not_bleed():
     assert 0.9 < seen.mean() / ((pixels[..., 3] > 0).mean()) < 1.1
 
 
-def test_masks_stay_black_and_white():
+def test_masks_stay_binary():
     camera = lens(*LENSES["barrel"])
     x, y = np.meshgrid(np.arange(320), np.arange(240))
     disc = (np.hypot(x - 158, y - 121) < 70).astype(np.uint8) * 255
     made = np.asarray(undistort_mask(Image.fromarray(disc), pinhole_of(camera)))
     assert set(np.unique(made)) == {0, 255}
-    assert 1.0 < (made > 0).sum() / (disc > 0).sum() < 1.1  # a barrel is blown up
+    assert 1.0 < (made > 0).sum() / (disc > 0).sum() < 1.1  # barrel distortion: enlarged
 
 
-def test_neither_borders_nor_levels_change():
+def test_borders_and_levels_do_not_change():
     pinhole = pinhole_of(lens(*LENSES["tangential"]))
     for mode, colour in (("L", 255), ("L", 3), ("RGB", (1, 128, 254)), ("RGBA", (9, 99, 199, 255))):
         made = undistort_image(Image.new(mode, (320, 240), colour), pinhole)
@@ -91,14 +91,14 @@ def test_neither_borders_nor_levels_change():
         assert made.getcolors() == [(pinhole.width * pinhole.height, colour)]
 
 
-def test_without_distortion_the_photo_stays_as_it_is():
+def test_without_distortion_the_photo_is_unchanged():
     pinhole = pinhole_of(lens("PINHOLE", [260.0, 255.0, 160.0, 120.0]))
     image = Image.effect_noise((320, 240), 60)
     assert undistort_image(image, pinhole) is image
 
 
 @pytest.mark.parametrize("strip", [100, 5000, 1 << 30])
-def test_work_in_strips_does_not_show(strip, monkeypatch):
+def test_the_strip_size_does_not_change_the_result(strip, monkeypatch):
     camera = lens(*LENSES["tangential"])
     image, pinhole = to_image(photograph(camera, 110)), pinhole_of(camera)
     whole = np.asarray(undistort_image(image, pinhole), np.int64)

@@ -1,4 +1,4 @@
-"""The drawing of cameras and points: everything at its place, wild points left out, quick."""
+"""The drawing of cameras and points: correct positions, no outliers, fast."""
 
 import re
 import time
@@ -34,7 +34,7 @@ def cloud(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def frusta(root: ET.Element) -> dict[str, np.ndarray]:
-    """(8, 2) corners and eye of each camera's path, by its name."""
+    """(8, 2) corners and centre of each camera's path, by the photo's name."""
     found = {}
     for path in root.iter(f"{SVG}path"):
         title = path.find(f"{SVG}title")
@@ -45,13 +45,13 @@ def frusta(root: ET.Element) -> dict[str, np.ndarray]:
 
 
 def dots(root: ET.Element) -> np.ndarray:
-    """(n, 2) of all points."""
+    """(n, 2) positions of all points."""
     paths = [p.attrib["d"] for p in root.iter(f"{SVG}path") if "h0" in p.attrib["d"]]
     pairs = [pair for d in paths for pair in re.findall(r"M(-?[\d.]+) (-?[\d.]+)h0", d)]
     return np.array(pairs, float).reshape(-1, 2)
 
 
-def test_above_shows_ahead_at_the_top_and_the_side_shows_up_at_the_top():
+def test_the_top_is_forward_in_one_view_and_up_in_the_other():
     photos = [
         placed((0.0, 0.0, -3.0), name="near"),
         placed((0.0, 0.0, 3.0), name="far"),
@@ -66,14 +66,14 @@ def test_above_shows_ahead_at_the_top_and_the_side_shows_up_at_the_top():
     eye = {name: corners[5] for name, corners in frusta(side).items()}
     assert eye["high"][1] < eye["near"][1]
     assert eye["far"][0] > eye["near"][0]
-    # One scale, in both directions and both drawings.
+    # The scale is the same in both directions and both drawings.
     lengths = [
         np.linalg.norm(frusta(view)["far"][5] - frusta(view)["near"][5]) for view in (above, side)
     ]
     assert lengths[0] == pytest.approx(lengths[1], abs=0.3)
 
 
-def test_cameras_look_where_they_look():
+def test_frusta_show_the_viewing_direction():
     above = ET.fromstring(
         draw_scene([placed((0.0, 0.0, -3.0)), placed((3.0, 0.0, 0.0), name="r")], *cloud(100))[
             0
@@ -85,7 +85,7 @@ def test_cameras_look_where_they_look():
         assert np.allclose(direction / np.linalg.norm(direction), ahead, atol=0.02)
 
 
-def test_every_camera_is_inside_and_wild_points_are_not_there():
+def test_every_camera_is_inside_and_outliers_are_not_drawn():
     xyz, rgb = cloud(2000)
     xyz[:20] *= 1e4
     photos = ring(30)
@@ -100,7 +100,7 @@ def test_every_camera_is_inside_and_wild_points_are_not_there():
             assert (corners > -1).all()
             assert (corners < [width + 1, height + 1]).all()
         assert 1500 < len(dots(root)) <= 1980
-        # The wild ones did not make the rest small.
+        # The outliers did not reduce the scale of the rest.
         spread = np.ptp(np.array([c[5] for c in shown.values()]), axis=0)
         assert spread.max() > 0.5 * max(width, height)
 
@@ -113,7 +113,7 @@ def test_points_keep_their_colours():
     assert strokes == {"#ff2d2d"}
 
 
-def test_the_way_of_a_video_is_drawn_and_of_photos_is_not():
+def test_the_path_of_a_video_is_drawn_but_not_of_photos():
     lines = [
         list(ET.fromstring(draw_scene(ring(8, sequence), *cloud(50))[0].svg).iter(f"{SVG}polyline"))
         for sequence in ("walk <1>.mp4", None)
@@ -125,14 +125,14 @@ def test_the_way_of_a_video_is_drawn_and_of_photos_is_not():
 
 
 @pytest.mark.parametrize("photos", [[placed((0.0, 0.0, -3.0))], [placed((0.0, 0.0, -3.0))] * 3])
-def test_one_place_and_no_points(photos):
+def test_a_single_position_without_points(photos):
     for drawing in draw_scene(photos, np.empty((0, 3)), np.empty((0, 3), np.uint8)):
         root = ET.fromstring(drawing.svg)
         assert "nan" not in drawing.svg
         assert len(list(root.iter(f"{SVG}title"))) == len(photos)
 
 
-def test_a_large_scene_is_quick_and_small():
+def test_a_large_scene_is_drawn_fast_and_is_small():
     start = time.perf_counter()
     drawings = draw_scene(ring(1000), *cloud(300_000))
     assert time.perf_counter() - start < 5

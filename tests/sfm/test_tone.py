@@ -1,4 +1,4 @@
-"""HDR frames look like what they show."""
+"""Tone mapping of HDR video frames."""
 
 import av
 import numpy as np
@@ -32,7 +32,7 @@ def greys(picture):
         (16, [0.0, 0.3, 0.4, 0.58, 0.8]),  # PQ: diffuse white is 0.58
     ],
 )
-def test_white_is_nearly_white_and_what_is_brighter_too(transfer, signals):
+def test_diffuse_white_is_nearly_white_and_highlights_are_brighter(transfer, signals):
     black, dark, middle, white, light = greys(rgb_picture(frame_of(signals, transfer)))
     assert black <= 2
     assert 35 < dark < middle < 200
@@ -44,7 +44,7 @@ def test_ten_bits_without_hdr():
     assert np.abs(greys(rgb_picture(frame_of([0, 0.5, 1], 1))) - [0, 127.5, 255]).max() <= 2
 
 
-def test_colours_of_hdr_keep_their_hue():
+def test_hdr_colours_keep_their_hue():
     frame = frame_of([0.5, 0.5], 18)
     for plane, value in zip(frame.planes[1:], (470, 580), strict=True):
         plane.update(np.full((plane.height, plane.line_size // 2), value, np.uint16).tobytes())

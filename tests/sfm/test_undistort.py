@@ -1,4 +1,4 @@
-"""Photos and the model of SfM become a dataset that trains: files, masks, keypoints, sizes."""
+"""Photos and an SfM model become a dataset for training: files, masks, keypoints, sizes."""
 
 import json
 import threading
@@ -52,7 +52,7 @@ def write_photo(path: Path, mode: str = "RGB") -> None:
 
 @pytest.fixture
 def dataset(tmp_path, model_of) -> Path:
-    """Six photos with two lenses, as SfM leaves them; and one that it could not place."""
+    """The result of SfM: six photos with poses, by two lenses, and one photo without a pose."""
     return make_dataset_folder(tmp_path / "my dataset é", model_of, [lens(), lens(0.06)])
 
 
@@ -87,7 +87,7 @@ def make_dataset_folder(root: Path, model_of, cameras: list[pycolmap.Camera]) ->
 
 
 def test_a_mask_of_a_transparent_photo(dataset):
-    # Transparency is no mask in training, but a way to see nothing; a mask on top of it is one.
+    # Training treats transparent pixels as empty space; only the rest of a mask is needed.
     path = dataset / "distorted" / "masks" / f"{NAMES[2]}.png"
     alpha = np.asarray(Image.open(dataset / "input" / NAMES[2]))[..., 3]
     opaque = np.where(alpha > 0, 255, 0).astype(np.uint8)
@@ -111,7 +111,7 @@ def files(folder: Path) -> list[str]:
     return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
 
-def test_a_dataset_that_loads_comes_of_it(dataset):
+def test_the_result_is_a_dataset_that_can_be_loaded(dataset):
     made = undistort(dataset, PHOTOS, scene(), True, silent)
     assert made.images == 6
     assert made.resampled
@@ -125,7 +125,7 @@ def test_a_dataset_that_loads_comes_of_it(dataset):
     assert files(dataset / "masks") == sorted([f"{NAMES[1]}.png", f"{NAMES[2]}.png"])
     loaded = load_dataset(dataset, hold_out=None)
     assert len(loaded.train) == 6
-    assert len(loaded.points.xyz) > 290  # those in two photos or more
+    assert len(loaded.points.xyz) > 290  # those that two or more photos see
     for divisor in (2, 4, 8):
         smaller = load_dataset(dataset, hold_out=None, resolution=divisor)
         for view in smaller.train:
@@ -137,7 +137,7 @@ def test_a_dataset_that_loads_comes_of_it(dataset):
         assert float(share) == pytest.approx(1 - 100 * 50 / (WIDTH * HEIGHT), abs=0.03)
 
 
-def test_formats_and_transparency_stay(dataset):
+def test_formats_and_transparency_are_preserved(dataset):
     undistort(dataset, PHOTOS, scene(), True, silent)
     for name, form in zip(NAMES, ["JPEG", "JPEG", "PNG", "PNG", "WEBP", "TIFF"], strict=True):
         for folder in ("images", "images_2"):
@@ -152,7 +152,7 @@ def test_formats_and_transparency_stay(dataset):
 
 
 @pytest.mark.parametrize("strength", [-0.12, 0.0])
-def test_the_model_sees_what_it_saw(tmp_path, model_of, strength):
+def test_the_model_matches_the_undistorted_keypoints(tmp_path, model_of, strength):
     dataset = make_dataset_folder(tmp_path, model_of, [lens(strength)])
     before = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
     undistort(dataset, PHOTOS, scene(), False, silent)
@@ -171,12 +171,12 @@ def test_the_model_sees_what_it_saw(tmp_path, model_of, strength):
         if p.has_point3D()
     ]
     assert len(errors) > 1000
-    assert max(errors) < 1e-3  # pixels; the keypoints were exact
+    assert max(errors) < 1e-3  # pixels; the original keypoints are exact
     assert (dataset / "sparse" / "0" / "points3D.ply").is_file()
 
 
-def test_pixels_are_where_the_model_says(dataset):
-    # A white dot on black at each keypoint, and again at each undistorted keypoint.
+def test_pixels_are_where_the_model_predicts(dataset):
+    # A white blob is drawn at a keypoint, and must be found at the undistorted keypoint.
     before = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
     image = before.find_image_with_name(NAMES[3])
     spots = [p.xy for p in image.points2D if (p.xy > 20).all() and (p.xy < [300, 220]).all()][:40]
@@ -206,7 +206,7 @@ def test_without_distortion_photos_are_copied(tmp_path, model_of):
     assert sorted(mask.getcolors()) == sorted([(5000, 0), (WIDTH * HEIGHT - 5000, 255)])
 
 
-def test_orientation_can_be_undone(dataset):
+def test_the_orientation_can_be_inverted(dataset):
     model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
     scene_from_sfm = orientation(model)
     undistort(dataset, PHOTOS, scene_from_sfm, False, silent)
@@ -218,7 +218,7 @@ def test_orientation_can_be_undone(dataset):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_number_of_threads_changes_nothing(dataset, threads):
+def test_the_number_of_threads_does_not_change_the_result(dataset, threads):
     before = torch.get_num_threads()
     steps: list[tuple[int, int]] = []
     undistort(
@@ -231,7 +231,7 @@ def test_number_of_threads_changes_nothing(dataset, threads):
     assert once == [(dataset / "images" / name).read_bytes() for name in NAMES]
 
 
-def test_stopping_leaves_no_model_and_no_threads(dataset):
+def test_an_interruption_leaves_no_model_and_no_threads(dataset):
     def stop(done: int, total: int, what: str = "") -> None:
         if done == 2:
             raise KeyboardInterrupt
@@ -243,11 +243,11 @@ def test_stopping_leaves_no_model_and_no_threads(dataset):
     assert not [t for t in threading.enumerate() if t.name.startswith("snowsplat-undistort")]
 
 
-def test_photos_that_went_away_or_changed_are_named(dataset):
+def test_missing_and_changed_photos_are_named(dataset):
     path = dataset / "input" / NAMES[1]
     good = path.read_bytes()
     path.unlink()
-    with pytest.raises(UserError, match="one.jpg: no such image"):
+    with pytest.raises(UserError, match="one.jpg: missing"):
         undistort(dataset, PHOTOS, scene(), False, silent)
     path.write_bytes(good[: len(good) // 2])
     with pytest.raises(UserError, match="one.jpg: cannot be decoded"):
@@ -256,25 +256,25 @@ def test_photos_that_went_away_or_changed_are_named(dataset):
     with pytest.raises(UserError, match="one.jpg: cannot be read"):
         undistort(dataset, PHOTOS, scene(), False, silent)
     Image.new("RGB", (100, 50)).save(path)
-    with pytest.raises(UserError, match="one.jpg: is 100x50"):
+    with pytest.raises(UserError, match="one.jpg: size is 100x50"):
         undistort(dataset, PHOTOS, scene(), False, silent)
 
 
-def test_a_calibration_that_is_partly_sound_is_cropped_with_a_warning(tmp_path, model_of, caplog):
+def test_a_partly_valid_calibration_is_cropped_with_a_warning(tmp_path, model_of, caplog):
     dataset = make_dataset_folder(tmp_path, model_of, [lens(-0.6)])
     made = undistort(dataset, PHOTOS, scene(), False, silent)
     assert "OPENCV 260, 258, 164, 119, -0.6, " in caplog.text
-    assert "show less" in caplog.text
+    assert "images are cropped" in caplog.text
     assert made.sizes[0][1] < HEIGHT
 
 
-def test_a_calibration_that_is_nonsense_is_refused(tmp_path, model_of):
+def test_an_absurd_calibration_is_rejected(tmp_path, model_of):
     dataset = make_dataset_folder(tmp_path, model_of, [lens()])
     sparse = dataset / "distorted" / "sparse" / "0"
     model = pycolmap.Reconstruction(sparse)
     for camera in model.cameras.values():
         camera.params = [260.0, 258.0, 164.0, 119.0, -40.0, 0.0, 0.0, 0.0]
     model.write(sparse)
-    with pytest.raises(UserError, match="OPENCV.*makes no sense"):
+    with pytest.raises(UserError, match="lens distortion: implausible estimate .*OPENCV"):
         undistort(dataset, PHOTOS, scene(), False, silent)
     assert not (dataset / "images").exists()

@@ -14,7 +14,7 @@ from snowsplat.cli.stages import StageProgress
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from snowsplat.sfm.pipeline import DatasetOptions
+    from snowsplat.sfm.dataset_folder import DatasetOptions
     from snowsplat.sfm.progress import Report
     from snowsplat.util.stages import Outcome
 
@@ -76,7 +76,7 @@ class Sfm:
 
     def run(self) -> int:
         """Gives the exit code, 0."""
-        from snowsplat.sfm.pipeline import make_dataset
+        from snowsplat.sfm.dataset_folder import make_dataset
 
         inputs, folder = self._where()
         with StageProgress(self.quiet) as progress:
@@ -112,7 +112,7 @@ class Sfm:
     def _options(self) -> DatasetOptions:
         from snowsplat.sfm.colmap import SfmOptions
         from snowsplat.sfm.ingest.inputs import GatherOptions
-        from snowsplat.sfm.pipeline import DatasetOptions
+        from snowsplat.sfm.dataset_folder import DatasetOptions
 
         check_threads(self.threads)
         lens: dict[str, Any] = {}

@@ -124,7 +124,7 @@ class Making:
         from snowsplat.cli.stages import StageProgress
         from snowsplat.sfm.colmap import SfmOptions
         from snowsplat.sfm.ingest.inputs import GatherOptions
-        from snowsplat.sfm.pipeline import DatasetOptions, make_dataset
+        from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
 
         options = DatasetOptions(
             gather=GatherOptions(size=PRESETS[self.quality].photos),

@@ -1,7 +1,7 @@
-"""Which way is up, where the middle is and how large the scene is: from the cameras alone.
+"""Orientation, origin and scale of the scene, estimated from the camera poses alone.
 
-SfM leaves the world frame open: its solution is as good when turned, moved and scaled. People and
-viewers care: up should be up, and the thing photographed where one looks first.
+SfM determines the scene only up to a similarity transform. Viewers need more: up should be up, and
+the photographed object should be at the origin.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _POINTS_SAMPLED = 5000  # enough for medians
 
 @dataclass(frozen=True)
 class _Seen:
-    """The parts of a model that matter here, world frame of SfM; cameras in order of names."""
+    """The parts of a model that are needed here, in the world frame of SfM; cameras by name."""
 
-    rotations: np.ndarray  # (N, 3, 3), of cam_from_world: rows are the cameras' x, y, z axes
+    rotations: np.ndarray  # (N, 3, 3) of cam_from_world: the rows are the cameras' x, y, z axes
     centres: np.ndarray  # (N, 3)
     points: np.ndarray  # (P, 3)
-    distances: np.ndarray  # (N,) from a camera to the median point it sees; NaN if it sees none
+    distances: np.ndarray  # (N,) from a camera to the median point that it sees; NaN without points
 
     @property
     def forward(self) -> np.ndarray:
@@ -38,11 +38,11 @@ class _Seen:
 
 
 def orientation(model: pycolmap.Reconstruction) -> Similarity:
-    """``scene_from_sfm``: y down, z where the cameras look on the whole, the middle at the origin.
+    """``scene_from_sfm``: y points down, z along the mean viewing direction, centre at the origin.
 
-    Up is chosen so that the photos are level; the middle is what the cameras look at, or, where
-    they look outwards or all the same way, the median of the points. The scale makes
-    `VIEWING_DISTANCE` the median distance from camera to point.
+    Up is the direction that makes the photos level. The centre is the point that the cameras look
+    at. If they look outwards or all in the same direction, it is the median of the points. The
+    scale makes `VIEWING_DISTANCE` the median distance from a camera to the points that it sees.
 
     Raises:
         ValueError: the model has no cameras.
@@ -88,9 +88,9 @@ def _read(model: pycolmap.Reconstruction) -> _Seen:
 
 
 def _heading(seen: _Seen, up: np.ndarray) -> np.ndarray:
-    """(3,) horizontal: where the cameras look on the whole, else where the first one looks."""
+    """(3,) horizontal: the mean viewing direction; if it is too short, that of the first camera."""
     level = np.eye(3) - np.outer(up, up)
-    # One that looks straight down is turned as its upper edge says.
+    # For a camera that looks straight down, use the direction of its upper image edge.
     candidates = (seen.forward.mean(axis=0), seen.forward[0], -seen.rotations[0, 1])
     for direction, least in zip(candidates, (0.5, 0.1, 0.0), strict=True):
         horizontal = level @ direction
@@ -101,7 +101,7 @@ def _heading(seen: _Seen, up: np.ndarray) -> np.ndarray:
 
 
 def _middle(seen: _Seen) -> np.ndarray:
-    """(3,) where the optical axes meet, if they do; else the median of the points."""
+    """(3,) the point where the optical axes meet; if they do not, the median of the points."""
     meeting = _meeting_point(seen)
     if meeting is not None:
         return meeting
@@ -111,9 +111,10 @@ def _middle(seen: _Seen) -> np.ndarray:
 
 
 def _meeting_point(seen: _Seen) -> np.ndarray | None:
-    """(3,) the point nearest to the optical axes (least sum of distances).
+    """(3,) the point with the least sum of distances to the optical axes.
 
-    None where the axes are nearly parallel, pass each other far off, or meet behind the cameras.
+    None if the axes are nearly parallel, if they do not come close to one point, or if that point
+    is behind the cameras. Computed by iteratively reweighted least squares.
     """
     axes, centres = seen.forward, seen.centres
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (N, 3, 3)
@@ -132,7 +133,7 @@ def _meeting_point(seen: _Seen) -> np.ndarray | None:
 
 
 def _distance(seen: _Seen) -> float:
-    """The median distance from a camera to the points it sees; without points, between cameras."""
+    """Median distance from a camera to the points it sees; without points, between the cameras."""
     distances = seen.distances[np.isfinite(seen.distances)]
     if not len(distances):
         distances = np.linalg.norm(seen.centres - np.median(seen.centres, axis=0), axis=1)

@@ -1,6 +1,7 @@
-"""The pinhole camera that a photo gets when its lens distortion is taken out.
+"""The pinhole camera of an undistorted photo.
 
-Sound for every calibration that SfM may come up with: no blank borders, nothing folded.
+It is chosen so that the undistorted image has no blank borders and no folded parts, for every
+calibration that SfM may return.
 """
 
 from __future__ import annotations
@@ -13,36 +14,36 @@ import numpy as np
 if TYPE_CHECKING:
     import pycolmap
 
-_MAP_ERROR = 0.02  # pixels, at most
-_CELLS = (64, 32, 16, 8, 4)  # pixels, about
-_SMALLEST = 0.2  # of the photo's width and height; below it the calibration is no such thing
+_MAP_ERROR = 0.02  # pixels: largest error of the bilinear interpolation between nodes
+_CELLS = (64, 32, 16, 8, 4)  # pixels: approximate cell sizes, tried in this order
+_SMALLEST = 0.2  # of the photo's width and height: if less remains, the calibration is wrong
 
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """A camera without distortion, and where its pixels are found in photos of the distorted one.
+    """A camera without distortion, and the map from its pixels to those of the distorted photo.
 
-    ``nodes`` (n + 1, m + 1, 2) are positions x, y in the photo, in pixels, of the corners of n × m
-    equal cells into which the new picture is divided; in between they are interpolated
-    bilinearly. None where there is no distortion.
+    The undistorted image is divided into n × m equal cells. ``nodes`` (n + 1, m + 1, 2) holds the
+    positions x, y in the photo, in pixels, of the corners of the cells. Positions in between are
+    interpolated bilinearly. None if there is no distortion.
     """
 
     width: int  # pixels
     height: int
     params: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
     nodes: np.ndarray | None = None
-    cropped: bool = False  # shows less than it might, as the calibration is not sound further out
+    cropped: bool = False  # the calibration is valid only near the centre, so a part is cut off
 
 
 def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
     """The pinhole camera of a distorted one: same focal lengths, no blank borders.
 
     Raises:
-        ValueError: the distortion leaves next to nothing of the photo.
+        ValueError: the calibration is valid only for a small part of the photo.
     """
     import pycolmap
 
-    # A fisheye lens without coefficients is "undistorted" too, but no pinhole.
+    # A fisheye lens with zero coefficients counts as "undistorted", but it is no pinhole camera.
     if camera.is_perspective_pinhole() and camera.is_undistorted():
         params = (
             camera.focal_length_x,
@@ -51,13 +52,13 @@ def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
             camera.principal_point_y,
         )
         return Pinhole(camera.width, camera.height, params)
-    # Fills the picture from border to border, within 0.2 to 2 times the photo's size.
+    # COLMAP chooses an image without blank borders, of 0.2 to 2 times the size of the photo.
     whole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     made, cropped = whole, False
     if not _is_sound(camera, whole):
-        # Outside of some radius a polynomial may turn back, and the picture be folded there; and a
-        # picture at a bound of its size may have blank borders. Take as much around the principal
-        # point as has neither.
+        # Beyond some radius the distortion polynomial may turn back, so that the image is folded
+        # there. An image at a bound of its size may have blank borders. Search for the largest
+        # part around the principal point that has neither.
         cropped = True
         low, high = 0.0, 1.0
         while high - low > 1e-3:
@@ -69,7 +70,7 @@ def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
                 high = middle
         small = made.width < _SMALLEST * camera.width or made.height < _SMALLEST * camera.height
         if low == 0 or small:
-            raise ValueError("the distortion leaves next to nothing of the picture")
+            raise ValueError("less than a fifth of the width or height can be undistorted")
     fx, fy, cx, cy = (float(value) for value in made.params)
     return Pinhole(made.width, made.height, (fx, fy, cx, cy), _nodes(camera, made), cropped)
 
@@ -77,9 +78,9 @@ def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
 def _to_photo(
     camera: pycolmap.Camera, pinhole: pycolmap.Camera, x: np.ndarray, y: np.ndarray
 ) -> np.ndarray:
-    """(len(y), len(x), 2): where positions of the undistorted picture lie in the photo, pixels.
+    """(len(y), len(x), 2): positions of undistorted pixels in the photo, in pixels.
 
-    NaN where the lens model has no answer.
+    NaN where the lens model is undefined.
     """
     fx, fy, cx, cy = pinhole.params
     across, down = np.meshgrid((x - cx) / fx, (y - cy) / fy)
@@ -88,7 +89,7 @@ def _to_photo(
 
 
 def _shrunk(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera | None:
-    """The part around the principal point, ``factor`` times as large; same focal lengths."""
+    """The part around the principal point, scaled by ``factor`` in size; same focal lengths."""
     import pycolmap
 
     width, height = int(factor * camera.width), int(factor * camera.height)
@@ -100,22 +101,22 @@ def _shrunk(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera | None:
 
 
 def _is_sound(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
-    """Whether every pixel of the picture is in the photo, and none of it is folded or torn."""
+    """Whether every pixel of the undistorted image is in the photo, without folds or gaps."""
     x, y = (np.linspace(0, size, 65) for size in (pinhole.width, pinhole.height))
     source = _to_photo(camera, pinhole, x, y)
     if not np.isfinite(source).all():
         return False
-    # One pixel for rounding sizes: the outermost pixels are repeated that far.
+    # Sizes are rounded: allow one pixel outside, where the outermost pixels are repeated.
     if (source < -1).any() or (source > [camera.width + 1, camera.height + 1]).any():
         return False
     right, down = source[:-1, 1:] - source[:-1, :-1], source[1:, :-1] - source[:-1, :-1]
     area = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
-    # A hundredth of the area at the middle: what is spread so thin is not a picture any more.
+    # At least 1% of the area at the centre: what is stretched more has no usable detail.
     return bool(area.min() > 0.01 * area[32, 32] > 0)
 
 
 def _nodes(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> np.ndarray:
-    """Of the largest cells on whose inside bilinear interpolation is exact enough."""
+    """The nodes of the largest cells in which bilinear interpolation is exact enough."""
     for cell in _CELLS:
         x, y = (
             np.linspace(0, size, -(-size // cell) + 1) for size in (pinhole.width, pinhole.height)

@@ -1,4 +1,4 @@
-"""The model of SfM -> that of the undistorted images, in the scene's frame."""
+"""The COLMAP model of the photos -> that of the undistorted images, in the scene's frame."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def write_model(
     scene_from_sfm: Similarity,
     sparse: Path,
 ) -> None:
-    """Turn ``model`` into that of the images and write it to ``sparse``/0; replaces what is there.
+    """Transform ``model`` in place and write it to ``sparse``/0; replaces an existing folder.
 
-    Points keep their tracks and colours, keypoints move to where the images have them.
-    ``pinholes`` are by the number of the camera.
+    Points keep their tracks and colours. Keypoints are moved to their undistorted positions.
+    ``pinholes`` maps camera ids to the new cameras.
     """
     import pycolmap
 
@@ -39,7 +39,7 @@ def write_model(
         camera.model = pycolmap.CameraModelId.PINHOLE
         camera.width, camera.height = pinhole.width, pinhole.height
         camera.params = list(pinhole.params)
-    # Under another name until it is whole.
+    # Write under a temporary name, so that ``sparse`` is always complete.
     new = sparse.with_name(f".{sparse.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     (new / "0").mkdir(parents=True)
@@ -56,5 +56,5 @@ def _undistort_keypoints(image: pycolmap.Image, camera: pycolmap.Camera, pinhole
     fx, fy, cx, cy = pinhole.params
     pixels = camera.cam_from_img(np.array([point.xy for point in points])) * (fx, fy) + (cx, cy)
     for point, xy in zip(points, pixels, strict=True):
-        # Near the rim the lens model may have no inverse; readers want numbers all the same.
+        # Near the border the lens model may have no inverse; readers need finite numbers.
         point.xy = xy if np.isfinite(xy).all() else np.array([-1.0, -1.0])

@@ -1,4 +1,4 @@
-"""How a long job says how far it is."""
+"""The progress callback of a long job."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from typing import Protocol
 
 
 class Report(Protocol):
-    """Called now and then: ``done`` of ``total`` (0: not known) of ``what`` are finished."""
+    """Called repeatedly: ``done`` of ``total`` items are finished; a total of 0 is unknown.
+
+    ``what`` names the items, e.g. "photos".
+    """
 
     def __call__(self, done: int, total: int, what: str = "") -> None: ...
 
 
 def silent(done: int, total: int, what: str = "") -> None:
-    """A `Report` that says nothing."""
+    """A `Report` that does nothing."""

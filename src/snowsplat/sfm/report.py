@@ -1,4 +1,4 @@
-"""capture_report.html: what came of the photos, on one page that needs nothing else."""
+"""capture_report.html: the result of structure from motion as one self-contained page."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from snowsplat.util.html import bar, cards, duration, page, picture, table, text
 from snowsplat.util.safe_json import printable
 
 _FILE = "capture_report.html"
-_THUMBNAILS = 24  # at most, evenly chosen
+_THUMBNAILS = 24  # at most, evenly spaced over the photos
 _THUMBNAIL_HEIGHT = 110  # pixels
-_NAMED = 200  # photos that are listed one by one
-_ERROR_HIGH = 1.5  # pixels; good ones are below 1
+_NAMED = 200  # unused photos that are listed; the rest is counted
+_ERROR_HIGH = 1.5  # pixels; a good reconstruction is below 1
 
-_FOCAL_FROM = {"exif": "the camera's note (EXIF) refined", "guessed": "found from the photos"}
-_STAGES = {"photos": "reading photos", "poses": "finding poses", "images": "undistorting"}
+_FOCAL_FROM = {"exif": "from EXIF, refined", "guessed": "estimated from the photos"}
+_STAGES = {"photos": "reading photos", "poses": "estimating poses", "images": "undistorting"}
 
 _STYLE = """
 .maps { display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start; }
@@ -36,11 +36,11 @@ svg.map { width: 100%; height: auto; display: block; }
 
 
 def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
-    """Write ``capture_report.html`` of a finished dataset; gives its path.
+    """Write ``capture_report.html`` of a finished dataset; returns its path.
 
     Args:
-        facts: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm", an
-            `SfmResult`; "undistorted", an `Undistorted`; "seconds" of each stage: JSON values.
+        facts: JSON values: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm",
+            an `SfmResult`; "undistorted", an `Undistorted`; "seconds", the duration of each stage.
 
     Raises:
         UserError: the model in ``sparse/0`` or an image cannot be read.
@@ -54,8 +54,8 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         _strip(dataset, [photo.name for photo in photos]),
         _lenses(facts["sfm"]["cameras"], facts["undistorted"]),
         _left_out(facts),
-        _course(facts),
-        _next(dataset),
+        _timing(facts),
+        _next_step(dataset),
     ]
     path = dataset / _FILE
     write_text(path, page(f"{name} – dataset", body, _STYLE))
@@ -81,21 +81,21 @@ def _headline(name: str, facts: dict[str, Any]) -> str:
     sfm = facts["sfm"]
     placed, rest = len(sfm["registered"]), len(sfm["unregistered"])
     if not rest:
-        verdict = f"All {placed} photos have their place."
+        verdict = f"The poses of all {placed} photos were found."
     else:
-        verdict = f"{placed} of {placed + rest} photos have their place."
+        verdict = f"The poses of {placed} of {placed + rest} photos were found."
     lines = [f"<h1>{text(name)}</h1>", f"<p>{verdict}</p>"]
     if len(sfm["sub_models"]) > 1:
         sizes = ", ".join(map(str, sfm["sub_models"]))
         lines.append(
-            f'<p class="bad">The photos fall into {len(sfm["sub_models"])} parts that do not hang '
-            f"together ({sizes} photos); the largest is used. Photos from in between join them.</p>"
+            f'<p class="bad">The photos form {len(sfm["sub_models"])} separate groups ({sizes} '
+            "photos); only the largest is used. Take more photos in between to connect them.</p>"
         )
     error = sfm["reprojection_error"]
     if error is not None and error > _ERROR_HIGH:
         lines.append(
-            '<p class="bad">The reprojection error is high: look for photos that are blurred, or '
-            "of things that moved, or another camera model.</p>"
+            '<p class="bad">The reprojection error is high. Remove photos that are blurred or show '
+            "moving objects, or try another camera model.</p>"
         )
     return "\n".join(lines)
 
@@ -105,11 +105,11 @@ def _cards(facts: dict[str, Any]) -> str:
     total = len(sfm["registered"]) + len(sfm["unregistered"])
     error = sfm["reprojection_error"]
     figures = [
-        (f"{len(sfm['registered'])} / {total}", "photos placed"),
-        (f"{sfm['points']:,}", f"points, seen {sfm['observations']:,} times"),
+        (f"{len(sfm['registered'])} / {total}", "photos with a pose"),
+        (f"{sfm['points']:,}", f"points, {sfm['observations']:,} observations"),
         ("–" if error is None else f"{error:.2f} px", "mean reprojection error"),
         (str(len(sfm["cameras"])), "lens" if len(sfm["cameras"]) == 1 else "lenses"),
-        (duration(sum(facts["seconds"].values())), "in all"),
+        (duration(sum(facts["seconds"].values())), "total time"),
     ]
     return cards(figures)
 
@@ -119,12 +119,12 @@ def _maps(dataset: Path, photos: Sequence[PlacedPhoto]) -> str:
     xyz = np.empty((0, 3)) if points is None else points.xyz.numpy().astype(np.float64)
     rgb = np.empty((0, 3), np.uint8) if points is None else points.rgb.numpy()
     captions = (
-        "From above. Orange: the cameras; white: the first one.",
-        "From the side. Up is up.",
+        "From above. Orange: the cameras; white: the first camera.",
+        "From the side.",
     )
     if any(photo.sequence is not None for photo in photos):
-        captions = (captions[0] + " Blue: the way of the video.", captions[1])
-    # Beside each other they fill the page at one scale: they grow as they are wide.
+        captions = (captions[0] + " Blue: the path of the video.", captions[1])
+    # Side by side, both drawings have the same scale: flex-grow is proportional to the width.
     figures = "\n".join(
         f'<figure style="flex:{drawing.width} 1 {drawing.width // 2}px;'
         f'max-width:{2 * drawing.width}px">{drawing.svg}'
@@ -147,7 +147,7 @@ def _strip(dataset: Path, names: Sequence[str]) -> str:
 
 def _thumbnail(path: Path) -> Image.Image:
     with Image.open(path) as image:
-        image.draft("RGB", (4 * _THUMBNAIL_HEIGHT, 2 * _THUMBNAIL_HEIGHT))  # JPEG decodes smaller
+        image.draft("RGB", (4 * _THUMBNAIL_HEIGHT, 2 * _THUMBNAIL_HEIGHT))  # faster JPEG decoding
         width = max(1, round(image.width * _THUMBNAIL_HEIGHT / image.height))
         small = image.convert("RGBA" if "A" in image.mode else "RGB")
         small = small.resize((width, _THUMBNAIL_HEIGHT), Image.Resampling.LANCZOS)
@@ -161,7 +161,7 @@ def _lenses(cameras: Iterable[dict[str, Any]], undistorted: dict[str, Any]) -> s
     rows = []
     for camera in cameras:
         width, height, focal = camera["width"], camera["height"], float(camera["params"][0])
-        # The angle that a pinhole of that focal length sees; a lens' own differs a little.
+        # The angle of view of a pinhole camera; that of the distorted lens differs a little.
         angle = math.degrees(2 * math.atan(max(width, height) / 2 / focal)) if focal > 0 else 0.0
         parameters = ", ".join(f"{value:.5g}" for value in camera["params"])
         rows.append(
@@ -173,9 +173,7 @@ def _lenses(cameras: Iterable[dict[str, Any]], undistorted: dict[str, Any]) -> s
             ]
         )
     sizes = ", ".join(f"{w} × {h}" for w, h, *_ in undistorted["sizes"])
-    how = (
-        "without lens distortion" if undistorted["resampled"] else "copied: there is no distortion"
-    )
+    how = "undistorted" if undistorted["resampled"] else "copied, as there is no distortion"
     lenses = table(["photos", "size", "focal length (longer side)", "lens model"], rows)
     return f'<h2>Lenses</h2>\n{lenses}\n<p class="soft">Images for training: {sizes}, {how}.</p>'
 
@@ -190,10 +188,10 @@ def _left_out(facts: dict[str, Any]) -> str:
     rows = [[text(name), text(why)] for name, why in entries[:_NAMED]]
     more = len(entries) - _NAMED
     rest = f'<p class="soft">… and {more:,} more, see capture.json.</p>' if more > 0 else ""
-    return f"<h2>Not used</h2>\n{table(['photo', 'why'], rows, 'names')}{rest}"
+    return f"<h2>Photos not used</h2>\n{table(['photo', 'reason'], rows, 'names')}{rest}"
 
 
-def _course(facts: dict[str, Any]) -> str:
+def _timing(facts: dict[str, Any]) -> str:
     seconds = facts["seconds"]
     longest = max([*seconds.values(), 1e-9])
     rows = []
@@ -204,19 +202,19 @@ def _course(facts: dict[str, Any]) -> str:
     settings = text(json.dumps(facts["settings"], indent=2, ensure_ascii=False))
     inputs = ", ".join(text(path) for path in facts["inputs"])
     return (
-        f"<h2>How it went</h2>\n{table(['stage', 'time', ''], rows)}\n"
-        f'<p class="soft">From {inputs}. Pairs of photos: {text(sfm["pairs"])}.</p>\n'
+        f"<h2>Time and settings</h2>\n{table(['stage', 'time', ''], rows)}\n"
+        f'<p class="soft">Inputs: {inputs}. Matched pairs: {text(sfm["pairs"])}.</p>\n'
         f"<ol>{attempts}</ol>\n"
         f"<details><summary>Settings</summary><pre>{settings}</pre></details>"
     )
 
 
 def _name(inputs: Sequence[str]) -> str:
-    """What the dataset is of; of photos in LOCATION/input, that is LOCATION."""
+    """A name for the dataset: that of the input; of the folder above if that is ``input``."""
     first = Path(inputs[0])
     return first.parent.name if first.name == "input" else first.stem
 
 
-def _next(dataset: Path) -> str:
+def _next_step(dataset: Path) -> str:
     command = f"snowsplat train {shlex.quote(str(dataset))} -o {shlex.quote(dataset.name + '-out')}"
-    return f"<h2>Next</h2>\n<pre>{text(command)}</pre>"
+    return f"<h2>Next step</h2>\n<pre>{text(command)}</pre>"

@@ -1,7 +1,7 @@
-"""Pixels of a photo where a `Pinhole` wants them. A pixel's centre is at one half throughout.
+"""Resample photos and masks for a `Pinhole`. The centre of a pixel is at one half throughout.
 
-Photos are sampled with Catmull-Rom splines, whose error is a quarter of that of bilinear
-interpolation or less: training looks at every pixel, and what is blurred here stays blurred.
+Photos are sampled with Catmull-Rom splines, which have at most a quarter of the error of bilinear
+interpolation. Training uses every pixel, so blur added here would limit its quality.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torch import Tensor
 
 from snowsplat.sfm.pinhole import Pinhole
 
-_STRIP_PIXELS = 1 << 16  # done at once: bounds the memory, and fits the caches
+_STRIP_PIXELS = 1 << 16  # processed at a time: limits the memory and fits the caches
 
 
 def undistort_image(image: Image.Image, pinhole: Pinhole) -> Image.Image:
-    """A photo, "L", "RGB" or "RGBA", as the pinhole camera would have taken it."""
+    """A photo, "L", "RGB" or "RGBA", resampled to the pinhole camera; same mode."""
     if pinhole.nodes is None:
         return image
-    # With colours multiplied by alpha, so that what is transparent does not bleed.
+    # Colours are multiplied by alpha, so that transparent pixels do not bleed into others.
     mode = "RGBa" if image.mode == "RGBA" else image.mode
     pixels = np.asarray(image.convert(mode)).reshape(image.height, image.width, -1)
     made = np.empty((pinhole.height, pinhole.width, pixels.shape[2]), np.uint8)
@@ -35,7 +35,7 @@ def undistort_image(image: Image.Image, pinhole: Pinhole) -> Image.Image:
 
 
 def undistort_mask(mask: Image.Image, pinhole: Pinhole) -> Image.Image:
-    """The same of a mask, "L": black or white, as is the larger share of a pixel."""
+    """A mask, "L", resampled to the pinhole camera: 255 where at least half of a pixel is set."""
     if pinhole.nodes is not None:
         pixels = np.asarray(mask)[..., None]
         made = np.empty((pinhole.height, pinhole.width), np.uint8)
@@ -46,9 +46,9 @@ def undistort_mask(mask: Image.Image, pinhole: Pinhole) -> Image.Image:
 
 
 def _strips(pixels: np.ndarray, pinhole: Pinhole) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """Rows of the new picture; the part (1, C, h, w) of the photo they need; positions in it.
+    """Yields rows of the new image, the part (1, C, h, w) of the photo they need, and positions.
 
-    Positions (1, H, W, 2) are x, y in pixels of the part.
+    Positions (1, H, W, 2) are x, y in pixels of the part, float64.
     """
     nodes = pinhole.nodes
     assert nodes is not None
@@ -69,7 +69,7 @@ def _strips(pixels: np.ndarray, pinhole: Pinhole) -> Iterator[tuple[slice, Tenso
 
 
 def _cells(size: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """For each of ``size`` pixel centres the number of its cell, of ``count``, and where in it."""
+    """For each of ``size`` pixel centres: the index of its cell of ``count``, and the fraction."""
     position = (np.arange(size) + 0.5) * (count / size)
     cell = np.minimum(position.astype(np.int64), count - 1)
     return cell, position - cell
@@ -78,10 +78,11 @@ def _cells(size: int, count: int) -> tuple[np.ndarray, np.ndarray]:
 def _catmull_rom(part: Tensor, position: Tensor) -> Tensor:
     """(H, W, C) float32 of a part (1, C, h, w) at positions (1, H, W, 2).
 
-    Cubic convolution has a free number a: its kernel is K₀ + a·G. Torch's has a = −0.75, which
-    sharpens; Catmull-Rom's has −0.5, which is exact for quadratics (Keys 1981), and is two thirds
-    of the way from K₀ to torch's. K₀ reaches two pixels, so it is bilinear interpolation with its
-    fractions bent. (Of the product of two axes, 2/3 + 1/3 leaves an error of the fourth order.)
+    Kernels of cubic convolution have a free parameter a: the kernel is K₀ + a·G. Torch uses
+    a = −0.75, which sharpens. Catmull-Rom uses a = −0.5, which is exact for quadratics (Keys 1981).
+    So its kernel is 1/3 of K₀ plus 2/3 of torch's. K₀ reaches two pixels: it is bilinear
+    interpolation with its fractions replaced by 3f² − 2f³. (Mixing the 2D products instead of the
+    1D kernels leaves an error of the fourth order.)
     """
     whole = torch.floor(position - 0.5)
     fraction = position - 0.5 - whole
@@ -90,7 +91,7 @@ def _catmull_rom(part: Tensor, position: Tensor) -> Tensor:
 
 
 def _sample(part: Tensor, position: Tensor, how: str) -> Tensor:
-    """(H, W, C) float32; outside of the part its outermost pixels are repeated."""
+    """(H, W, C) float32; outside of the part its border pixels are repeated."""
     size = torch.tensor([part.shape[3], part.shape[2]], dtype=position.dtype)
     grid = (2 * position / size - 1).float()
     made = F.grid_sample(part, grid, mode=how, padding_mode="border", align_corners=False)

@@ -1,7 +1,7 @@
-"""Cameras and points of a dataset as a drawing: from above and from the side, to one scale.
+"""Cameras and points of a dataset as SVG drawings: from above and from the side, at one scale.
 
-The scene's frame is that of `orient`: x right, y down, z ahead, in units of which a camera has
-some three to what it sees.
+The frame is that of `orient`: x right, y down, z forward. The median distance from a camera to the
+points is about `VIEWING_DISTANCE` units.
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ import numpy as np
 
 from snowsplat.scene.orientation import VIEWING_DISTANCE
 
-_WIDTH, _HEIGHT = 520, 400  # the larger view fits into it; in units of the drawing
+_WIDTH = 520  # of the largest drawing, in SVG units
+_HEIGHT = 400
 _MARGIN = 16
-_MOST_POINTS = 6000  # in a view; more make the file large and the picture no clearer
-_SHADES = 12  # of each of red, green and blue: points of one colour are one element
+_MOST_POINTS = 6000  # per view; more make the file large and the drawing no clearer
+_SHADES = 12  # levels of red, green and blue: all points of one colour become one SVG path
 
 
 @dataclass(frozen=True)
 class PlacedPhoto:
-    """What the drawing shows of a photo."""
+    """A photo as the drawing shows it."""
 
     name: str
-    sequence: str | None  # photos of one are joined by a line, in their order here
+    sequence: str | None  # photos of one sequence are joined by a line, in the given order
     cam_from_world: np.ndarray  # (3, 4)
-    half_width: float  # of the picture, over the focal length
+    half_width: float  # of the image, divided by the focal length
     half_height: float
 
     @property
@@ -36,7 +37,7 @@ class PlacedPhoto:
         return -self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3]
 
     def corners(self, depth: float) -> np.ndarray:
-        """(4, 3) of the picture's corners at a depth, world, going around."""
+        """(4, 3) world positions of the image corners at a depth, in order around the image."""
         x, y = self.half_width, self.half_height
         rays = depth * np.array([(-x, -y, 1), (x, -y, 1), (x, y, 1), (-x, y, 1)])
         return (rays - self.cam_from_world[:, 3]) @ self.cam_from_world[:, :3]
@@ -57,22 +58,22 @@ _SIDES = (_Side("From above", _X, -_Z), _Side("From the side", _Z, _Y))
 
 @dataclass(frozen=True)
 class Drawing:
-    """An SVG element, and its width in units of the drawing, the same for all of a scene."""
+    """An SVG element and its width in SVG units; all drawings of a scene have the same scale."""
 
     svg: str
     width: int
 
 
 def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) -> list[Drawing]:
-    """A drawing for each side, of points (P, 3) and their colours (P, 3) uint8.
+    """One drawing for each side, of points (P, 3) and their colours (P, 3) uint8.
 
-    All cameras are in it; of the points those that lie around them and most other points.
+    All cameras are inside. Points are drawn if they are near the cameras and not outliers.
     """
     centres = np.array([photo.centre for photo in photos]).reshape(-1, 3)
     low, high = _box(centres, xyz)
     inside = ((xyz >= low) & (xyz <= high)).all(axis=1)
     shown = np.flatnonzero(inside)
-    # Evenly spread, by a stride that has nothing to do with the order of the points.
+    # A random choice: a regular one could follow a pattern in the order of the points.
     shown = shown[np.random.default_rng(0).permutation(len(shown))[:_MOST_POINTS]]
     extents = [np.abs((high - low) @ np.stack([side.right, side.down], 1)) for side in _SIDES]
     scale = min(_fit(extent) for extent in extents)
@@ -88,19 +89,19 @@ def _fit(extent: np.ndarray) -> float:
 
 
 def _box(centres: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest coordinates (3,) of what is shown: wild and very far points are not."""
+    """Lowest and highest coordinates (3,) of the drawing; outliers and far points are outside."""
     low, high = centres.min(axis=0), centres.max(axis=0)
     if len(xyz):
         reach = 3 * VIEWING_DISTANCE
         points_low, points_high = np.quantile(xyz, [0.02, 0.98], axis=0)
         low = np.minimum(low, np.maximum(points_low, low - reach))
         high = np.maximum(high, np.minimum(points_high, high + reach))
-    room = np.maximum(0.04 * float((high - low).max()), 0.05 * VIEWING_DISTANCE)
-    return low - room, high + room
+    margin = np.maximum(0.04 * float((high - low).max()), 0.05 * VIEWING_DISTANCE)
+    return low - margin, high + margin
 
 
 def _frustum_depth(centres: np.ndarray, size: np.ndarray) -> float:
-    """So large that one sees where a camera looks, so small that neighbours stay apart."""
+    """Large enough to show the viewing direction, small enough not to overlap neighbours."""
     large = 0.06 * float(size.max())
     if len(centres) < 2:
         return large
@@ -146,7 +147,7 @@ def _draw(
 
 
 def _points(xy: np.ndarray, rgb: np.ndarray) -> list[str]:
-    """Dots, one path for each colour, on a dark ground: dark ones are made a little lighter."""
+    """Dots, one path for each colour; dark colours are lightened, as the background is dark."""
     shades = np.rint(rgb.astype(np.float64) * ((_SHADES - 1) / 255)).astype(np.int64)
     lines = []
     for shade in np.unique(shades, axis=0):
@@ -159,7 +160,7 @@ def _points(xy: np.ndarray, rgb: np.ndarray) -> list[str]:
 
 
 def _paths(photos: Sequence[PlacedPhoto], flat: _Flat) -> list[str]:
-    """The way that each video went."""
+    """The camera path of each video."""
     lines = []
     for sequence in dict.fromkeys(photo.sequence for photo in photos):
         if sequence is None:

@@ -1,4 +1,4 @@
-"""A frame of a video as RGB of 8 bits: the right matrix, and HDR brought to what a screen shows."""
+"""A video frame as 8-bit RGB: the correct YUV matrix, and tone mapping of HDR."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ import numpy as np
 if TYPE_CHECKING:
     from av import VideoFrame
 
-# Numbers of ITU-T H.273.
-_PQ, _HLG = 16, 18
-_UNSPECIFIED, _BT709, _BT2020 = 2, 1, 9
-# Light that is shown as white: nominal diffuse white of BT.2408, in cd/m².
+# Code points of ITU-T H.273: transfer characteristics, then matrix coefficients.
+_PQ = 16  # SMPTE ST 2084
+_HLG = 18  # ARIB STD-B67
+_BT709 = 1
+_UNSPECIFIED = 2
+_BT2020 = 9
+# The luminance that is shown as white: nominal diffuse white of BT.2408, in cd/m².
 _WHITE = 203.0
 # Linear BT.2020 to BT.709 (BT.2087).
 _TO_709 = np.array(
@@ -23,15 +26,15 @@ _TO_709 = np.array(
     ],
     np.float32,
 )
-_KNEE = 0.7  # of white: below it light is shown as it is
-_STEPS = 4096  # of the tables
+_KNEE = 0.7  # of white: luminance below it is unchanged
+_STEPS = 4096  # entries of the lookup tables
 
 
 def rgb_picture(frame: VideoFrame) -> np.ndarray:
-    """(H, W, 3) uint8 of a decoded frame, as stored (not turned)."""
-    matrix = None  # the frame's own
+    """(H, W, 3) uint8 of a decoded frame, in the stored orientation."""
+    matrix = None  # that of the frame
     if frame.colorspace == _UNSPECIFIED and frame.height >= 720:
-        matrix = _BT709  # what players take for pictures of this size
+        matrix = _BT709  # what players assume for this size
     transfer = frame.color_trc
     if transfer not in (_PQ, _HLG):
         return frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()
@@ -39,7 +42,7 @@ def rgb_picture(frame: VideoFrame) -> np.ndarray:
         matrix = _BT2020
     rgb48 = frame.reformat(format="rgb48le", src_colorspace=matrix)
     deep = rgb48.to_ndarray().astype(np.uint16, copy=False)
-    # Row by row in bands, since floats of a whole 4K frame would take 100 MB.
+    # In bands of rows, since a whole 4K frame in float32 would take 100 MB.
     light = _LIGHT_OF_PQ if transfer == _PQ else _LIGHT_OF_HLG
     out = np.empty(deep.shape, np.uint8)
     for top in range(0, len(deep), 256):
@@ -50,17 +53,17 @@ def rgb_picture(frame: VideoFrame) -> np.ndarray:
 def _shown(light: np.ndarray) -> np.ndarray:
     """(…, 3) float32 linear BT.2020 in units of white, to sRGB 8 bits."""
     colours = np.clip(light @ _TO_709.T, 0, None)
-    # What is brighter than the knee is bent below 1, by the brightest channel: that keeps hues.
+    # Values above the knee are compressed below 1, by the brightest channel: that keeps the hue.
     peak = np.maximum(colours.max(axis=-1, keepdims=True), 1e-6)
-    room = 1 - _KNEE
-    bent = _KNEE + room * (1 - np.exp((_KNEE - peak) / room))
+    headroom = 1 - _KNEE
+    bent = _KNEE + headroom * (1 - np.exp((_KNEE - peak) / headroom))
     colours *= np.where(peak > _KNEE, bent / peak, 1)
     scaled = np.clip(colours, 0, 1) * (_STEPS - 1)
     return _SRGB[scaled.astype(np.int32)]
 
 
 def _light_of_pq(signal: np.ndarray) -> np.ndarray:
-    """SMPTE ST 2084, in units of white."""
+    """SMPTE ST 2084, relative to `_WHITE`."""
     m1, m2 = 2610 / 16384, 2523 / 4096 * 128
     c1, c2, c3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
     power = signal ** (1 / m2)
@@ -68,9 +71,10 @@ def _light_of_pq(signal: np.ndarray) -> np.ndarray:
 
 
 def _light_of_hlg(signal: np.ndarray) -> np.ndarray:
-    """BT.2100, in units of white (a signal of 0.75); each channel gets the system's gamma of 1.2.
+    """BT.2100, relative to `_WHITE` (a signal of 0.75), with the system gamma of 1.2.
 
-    That is meant for the luminance, but differs little, and one table does.
+    BT.2100 applies the gamma to the luminance. Here it is applied to each channel, which differs
+    little and needs one table only.
     """
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     scene = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)

@@ -1,8 +1,9 @@
-"""Photos and the model of SfM -> photos without lens distortion and a model of pinhole cameras.
+"""Remove the lens distortion of photos and of the SfM model.
 
     distorted/sparse/0, input/, distorted/masks/  ->  sparse/0, images/, masks/, images_2/ …
 
-The layout that training reads. The new model is in the scene's frame (see `orient`).
+The result has pinhole cameras, in the layout that training reads. The new model is in the scene's
+frame (see `orient`).
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _DIVISORS = (2, 4, 8)
-_BYTES_PER_PIXEL = 50  # at the worst moment of a photo, which is when it is made smaller
-# How each format is written: as good as loses nothing that training could see.
+_BYTES_PER_PIXEL = 50  # peak memory per photo, reached while it is resized
+# How each format is saved: without a loss that training could notice.
 _SAVING: dict[str, dict[str, Any]] = {
     "JPEG": {"quality": 95, "subsampling": 0},
     "PNG": {"compress_level": 3},
@@ -56,13 +57,13 @@ _SAVING: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Undistorted:
-    """What was made. All of it fits JSON."""
+    """The images that were written. All fields can be stored as JSON."""
 
     images: int
     masks: int
     sizes: list[tuple[int, int, int]]  # width, height, and how many images have it
     folders: list[str]  # of images, in the dataset
-    resampled: bool  # False where no photo had distortion: then images are copies
+    resampled: bool  # False if no photo had distortion: then the images are copies
 
 
 @dataclass(frozen=True)
@@ -81,21 +82,21 @@ def undistort(
     report: Report,
     threads: int | None = None,
 ) -> Undistorted:
-    """Make ``images/``, ``masks/`` and ``sparse/0`` of a dataset whose poses are found.
+    """Make ``images/``, ``masks/`` and ``sparse/0`` of a dataset whose poses are known.
 
-    Photos without a pose are left out. Files keep their names and formats: JPEG at quality 95
-    without chroma subsampling, all others without loss; transparency stays. Where the camera has
-    no distortion, photos are copied. Masks are made for photos that have one; where it leaves out
-    no more than what is transparent, the transparency says it already. The model is written last.
+    Photos without a pose are left out. Files keep their names and formats: JPEG is saved at quality
+    95 without chroma subsampling, all others without loss, with transparency. Where the camera has
+    no distortion, photos are copied. A mask is written for each photo that has one, unless all that
+    it leaves out is transparent in the image anyway. The model is written last.
 
     Args:
-        photos: what is known of those in ``input/``.
+        photos: the photos in ``input/``.
         resize: also make ``images_2``, ``images_4`` and ``images_8``.
-        threads: that work at once; None takes one a core, at most 4. Fewer where the photos are
-            so large that memory is short.
+        threads: number of threads; None uses one per core, at most 4. Fewer are used if the
+            available memory is not enough for photos of this size.
 
     Raises:
-        UserError: a photo that is absent, damaged or changed; a calibration that makes no sense.
+        UserError: a photo is missing, damaged or changed; the calibration is implausible.
         OSError: the disk is full.
     """
     import pycolmap
@@ -138,25 +139,25 @@ def _pinhole(camera: pycolmap.Camera) -> Pinhole:
         pinhole = pinhole_of(camera)
     except ValueError as error:
         raise UserError(
-            f"the lens distortion found ({found}) makes no sense: {error}; take more photos, from "
-            "more sides, or try another --camera-model"
+            f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
+            "different positions, or set another camera_model"
         ) from None
     if pinhole.cropped:
         logger.warning(
-            "the lens distortion found (%s) is sound only near the middle of the photos: images "
-            "show less than them; another --camera-model may keep more",
+            "the estimated lens distortion (%s) is valid only near the centre of the photos, so "
+            "images are cropped; another camera_model may keep more",
             found,
         )
     return pinhole
 
 
 def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> list[bool]:
-    """Run jobs in threads; what they give, in any order.
+    """Run jobs in threads; returns their results in any order.
 
-    The first error, and Ctrl-C, ends it after those that are under way.
+    After the first error or Ctrl-C, running jobs finish and the others are cancelled.
     """
     report(0, len(jobs), "photos")
-    # Pillow and torch let go of the interpreter while they work; torch itself on one thread each.
+    # Pillow and torch release the GIL while they work; each job uses torch with one thread.
     pool = ThreadPoolExecutor(threads, "snowsplat-undistort", torch.set_num_threads, (1,))
     try:
         results = []
@@ -173,7 +174,7 @@ def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> li
 
 
 def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> bool:
-    """Write the image, its smaller copies, its mask; whether it has one."""
+    """Write the image, its smaller copies and its mask; returns whether a mask was written."""
     source, target = dataset / "input" / job.name, dataset / "images" / job.name
     opaque = None
     with _opened(source, job) as opened:
@@ -201,7 +202,7 @@ def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> bool
     with _opened(path, job) as opened:
         mask = _decoded(opened, path).convert("L")
     if opaque is not None:
-        # What is transparent was left out for SfM. In training it counts: as empty space.
+        # SfM ignores transparent pixels. Training uses them: as empty space.
         counts = (np.asarray(mask) >= 128) | ~opaque
         if counts.all():
             return False
@@ -214,14 +215,14 @@ def _opened(path: Path, job: _Job) -> Image.Image:
     try:
         image = open_image(path, list(_SAVING))
     except FileNotFoundError:
-        raise UserError(f"{path}: no such image; its pose was found before it went away") from None
+        raise UserError(f"{path}: missing; restore it, or run sfm again") from None
     except Exception as error:  # Pillow's parsers raise anything on damaged files
         raise UserError(f"{path}: cannot be read ({reason_of(error)}); replace it") from None
     if image.size != job.camera_size:
         image.close()
         raise UserError(
-            f"{path}: is {image.width}x{image.height}, but its pose was found for "
-            f"{job.camera_size[0]}x{job.camera_size[1]}; put the old image back or start again"
+            f"{path}: size is {image.width}x{image.height}, but its pose was estimated at "
+            f"{job.camera_size[0]}x{job.camera_size[1]}; restore the image, or run sfm again"
         )
     return image
 
@@ -235,8 +236,8 @@ def _decoded(opened: Image.Image, path: Path) -> Image.Image:
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
-    """L, RGB or, where anything may be transparent, RGBA."""
-    if image.mode.startswith("I"):  # 16-bit grey, which convert() would clip rather than scale
+    """Mode L or RGB, or RGBA if the image may have transparent pixels."""
+    if image.mode.startswith("I"):  # 16-bit grey: convert() would clip it, not scale it
         grey = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255).astype(np.uint8)
         return Image.fromarray(grey)
     if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
@@ -245,9 +246,9 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 
 
 def _divided(image: Image.Image, divisor: int) -> Image.Image:
-    """1/divisor of the size, rounded as the loader of datasets does; means over areas."""
+    """1/divisor of the size, rounded as `snowsplat.data` rounds; each pixel is a mean over area."""
     width, height = (max(1, round(side / divisor)) for side in image.size)
-    # With colours multiplied by alpha, so that what is transparent does not bleed.
+    # Colours are multiplied by alpha, so that transparent pixels do not bleed into others.
     mode = "RGBa" if image.mode == "RGBA" else image.mode
     pixels = np.asarray(image.convert(mode)).reshape(image.height, image.width, -1)
     planes = resize_area(np.ascontiguousarray(pixels.transpose(2, 0, 1)), width, height)
@@ -261,6 +262,6 @@ def _into(path: Path) -> AbstractContextManager[Path]:
 
 
 def _save(image: Image.Image, path: Path, form: str, profile: bytes | None = None) -> None:
-    """No metadata but the colour profile, without which the colours are others."""
+    """Save without metadata except the colour profile, which defines the colours."""
     with _into(path) as temporary:
         image.save(temporary, form, icc_profile=profile, **_SAVING[form])

@@ -1,4 +1,4 @@
-"""Small photos of textured boards, taken by known cameras: structure from motion in seconds."""
+"""Small rendered photos of textured boards from known cameras: SfM runs in seconds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Board:
 
 
 def texture(seed: int, size: int = 256) -> np.ndarray:
-    """Blotches of all sizes, (size, size) 0–1: features everywhere, no two alike."""
+    """Blobs of many sizes, (size, size) 0–1: unique features everywhere."""
     random = np.random.default_rng(seed)
     sum_ = np.zeros((size, size))
     for cells in (8, 16, 32, 64):
@@ -51,14 +51,14 @@ def boards(seed: int = 0) -> list[Board]:
 
 
 def wall(seed: int = 0) -> list[Board]:
-    """One flat picture."""
+    """One plane."""
     return [
         Board(np.array([-6.0, -4, 6]), np.array([12.0, 0, 0]), np.array([0, 8.0, 0]), texture(seed))
     ]
 
 
 def look(position, target) -> np.ndarray:
-    """(3, 4) cam_from_world of a camera there, that looks there; its y axis down."""
+    """(3, 4) cam_from_world of a camera at ``position`` that looks at ``target``; y axis down."""
     position, target = np.array(position, float), np.array(target, float)
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -77,7 +77,7 @@ def arc(count: int) -> list[np.ndarray]:
 
 
 def photograph(scene: list[Board], cam_from_world: np.ndarray, seed: int = 0) -> np.ndarray:
-    """(HEIGHT, WIDTH) uint8: what a pinhole camera sees, four rays a pixel, a little noise."""
+    """(HEIGHT, WIDTH) uint8: a pinhole camera with four rays per pixel and a little noise."""
     rotation, translation = cam_from_world[:, :3], cam_from_world[:, 3]
     centre = -rotation.T @ translation
     y, x = (np.indices((2 * HEIGHT, 2 * WIDTH)) + 0.5) / 2
@@ -109,7 +109,7 @@ def _sample(texture: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
 
 
 def write(dataset: Path, images: list[np.ndarray], **of_all) -> list[Photo]:
-    """Put the images into ``capture/input`` as 000.png …; the photos that they are."""
+    """Write images to ``input/`` of a dataset as 000.png …; returns their `Photo` records."""
     names = [f"{i:03}.png" for i in range(len(images))]
     return [save(dataset, name, image, **of_all) for name, image in zip(names, images, strict=True)]
 

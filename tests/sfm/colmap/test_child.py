@@ -1,4 +1,4 @@
-"""The child process: it ends with its parent, and its death is told or mended."""
+"""The child process ends with its parent, and a crash is reported or handled by a second run."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from . import scenes
 
 DRAFT = SfmOptions(effort="draft", threads=2)
 CHILDREN = Path("/proc/self/task") / str(os.getpid()) / "children"
-# `snowsplat` as this process finds it.
+# The child imports the same `snowsplat` as this process.
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 PARENT = """
@@ -68,7 +68,7 @@ def wait_until(condition, seconds=20):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
+        assert time.monotonic() < end, "timed out"
 
 
 def kill_child(number=signal.SIGKILL):
@@ -78,9 +78,9 @@ def kill_child(number=signal.SIGKILL):
 
 @needs_proc
 @pytest.mark.parametrize(
-    ("number", "words"), [(signal.SIGKILL, "memory"), (signal.SIGSEGV, "crashed (SIGSEGV)")]
+    ("number", "reason"), [(signal.SIGKILL, "memory"), (signal.SIGSEGV, "crashed (SIGSEGV)")]
 )
-def test_one_death_is_mended_with_gentler_settings(tmp_path, photos, number, words):
+def test_after_one_crash_it_is_repeated_with_less_effort(tmp_path, photos, number, reason):
     killed = []
 
     def report(done, total, what):
@@ -90,13 +90,13 @@ def test_one_death_is_mended_with_gentler_settings(tmp_path, photos, number, wor
 
     result = estimate_poses(tmp_path, photos, DRAFT, report)
     assert len(result.registered) == len(photos)
-    assert words in result.attempts[0]
+    assert reason in result.attempts[0]
     assert "1024 features" in result.attempts[1]
 
 
 @needs_proc
-@pytest.mark.parametrize("what", ["features", "pairs", "photos placed"])
-def test_two_deaths_are_one_clear_line(tmp_path, photos, what):
+@pytest.mark.parametrize("what", ["features", "pairs", "registered photos"])
+def test_two_crashes_are_reported_in_one_line(tmp_path, photos, what):
     def report(done, total, now):
         if now == what:
             kill_child()
@@ -105,7 +105,7 @@ def test_two_deaths_are_one_clear_line(tmp_path, photos, what):
         estimate_poses(tmp_path, photos, DRAFT, report)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "distorted" / "sparse").exists()
-    # And then it works, with what is left.
+    # The next run reuses what was finished.
     assert len(estimate_poses(tmp_path, photos, DRAFT, silent).registered) == len(photos)
 
 
@@ -126,12 +126,12 @@ def test_interrupt_ends_the_child(tmp_path, photos):
 
 
 @needs_proc
-@pytest.mark.parametrize("what", ["features", "pairs", "photos placed"])
+@pytest.mark.parametrize("what", ["features", "pairs", "registered photos"])
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_child_ends_with_a_killed_parent(tmp_path, photos, what, number):
-    told = json.dumps([asdict(photo) for photo in photos])
+    photos_json = json.dumps([asdict(photo) for photo in photos])
     parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT, str(tmp_path), told],
+        [sys.executable, "-c", PARENT, str(tmp_path), photos_json],
         stdout=subprocess.PIPE,
         text=True,
         env=ENVIRONMENT,
@@ -147,8 +147,8 @@ def test_child_ends_with_a_killed_parent(tmp_path, photos, what, number):
     assert len(estimate_poses(tmp_path, photos, DRAFT, silent).registered) == len(photos)
 
 
-def test_child_finds_its_modules_from_any_folder(tmp_path, photos, monkeypatch):
-    """Whatever lies in the current folder, and with paths of the search that are relative."""
+def test_child_imports_its_modules_from_any_folder(tmp_path, photos, monkeypatch):
+    """With another numpy in the current folder, and relative paths in sys.path."""
     root = next(path for path in sys.path if (Path(path) / "snowsplat" / "__init__.py").exists())
     elsewhere = tmp_path / "else where"
     elsewhere.mkdir()
@@ -156,13 +156,13 @@ def test_child_finds_its_modules_from_any_folder(tmp_path, photos, monkeypatch):
     monkeypatch.chdir(elsewhere)
     monkeypatch.setattr(sys, "path", [os.path.relpath(root), *sys.path])
     if sys.version_info < (3, 11):
-        (elsewhere / "numpy.py").unlink()  # Python knows no safe path yet
+        (elsewhere / "numpy.py").unlink()  # older Python does not have PYTHONSAFEPATH
     result = estimate_poses(Path(os.path.relpath(tmp_path)), photos[:3], DRAFT, silent)
     assert len(result.registered) == 3
 
 
-def test_what_goes_wrong_in_the_child_is_in_the_log(tmp_path, photos):
-    """A dataset whose photos are gone: no answer, twice; one line with what it said last."""
+def test_errors_in_the_child_are_in_the_log(tmp_path, photos):
+    """Without the photo files both runs fail; the error has the last line of the log."""
     for path in (tmp_path / "input").iterdir():
         path.unlink()
     with pytest.raises(
@@ -172,8 +172,8 @@ def test_what_goes_wrong_in_the_child_is_in_the_log(tmp_path, photos):
     assert "FileNotFoundError" in (tmp_path / "distorted" / "colmap.log").read_text()
 
 
-def test_files_that_cannot_grow_are_told_as_such(tmp_path, photos):
-    """As on a full disk, where the child ends in COLMAP's words; here by a limit, which is real."""
+def test_files_that_cannot_grow_are_reported(tmp_path, photos):
+    """As on a full disk, where COLMAP crashes; simulated by a limit of the file size."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
     try:

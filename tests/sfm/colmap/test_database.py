@@ -1,4 +1,4 @@
-"""The database: cameras by group, the same after any kill, used again only where it fits."""
+"""The COLMAP database: one camera per group, and reuse only if photos and settings are the same."""
 
 import sqlite3
 from contextlib import closing
@@ -60,7 +60,7 @@ def test_photos_of_a_group_share_a_camera(path):
     assert of_photo[PHOTOS[7].name] is phone
     assert of_photo["y.jpg"] is zoom
     assert (phone.model_name, phone.width, phone.has_prior_focal_length) == ("OPENCV", 640, False)
-    # Two photos cannot fix eight numbers.
+    # Two photos are not enough for the eight parameters of OPENCV.
     assert (zoom.model_name, zoom.width, zoom.has_prior_focal_length) == (
         "SIMPLE_RADIAL",
         480,
@@ -69,7 +69,7 @@ def test_photos_of_a_group_share_a_camera(path):
     assert zoom.mean_focal_length() == 905
 
 
-def test_what_was_computed_is_kept_for_the_same_settings(path):
+def test_features_are_reused_for_the_same_settings_only(path):
     add_features(path)
     open_database(path, PHOTOS, "auto", "one")
     assert feature_counts(path, len(PHOTOS))[0] == 5
@@ -85,14 +85,14 @@ def test_another_camera_model_keeps_the_features(path):
         assert {c.model_name for c in database.read_all_cameras()} == {"RADIAL"}
 
 
-def test_names_are_mended_after_a_kill_in_matching(path):
+def test_names_are_restored_after_a_kill_during_matching(path):
     set_names(path, [str(i) for i in range(len(PHOTOS))])
     open_database(path, PHOTOS, "auto", "one")
     assert names(path) == {i: p.name for i, p in enumerate(PHOTOS, start=1)}
 
 
 @pytest.mark.parametrize("how", ["truncated", "no fingerprint", "text", "empty"])
-def test_a_damaged_database_is_made_anew(path, how):
+def test_a_damaged_database_is_replaced(path, how):
     add_features(path, 5000)
     if how == "truncated":
         with open(path, "rb+") as file:
@@ -107,7 +107,7 @@ def test_a_damaged_database_is_made_anew(path, how):
     assert feature_counts(path, len(PHOTOS)) == [0] * len(PHOTOS)
 
 
-def test_a_database_takes_the_place_of_another(path):
+def test_one_database_replaces_another(path):
     strong = path.with_name("strong.db")
     open_database(strong, PHOTOS, "auto", "strong")
     add_features(strong)
@@ -116,7 +116,7 @@ def test_a_database_takes_the_place_of_another(path):
     assert feature_counts(path, len(PHOTOS))[0] == 5
 
 
-def test_pairs_come_back_with_their_kind(path):
+def test_verified_pairs_have_their_kind(path):
     matches = np.stack([np.arange(20), np.arange(20)], 1).astype(np.uint32)
     with closing_database(path) as database:
         for other, config in ((2, "CALIBRATED"), (3, "PANORAMIC")):

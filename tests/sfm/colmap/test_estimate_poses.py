@@ -1,4 +1,4 @@
-"""From small photos of known cameras to poses, and what comes of photos that give none."""
+"""Poses from small photos of known cameras, and the errors for unsuitable photos."""
 
 import dataclasses
 import json
@@ -33,15 +33,15 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory, pictures):
-    """A dataset with poses, in a folder with an awkward name; not to be changed."""
+    """A dataset with poses, in a folder with an unusual name; read-only for the tests."""
     dataset = tmp_path_factory.mktemp("Größe 10 – ä b")
     names = [f"ünter weg/{i} b.png" for i in range(10)]
     photos = [
         scenes.save(dataset, name, image) for name, image in zip(names, pictures, strict=True)
     ]
-    said = []
-    result = estimate_poses(dataset, photos, DRAFT, lambda *line: said.append(line))
-    return dataset, photos, result, said
+    calls = []
+    result = estimate_poses(dataset, photos, DRAFT, lambda *call: calls.append(call))
+    return dataset, photos, result, calls
 
 
 def centres(model, photos):
@@ -74,20 +74,20 @@ def test_result_fits_json(done):
     assert SfmResult(**json.loads(json.dumps(dataclasses.asdict(result)))) == result
 
 
-def test_progress_tells_the_stages_in_order(done):
-    said = done[3]
-    assert list(dict.fromkeys(what for _, _, what in said)) == [
+def test_progress_has_all_steps_in_order(done):
+    calls = done[3]
+    assert list(dict.fromkeys(what for _, _, what in calls)) == [
         "features",
         "pairs",
-        "photos placed",
+        "registered photos",
     ]
-    assert all(0 <= done <= total for done, total, _ in said)
-    assert (10, 10, "features") in said
-    assert (45, 45, "pairs") in said
-    assert said[-1] == (10, 10, "photos placed")
+    assert all(0 <= done <= total for done, total, _ in calls)
+    assert (10, 10, "features") in calls
+    assert (45, 45, "pairs") in calls
+    assert calls[-1] == (10, 10, "registered photos")
 
 
-def test_colmap_prints_into_its_log_alone(done, pictures, tmp_path, capfd):
+def test_colmap_prints_to_its_log_only(done, pictures, tmp_path, capfd):
     estimate_poses(tmp_path, scenes.write(tmp_path, pictures[:3]), DRAFT, silent)
     assert capfd.readouterr() == ("", "")
     assert "Feature extraction" in (tmp_path / "distorted" / "colmap.log").read_text()
@@ -95,7 +95,7 @@ def test_colmap_prints_into_its_log_alone(done, pictures, tmp_path, capfd):
     assert left == {"colmap.log", "database.db", "sparse"}
 
 
-def test_same_photos_give_the_same_pairs_and_poses(done, tmp_path):
+def test_same_photos_have_the_same_pairs_and_poses(done, tmp_path):
     dataset, photos, result, _ = done
     shutil.copytree(dataset / "input", tmp_path / "input")
     again = estimate_poses(tmp_path, photos, DRAFT, silent)
@@ -108,7 +108,7 @@ def test_same_photos_give_the_same_pairs_and_poses(done, tmp_path):
     assert np.abs(first - second).max() < 1e-3
 
 
-def test_model_that_is_there_is_described(done):
+def test_an_existing_model_is_described(done):
     dataset, photos, result, _ = done
     described = describe_model(dataset, photos)
     for name in ("registered", "points", "observations", "sub_models", "cameras"):
@@ -118,7 +118,7 @@ def test_model_that_is_there_is_described(done):
     assert "other.png" in describe_model(dataset, [*photos, other]).unregistered
     with pytest.raises(UserError, match="none of the photos"):
         describe_model(dataset, [other])
-    with pytest.raises(UserError, match="no COLMAP model here"):
+    with pytest.raises(UserError, match="no COLMAP model"):
         describe_model(dataset / "input", photos)
 
 
@@ -133,7 +133,7 @@ def test_camera_model_and_focal_length_are_as_given(tmp_path, pictures, camera_m
 def test_unknown_camera_model(tmp_path, pictures):
     photos = scenes.write(tmp_path, pictures[:3])
     options = dataclasses.replace(DRAFT, camera_model="OPENVC")
-    with pytest.raises(UserError, match="'OPENVC': no such camera model; there are auto, .*OPENCV"):
+    with pytest.raises(UserError, match="camera_model: unknown value 'OPENVC'; .*auto, .*OPENCV"):
         estimate_poses(tmp_path, photos, options, silent)
 
 
@@ -152,8 +152,8 @@ def test_global_mapper(tmp_path, pictures):
     assert "global" in result.attempts[0]
 
 
-def test_nothing_is_looked_for_under_a_mask(tmp_path, pictures):
-    """Two photos have the left half masked, one has not; features of the two are on the right."""
+def test_masked_areas_have_no_features(tmp_path, pictures):
+    """Two of three photos have their left half masked, so their features are on the right."""
     photos = scenes.write(tmp_path, pictures[:3])
     masks = tmp_path / "distorted" / "masks"
     masks.mkdir(parents=True)
@@ -170,25 +170,25 @@ def test_nothing_is_looked_for_under_a_mask(tmp_path, pictures):
     assert leftmost[2] < scenes.WIDTH / 4
 
 
-def test_photos_that_do_not_belong_are_named(tmp_path, pictures):
+def test_photos_of_another_scene_are_named(tmp_path, pictures):
     stranger = scenes.photograph(scenes.boards(7), scenes.arc(3)[1])
     photos = scenes.write(tmp_path, [*pictures, BLACK, stranger])
     result = estimate_poses(tmp_path, photos, DRAFT, silent)
     assert len(result.registered) == 10
     assert "hardly any detail" in result.unregistered["010.png"]
     assert result.unregistered["011.png"] == "it matches no other photo"
-    # Nothing could be gained from these two: no second try.
+    # More effort cannot add these two: no second attempt.
     assert len(result.attempts) == 1
 
 
 @pytest.mark.slow
-def test_two_scenes_give_the_larger_and_a_second_try(tmp_path, pictures):
+def test_two_scenes_yield_the_larger_one_after_a_second_attempt(tmp_path, pictures):
     other = [scenes.photograph(scenes.boards(9), pose, i) for i, pose in enumerate(scenes.arc(5))]
     photos = scenes.write(tmp_path, [*other, *pictures[:7]])
     result = estimate_poses(tmp_path, photos, DRAFT, silent)
     assert result.registered == [f"{i:03}.png" for i in range(5, 12)]
     assert result.sub_models == [7, 5]
-    assert "another part of 5 photos" in result.unregistered["000.png"]
+    assert "a separate group of 5 photos" in result.unregistered["000.png"]
     assert len(result.attempts) > 1
     assert "4096 features" in result.attempts[1]
     sparse = tmp_path / "distorted" / "sparse"
@@ -197,7 +197,7 @@ def test_two_scenes_give_the_larger_and_a_second_try(tmp_path, pictures):
     assert left == {"colmap.log", "database.db", "sparse"}
 
 
-def turned(count):
+def rotating(count):
     return [
         scenes.look((0, 0, 0), (5 * np.sin(angle), 0, 5 * np.cos(angle)))
         for angle in np.linspace(-0.4, 0.4, count)
@@ -208,9 +208,9 @@ def turned(count):
     ("poses", "message"),
     [
         ([scenes.arc(3)[1]] * 5, "the camera hardly moved between the photos"),
-        (turned(5), "only turned on the spot"),
+        (rotating(5), "only rotated"),
     ],
-    ids=["still", "turned"],
+    ids=["static", "rotating"],
 )
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_camera_that_did_not_move(tmp_path, poses, message, mapper):
@@ -224,9 +224,9 @@ def test_camera_that_did_not_move(tmp_path, poses, message, mapper):
     assert not (tmp_path / "distorted" / "sparse").exists()
 
 
-def test_photos_of_different_things(tmp_path):
+def test_photos_of_different_scenes(tmp_path):
     different = [scenes.photograph(scenes.boards(i), scenes.arc(3)[i % 3]) for i in range(1, 5)]
-    with pytest.raises(UserError, match="do not show the same things"):
+    with pytest.raises(UserError, match="do not overlap"):
         estimate_poses(tmp_path, scenes.write(tmp_path, different), DRAFT, silent)
 
 
@@ -236,27 +236,27 @@ def test_black_photos(tmp_path):
 
 
 def test_two_photos(tmp_path, pictures):
-    with pytest.raises(UserError, match="2 photos are too few"):
+    with pytest.raises(UserError, match="photos: 2 are not enough"):
         estimate_poses(tmp_path, scenes.write(tmp_path, pictures[:2]), DRAFT, silent)
 
 
-def test_a_wall_is_found_although_it_is_flat(tmp_path):
+def test_a_flat_wall_is_reconstructed(tmp_path):
     flat = [scenes.photograph(scenes.wall(), pose, i) for i, pose in enumerate(scenes.arc(6))]
     result = estimate_poses(tmp_path, scenes.write(tmp_path, flat), DRAFT, silent)
     assert len(result.registered) == 6
 
 
-def test_features_and_matches_are_used_again(tmp_path, pictures):
+def test_features_and_matches_are_reused(tmp_path, pictures):
     photos = scenes.write(tmp_path, pictures[:4])
     estimate_poses(tmp_path, photos, DRAFT, silent)
-    said = []
-    estimate_poses(tmp_path, photos, DRAFT, lambda *line: said.append(line))
-    assert said[0] == (4, 4, "features")
-    assert next(line for line in said if line[2] == "pairs") == (6, 6, "pairs")
-    # A photo that has changed is noticed.
+    calls = []
+    estimate_poses(tmp_path, photos, DRAFT, lambda *call: calls.append(call))
+    assert calls[0] == (4, 4, "features")
+    assert next(call for call in calls if call[2] == "pairs") == (6, 6, "pairs")
+    # A changed photo is noticed.
     scenes.save(tmp_path, photos[0].name, pictures[5])
-    said.clear()
-    estimate_poses(tmp_path, photos, DRAFT, lambda *line: said.append(line))
-    assert said[0] == (0, 4, "features")
+    calls.clear()
+    estimate_poses(tmp_path, photos, DRAFT, lambda *call: calls.append(call))
+    assert calls[0] == (0, 4, "features")
     with closing(connect(tmp_path / "distorted" / "database.db")) as connection:
         assert connection.execute("SELECT COUNT(*) FROM images").fetchone() == (4,)

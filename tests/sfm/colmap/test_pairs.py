@@ -1,4 +1,4 @@
-"""Which pairs are compared, for each kind of input."""
+"""The pairs that are matched, for each kind of input."""
 
 import numpy as np
 import pytest
@@ -15,23 +15,23 @@ def photo(number, sequence=None, location=None):
     return Photo(name, name, 640, 480, "phone", sequence, None, location, False, False)
 
 
-def not_asked():
+def not_needed():
     raise AssertionError("retrieval is not needed here")
 
 
 def ring(count, places):
-    """How alike photos look that stand on a ring of ``places``: the nearer, the more."""
+    """Similarity of photos at positions on a ring of ``places``: the nearer, the more similar."""
     angles = 2 * np.pi * np.arange(count) / places
     return np.cos(angles[:, None] - angles[None])
 
 
-def test_few_photos_are_compared_each_with_each():
-    choice = choose_pairs([photo(i) for i in range(20)], EFFORT, not_asked)
+def test_all_pairs_of_few_photos_are_matched():
+    choice = choose_pairs([photo(i) for i in range(20)], EFFORT, not_needed)
     assert len(choice.pairs) == len(set(choice.pairs)) == 190
-    assert "each" in choice.words
+    assert "all pairs" in choice.description
 
 
-def test_frames_are_compared_with_the_next_and_sparser_further_on():
+def test_frames_are_matched_with_following_ones_in_growing_steps():
     count = 400
     photos = [photo(i, "walk.mp4") for i in range(count)]
     chosen = set(choose_pairs(photos, EFFORT, lambda: np.eye(count)).pairs)
@@ -42,14 +42,14 @@ def test_frames_are_compared_with_the_next_and_sparser_further_on():
 
 
 def test_loop_of_a_video_is_closed():
-    """The walk comes round to its start: the first frames are compared with the last."""
+    """The camera returns to its starting point: the first frames are matched with the last."""
     count = 300
     photos = [photo(i, "walk.mp4") for i in range(count)]
     chosen = set(choose_pairs(photos, EFFORT, lambda: ring(count, count)).pairs)
     assert {(0, 299), (1, 299), (0, 298)} <= chosen
 
 
-def test_photos_with_gps_are_compared_with_the_nearest():
+def test_photos_with_gps_are_matched_with_the_nearest():
     """Two streets 500 m apart; one degree of latitude is 111 km."""
     photos = [
         photo(i, location=(52 + street * 500 / 111_320 + 1e-6 * i, 4 + i * 5e-5, 0))
@@ -62,17 +62,17 @@ def test_photos_with_gps_are_compared_with_the_nearest():
     assert near > 0.6 * len(chosen)
 
 
-def test_many_photos_are_compared_with_those_that_look_alike():
+def test_many_photos_are_matched_with_similar_ones():
     count = 200
     choice = choose_pairs([photo(i) for i in range(count)], EFFORT, lambda: ring(count, count))
     partners = {j for i, j in choice.pairs if i == 50} | {i for i, j in choice.pairs if j == 50}
     assert partners >= set(range(40, 61)) - {50}
     assert len(choice.pairs) < 20 * count
     assert choice.pairs == sorted(set(choice.pairs))
-    assert "alike" in choice.words
+    assert "similar" in choice.description
 
 
-def test_two_videos_and_photos_are_joined():
+def test_two_videos_and_photos_are_connected():
     photos = (
         [photo(i, "a.mp4") for i in range(60)]
         + [photo(i, "b.mp4") for i in range(60)]
@@ -84,7 +84,7 @@ def test_two_videos_and_photos_are_joined():
 
 
 @pytest.mark.parametrize("effort", EFFORTS.values(), ids=EFFORTS)
-def test_a_stronger_effort_compares_more(effort):
+def test_a_stronger_effort_matches_more_pairs(effort):
     photos = [photo(i) for i in range(300)]
     few = choose_pairs(photos, effort, lambda: ring(300, 300)).pairs
     assert len(choose_pairs(photos, effort.stronger(), lambda: ring(300, 300)).pairs) > len(few)

@@ -1,4 +1,4 @@
-"""Real photos, beside the project: all are placed, where COLMAP placed them before."""
+"""Real photos, stored beside the project: all get poses, as in an earlier run of COLMAP."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def centres(model):
 
 
 def largest_centre_error(found, given):
-    """Of the extent of the given centres, after the best similarity."""
+    """Relative to the extent of the given centres, after the best similarity transform."""
     names = sorted(found.keys() & given.keys())
     a, b = (torch.tensor([c[name].tolist() for name in names]) for c in (found, given))
     error = (similarity_from_points(a, b).apply(a) - b).norm(dim=1).max()
@@ -50,7 +50,7 @@ def largest_centre_error(found, given):
         ("kitchen25/images", "kitchen25", "normal", None, 0.5, 0.01),
     ],
 )
-def test_all_photos_are_placed(tmp_path, photos, given, effort, sequence, pixels, centre_error):
+def test_all_photos_get_poses(tmp_path, photos, given, effort, sequence, pixels, centre_error):
     images = CAPTURES / photos
     if not images.is_dir():
         pytest.skip(f"no real photos at ../shared/captures/{photos}")

@@ -1,4 +1,4 @@
-"""Photos that show the same look alike, by the features that they have."""
+"""The visual similarity of photos, from their features."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from snowsplat.sfm.colmap.retrieval import nearest, similarity
 
 
 def places(count, per_place, seed=0):
-    """Descriptors of photos: those of one place share features, with noise; others share none."""
+    """Descriptors of photos: those of one place share noisy features; others share none."""
     random = np.random.default_rng(seed)
     photos = []
     for _ in range(count):
@@ -25,12 +25,12 @@ def test_photos_of_one_place_find_each_other():
         assert i // 4 == j // 4
 
 
-def test_same_features_give_the_same_neighbours():
+def test_same_features_have_the_same_neighbours():
     photos = places(6, 3, seed=1)
     assert np.array_equal(similarity(photos), similarity([d.copy() for d in photos]))
 
 
-def test_photos_without_features_look_like_none():
+def test_photos_without_features_are_similar_to_none():
     photos = places(3, 3)
     photos[4] = np.zeros((0, 128))
     alike = similarity(photos)
@@ -39,7 +39,7 @@ def test_photos_without_features_look_like_none():
     assert np.array_equal(similarity([np.zeros((0, 128))] * 3), np.eye(3))
 
 
-def test_nearest_gives_each_its_share():
+def test_nearest_returns_count_partners_of_each():
     alike = np.array([[1, 0.9, 0.1], [0.9, 1, 0.2], [0.1, 0.2, 1]])
     assert nearest(alike, 1) == {(0, 1), (1, 2)}
     assert nearest(alike, 5) == {(0, 1), (0, 2), (1, 2)}

@@ -1,4 +1,4 @@
-"""How long a video is, whatever its header says; and how many frames are taken of it."""
+"""The length of a video, independent of its header, and the number of frames to use."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -14,12 +14,18 @@ from ..pictures import HEIGHT, WIDTH, pan, write_video
 @pytest.mark.parametrize(
     ("name", "codec"),
     [
-        *(("a.mp4", "libx264"), ("a.mov", "libx264"), ("a.m4v", "mpeg4"), ("a.mkv", "libx264")),
-        *(("a.avi", "mjpeg"), ("a.webm", "libvpx"), ("a.mpg", "mpeg2video"), ("a.h264", "libx264")),
+        ("a.mp4", "libx264"),
+        ("a.mov", "libx264"),
+        ("a.m4v", "mpeg4"),
+        ("a.mkv", "libx264"),
+        ("a.avi", "mjpeg"),
+        ("a.webm", "libvpx"),
+        ("a.mpg", "mpeg2video"),
+        ("a.h264", "libx264"),
     ],
 )
 def test_containers(name, codec, tmp_path):
-    rate = 25  # which MPEG-2 knows
+    rate = 25  # supported by MPEG-2
     clip = read_clip(write_video(tmp_path / name, pan(20), rate=rate, codec=codec))
     assert clip.packets == 20
     assert clip.seconds == pytest.approx(20 / rate, rel=0.06)
@@ -28,20 +34,20 @@ def test_containers(name, codec, tmp_path):
         assert len(list(decoded_frames(container))) == 20
 
 
-def test_turned(tmp_path):
+def test_a_rotated_video(tmp_path):
     clip = read_clip(write_video(tmp_path / "a.mp4", pan(3), rotation=90))
     assert (clip.width, clip.height) == (HEIGHT, WIDTH)
 
 
-def test_pixels_that_are_not_square(tmp_path):
+def test_non_square_pixels(tmp_path):
     video = write_video(tmp_path / "a.mp4", pan(3), aspect=Fraction(4, 3), rotation=90)
     clip = read_clip(video)
     assert (clip.width, clip.height) == (HEIGHT, 427)
 
 
-def test_what_is_no_video(tmp_path):
-    whole = write_video(tmp_path / "a.mp4", pan(20)).read_bytes()
-    for content in (b"", whole[:500], b"text\n" * 500):
+def test_empty_truncated_and_text_files(tmp_path):
+    video = write_video(tmp_path / "a.mp4", pan(20)).read_bytes()
+    for content in (b"", video[:500], b"text\n" * 500):
         (tmp_path / "b.mp4").write_bytes(content)
         with pytest.raises(UserError, match=r"b.mp4: no frame of this video can be decoded.*copy"):
             read_clip(tmp_path / "b.mp4")
@@ -56,11 +62,11 @@ def clip(seconds, rate=30):
     ("seconds", "frames"),
     [(0.1, 2), (2, 30), (10, 60), (23.5, 60), (40, 100), (100, 150), (200, 200), (3600, 300)],
 )
-def test_by_default(seconds, frames):
+def test_default_number_of_frames(seconds, frames):
     assert frames_wanted(clip(seconds), None, None) == pytest.approx(frames, abs=1)
 
 
-def test_as_asked_but_never_more_than_there_are():
+def test_requested_number_of_frames_is_limited_by_the_video():
     assert frames_wanted(clip(10), 2.0, None) == 20
     assert frames_wanted(clip(10), None, 77) == 77
     assert frames_wanted(clip(10), 1000.0, None) == 300

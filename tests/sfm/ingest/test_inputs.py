@@ -1,4 +1,4 @@
-"""Photos, videos and masks as users have them become input/; what is of no use is named."""
+"""Photos, videos and masks are gathered in input/; unusable files are skipped and named."""
 
 import errno
 import logging
@@ -31,7 +31,7 @@ def content(folder):
     return {name: (folder / name).read_bytes() for name in files(folder)}
 
 
-def test_plain_photos_are_linked_as_they_are(tmp_path):
+def test_ready_photos_are_linked_unchanged(tmp_path):
     root = write_photos(tmp_path / "p q")
     photo(60).save(root / "Ünïcode name (1).JPG", quality=90)
     (root / "deep").mkdir()
@@ -57,13 +57,13 @@ def test_plain_photos_are_linked_as_they_are(tmp_path):
     assert not (tmp_path / "out" / "distorted").exists()
 
 
-def test_what_colmap_cannot_read_is_converted_and_upright(tmp_path):
+def test_formats_unknown_to_colmap_are_converted_and_upright(tmp_path):
     pillow_heif.register_heif_opener()
     root = write_photos(tmp_path / "p", 1)
     photo(20).save(root / "0.heic", quality=90)
     photo(40).save(root / "a.webp", quality=95)
-    notes = exif({0x0112: 6, 0x0110: "M1"}, {0xA405: 26})
-    photo(60).transpose(Image.Transpose.ROTATE_90).save(root / "turned.jpg", exif=notes, quality=95)
+    data = exif({0x0112: 6, 0x0110: "M1"}, {0xA405: 26})
+    photo(60).transpose(Image.Transpose.ROTATE_90).save(root / "turned.jpg", exif=data, quality=95)
     made = gathered(root, tmp_path / "out")
     assert [p.name for p in made.photos] == ["0.jpg", "0_2.jpg", "a.jpg", "turned.jpg"]
     assert [os.path.basename(p.source) for p in made.photos][1] == "0.heic"
@@ -76,7 +76,7 @@ def test_what_colmap_cannot_read_is_converted_and_upright(tmp_path):
     assert made.photos[3].focal == pytest.approx(26 / 43.267 * 400, rel=1e-3)
 
 
-def test_size_scales_pictures_and_their_focal_lengths(tmp_path):
+def test_size_scales_photos_and_their_focal_lengths(tmp_path):
     root = tmp_path / "p"
     root.mkdir()
     for i in range(3):
@@ -89,13 +89,13 @@ def test_size_scales_pictures_and_their_focal_lengths(tmp_path):
 
 
 def test_groups(tmp_path):
-    """One camera with one zoom, held the same way, in one folder."""
+    """A group is one camera at one zoom, in one orientation and one folder."""
     root = tmp_path / "p"
     (root / "other").mkdir(parents=True)
 
     def take(name, model="M1", zoom=26, orientation=1):
-        notes = exif({0x0110: model, 0x0112: orientation}, {0xA405: zoom})
-        photo(20).save(root / name, exif=notes)
+        data = exif({0x0110: model, 0x0112: orientation}, {0xA405: zoom})
+        photo(20).save(root / name, exif=data)
 
     take("a.jpg"), take("b.jpg"), take("other.jpg", model="M2"), take("zoomed.jpg", zoom=52)
     take("portrait.jpg", orientation=6), take("portrait2.jpg", orientation=8)
@@ -141,28 +141,28 @@ def test_masks_and_alpha(tmp_path):
         assert image.mode == "RGBA"
 
 
-def test_a_mask_of_the_wrong_size_and_one_of_no_photo(tmp_path, caplog):
+def test_a_mask_of_the_wrong_size_and_a_mask_without_a_photo(tmp_path, caplog):
     root = write_photos(tmp_path / "p")
     (root / "masks").mkdir()
     Image.new("L", (WIDTH, HEIGHT), 255).save(root / "masks" / "7.png")
     with caplog.at_level(logging.WARNING, "snowsplat"):
         gathered(root, tmp_path / "out")
-    assert "7.png: is the mask of no photo here" in caplog.text
+    assert "7.png: unused mask, no such photo" in caplog.text
     Image.new("L", (99, 99)).save(root / "masks" / "1.png")
     with pytest.raises(UserError, match=r"1.png: the mask is 99x99, but its photo is 320x240"):
         gathered(root, tmp_path / "other")
 
 
-def test_a_photo_whose_mask_leaves_nothing_is_skipped(tmp_path):
+def test_a_completely_masked_photo_is_skipped(tmp_path):
     root = write_photos(tmp_path / "p", 4)
     (root / "masks").mkdir()
     Image.new("L", (WIDTH, HEIGHT)).save(root / "masks" / "1.png")
     made = gathered(root, tmp_path / "out")
-    assert made.skipped == [(str(root / "1.jpg"), "is masked out all over")]
+    assert made.skipped == [(str(root / "1.jpg"), "is completely masked out")]
     assert files(tmp_path / "out" / "input") == ["0.jpg", "2.jpg", "3.jpg"]
 
 
-def test_unusable_ones_among_good_ones_are_skipped_and_named(tmp_path):
+def test_unusable_photos_are_skipped_and_named(tmp_path):
     root = write_photos(tmp_path / "p", 4)
     cut = (root / "1.jpg").read_bytes()
     (root / "1.jpg").write_bytes(cut[: len(cut) // 2])
@@ -175,10 +175,10 @@ def test_unusable_ones_among_good_ones_are_skipped_and_named(tmp_path):
     assert reasons.keys() == {"1.jpg", "text.jpg", "cap.png"}
     assert "truncated" in reasons["1.jpg"]
     assert "not an image of a known format" in reasons["text.jpg"]
-    assert reasons["cap.png"] == "is black all over"
+    assert reasons["cap.png"] == "is completely black"
 
 
-def test_the_same_on_one_thread(tmp_path, monkeypatch):
+def test_one_thread_has_the_same_result(tmp_path, monkeypatch):
     root = write_photos(tmp_path / "p", 5, "webp")
     (root / "2.webp").write_text("no photo")
     many = gathered(root, tmp_path / "a")
@@ -204,16 +204,21 @@ def test_photos_and_videos_together(tmp_path):
     two = write_video(tmp_path / "a.mkv", pan(12, seed=1))
     made = gathered([root, one, two], tmp_path / "out", frames=3)
     assert [p.name for p in made.photos] == [
-        *(f"a/frame_{i:05d}.jpg" for i in (1, 2, 3)),
-        *(f"a_2/frame_{i:05d}.jpg" for i in (1, 2, 3)),
-        *("p/0.jpg", "p/1.jpg"),
+        "a/frame_00001.jpg",
+        "a/frame_00002.jpg",
+        "a/frame_00003.jpg",
+        "a_2/frame_00001.jpg",
+        "a_2/frame_00002.jpg",
+        "a_2/frame_00003.jpg",
+        "p/0.jpg",
+        "p/1.jpg",
     ]
     assert [p.sequence for p in made.photos] == ["a"] * 3 + ["a_2"] * 3 + [None] * 2
     assert files(tmp_path / "out" / "input") == [p.name for p in made.photos]
     assert len({p.group for p in made.photos}) == 3
 
 
-def test_in_place_nothing_is_changed(tmp_path):
+def test_input_in_place_is_not_changed(tmp_path):
     dataset = tmp_path / "location"
     root = write_photos(dataset / "input", 4)
     (root / "3.jpg").write_text("no photo")
@@ -228,7 +233,7 @@ def test_in_place_nothing_is_changed(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["webp", "turned", "size", "video"])
-def test_in_place_what_would_have_to_be_changed_is_refused(kind, tmp_path):
+def test_input_in_place_that_needs_a_change_is_rejected(kind, tmp_path):
     root = write_photos(tmp_path / "location" / "input", 0 if kind == "video" else 4)
     if kind == "webp":
         photo().save(root / "x.webp")
@@ -237,7 +242,7 @@ def test_in_place_what_would_have_to_be_changed_is_refused(kind, tmp_path):
     elif kind == "video":
         write_video(root / "x.mp4", pan(9))
     before = content(tmp_path)
-    with pytest.raises(UserError, match=r"has to be converted.*use snowsplat sfm PHOTOS -o"):
+    with pytest.raises(UserError, match="must be converted.*never changed; .* in a new folder"):
         gathered(root, tmp_path / "location", size=160 if kind == "size" else None)
     assert content(tmp_path) == before
 
@@ -254,26 +259,26 @@ def write_all(folder, picture, count=5):
     [
         (
             np.zeros((240, 320, 3), np.uint8),
-            "all 5 pictures are black all over; check the lens cap",
+            "photos: all 5 images are completely black; check the lens cap",
         ),
-        (np.full((240, 320, 3), 255, np.uint8), "all 5 pictures are white all over"),
-        (blurred(wall(), 12), "all 5 pictures are blurred all over.*hold the camera still"),
+        (np.full((240, 320, 3), 255, np.uint8), "all 5 images are completely white"),
+        (blurred(wall(), 12), "all 5 images are too blurred.*hold the camera still"),
     ],
 )
-def test_photos_of_nothing(picture, message, tmp_path):
+def test_photos_without_content(picture, message, tmp_path):
     with pytest.raises(UserError, match=message):
         gathered(write_all(tmp_path / "p", picture), tmp_path / "out")
 
 
-def test_a_video_of_a_still_scene(tmp_path):
+def test_a_video_of_a_static_camera(tmp_path):
     path = write_video(tmp_path / "still.mp4", [wall()] * 20)
     with pytest.raises(UserError, match=r"still.mp4: the camera does not move .* walking around"):
         gathered(path, tmp_path / "out")
 
 
-def test_too_few(tmp_path):
+def test_too_few_photos(tmp_path):
     root = write_photos(tmp_path / "p", 2)
-    with pytest.raises(UserError, match="only 2 usable pictures, .* at least 3, better 20"):
+    with pytest.raises(UserError, match="only 2 usable images; .* at least 3, better 20"):
         gathered(root, tmp_path / "out")
     (root / "broken.jpg").write_text("no photo")
     with pytest.raises(UserError, match=r"only 2 .*; .*broken.jpg cannot be decoded \(not an"):
@@ -281,7 +286,7 @@ def test_too_few(tmp_path):
     for name in ("0.jpg", "1.jpg"):
         (root / name).write_text("no photo")
     with pytest.raises(
-        UserError, match=r"no usable picture: all 3 pictures, .*0.jpg first, cannot be decoded"
+        UserError, match=r"no usable image; all 3 images, .*0.jpg first, cannot be decoded"
     ):
         gathered(root, tmp_path / "out3")
 
@@ -289,24 +294,24 @@ def test_too_few(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"fps": 2.0, "frames": 60}, "both --fps and --frames"),
-        ({"fps": 0.0}, "--fps 0 makes no sense"),
-        ({"fps": float("nan")}, "--fps nan makes no sense"),
-        ({"frames": 2}, "--frames 2 is too few"),
-        ({"size": 50}, "--size 50 is too small"),
+        ({"fps": 2.0, "frames": 60}, "fps, frames: both are set"),
+        ({"fps": 0.0}, "fps: 0 is not a positive number"),
+        ({"fps": float("nan")}, "fps: nan is not a positive number"),
+        ({"frames": 2}, "frames: 2 is too few"),
+        ({"size": 50}, "size: 50 is too small"),
     ],
 )
-def test_settings_that_make_no_sense(options, message, tmp_path):
+def test_invalid_settings(options, message, tmp_path):
     with pytest.raises(UserError, match=message):
         gathered(write_photos(tmp_path / "p"), tmp_path / "out", **options)
 
 
-def test_not_enough_room(tmp_path, monkeypatch):
+def test_not_enough_disk_space(tmp_path, monkeypatch):
     root = write_photos(tmp_path / "p", 3, "webp")
     path = write_video(tmp_path / "a.mp4", pan(9))
     monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage)
     for source in (root, path):
-        with pytest.raises(UserError, match=r"need about \d+ MB and the disk has \d+ MB left"):
+        with pytest.raises(UserError, match=r"about \d+ MB are needed and \d+ MB are free"):
             gathered(source, tmp_path / "out")
         assert files(tmp_path / "out") == []
 
@@ -316,7 +321,7 @@ class _Usage:
 
 
 @pytest.mark.parametrize("writes", ["photos", "video"])
-def test_the_disk_is_full_on_the_way(writes, tmp_path, monkeypatch):
+def test_the_disk_becomes_full(writes, tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -326,7 +331,7 @@ def test_the_disk_is_full_on_the_way(writes, tmp_path, monkeypatch):
     else:
         source = write_video(tmp_path / "a.mp4", pan(9))
         monkeypatch.setattr("snowsplat.sfm.ingest.video.save", full)
-    with pytest.raises(UserError, match="the disk is full; make room"):
+    with pytest.raises(UserError, match="disk: it is full; free some space"):
         gathered(source, tmp_path / "out")
 
 
@@ -343,7 +348,7 @@ def test_ctrl_c_and_progress(tmp_path):
         gathered(root, tmp_path / "other", report=stop)
 
 
-def test_find_inputs_lists_what_is_read(tmp_path):
+def test_find_inputs_lists_all_files_that_are_read(tmp_path):
     root = write_photos(tmp_path / "p")
     (root / "masks").mkdir()
     photo().save(root / "masks" / "1.png")

@@ -1,4 +1,4 @@
-"""Any file of a photo becomes upright pixels that COLMAP reads."""
+"""Photo files of any format become upright pixels in a format that COLMAP reads."""
 
 import numpy as np
 import pillow_heif
@@ -20,7 +20,7 @@ from ..pictures import HEIGHT, WIDTH, exif, photo, wall
 
 
 def stored(upright: Image.Image, orientation: int) -> Image.Image:
-    """As a camera with that orientation would store it: the inverse of what EXIF says to do."""
+    """The pixels as a camera with that orientation stores them: the inverse of EXIF's rotation."""
     undo = {
         2: [Image.Transpose.FLIP_LEFT_RIGHT],
         3: [Image.Transpose.ROTATE_180],
@@ -60,8 +60,8 @@ def test_every_orientation_becomes_upright(ending, orientation, tmp_path):
     assert difference(seen, wall()) < 12
 
 
-def test_colmap_does_not_turn_by_itself(tmp_path):
-    """Else pixels that we have turned would be turned twice, and this module would be wrong."""
+def test_colmap_ignores_the_exif_orientation(tmp_path):
+    """Otherwise, COLMAP would rotate pixels that are already upright."""
     stored(photo(), 6).save(tmp_path / "a.jpg", exif=exif({0x0112: 6}))
     assert pycolmap.Bitmap.read(str(tmp_path / "a.jpg"), True).width == HEIGHT
 
@@ -78,7 +78,7 @@ def test_heic(orientation, tmp_path):
     assert difference(decode(path, header, None), wall()) < 12
 
 
-def test_names_keep_their_ending_where_it_says_the_truth(tmp_path):
+def test_names_keep_a_correct_extension(tmp_path):
     photo().save(tmp_path / "A.JPG", "JPEG")
     photo().save(tmp_path / "b.png", "JPEG")
     photo().save(tmp_path / "c.TIFF", "TIFF")
@@ -96,7 +96,7 @@ def test_cmyk(tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["png", "tif"])
-def test_sixteen_bits_of_grey(ending, tmp_path):
+def test_16_bit_grey(ending, tmp_path):
     grey = wall()[..., 0].astype(np.uint16) * 256 + 77
     path = tmp_path / f"a.{ending}"
     Image.fromarray(grey).save(path)
@@ -108,7 +108,7 @@ def test_sixteen_bits_of_grey(ending, tmp_path):
     assert header.file_name(path.name, None) == "a.png"
 
 
-def test_sixteen_bits_of_colour(tmp_path):
+def test_16_bit_colour(tmp_path):
     import struct
     import zlib
 
@@ -127,7 +127,7 @@ def test_sixteen_bits_of_colour(tmp_path):
     assert np.array_equal(np.asarray(decode(tmp_path / "a.png", header, None)), wall())
 
 
-def test_floating_point_is_refused(tmp_path):
+def test_floating_point_is_rejected(tmp_path):
     Image.fromarray(np.zeros((100, 100), np.float32)).save(tmp_path / "a.tif")
     with pytest.raises(Unusable, match="floating-point"):
         decode(tmp_path / "a.tif", read_header(tmp_path / "a.tif"), None)
@@ -149,21 +149,21 @@ def test_transparency_becomes_rgba(mode, tmp_path):
     assert (got[:, 100:, 3] == 255).all()
 
 
-def test_alpha_that_hides_nothing_is_none(tmp_path):
+def test_an_opaque_alpha_channel_is_removed(tmp_path):
     photo().convert("RGBA").save(tmp_path / "a.webp")
     header = read_header(tmp_path / "a.webp")
     assert decode(tmp_path / "a.webp", header, None).mode == "RGB"
     assert header.file_name("a.webp", None).startswith("a.")
 
 
-def test_scaled_to_the_longest_side():
+def test_the_longest_side_is_limited():
     assert scaled_size(4000, 3000, 1600) == (1600, 1200)
     assert scaled_size(3000, 4000, 1600) == (1200, 1600)
     assert scaled_size(800, 600, 1600) == (800, 600)
     assert scaled_size(100_000, 20, 1600) == (1600, 1)
 
 
-def test_small_copies_of_a_jpeg_are_decoded_small_and_whole(tmp_path):
+def test_a_jpeg_is_decoded_at_a_smaller_size_but_read_completely(tmp_path):
     photo().resize((3200, 2400)).save(tmp_path / "a.jpg", quality=90)
     image = decode_small(tmp_path / "a.jpg", 320)
     assert 640 <= image.width <= 1000
@@ -173,9 +173,9 @@ def test_small_copies_of_a_jpeg_are_decoded_small_and_whole(tmp_path):
         decode_small(tmp_path / "a.jpg", 320)
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow tells of damaged tags
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow warns of damaged tags
 @pytest.mark.parametrize("ending", ["jpg", "png", "tif", "webp", "heic"])
-def test_any_damage_is_only_unusable(ending, tmp_path):
+def test_any_damage_raises_unusable(ending, tmp_path):
     pillow_heif.register_heif_opener()
     path = tmp_path / f"a.{ending}"
     photo(width=160, height=120).save(path)
@@ -193,7 +193,7 @@ def test_any_damage_is_only_unusable(ending, tmp_path):
     assert refused > 5
 
 
-def test_text_and_icons(tmp_path):
+def test_text_files_and_icons(tmp_path):
     (tmp_path / "a.jpg").write_text("not a photo")
     with pytest.raises(Unusable, match="not an image of a known format"):
         read_header(tmp_path / "a.jpg")
@@ -202,7 +202,7 @@ def test_text_and_icons(tmp_path):
         read_header(tmp_path / "b.png")
 
 
-def test_a_link_where_possible(tmp_path):
+def test_a_hard_link_if_possible(tmp_path):
     photo().save(tmp_path / "a.jpg")
     (tmp_path / "link.jpg").symlink_to(tmp_path / "a.jpg")
     link_or_copy(tmp_path / "link.jpg", tmp_path / "b.jpg")
@@ -210,7 +210,7 @@ def test_a_link_where_possible(tmp_path):
     assert (tmp_path / "b.jpg").samefile(tmp_path / "a.jpg")
 
 
-def test_a_copy_where_the_disk_has_no_links(tmp_path, monkeypatch):
+def test_a_copy_if_links_are_not_supported(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(18, "Invalid cross-device link")
 
@@ -221,7 +221,7 @@ def test_a_copy_where_the_disk_has_no_links(tmp_path, monkeypatch):
     assert (tmp_path / "b.jpg").read_bytes() == (tmp_path / "a.jpg").read_bytes()
 
 
-def test_profile_and_notes_go_along(tmp_path):
+def test_colour_profile_and_exif_are_copied(tmp_path):
     from PIL import ImageCms
 
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()

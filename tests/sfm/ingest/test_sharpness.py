@@ -1,4 +1,4 @@
-"""Sharp frames are told from blurred ones, pictures of something from useless ones."""
+"""Sharpness, images without content, and camera motion between frames."""
 
 import numpy as np
 import pytest
@@ -28,20 +28,20 @@ def noisy(picture: np.ndarray, level: float, seed: int) -> np.ndarray:
     return np.clip(picture + noise, 0, 255).astype(np.uint8)
 
 
-def test_grey_copy_has_the_asked_side_and_is_never_larger():
+def test_grey_copy_has_the_requested_side_and_is_never_larger():
     assert grey_copy(Image.new("RGB", (4000, 3000)), 320).shape == (240, 320)
     assert grey_copy(Image.new("RGB", (700, 1000)), 320).shape == (320, 224)
     assert grey_copy(Image.new("L", (100, 60)), 320).shape == (60, 100)
     assert grey_copy(Image.new("RGB", (5000, 3)), 320).shape == (1, 320)
 
 
-def test_a_little_blur_is_less_sharp():
+def test_sharpness_decreases_with_blur():
     values = [sharpness(grey(blurred(wall(), radius))) for radius in (0, 0.5, 1, 2)]
     assert values == sorted(values, reverse=True)
     assert values[1] < 0.9 * values[0]
 
 
-def test_blur_of_the_hand_in_one_direction_is_less_sharp():
+def test_motion_blur_decreases_sharpness():
     frames = pan(8, step=2)
     smeared = np.mean(frames, axis=0).astype(np.uint8)
     assert sharpness(grey(smeared)) < 0.7 * min(sharpness(grey(frame)) for frame in frames)
@@ -49,48 +49,48 @@ def test_blur_of_the_hand_in_one_direction_is_less_sharp():
 
 @pytest.mark.parametrize("level", [0, 3])
 @pytest.mark.parametrize(("value", "reason"), [(0, BLACK), (255, WHITE), (128, FLAT)])
-def test_pictures_of_nothing(value, reason, level):
+def test_uniform_images_are_useless(value, reason, level):
     picture = np.full((960, 1280, 3), value, np.uint8)
     assert why_useless(grey(noisy(picture, level, seed=1))) == reason
 
 
-def test_only_what_is_hopelessly_blurred_is_useless():
+def test_only_strongly_blurred_images_are_useless():
     large = wall(width=1280, height=960)
     assert why_useless(grey(large)) is None
     assert why_useless(grey(blurred(large, 6))) is None
     assert why_useless(grey(blurred(large, 32))) == BLURRED
 
 
-def test_dark_pictures_with_little_contrast_are_used():
+def test_dark_images_with_little_contrast_are_used():
     dim = (wall(width=640, height=480) / 16).astype(np.uint8)
     assert why_useless(grey(dim)) is None
 
 
 @pytest.mark.parametrize("level", [0, 2, 6])
-def test_a_still_camera_has_not_moved_whatever_the_noise(level):
+def test_noise_is_not_motion(level):
     still = wall()
     assert not has_moved(grey(noisy(still, level, 1)), grey(noisy(still, level, 2)))
 
 
-def test_a_camera_that_moves_has_moved():
+def test_camera_motion_is_detected():
     frames = [grey(frame) for frame in pan(10, step=4)]
     assert has_moved(frames[0], frames[1])
     assert has_moved(frames[0], frames[9])
     assert not has_moved(frames[3], frames[3])
 
 
-def test_somebody_who_walks_through_a_still_picture_does_not_count():
+def test_a_moving_object_is_not_camera_motion():
     before, after = wall().copy(), wall().copy()
     before[60:200, 40:100] = wall(seed=5)[60:200, 40:100]
     after[60:200, 140:200] = wall(seed=5)[60:200, 40:100]
     assert not has_moved(grey(before), grey(after))
 
 
-def test_neither_does_the_light():
+def test_a_change_of_light_is_not_camera_motion():
     assert not has_moved(grey(wall()), grey((wall() * 0.8).astype(np.uint8)))
 
 
-def test_walls_without_texture_and_tiny_pictures():
+def test_images_without_texture_and_tiny_images():
     flat = np.full((240, 320), 120, np.uint8)
     assert not has_moved(flat, flat)
     assert has_moved(flat, flat + 20)

@@ -1,4 +1,4 @@
-"""Frames of a video: sharp, upright, different from each other, and as many as asked."""
+"""Frames of a video: sharp, upright, without repeated views, at most as many as requested."""
 
 import logging
 from fractions import Fraction
@@ -30,7 +30,7 @@ def difference(path, picture) -> float:
         return float(np.abs(np.asarray(image, np.float64) - picture).mean())
 
 
-def test_the_sharpest_of_each_window(tmp_path):
+def test_the_sharpest_frame_of_each_window(tmp_path):
     pictures = pan(24)
     sharp = [2, 5, 8, 15, 16, 23]
     frames = [p if i in sharp else blurred(p, 1.5) for i, p in enumerate(pictures)]
@@ -45,8 +45,8 @@ def test_the_sharpest_of_each_window(tmp_path):
         assert difference(tmp_path / "f" / frame.name, wrong) > 20
 
 
-def test_windows_are_of_equal_time_where_the_rate_varies(tmp_path):
-    # 20 frames in the first second, 4 in the three that follow.
+def test_windows_have_equal_duration_if_the_frame_rate_varies(tmp_path):
+    # 20 frames in the first second, 4 frames in the next three seconds.
     times = [50 * i for i in range(20)] + [1000 + 750 * i for i in range(4)]
     video = write_video(tmp_path / "a.mkv", pan(24), rate=20, times=times)
     made = extract(video, tmp_path / "f", 4)
@@ -57,9 +57,9 @@ def test_windows_are_of_equal_time_where_the_rate_varies(tmp_path):
 
 
 @pytest.mark.parametrize("rotation", [90, -90, 180])
-def test_turned_upright(rotation, tmp_path):
+def test_frames_are_rotated_upright(rotation, tmp_path):
     upright = pan(4)
-    turns = {90: 3, -90: 1, 180: 2}[rotation]  # undone by turning so far counter-clockwise
+    turns = {90: 3, -90: 1, 180: 2}[rotation]  # counter-clockwise, undone by the rotation
     frames = [np.ascontiguousarray(np.rot90(picture, turns)) for picture in upright]
     video = write_video(tmp_path / "a.mp4", frames, rotation=rotation)
     made = extract(video, tmp_path / "f", 4)
@@ -73,14 +73,14 @@ def test_pixels_become_square(tmp_path):
     assert (made.kept[0].width, made.kept[0].height) == (427, HEIGHT)
 
 
-def test_scaled(tmp_path):
+def test_frames_are_resized(tmp_path):
     made = extract(write_video(tmp_path / "a.mp4", pan(4)), tmp_path / "f", 2, size=160)
     assert (made.kept[0].width, made.kept[0].height) == (160, 120)
     with Image.open(tmp_path / "f" / "frame_00001.jpg") as image:
         assert image.size == (160, 120)
 
 
-def test_where_the_camera_stands_still_one_frame_is_kept(tmp_path):
+def test_one_frame_is_kept_while_the_camera_does_not_move(tmp_path):
     moving = pan(12)
     frames = [*moving[:4], *[moving[4]] * 8, *moving[5:]]
     made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", len(frames))
@@ -88,7 +88,7 @@ def test_where_the_camera_stands_still_one_frame_is_kept(tmp_path):
     assert [reason for _, reason in made.skipped] == [SAME_VIEW] * 7
 
 
-def test_frames_of_nothing_are_left_out(tmp_path):
+def test_frames_without_content_are_skipped(tmp_path):
     frames = pan(8)
     frames[0] = np.zeros_like(frames[0])
     frames[5] = blurred(frames[5], 12)
@@ -97,7 +97,7 @@ def test_frames_of_nothing_are_left_out(tmp_path):
     assert len(made.kept) == 6
 
 
-def test_a_damaged_video_gives_what_can_be_read_and_says_so(tmp_path, caplog):
+def test_a_damaged_video_is_read_as_far_as_possible_with_a_warning(tmp_path, caplog):
     pictures = pan(60, seed=3)
     path = write_video(tmp_path / "a.avi", pictures, codec="mjpeg")
     content = bytearray(path.read_bytes())
@@ -108,14 +108,14 @@ def test_a_damaged_video_gives_what_can_be_read_and_says_so(tmp_path, caplog):
         made = extract(path, tmp_path / "f", 10)
     assert 3 <= len(made.kept) <= 10
     assert made.read < 58
-    assert "a.avi: is damaged or cut off" in caplog.text
+    assert "a.avi: is damaged or truncated" in caplog.text
 
 
 def test_colours(tmp_path):
-    """Of both matrices that videos come with: named in the file, or guessed by its size."""
+    """With the colour matrix that is named in the file, and with the default for its size."""
     colours = np.zeros((720, 1280, 3), np.uint8)
     colours[:360], colours[360:] = (210, 40, 60), (30, 190, 50)
-    colours[::16, ::16] = 255  # something to see
+    colours[::16, ::16] = 255  # some detail, as uniform frames are skipped
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
         stream = container.add_stream("libx264", rate=5)
         stream.width, stream.height, stream.pix_fmt = 1280, 720, "yuv420p"
@@ -143,7 +143,7 @@ def test_progress_reaches_the_end(tmp_path):
     assert calls[-1] == (25, 25, "frames of a.mp4")
 
 
-def test_ctrl_c_comes_through(tmp_path):
+def test_ctrl_c_is_raised(tmp_path):
     def stop(*_):
         raise KeyboardInterrupt
 
@@ -152,7 +152,7 @@ def test_ctrl_c_comes_through(tmp_path):
         extract(video, tmp_path / "f", 5, report=stop)
 
 
-def test_a_full_disk_is_no_damaged_video(tmp_path, monkeypatch):
+def test_a_full_disk_is_not_reported_as_a_damaged_video(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
@@ -171,12 +171,12 @@ def test_a_real_video(tmp_path):
     assert made.read == 706
     assert 54 <= len(made.kept) <= 60
     assert {reason for _, reason in made.skipped} == {SAME_VIEW}
-    # By the eye: around 4.5 s and 22.7 s the hand jerks; the frames taken there are sharp.
+    # Around 4.5 s and 22.7 s the camera jerks; the frames selected there are sharp.
     taken = [round(frame.seconds * 30) for frame in made.kept]
     assert not {137, 138, 683, 684} & set(taken)
 
 
-def test_no_video(tmp_path):
+def test_not_a_video(tmp_path):
     (tmp_path / "a.mp4").write_text("x")
     with pytest.raises(UserError):
         extract(tmp_path / "a.mp4", tmp_path / "f", 3)

@@ -1,10 +1,10 @@
-"""Structure from motion: photos -> where each was taken, the cameras' lenses, points of the scene.
+"""Structure from motion: estimates camera poses, lens parameters and scene points from photos.
 
-child        runs the rest in a process of its own and tells how that ended
-worker       that process
-reconstruct  the tries, one after another, until enough photos are placed
-features, pairs, retrieval, mapping   the steps of a try, on COLMAP's `database`
-diagnosis    why a photo, or none, could be placed
+child        starts the child process and handles its end
+worker       the child process, in which COLMAP runs
+reconstruct  repeated attempts, until enough photos have a pose
+features, pairs, retrieval, mapping   the steps of an attempt, on the COLMAP `database`
+diagnosis    explains why photos have no pose
 """
 
 from snowsplat.sfm.colmap.child import estimate_poses

@@ -1,9 +1,9 @@
-"""Whether COLMAP can read a model that somebody else made: tried out in a child process first.
+"""Check in a child process whether COLMAP can read a model from an unknown source.
 
     python -m snowsplat.sfm.colmap.check_model FOLDER BYTES
 
-COLMAP believes the counts in its files: one of a damaged file makes it take all memory there is, or
-run for hours. A child that takes BYTES more than it begins with, or too long, only ends itself.
+COLMAP trusts the counts in its files: a damaged count makes it allocate all memory or run for
+hours. The child process is limited to BYTES of additional memory and to a time, so only it fails.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from pathlib import Path
 
 from snowsplat.sfm.colmap.child import child_environment
 
-_SECONDS, _BYTES_A_SECOND = 10.0, 1_000_000
-_MEMORY, _RATIO = 1 << 30, 16  # bytes of address space, and for each byte of the files
+_SECONDS = 10.0  # to start Python and COLMAP
+_BYTES_A_SECOND = 1_000_000  # a low estimate of the reading speed
+_MEMORY = 1 << 30  # bytes of address space, for a model of any size
+_RATIO = 16  # additional bytes of address space per byte of the files
 
 
 def can_be_read(folder: Path) -> bool:
-    """Whether COLMAP reads the model in a folder, in the time and memory that its size deserves."""
+    """Whether COLMAP reads the model in ``folder`` within limits that depend on its size."""
     size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
     limit = _MEMORY + _RATIO * size
     try:

@@ -1,4 +1,4 @@
-"""The parent's side of the child process: starts it, listens, ends it, and tells how it ended."""
+"""Runs the COLMAP worker as a child process, reports its progress and handles its failures."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import UserError
 
-# A database that grows may need so many bytes for its next step.
-_ROOM = 8_000_000
+# Bytes that a growing database may need for its next transaction.
+_DATABASE_GROWTH = 8_000_000
 _MODULE = "snowsplat.sfm.colmap.worker"
 _POLL_SECONDS = 0.5
 
 
 class Crashed(Exception):
-    """The child ended without an answer; ``code`` is its exit status, negative for a signal."""
+    """The child ended without a result; ``code`` is its exit status, negative for a signal."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
         self.code = code
 
     @property
-    def how(self) -> str:
-        """The end of it, in words."""
+    def reason(self) -> str:
+        """How the child ended, as text."""
         if self.code == -getattr(signal, "SIGKILL", 9):
-            return "it was killed, most likely because the memory was full"
+            return "it was killed, probably because the memory was full"
         if self.code < 0:
             return f"it crashed ({signal.Signals(-self.code).name})"
         return f"it ended with status {self.code}"
@@ -48,26 +48,24 @@ class Crashed(Exception):
 def estimate_poses(
     dataset: Path, photos: list[Photo], options: SfmOptions, report: Report
 ) -> SfmResult:
-    """Find where each photo of ``capture/input`` was taken, and points of the scene.
+    """Estimate the pose of each photo in ``input/`` of a dataset, and points of the scene.
 
-    Writes ``distorted/sparse/N`` (0 has most photos), in the photos' own cameras, at an arbitrary
-    scale and orientation, and ``distorted/database.db``; ``distorted/colmap.log`` is what COLMAP
-    said. Features and matches of an interrupted run are used again. The same photos and settings
-    give the same pairs and matches, and the same poses but for rounding; of more than 150 photos,
-    also but for the frame.
+    Writes ``distorted/sparse/N`` (0 has the most photos), with distorted cameras, at an arbitrary
+    scale and orientation; ``distorted/database.db``; and ``distorted/colmap.log``, the output of
+    COLMAP. Features and matches of an interrupted run are reused. The same photos and settings
+    lead to the same pairs and matches, and to the same poses except for rounding. With more than
+    150 photos, the coordinate frame may differ, too.
 
     Raises:
-        UserError: fewer than 3 photos, no such camera model, no poses to be found (the message
-            says why), or COLMAP crashed twice.
+        UserError: fewer than 3 photos, an unknown camera model, no poses found (the message
+            explains why), or COLMAP crashed twice.
         OSError: the disk is full.
     """
     if len(photos) < 3:
-        raise UserError(
-            f"{len(photos)} photos are too few to see depth; take at least 3, better 30 or more"
-        )
+        raise UserError(f"photos: {len(photos)} are not enough; take at least 3, better 30 or more")
     if options.camera_model not in ("auto", *CAMERA_MODELS):
         raise UserError(
-            f"{options.camera_model!r}: no such camera model; there are auto, "
+            f"camera_model: unknown value {options.camera_model!r}; use one of auto, "
             + ", ".join(CAMERA_MODELS)
         )
     distorted = dataset.absolute() / "distorted"
@@ -81,32 +79,32 @@ def estimate_poses(
     }
     threads = thread_count(options.threads)
     try:
-        return _run({**job, "gentle": False}, log, threads, report)
+        return _run({**job, "reduced": False}, log, threads, report)
     except Crashed as crash:
         first = crash
         _check_disk(distorted)
     try:
-        result = _run({**job, "gentle": True}, log, 1, report)
+        result = _run({**job, "reduced": True}, log, 1, report)
     except Crashed as crash:
         _check_disk(distorted)
         advice = "report it"
         if crash.code < 0:
-            advice = "use fewer or smaller photos, or a lower quality"
+            advice = "use fewer or smaller photos, or a lower effort"
         raise UserError(
-            f"finding the camera positions failed twice: {crash.how}; {advice} "
-            f"(its last words: {_last_line(log)})"
+            f"pose estimation: failed twice: {crash.reason}; {advice} "
+            f"(last line of the log: {_last_line(log)})"
         ) from None
-    note = f"as asked: {first.how}; what follows was done with smaller photos and one thread"
+    note = f"first attempt: {first.reason}; repeated with smaller photos and one thread"
     return dataclasses.replace(result, attempts=[note, *result.attempts])
 
 
 def _check_disk(folder: Path) -> None:
-    """Raises: OSError: files here cannot grow, which is why the child has ended."""
+    """Raises OSError if files in ``folder`` cannot grow: the likely reason of a crash."""
     try:
         largest = max(path.stat().st_size for path in folder.iterdir())
         with tempfile.TemporaryFile(dir=folder) as file:
             file.seek(largest)
-            file.write(bytes(_ROOM))
+            file.write(bytes(_DATABASE_GROWTH))
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(folder)) from None
 
@@ -130,7 +128,7 @@ def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmRes
         ) as child,
     ):
         try:
-            answer = _converse(child, job, report)
+            answer = _communicate(child, job, report)
             code = child.wait()
         finally:
             child.kill()
@@ -141,10 +139,13 @@ def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmRes
     return SfmResult(**answer["result"])
 
 
-def _converse(child: subprocess.Popen[str], job: dict[str, Any], report: Report) -> dict[str, Any]:
-    """Send the job, report progress until the child ends, and give its last line.
+def _communicate(
+    child: subprocess.Popen[str], job: dict[str, Any], report: Report
+) -> dict[str, Any]:
+    """Send the job, report progress until the child ends, and return its last line.
 
-    All in this thread, so that Ctrl-C ends it and ``report`` needs no lock; another one listens.
+    ``report`` is called in this thread, so it needs no lock and Ctrl-C interrupts it. A second
+    thread reads the lines.
     """
     lines: queue.Queue[str | None] = queue.Queue()
 
@@ -157,7 +158,7 @@ def _converse(child: subprocess.Popen[str], job: dict[str, Any], report: Report)
 
     threading.Thread(target=listen, daemon=True).start()
     assert child.stdin is not None
-    with contextlib.suppress(BrokenPipeError):  # its end shows below
+    with contextlib.suppress(BrokenPipeError):  # the child has ended: detected below
         child.stdin.write(json.dumps(job) + "\n")
         child.stdin.flush()
     answer: dict[str, Any] = {}
@@ -168,12 +169,12 @@ def _converse(child: subprocess.Popen[str], job: dict[str, Any], report: Report)
             if "watch" in answer:
                 _report_rows(report, *answer["watch"])
             continue
-        if line is None or not line.endswith("\n"):  # it died in the middle of a word
+        if line is None or not line.endswith("\n"):  # the child has ended, or died in a line
             break
         answer = json.loads(line)
         if "progress" in answer:
             report(*answer["progress"])
-    # Open until here: at its end the child ends too.
+    # Closed only now: when its stdin closes, the child ends.
     with contextlib.suppress(BrokenPipeError):
         child.stdin.close()
     return answer
@@ -182,7 +183,7 @@ def _converse(child: subprocess.Popen[str], job: dict[str, Any], report: Report)
 def _report_rows(report: Report, database: str, table: str, total: int, what: str) -> None:
     address = f"{Path(database).as_uri()}?mode=ro"
     with (
-        contextlib.suppress(sqlite3.Error),  # it is being written: the next time
+        contextlib.suppress(sqlite3.Error),  # locked while it is written: count next time
         contextlib.closing(sqlite3.connect(address, uri=True)) as connection,
     ):
         (rows,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
@@ -190,9 +191,12 @@ def _report_rows(report: Report, database: str, table: str, total: int, what: st
 
 
 def child_environment(threads: int) -> dict[str, str]:
-    """For a child that runs our modules, COLMAP with so many threads."""
-    # The child finds the modules that this process finds, from a checkout or a wheel, and not
-    # what happens to lie in the current folder.
+    """The environment of a child process that runs modules of this package.
+
+    COLMAP uses ``threads`` threads there.
+    """
+    # The child imports modules from the same places as this process, from a checkout or a wheel,
+    # but not from the current folder.
     paths: Sequence[str] = [os.path.abspath(path) for path in sys.path if path]
     return {
         **os.environ,

@@ -1,8 +1,8 @@
-"""COLMAP's database of the features and matches of a dataset: made by us, kept after a kill.
+"""The COLMAP database of a dataset: features and matches, reused after an interrupted run.
 
-Photo number i of the list has image, frame id i + 1, whatever thread came first, so that the same
-photos always give the same database. A fingerprint of photos and settings lies in it: after an
-interrupted run what was computed is used again, unless the photos or the settings are others.
+Photo number i of the list has image id and frame id i + 1, independent of thread timing, so the
+same photos always lead to the same database. The database stores a fingerprint of photos and
+settings. Its features and matches are reused only if the fingerprint is unchanged.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.ingest.photo import Photo
 
-# Fewer photos cannot fix the eight numbers of OPENCV.
+# With fewer photos the eight parameters of OPENCV are not well determined.
 MIN_PHOTOS_FOR_OPENCV = 8
-# Without EXIF: about a 29 mm lens on 35 mm film, between a phone's photo and its cropped video.
-# The true focal length is found with the poses.
+# Times the longest side, if there is no EXIF: a 29 mm lens on 35 mm film. This is between a phone's
+# photos and its cropped videos. The focal length is then refined together with the poses.
 GUESSED_FOCAL = 0.8
 
-_PLANE_OR_TURN = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
+_PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two photos, by index into the list of photos, and what they have in common."""
+    """Two photos, by index into the list of photos, and the result of matching them."""
 
     first: int
     second: int
-    inliers: int  # matches that fit one motion of the camera
-    flat: bool  # a plane, or a camera that only turned, explains them as well
+    inliers: int  # matches that are consistent with one relative pose
+    flat: bool  # also consistent with a plane, or with a pure rotation of the camera
 
 
 def open_database(path: Path, photos: list[Photo], camera_model: str, fingerprint: str) -> None:
-    """Make ``path`` a database that has ``photos``; keep its features and matches if they fit.
+    """Open or create the database ``path`` of ``photos``; keep features and matches if valid.
 
-    They do if the database is sound and carries the same ``fingerprint``. Names and cameras are
-    written anew in each case: a change of camera model does not touch features.
+    They are valid if the database is intact and has the same ``fingerprint``. Names and cameras are
+    always rewritten, since features do not depend on the camera model.
     """
     if not _is_sound(path, fingerprint):
         remove_database(path)
@@ -62,13 +62,13 @@ def open_database(path: Path, photos: list[Photo], camera_model: str, fingerprin
 
 
 def remove_database(path: Path) -> None:
-    """Remove the database, if there is one, and what SQLite keeps beside it."""
+    """Remove the database, if it exists, and the files that SQLite writes beside it."""
     for suffix in ("", "-journal", "-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 def replace_database(path: Path, by: Path) -> None:
-    """Let the database ``by`` take the place of ``path``."""
+    """Replace the database ``path`` by the database ``by``."""
     with closing(sqlite3.connect(by)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     remove_database(path)
@@ -86,7 +86,7 @@ def closing_database(path: Path) -> Iterator[pycolmap.Database]:
 
 
 def fingerprint_of(images: Path, photos: list[Photo], settings: object) -> str:
-    """A hash of all on which features and matches depend: the photos' files, the settings."""
+    """A hash of everything that features and matches depend on: photo files and settings."""
     files = [(images / photo.name).stat() for photo in photos]
     facts = [
         pycolmap.__version__,
@@ -105,7 +105,7 @@ def _is_sound(path: Path, fingerprint: str) -> bool:
     try:
         with closing(sqlite3.connect(path)) as connection:
             found = connection.execute("SELECT fingerprint FROM snowsplat").fetchall()
-            # COLMAP does not wait for the disk: after a power cut the file may be damaged.
+            # COLMAP does not sync to disk: after a power failure the file may be damaged.
             return found == [(fingerprint,)] and connection.execute(
                 "PRAGMA quick_check"
             ).fetchall() == [("ok",)]
@@ -135,7 +135,7 @@ def _write_photos(database: pycolmap.Database, photos: list[Photo], camera_model
 
 
 def _camera_key(photo: Photo) -> tuple[str, int, int]:
-    # A group has one size; should it not, one camera cannot hold it.
+    # All photos of a group should have one size. If not, they need separate cameras.
     return photo.group, photo.width, photo.height
 
 
@@ -161,9 +161,9 @@ def _cameras(photos: list[Photo], camera_model: str) -> list[pycolmap.Camera]:
 
 
 def set_names(path: Path, names: list[str]) -> None:
-    """Name the images of the database, in order of their ids."""
+    """Set the names of the images in the database, in the order of their ids."""
     with closing(sqlite3.connect(path)) as connection, connection:
-        # Names are unique, so that swapping them takes two steps.
+        # Names must be unique at any time, so they are first replaced by temporary ones.
         connection.execute("UPDATE images SET name = ':' || image_id")
         connection.executemany(
             "UPDATE images SET name = ? WHERE image_id = ?",
@@ -172,13 +172,13 @@ def set_names(path: Path, names: list[str]) -> None:
 
 
 def count_rows(path: Path, table: str) -> int:
-    """Rows of a table."""
+    """Number of rows of a table."""
     with closing(sqlite3.connect(path)) as connection:
         return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
 
 
 def feature_counts(path: Path, photo_count: int) -> list[int]:
-    """Features of each photo, 0 where none were found or the photo could not be read."""
+    """Number of features of each photo; 0 if none were found or the photo could not be read."""
     counts = [0] * photo_count
     with closing(sqlite3.connect(path)) as connection:
         for image_id, rows in connection.execute("SELECT image_id, rows FROM keypoints"):
@@ -187,11 +187,11 @@ def feature_counts(path: Path, photo_count: int) -> list[int]:
 
 
 def verified_pairs(path: Path) -> list[Pair]:
-    """The pairs whose matches fit a motion of the camera, weak ones too."""
+    """All pairs with matches consistent with a relative pose, also those with few matches."""
     flat = {
         int(config)
         for name, config in pycolmap.TwoViewGeometryConfiguration.__members__.items()
-        if name in _PLANE_OR_TURN
+        if name in _PLANE_OR_ROTATION
     }
     query = "SELECT pair_id, rows, config FROM two_view_geometries WHERE rows > 0"
     with closing(sqlite3.connect(path)) as connection:
@@ -204,9 +204,9 @@ def verified_pairs(path: Path) -> list[Pair]:
 
 
 def trim_features(path: Path, limit: int) -> None:
-    """Keep the ``limit`` largest features of each photo; matching takes time by their square.
+    """Keep the ``limit`` largest features of each photo: matching time grows with their square.
 
-    COLMAP's own limit is a rough one: it takes whole octaves, up to four times as many.
+    COLMAP's own limit is approximate: it keeps whole octaves, up to four times as many features.
     """
     with closing(sqlite3.connect(path)) as connection:
         query = "SELECT image_id FROM keypoints WHERE rows > ?"
@@ -231,13 +231,13 @@ def _read_rows(
 
 
 def _largest(keypoints: NDArray[np.float32], count: int) -> NDArray[np.intp]:
-    # The columns after x, y are an affine shape, whose determinant is the squared scale.
+    # The columns after x, y are an affine shape. Its determinant is the squared scale.
     scale = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     return np.argsort(-scale, kind="stable")[:count]
 
 
 def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
-    """(≤ limit, 128) descriptors of a photo, those of the largest features."""
+    """(≤ limit, 128) float32 descriptors of a photo: those of its largest features."""
     with closing_database(path) as database:
         if not database.exists_descriptors(index + 1):
             return np.zeros((0, 128), np.float32)
@@ -249,9 +249,10 @@ def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
 
 
 def displacement_of(path: Path, pairs: Sequence[Pair]) -> float:
-    """How far apart matches lie in the two photos of a pair, in pixels: the median match.
+    """Typical distance in pixels between the positions of a match in the two photos.
 
-    Of the pairs, that of which 90% lie below: a slow walk has many pairs that hardly differ.
+    The median over the matches of a pair, then the 90% quantile over the pairs: a slow video has
+    many pairs that hardly differ.
     """
     medians = []
     with closing_database(path) as database:

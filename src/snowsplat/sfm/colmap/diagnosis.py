@@ -1,4 +1,4 @@
-"""Why photos could not be placed, in words for people, read off the features and matches."""
+"""Explains to the user why photos have no pose, from the features and matches."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from snowsplat.sfm.colmap.database import (
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import UserError
 
-_FEW_FEATURES = 60
+_FEW_FEATURES = 60  # a photo with fewer is too dark, blurred or plain
 _WEAK_PAIR = 50  # matches
-_MANY_FEATURES = 500  # a sharp photo of nearly anything has more
-_STILL = 0.01  # of the photo's longest side
-_FLAT_SHARE = 0.8
+_MANY_FEATURES = 500  # nearly every sharp photo has more
+_STILL = 0.01  # displacement relative to the photo's longest side
+_FLAT_SHARE = 0.8  # of all matches
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the database says about the photos, by index."""
+    """What the database contains about the photos, by index."""
 
     features: list[int]
     pairs: list[Pair]
-    displacement: float | None  # of matches from photo to photo, as a part of the longest side
-    compared: int  # pairs that were
+    displacement: float | None  # of matches between two photos, relative to the longest side
+    compared: int  # number of pairs that were matched
 
     @property
     def compared_all(self) -> bool:
@@ -37,9 +37,10 @@ class Evidence:
         return self.compared >= count * (count - 1) // 2
 
     @property
-    def hopeful(self) -> int:
-        """How many photos could be placed at all: they have detail, and it is not all their own."""
+    def usable(self) -> int:
+        """Number of photos that could get a pose: they have detail and share it with others."""
         paired = {i for pair in self.pairs for i in (pair.first, pair.second)}
+        # If all pairs were matched, a photo with many features but no match shows another scene.
         alone = _MANY_FEATURES if self.compared_all else float("inf")
         return sum(
             count >= _FEW_FEATURES and (i in paired or count < alone)
@@ -48,7 +49,7 @@ class Evidence:
 
     @property
     def flat(self) -> bool:
-        """Whether one plane, or a camera that only turned, explains the matches."""
+        """Whether one plane, or a pure rotation of the camera, explains most matches."""
         flat = sum(pair.inliers for pair in self.pairs if pair.flat)
         return flat > 0 and flat >= _FLAT_SHARE * sum(pair.inliers for pair in self.pairs)
 
@@ -57,18 +58,18 @@ class Evidence:
         return self.displacement is not None and self.displacement < _STILL
 
     @property
-    def hopeless(self) -> bool:
-        """Whether, where no model was found, stronger settings would find none either."""
+    def more_effort_is_useless(self) -> bool:
+        """Whether stronger settings would not find a model either, if none was found."""
         if self.still or self.flat:
             return True
-        return self.hopeful < 3
+        return self.usable < 3
 
 
 def gather_evidence(database: Path, photos: Sequence[Photo], compared: int) -> Evidence:
-    """Read the database after matching; ``compared`` is how many pairs were."""
+    """Read the database after matching; ``compared`` is the number of matched pairs."""
     pairs = verified_pairs(database)
     size = max(max(photo.width, photo.height) for photo in photos)
-    # Some pairs tell; an even choice of them.
+    # About 100 evenly chosen pairs are enough.
     some = pairs[:: max(1, len(pairs) // 100)]
     displacement = displacement_of(database, some) / size if some else None
     return Evidence(feature_counts(database, len(photos)), pairs, displacement, compared)
@@ -77,7 +78,7 @@ def gather_evidence(database: Path, photos: Sequence[Photo], compared: int) -> E
 def explain(
     photos: Sequence[Photo], evidence: Evidence, models: Sequence[set[str]]
 ) -> dict[str, str]:
-    """Name -> why, of each photo that is not in the first of ``models`` (sets of names)."""
+    """Name -> reason, for each photo that is not in the first of ``models`` (sets of names)."""
     partners: list[list[int]] = [[] for _ in photos]
     for pair in evidence.pairs:
         partners[pair.first].append(pair.inliers)
@@ -88,50 +89,51 @@ def explain(
             continue
         part = next((model for model in models[1:] if photo.name in model), None)
         if part is not None:
-            reason = f"it is in another part of {len(part)} photos, which does not join the rest"
+            reason = f"it is in a separate group of {len(part)} photos"
         elif features < _FEW_FEATURES:
-            reason = f"it shows hardly any detail ({features} points): too dark, blurred or plain"
+            reason = f"it shows hardly any detail ({features} features): too dark, blurred or plain"
         elif not matches:
             reason = "it matches no other photo"
         elif max(matches) < _WEAK_PAIR:
             reason = (
-                f"it matches only {_photos(len(matches), 'other ')}, weakly "
-                f"(at most {max(matches)} points)"
+                f"it has too few matches with {_photos(len(matches), 'other ')} "
+                f"(at most {max(matches)})"
             )
         else:
-            reason = f"its matches with {_photos(len(matches), 'other ')} do not fit the rest"
+            others = _photos(len(matches), "other ")
+            reason = f"its matches with {others} are not consistent with the model"
         reasons[photo.name] = reason
     return reasons
 
 
 def failure(evidence: Evidence) -> UserError:
-    """Why no model was found at all, and what to do about it."""
+    """The error to raise if no model was found: the reason, and what to do about it."""
     count = len(evidence.features)
     usable = sum(features >= _FEW_FEATURES for features in evidence.features)
     paired = {i for pair in evidence.pairs for i in (pair.first, pair.second)}
     if usable < 3:
         return UserError(
-            f"too few of the {count} photos have detail to go by ({usable}): the others are too "
-            "dark, blurred or plain; take sharp, well-lit photos of things with texture"
+            f"photos: only {usable} of {count} show enough detail, the others are too dark, "
+            "blurred or plain; take sharp, well-lit photos of objects with texture"
         )
     if len(paired) < 3:
         return UserError(
-            f"the {count} photos do not show the same things ({_matching(len(paired))}); take "
-            "photos of one scene, each showing more than half of what the one before it shows"
+            f"photos: the {count} photos do not overlap ({_matching(len(paired))}); take photos "
+            "of one scene, so that each shows more than half of what the previous one shows"
         )
     if evidence.still:
         return UserError(
-            "the camera hardly moved between the photos, so nothing tells how far things are; "
-            "walk around the scene while you take them"
+            "photos: the camera hardly moved between the photos, so depth cannot be estimated; "
+            "walk around the scene while taking them"
         )
     if evidence.flat:
         return UserError(
-            "the camera only turned on the spot, or the photos show one flat thing, so nothing "
-            "tells how far things are; walk around a scene that has depth"
+            "photos: the camera only rotated, or the scene is flat, so depth cannot be estimated; "
+            "walk around a scene that has depth"
         )
     return UserError(
-        f"the camera positions of the {count} photos could not be found: their matches are too "
-        "few or do not fit together; take more photos with smaller steps between them"
+        f"photos: no camera poses were found for the {count} photos, their matches are too "
+        "few or inconsistent; take more photos, with smaller steps between them"
     )
 
 

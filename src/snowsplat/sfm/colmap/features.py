@@ -1,4 +1,4 @@
-"""Features of the photos, and which of them match: what goes into the database."""
+"""Detects features in the photos and matches them, into the COLMAP database."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import Report
 
-# Pairs that are compared before they are written: what a kill loses, and how often progress shows.
+# Pairs that are matched before they are written: lost by a kill, and the step of the progress.
 _BLOCK = 64
 
-# No photo has more than so many times the features that were asked for.
+# A photo has at most this many times the requested number of features.
 _MOST = 2
 
 SEED = 1
@@ -26,7 +26,7 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Folders:
-    """Where the parts of a dataset lie."""
+    """Paths inside a dataset."""
 
     dataset: Path
 
@@ -52,15 +52,16 @@ class Folders:
 
 
 @dataclass(frozen=True)
-class Teller:
-    """How progress gets to the parent process.
+class WorkerProgress:
+    """How the worker sends progress to the parent process.
 
-    What COLMAP writes into its database is counted over there: two copies of SQLite in one process
-    (COLMAP has its own) break each other's locks on a database that both have open.
+    Rows that COLMAP writes into its database are counted by the parent process. COLMAP contains its
+    own copy of SQLite, and two copies of SQLite in one process break each other's locks on a
+    database that both have open.
     """
 
     report: Report
-    watch: Callable[[str, str, int, str], None]  # database, table, rows in the end, what they are
+    watch: Callable[[str, str, int, str], None]  # database, table, final number of rows, name
 
 
 def extract_features(
@@ -69,17 +70,17 @@ def extract_features(
     photos: list[Photo],
     effort: Effort,
     threads: int,
-    teller: Teller,
+    progress: WorkerProgress,
 ) -> None:
-    """Find the features of photos that have none yet in ``database``."""
+    """Detect the features of photos that have none in ``database`` yet."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = effort.image_size
     options.num_threads = threads
     options.use_gpu = False
     options.sift.max_num_features = effort.features
     options.sift.first_octave = effort.first_octave
-    with _counted(database, "keypoints", len(photos), "features", teller):
-        # COLMAP skips a photo whose mask it does not find, so those without go by themselves.
+    with _counted(database, "keypoints", len(photos), "features", progress):
+        # With a mask folder COLMAP skips photos without a mask, so these need a separate call.
         for masked in (False, True):
             names = [photo.name for photo in photos if photo.mask == masked]
             reader = pycolmap.ImageReaderOptions()
@@ -104,11 +105,11 @@ def match_pairs(
     pairs: list[tuple[int, int]],
     max_error: float,
     threads: int,
-    teller: Teller,
+    progress: WorkerProgress,
 ) -> None:
-    """Match the features of those of ``pairs`` (indices of photos) that are not in the database.
+    """Match the features of all ``pairs`` (indices of photos) that are not in the database yet.
 
-    ``max_error`` is how far a match may be from the motion of its pair, in pixels.
+    ``max_error`` in pixels is the largest distance of a match from its epipolar line.
     """
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
@@ -119,11 +120,11 @@ def match_pairs(
     pairing = pycolmap.ImportedPairingOptions()
     pairing.block_size = _BLOCK
     pairing.match_list_path = database.with_suffix(".pairs")
-    # A blank ends a name in COLMAP's list of pairs: the images go by their numbers meanwhile.
+    # COLMAP's list of pairs separates names by blanks, so images temporarily have numbers as names.
     set_names(database, [str(i) for i in range(len(photos))])
     Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
     try:
-        with _counted(database, "two_view_geometries", len(pairs), "pairs", teller):
+        with _counted(database, "two_view_geometries", len(pairs), "pairs", progress):
             pycolmap.match_image_pairs(
                 database,
                 matching_options=options,
@@ -137,9 +138,11 @@ def match_pairs(
 
 
 @contextmanager
-def _counted(database: Path, table: str, total: int, what: str, teller: Teller) -> Iterator[None]:
-    # While the block runs, COLMAP has the database open; see `Teller`.
-    teller.report(min(count_rows(database, table), total), total, what)
-    teller.watch(str(database), table, total, what)
+def _counted(
+    database: Path, table: str, total: int, what: str, progress: WorkerProgress
+) -> Iterator[None]:
+    # COLMAP has the database open inside the with block; see `WorkerProgress`.
+    progress.report(min(count_rows(database, table), total), total, what)
+    progress.watch(str(database), table, total, what)
     yield
-    teller.report(total, total, what)
+    progress.report(total, total, what)

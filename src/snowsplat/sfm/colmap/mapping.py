@@ -1,4 +1,4 @@
-"""From matches to cameras and points, and what is left when the badly fitting is taken away."""
+"""Camera poses and points from matches, and the removal of unreliable ones afterwards."""
 
 from __future__ import annotations
 
@@ -15,31 +15,33 @@ from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.options import Mapper
 from snowsplat.sfm.progress import Report
 
-# A camera that sees fewer of the points is not held in its place by them.
+# A camera that sees fewer points has no reliable pose.
 MIN_POINTS = 15
 MIN_PHOTOS = 3
-# Pixels at which features were looked for: an observation further off is left out at the end.
-_KEPT_ERROR = 3.0
-# COLMAP's threads race for the pair to begin with, and so for the frame and a little of everything.
-# With fewer photos than this they save nothing: one thread, and always the same poses.
+# In pixels of the scaled photo in which features were detected: at the end, observations with a
+# larger reprojection error are removed.
+_MAX_REPROJECTION_ERROR = 3.0
+# The result of COLMAP's mapper depends on thread timing: first the choice of the initial pair, and
+# so the frame and small differences everywhere. With fewer photos than this, threads do not make it
+# faster, so one thread is used and the poses are always the same.
 _MANY_PHOTOS = 150
 _MIN_ANGLE = 1.5  # degrees between the rays of a point
 
 
 @dataclass(frozen=True)
 class Mapping:
-    """What is mapped, and with what means."""
+    """The inputs and resources of the mapper."""
 
     database: Path
     images: Path
-    scale: float  # pixels of a photo to one at which its features were looked for (1 or more)
+    scale: float  # size of a photo over the size at which features were detected (1 or more)
     threads: int
     report: Report
 
     def run(self, mapper: Mapper, relaxed: bool = False) -> list[pycolmap.Reconstruction]:
-        """Find cameras and points; the models found, the one with most photos first.
+        """Estimate cameras and points; returns the models, the one with the most photos first.
 
-        ``relaxed``: start and go on with weaker matches than is usual (incremental only).
+        ``relaxed``: accept weaker matches than COLMAP does by default (incremental only).
         """
         if mapper == "global":
             models = self._map_globally()
@@ -48,9 +50,9 @@ class Mapping:
         return _usable([self._refine(model) for model in models])
 
     def extend(self, models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-        """Add photos to the first of ``models`` by weaker matches than is usual, where that helps.
+        """Try to add photos to the first of ``models``, accepting weaker matches.
 
-        Photos of the others are among them: what was apart may come together.
+        Photos of the other models are tried, too, so separate groups may be joined.
         """
         grown = self._map_incrementally(self._options(relaxed=True), start=models[0])
         if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():
@@ -92,12 +94,12 @@ class Mapping:
         def begin() -> None:
             nonlocal placed
             placed = 2 if start is None else start.num_reg_images()
-            self.report(placed, total, "photos placed")
+            self.report(placed, total, "registered photos")
 
         def step() -> None:
             nonlocal placed
             placed += 1
-            self.report(min(placed, total), total, "photos placed")
+            self.report(min(placed, total), total, "registered photos")
 
         with self._output() as output:
             begun = ""
@@ -124,14 +126,14 @@ class Mapping:
         options.mapper.num_threads = self.threads
         options.mapper.random_seed = SEED
         options.mapper.max_normalized_reproj_error *= self.scale
-        self.report(0, 0, "photos placed")
+        self.report(0, 0, "registered photos")
         with self._output() as output:
             models = pycolmap.global_mapping(self.database, self.images, output, options)
         return list(models.values())
 
     @contextmanager
     def _output(self) -> Iterator[Path]:
-        # COLMAP writes each model as it is found. We write them ourselves, all at once.
+        # COLMAP writes each model when it is found. `write_models` writes all of them at once.
         output = self.database.with_suffix(".models")
         shutil.rmtree(output, ignore_errors=True)
         output.mkdir()
@@ -141,13 +143,13 @@ class Mapping:
             shutil.rmtree(output, ignore_errors=True)
 
     def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """Leave out what fits badly, adjust all once more, and drop cameras that nothing holds."""
+        """Remove outliers and cameras with few points, and run bundle adjustment; twice."""
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.ceres.solver_options.num_threads = self.threads
         observations = pycolmap.ObservationManager(model)
         for _ in range(2):
-            observations.filter_all_points3D(_KEPT_ERROR * self.scale, _MIN_ANGLE)
+            observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
             for image_id in list(model.reg_image_ids()):
                 image = model.image(image_id)
                 if image.num_points3D < MIN_POINTS:
@@ -160,7 +162,7 @@ class Mapping:
 
 
 def _usable(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    # Largest first; one whose photos are all in larger ones says nothing new.
+    # Largest first; a model whose photos are all in larger ones is dropped.
     kept: list[pycolmap.Reconstruction] = []
     placed: set[int] = set()
     for model in sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D())):
@@ -172,7 +174,7 @@ def _usable(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstructi
 
 
 def write_models(models: list[pycolmap.Reconstruction], sparse: Path) -> None:
-    """Write them as ``sparse/0``, ``sparse/1`` …: all or nothing."""
+    """Write the models as ``sparse/0``, ``sparse/1`` …, replacing the folder at once."""
     temporary = sparse.with_name(f".{sparse.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     for number, model in enumerate(models):

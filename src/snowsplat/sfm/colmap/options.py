@@ -1,4 +1,4 @@
-"""What structure from motion may be told, what it tells, and what an effort means in figures."""
+"""Settings and result of structure from motion, and the numbers behind each effort level."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Literal
 Mapper = Literal["incremental", "global"]
 EffortName = Literal["draft", "normal", "best"]
 
-# Those of COLMAP's that can be undistorted to a pinhole camera.
+# The camera models of COLMAP that can be undistorted to a pinhole camera.
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -28,44 +28,44 @@ CAMERA_MODELS = (
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """How poses are found."""
+    """How poses are estimated."""
 
-    # One of `CAMERA_MODELS`, or "auto": OPENCV where enough photos share a camera to fix its eight
-    # numbers, else SIMPLE_RADIAL.
+    # One of `CAMERA_MODELS`, or "auto": OPENCV if enough photos share a camera to determine its
+    # eight parameters, else SIMPLE_RADIAL.
     camera_model: str = "auto"
     mapper: Mapper = "incremental"
     effort: EffortName = "normal"
-    threads: int | None = None  # None: one a processor
+    threads: int | None = None  # None: one per processor
 
 
 @dataclass(frozen=True)
 class SfmResult:
-    """Poses are in ``distorted/sparse/0``; this says how good they are. All of it fits JSON."""
+    """The quality of the poses in ``distorted/sparse/0``. All fields can be stored as JSON."""
 
-    registered: list[str]  # names of photos, sorted
-    unregistered: dict[str, str]  # name -> why, in words for people
+    registered: list[str]  # names of photos with a pose, sorted
+    unregistered: dict[str, str]  # name -> the reason, as text for users
     points: int
     observations: int
     reprojection_error: float  # pixels of the photos in input/, mean over points
-    sub_models: list[int]  # photos of each, largest first
+    sub_models: list[int]  # number of photos of each model, largest first
     cameras: list[dict[str, Any]]  # model, width, height, params, focal_from, images
     pairs: str  # how pairs of photos were chosen
-    attempts: list[str]  # what was tried, in order
+    attempts: list[str]  # a description of each attempt, in order
 
 
 @dataclass(frozen=True)
 class Effort:
-    """The figures behind a word: what is looked for in a photo, and how many pairs are compared."""
+    """The numbers behind an effort level: features per photo and pairs to match."""
 
-    image_size: int  # pixels of the longest side at which features are looked for
-    features: int  # about so many a photo
-    first_octave: int  # -1: also in the photo enlarged twice, where the small, exact ones are
-    exhaustive: int  # up to so many photos, each is compared with each
-    overlap: int  # a frame of a video is compared with so many next ones
-    neighbours: int  # a photo among many is compared with so many that look alike
+    image_size: int  # pixels of the longest side at which features are detected
+    features: int  # approximate number per photo
+    first_octave: int  # -1: also in the photo enlarged twice, which has small, precise features
+    exhaustive: int  # up to this number of photos, all pairs are matched
+    overlap: int  # number of following frames with which a frame of a video is matched
+    neighbours: int  # number of similar photos with which a photo is matched
 
     def stronger(self) -> Effort:
-        """More of everything, for photos that would not hold together: about 4 times the work."""
+        """More of everything, for photos without enough matches: about 4 times the work."""
         return dataclasses.replace(
             self,
             image_size=self.image_size * 3 // 2,
@@ -76,8 +76,8 @@ class Effort:
             neighbours=self.neighbours * 2,
         )
 
-    def gentler(self) -> Effort:
-        """A third of the memory, after a crash."""
+    def reduced(self) -> Effort:
+        """About a third of the memory, for a second run after a crash."""
         return dataclasses.replace(
             self,
             image_size=self.image_size * 2 // 3,
@@ -94,7 +94,7 @@ EFFORTS: dict[EffortName, Effort] = {
 
 
 def thread_count(threads: int | None) -> int:
-    """Threads to use: as asked, or one a processor that this process may use."""
+    """Number of threads: ``threads``, or the number of processors that this process may use."""
     if threads is not None:
         return max(1, threads)
     if hasattr(os, "sched_getaffinity"):

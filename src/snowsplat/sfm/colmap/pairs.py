@@ -1,12 +1,12 @@
-"""Which pairs of photos are compared: comparing each with each is quadratic, and rarely needed.
+"""Chooses the pairs of photos to match. Matching all pairs is quadratic and rarely needed.
 
-    few photos           each with each
-    frames of a video    with the next ones, ever sparser further on, and with those that look
-                         alike: where the walk comes back to a place, the loop is closed
-    photos with GPS      with the nearest, and some that look alike
-    many photos          with those that look alike
+    few photos           all pairs
+    frames of a video    the following frames, in growing steps, and frames that look similar:
+                         these close a loop when the camera returns to a place
+    photos with GPS      the nearest, and some that look similar
+    many photos          those that look similar
 
-A mix of these is compared by each rule that holds, so that parts are joined.
+In a mix of these, every rule that applies is used, so that all parts are connected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from snowsplat.sfm.colmap.retrieval import nearest
 from snowsplat.sfm.ingest.photo import Photo
 
 _METRES_PER_DEGREE = 111_320.0
-# A video has most of its pairs from the order in time already.
+# Share of `Effort.neighbours` if the order in time or GPS determines most pairs already.
 _LOOP_SHARE = 0.4
 
 Pairs = set[tuple[int, int]]
@@ -35,39 +35,39 @@ class PairChoice:
     """Pairs (i < j) of indices into the list of photos, sorted, and how they were chosen."""
 
     pairs: list[tuple[int, int]]
-    words: str
+    description: str
 
 
 def choose_pairs(
-    photos: Sequence[Photo], effort: Effort, alike: Callable[[], NDArray[np.floating[Any]]]
+    photos: Sequence[Photo], effort: Effort, similarity: Callable[[], NDArray[np.floating[Any]]]
 ) -> PairChoice:
-    """The pairs to compare.
+    """Choose the pairs to match.
 
-    ``alike`` gives how alike the photos look, (N, N); it is asked only where that is needed.
+    ``similarity`` returns the visual similarity of the photos, (N, N); called only if needed.
     """
     count = len(photos)
     if count <= effort.exhaustive:
         every = list(itertools.combinations(range(count), 2))
-        return PairChoice(every, f"each photo with each ({len(every)} pairs)")
+        return PairChoice(every, f"all pairs of photos ({len(every)} pairs)")
     pairs: Pairs = set()
-    words = []
+    rules = []
     sequences = _sequences(photos)
     if sequences:
         for sequence in sequences:
             pairs |= _along(sequence, effort.overlap)
-        words.append("frames of a video with the next ones")
+        rules.append("frames of a video with the following ones")
     located = [i for i, photo in enumerate(photos) if photo.location is not None]
     if len(located) > effort.neighbours:
         places = _metres(np.array([photos[i].location for i in located]))
         pairs |= {
             (located[i], located[j]) for i, j in nearest(-_distances(places), effort.neighbours)
         }
-        words.append("photos with the nearest by GPS")
+        rules.append("photos with the nearest by GPS")
     covered = len(located) == count or sum(map(len, sequences)) == count
     share = _LOOP_SHARE if covered else 1.0
-    pairs |= _look_alike(photos, alike(), round(share * effort.neighbours), effort.overlap)
-    words.append("photos with those that look alike")
-    return PairChoice(sorted(pairs), f"{', '.join(words)} ({len(pairs)} pairs)")
+    pairs |= _look_alike(photos, similarity(), round(share * effort.neighbours), effort.overlap)
+    rules.append("photos with similar ones")
+    return PairChoice(sorted(pairs), f"{', '.join(rules)} ({len(pairs)} pairs)")
 
 
 def _sequences(photos: Sequence[Photo]) -> list[list[int]]:
@@ -79,7 +79,7 @@ def _sequences(photos: Sequence[Photo]) -> list[list[int]]:
 
 
 def _along(sequence: Sequence[int], overlap: int) -> Pairs:
-    # Every frame with the next few, then with those 2, 4, 8 … times as far.
+    # Every frame with the next `overlap` frames, then with those 2, 4, 8 … times as far away.
     steps = list(range(1, overlap + 1))
     while steps[-1] * 2 < len(sequence):
         steps.append(steps[-1] * 2)
@@ -93,20 +93,20 @@ def _along(sequence: Sequence[int], overlap: int) -> Pairs:
 
 
 def _look_alike(
-    photos: Sequence[Photo], alike: NDArray[np.floating[Any]], count: int, overlap: int
+    photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], count: int, overlap: int
 ) -> Pairs:
-    # A frame looks most like its neighbours in time, which are paired already: leave them out, or
-    # no loop is ever found.
-    alike = alike.copy()
+    # A frame is most similar to its neighbours in time, which are paired already. They are
+    # excluded, as otherwise no loop would be found.
+    similarity = similarity.copy()
     for sequence in _sequences(photos):
         for position, i in enumerate(sequence):
             near = sequence[max(0, position - overlap) : position + overlap + 1]
-            alike[i, near] = -np.inf
-    return nearest(alike, count)
+            similarity[i, near] = -np.inf
+    return nearest(similarity, count)
 
 
 def _metres(locations: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    # Flat around the middle; the altitude of GPS is too rough to tell neighbours.
+    # A plane tangent at the mean; the altitude of GPS is too inaccurate to be used.
     latitude, longitude = locations[:, 0], locations[:, 1]
     middle = np.radians(latitude.mean())
     east = (longitude - longitude.mean()) * np.cos(middle)

@@ -1,14 +1,14 @@
-"""Photos -> poses, in as many tries as it takes: the first as asked, then with more of everything.
+"""Photos -> poses, in several attempts of growing effort.
 
-A try that places 90% of the photos that have detail and matches is the last. Otherwise the others
-follow, unless what was found says that none of them can help:
+An attempt that finds poses for 90% of the usable photos (those with detail and matches) is the
+last. Otherwise the next one follows, unless the matches show that no attempt can succeed:
 
-    1  features, pairs and mapper as asked
-    2  the same features, more pairs, weaker matches allowed
+    1  features, pairs and mapper as configured
+    2  the same features, more pairs, weaker matches accepted
     3  twice the features, from larger photos; about 4 times the work of the first
-    4  the other mapper, on the matches that are there
+    4  the other mapper, with the existing matches
 
-The one with most photos placed is kept.
+The result is the model with the most registered photos.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from snowsplat.sfm.colmap.database import (
     replace_database,
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
-from snowsplat.sfm.colmap.features import Folders, Teller, extract_features, match_pairs
+from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features, match_pairs
 from snowsplat.sfm.colmap.mapping import Mapping, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
@@ -38,8 +38,8 @@ from snowsplat.sfm.colmap.result import names_in, result_of
 from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 
-_ENOUGH = 0.9  # of the photos that could be placed
-_MAX_ERROR = 4.0  # pixels at which features are looked for
+_ENOUGH = 0.9  # of the usable photos
+_MAX_ERROR = 4.0  # pixels at the size at which features are detected
 
 
 @dataclass(frozen=True)
@@ -49,23 +49,23 @@ class Matched:
     database: Path
     effort: Effort
     choice: PairChoice
-    scale: float  # pixels of a photo to one at which its features were looked for
+    scale: float  # size of a photo over the size at which its features were detected
 
 
 @dataclass(frozen=True)
-class Trial:
-    """What a try came to."""
+class Attempt:
+    """The result of an attempt."""
 
     matched: Matched
     models: list[pycolmap.Reconstruction]
 
     @property
-    def placed(self) -> int:
+    def registered(self) -> int:
         return self.models[0].num_reg_images() if self.models else 0
 
 
 class Reconstruction:
-    """The tries on one set of photos. `run` makes them and writes what is best."""
+    """All attempts on one set of photos. `run` makes them and writes the best result."""
 
     def __init__(
         self,
@@ -73,40 +73,26 @@ class Reconstruction:
         photos: list[Photo],
         options: SfmOptions,
         threads: int,
-        teller: Teller,
+        progress: WorkerProgress,
     ) -> None:
-        self.folders, self.photos, self.options = folders, photos, options
-        self.threads, self.teller = threads, teller
-        self.attempts: list[str] = []
-        self.trials: list[Trial] = []
+        self.folders = folders
+        self.photos = photos
+        self.options = options
+        self.threads = threads
+        self.progress = progress
+        self.attempts: list[Attempt] = []
+        self.log: list[str] = []  # a line for each attempt
 
     def run(self, effort: Effort) -> SfmResult:
-        """Make the tries, the first with ``effort``; write ``sparse/`` and the database.
+        """Make the attempts, the first with ``effort``; write ``sparse/`` and the database.
 
         Raises:
-            UserError: no camera positions were found.
+            UserError: no camera poses were found.
         """
         shutil.rmtree(self.folders.sparse, ignore_errors=True)
-        first, second = self.folders.database, self.folders.distorted / "database_strong.db"
-        mapper = self.options.mapper
-        matched = self._match(first, effort, effort)
-        evidence = self._evidence(matched)
-        if evidence.flat:
-            mapper = "incremental"  # the global one finds depth even where there is none to see
-        self._try("as asked", matched, mapper)
-        if not self._enough(evidence) and (self.trials[0].models or not evidence.hopeless):
-            if not (self.trials[0].models and evidence.compared_all):
-                more = self._match(first, effort, effort.stronger())
-                self._try("with more pairs and weaker matches", more, "incremental", relaxed=True)
-            if not self._enough(evidence):
-                strong = effort.stronger()
-                more = self._match(second, strong, strong)
-                self._try("with more features, from larger photos", more, mapper, relaxed=True)
-            if not self._enough(evidence) and not evidence.flat:
-                other: Mapper = "incremental" if mapper == "global" else "global"
-                self._try("with the other mapper", more, other, relaxed=True)
-            evidence = self._evidence(more)
-        best = max(self.trials, key=lambda trial: trial.placed)
+        second = self.folders.distorted / "database_strong.db"
+        evidence = self._make_attempts(effort, second)
+        best = max(self.attempts, key=lambda attempt: attempt.registered)
         if not best.models:
             remove_database(second)
             raise failure(evidence)
@@ -115,32 +101,58 @@ class Reconstruction:
             self.photos, self._evidence(best.matched), [names_in(model) for model in best.models]
         )
         result = result_of(
-            best.models, self.photos, reasons, best.matched.choice.words, self.attempts
+            best.models, self.photos, reasons, best.matched.choice.description, self.log
         )
         if best.matched.database == second:
-            replace_database(first, by=second)
+            replace_database(self.folders.database, by=second)
         remove_database(second)
         return result
+
+    def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
+        """Make as many attempts as needed; returns the evidence of the last matching.
+
+        ``second`` is the path of the database with more features.
+        """
+        first, mapper = self.folders.database, self.options.mapper
+        matched = self._match(first, effort, effort)
+        evidence = self._evidence(matched)
+        if evidence.flat:
+            mapper = "incremental"  # the global mapper returns a wrong depth for flat scenes
+        self._try("as configured", matched, mapper)
+        found = bool(self.attempts[0].models)
+        if self._enough(evidence) or (not found and evidence.more_effort_is_useless):
+            return evidence
+        if not (found and evidence.compared_all):
+            matched = self._match(first, effort, effort.stronger())
+            self._try("with more pairs and weaker matches", matched, "incremental", relaxed=True)
+        if not self._enough(evidence):
+            strong = effort.stronger()
+            matched = self._match(second, strong, strong)
+            self._try("with more features, from larger photos", matched, mapper, relaxed=True)
+        if not self._enough(evidence) and not evidence.flat:
+            other: Mapper = "incremental" if mapper == "global" else "global"
+            self._try("with the other mapper", matched, other, relaxed=True)
+        return self._evidence(matched)
 
     def _match(self, database: Path, effort: Effort, pairing: Effort) -> Matched:
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
         open_database(database, self.photos, self.options.camera_model, fingerprint)
-        extract_features(self.folders, database, self.photos, effort, self.threads, self.teller)
-        choice = choose_pairs(self.photos, pairing, self._alike(database))
+        extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
+        choice = choose_pairs(self.photos, pairing, self._similarity(database))
         sizes = [max(photo.width, photo.height) for photo in self.photos]
         scale = max(1.0, float(np.median(sizes)) / effort.image_size)
         match_pairs(
-            database, self.photos, choice.pairs, _MAX_ERROR * scale, self.threads, self.teller
+            database, self.photos, choice.pairs, _MAX_ERROR * scale, self.threads, self.progress
         )
         return Matched(database, effort, choice, scale)
 
-    def _alike(self, database: Path) -> Callable[[], NDArray[np.floating]]:
+    def _similarity(self, database: Path) -> Callable[[], NDArray[np.floating]]:
         indices = range(len(self.photos))
         return lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices])
 
     def _try(self, how: str, matched: Matched, mapper: Mapper, relaxed: bool = False) -> None:
         mapping = Mapping(
-            matched.database, self.folders.images, matched.scale, self.threads, self.teller.report
+            matched.database, self.folders.images, matched.scale, self.threads, self.progress.report
         )
         models = mapping.run(mapper, relaxed)
         weak = ""
@@ -149,18 +161,18 @@ class Reconstruction:
             models = mapping.extend(models)
             added = models[0].num_reg_images() - before
             weak = f", {added} of them by weak matches" if added else ""
-        trial = Trial(matched, models)
-        self.trials.append(trial)
+        attempt = Attempt(matched, models)
+        self.attempts.append(attempt)
         effort = matched.effort
-        self.attempts.append(
-            f"{how}: {effort.features} features a photo at {effort.image_size} pixels, "
-            f"{matched.choice.words}, {mapper} mapping: "
-            f"{trial.placed} of {len(self.photos)} placed{weak}"
+        self.log.append(
+            f"{how}: {effort.features} features per photo at {effort.image_size} pixels, "
+            f"{matched.choice.description}, {mapper} mapping: "
+            f"{attempt.registered} of {len(self.photos)} photos registered{weak}"
         )
 
     def _enough(self, evidence: Evidence) -> bool:
-        placed = max(trial.placed for trial in self.trials)
-        return placed > 0 and placed >= _ENOUGH * evidence.hopeful
+        registered = max(attempt.registered for attempt in self.attempts)
+        return registered > 0 and registered >= _ENOUGH * evidence.usable
 
     def _evidence(self, matched: Matched) -> Evidence:
         return gather_evidence(matched.database, self.photos, len(matched.choice.pairs))

@@ -1,4 +1,4 @@
-"""What there is to say about models of a dataset."""
+"""The `SfmResult` of COLMAP models."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def result_of(
     pairs: str,
     attempts: list[str],
 ) -> SfmResult:
-    """The figures of the first of ``models`` (at least one, the largest first)."""
+    """Statistics of the first of ``models`` (at least one, the largest first)."""
     model = models[0]
     with_focal = {photo.name for photo in photos if photo.focal}
     cameras = []
@@ -57,39 +57,39 @@ def names_in(model: pycolmap.Reconstruction) -> set[str]:
 
 
 def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
-    """The figures of models that lie in ``distorted/sparse`` already, whoever made them.
+    """Statistics of existing models in ``distorted/sparse``, from an unknown source.
 
     Raises:
-        UserError: there is none, it is damaged, or it has none of the photos.
+        UserError: there is no model, it is damaged, or it has none of the photos.
     """
     sparse = dataset / "distorted" / "sparse"
     numbered = sorted(
         (p for p in sparse.glob("*") if p.name.isdecimal()), key=lambda p: int(p.name)
     )
     if not numbered or numbered[0].name != "0":
-        raise UserError(f"{sparse / '0'}: no COLMAP model here; leave out --skip-matching")
+        raise UserError(f"{sparse / '0'}: no COLMAP model; set skip_matching to False")
     models = []
     for folder in numbered:
         if not can_be_read(folder):
             raise UserError(
-                f"{folder}: this COLMAP model is damaged, or COLMAP cannot read it; leave out "
-                "--skip-matching"
+                f"{folder}: the COLMAP model is damaged or not supported; set skip_matching to "
+                "False"
             )
         models.append(pycolmap.Reconstruction(folder))
         models[-1].update_point_3d_errors()
     names = names_in(models[0])
     for name in names:
-        # Images are written under the names of the photos.
+        # `undistort` uses these names as paths.
         if inside(dataset / "input", name) is None:
             raise UserError(
-                f"{numbered[0]}: names the photo {quoted(name)}, which is not in "
-                f"{dataset / 'input'}; leave out --skip-matching"
+                f"{numbered[0]}: has a photo {quoted(name)} outside of {dataset / 'input'}; set "
+                "skip_matching to False"
             )
     if not names & {photo.name for photo in photos}:
         raise UserError(
             f"{numbered[0]}: the COLMAP model has none of the photos in {dataset / 'input'}; "
-            "leave out --skip-matching"
+            "set skip_matching to False"
         )
-    missing = {p.name: "it is not in the model that was there" for p in photos}
+    missing = {p.name: "it is not in the existing model" for p in photos}
     unregistered = {name: why for name, why in missing.items() if name not in names}
-    return result_of(models, photos, unregistered, "not chosen: the model was there", [])
+    return result_of(models, photos, unregistered, "not matched: the model existed already", [])

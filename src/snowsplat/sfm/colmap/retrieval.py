@@ -1,9 +1,9 @@
-"""Which photos look alike: a small description of each, from the features that it has already.
+"""Visual similarity of photos: a descriptor of each photo, from its local features.
 
 VLAD (Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010),
-each word's part normalised (Arandjelović and Zisserman, "All about VLAD", CVPR 2013). The words
-are learnt from the photos themselves: nothing is downloaded, and a dataset is one scene. All of it
-is a fixed sequence of sums: the same features give the same neighbours.
+with the residuals of each visual word normalised (Arandjelović and Zisserman, "All about VLAD",
+CVPR 2013). The visual words are learned from the photos themselves: nothing is downloaded, and a
+dataset shows one scene. All sums have a fixed order: the same features have the same neighbours.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating[Any]]
 
 WORDS = 64
-FEATURES = 1000  # a photo; the largest, which a change of distance leaves
-_SAMPLE = 64 * WORDS * 4
-_ROUNDS = 12
+FEATURES = 1000  # per photo; the largest ones, which are also found from another distance
+_SAMPLE = 64 * WORDS * 4  # descriptors for k-means
+_ROUNDS = 12  # of k-means
 
 
 def similarity(descriptors: Sequence[Floats]) -> Floats:
-    """(N, N) how alike N photos look, from their descriptors (n, D); −1 … 1, 1 on the diagonal.
+    """(N, N) float32 similarity of N photos, from their descriptors (n, D): −1 … 1.
 
-    A photo without features looks like none: 0.
+    The diagonal is 1. A photo without features has the similarity 0 to all others.
     """
     counts = [len(d) for d in descriptors]
     if sum(counts) == 0:
         return np.eye(len(descriptors), dtype=np.float32)
     words = _learn_words(np.concatenate([_unit(d) for d in descriptors if len(d)]))
     vectors = np.stack([_describe(_unit(d), words) for d in descriptors])
-    # What all photos of the scene have in common tells them not apart.
+    # What all photos of the scene have in common does not distinguish them.
     seen = np.array(counts) > 0
     vectors[seen] = _unit(vectors[seen] - vectors[seen].mean(0))
     alike = vectors @ vectors.T
@@ -41,7 +41,7 @@ def similarity(descriptors: Sequence[Floats]) -> Floats:
 
 
 def nearest(alike: Floats, count: int) -> set[tuple[int, int]]:
-    """Pairs (i < j) of each photo and the ``count`` that are most alike."""
+    """Pairs (i < j) of each photo with the ``count`` most similar ones."""
     pairs = set()
     for i, row in enumerate(alike):
         order = np.argsort(-row, kind="stable")
@@ -57,7 +57,7 @@ def _unit(rows: Floats) -> Floats:
 
 
 def _learn_words(points: Floats) -> Floats:
-    # k-means on an even sample; words without points stay where they are.
+    # k-means on evenly chosen descriptors; words without members are not moved.
     sample = points[:: max(1, len(points) // _SAMPLE)]
     words = sample[:: max(1, len(sample) // WORDS)][:WORDS].copy()
     for _ in range(_ROUNDS):
@@ -70,7 +70,7 @@ def _learn_words(points: Floats) -> Floats:
 
 
 def _assign(points: Floats, words: Floats) -> NDArray[np.intp]:
-    # |p − w|² = |p|² − 2 p·w + |w|², of which the first does not matter.
+    # |p − w|² = |p|² − 2 p·w + |w|²; the first term does not affect the minimum.
     return np.argmin((words**2).sum(1) - 2 * points @ words.T, axis=1)
 
 

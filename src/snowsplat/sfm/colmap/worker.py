@@ -1,11 +1,11 @@
-"""The child process in which COLMAP runs: it may crash, hang or be killed without us.
+"""The child process in which COLMAP runs, so that a crash of COLMAP does not end the parent.
 
     python -m snowsplat.sfm.colmap.worker
 
-One line of JSON on stdin is the job. Lines of JSON on stdout are progress, tables of the database
-whose rows the parent may count meanwhile, and then the result or the user's error. Stdin stays open
-as long as the parent lives: at its end the child ends at once. Ctrl-C is the parent's affair. What
-COLMAP prints goes to stderr, which the parent puts into a log.
+The job is one line of JSON on stdin. Lines of JSON on stdout are progress, database tables whose
+rows the parent may count, and at the end the result or a user error. Stdin stays open as long as
+the parent lives; when it closes, the child ends at once. The child ignores Ctrl-C, which the parent
+handles. The output of COLMAP goes to stderr, which the parent writes to a log.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any, TextIO
 
 import pycolmap
 
-from snowsplat.sfm.colmap.features import SEED, Folders, Teller
+from snowsplat.sfm.colmap.features import SEED, Folders, WorkerProgress
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions, SfmResult, thread_count
 from snowsplat.sfm.colmap.reconstruct import Reconstruction
 from snowsplat.sfm.ingest.photo import Photo
@@ -29,53 +29,53 @@ from snowsplat.util.errors import UserError
 
 
 def main() -> None:
-    """Do the one job that stdin names."""
+    """Run the job that is read from stdin."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    answers = _own_stdout()
+    answers = _redirected_stdout()
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
-    def say(**line: Any) -> None:
+    def send(**line: Any) -> None:
         answers.write(json.dumps(line) + "\n")
         answers.flush()
 
     try:
-        teller = Teller(
-            report=lambda *counts: say(progress=counts), watch=lambda *table: say(watch=table)
+        progress = WorkerProgress(
+            report=lambda *counts: send(progress=counts), watch=lambda *table: send(watch=table)
         )
-        say(result=asdict(_work(job, teller)))
+        send(result=asdict(_run(job, progress)))
     except UserError as error:
-        say(user_error=str(error))
+        send(user_error=str(error))
 
 
-def _own_stdout() -> TextIO:
-    # Whatever C++ code prints must not fall between our lines.
+def _redirected_stdout() -> TextIO:
+    # C++ code prints to stdout, too. Redirect that to stderr, so that it does not mix with JSON.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return answers
 
 
 def _end_with_parent() -> None:
-    # Not by sys.stdin: a thread that waits there keeps Python from ending in order.
+    # Not sys.stdin: a thread blocked in it would prevent a regular exit of Python.
     while os.read(0, 4096):
         pass
     os._exit(1)
 
 
-def _work(job: dict[str, Any], teller: Teller) -> SfmResult:
+def _run(job: dict[str, Any], progress: WorkerProgress) -> SfmResult:
     pycolmap.set_random_seed(SEED)
     pycolmap.logging.alsologtostderr = False
     pycolmap.logging.logtostderr = True
-    # The mapper takes that back: then there is to be no file in the folder for temporary ones.
+    # The mapper resets these settings. Without a destination it creates no log files in /tmp.
     for level in pycolmap.logging.Level.__members__.values():
         pycolmap.logging.set_log_destination(level, "")
     options = SfmOptions(**job["options"])
     effort, threads = EFFORTS[options.effort], thread_count(options.threads)
-    if job["gentle"]:
-        effort, threads = effort.gentler(), 1
+    if job["reduced"]:
+        effort, threads = effort.reduced(), 1
     photos = [Photo(**photo) for photo in job["photos"]]
     folders = Folders(Path(job["capture"]))
-    return Reconstruction(folders, photos, options, threads, teller).run(effort)
+    return Reconstruction(folders, photos, options, threads, progress).run(effort)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A video's file: what it says of itself, and its frames one after the other."""
+"""A video file: its properties, read from its packets, and its decoded frames in order."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from typing import TYPE_CHECKING
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
-# Containers that cameras, phones and programs make, by FFmpeg's names.
-_FORMATS = ",".join(
-    [
-        *("mov", "mp4", "m4a", "3gp", "3g2", "mj2", "matroska", "webm", "avi", "flv", "asf", "gif"),
-        *("mpeg", "mpegts", "mpegvideo", "m4v", "h264", "hevc", "vc1", "av1", "obu", "ivf", "ogg"),
-        *("mjpeg", "dv", "mxf"),
-    ]
+# Containers that cameras, phones and programs write, by FFmpeg's names.
+_FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,flv,asf,gif,mpeg,mpegts,mpegvideo,m4v,h264,hevc,"
+    "vc1,av1,obu,ivf,ogg,mjpeg,dv,mxf"
 )
 _MOST_PIXELS = 1 << 26  # of a frame: 8192×8192
-# Of the boxes that an mp4 file is made of: a head, kinds, those of frames and of nothing, and what
-# is counted: frames, of parts of a film too, and edits, each of which may repeat all frames.
-_BOX, _KIND = 8, re.compile(rb"[ -~\xa9]{4}")
-_NO_COUNTS = (b"mdat", b"free", b"skip", b"wide")
+
+# An mp4 file consists of nested boxes: a header of a length and a kind, then the content.
+_BOX_HEADER = 8  # bytes
+_KIND = re.compile(rb"[ -~\xa9]{4}")
+_NO_COUNTS = (b"mdat", b"free", b"skip", b"wide")  # boxes of frame data and padding
+# Boxes that begin with a count: of frames, also of fragments, and of edits (elst), each of which
+# may repeat all frames. A compressed header (cmov) could hide such counts.
 _COUNTS = re.compile(rb"stsz|stz2|trun|elst|cmov")
-_FEW_EDITS, _ALWAYS_ALLOWED = 16, 1 << 16
+_FEW_EDITS = 16  # up to this number, edits are not regarded as repetitions
+_ALWAYS_ALLOWED = 1 << 16  # frames that a file of any size may declare
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -37,55 +38,55 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Clip:
-    """What a video's packets tell, before anything is decoded."""
+    """Properties of a video, from its packets; no frame but the first is decoded."""
 
     path: Path
-    packets: int  # frames, as far as the file is whole
-    promised: int  # frames that the file says it has, at least `packets`
-    start: float  # seconds
+    packets: int  # number of frames that the file contains
+    promised: int  # number of frames that its header declares, at least `packets`
+    start: float  # time of the first frame, seconds
     seconds: float  # from the first frame to the end of the last
     width: int  # pixels, upright
     height: int
-    aspect: float = 1.0  # width over height of a stored pixel; some camcorders' are not square
+    aspect: float = 1.0  # width over height of a stored pixel; 1 except for some camcorders
 
 
 def _check_boxes(path: Path) -> None:
-    """Whether an mp4 file has the frames that it promises.
+    """Check that an mp4 file does not declare more frames than it can contain.
 
-    FFmpeg makes an entry of each before it looks for any: a few bytes can promise millions. Counts
-    stand in boxes within boxes, of any depth; frames in boxes of their own, which are passed over.
+    FFmpeg allocates an entry for each declared frame, so a few bytes could request millions. The
+    counts are in boxes nested at any depth. Boxes of frame data are skipped.
 
     Raises:
-        ValueError: more frames than bytes.
+        ValueError: the file declares more frames than it has bytes.
     """
     size = path.stat().st_size
-    if size < _BOX:
+    if size < _BOX_HEADER:
         return
     frames = edits = 0
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         start = 0
-        while start + _BOX <= size:
+        while start + _BOX_HEADER <= size:
             length, kind = struct.unpack_from(">I4s", data, start)
-            if length == 1 and start + 2 * _BOX <= size:
-                (length,) = struct.unpack_from(">Q", data, start + _BOX)
+            if length == 1 and start + 2 * _BOX_HEADER <= size:
+                (length,) = struct.unpack_from(">Q", data, start + _BOX_HEADER)
             end = min(size, start + length) if length else size
-            if end < start + _BOX or not _KIND.fullmatch(kind):
-                return  # another kind of file, or its end
+            if end < start + _BOX_HEADER or not _KIND.fullmatch(kind):
+                return  # not an mp4 file, or trailing bytes
             for tag in () if kind in _NO_COUNTS else _COUNTS.finditer(data, start, end):
                 at = tag.end() + (8 if tag[0] in (b"stsz", b"stz2") else 4)
                 if tag[0] == b"cmov":
-                    raise ValueError("a header that is packed")
+                    raise ValueError("compressed mp4 header")
                 if at + 4 <= end:
                     (count,) = struct.unpack_from(">I", data, at)
                     frames += 0 if tag[0] == b"elst" else count
                     edits += count if tag[0] == b"elst" else 0
                 if frames * max(1, edits // _FEW_EDITS) > max(size, _ALWAYS_ALLOWED):
-                    raise ValueError("promises more frames than it has bytes")
+                    raise ValueError("declares more frames than it has bytes")
             start = end
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file has moving pictures in it, by its content."""
+    """Whether a file contains a video stream, by its content."""
     import av
 
     try:
@@ -96,10 +97,10 @@ def is_video(path: Path) -> bool:
 
 
 def read_clip(path: Path) -> Clip:
-    """Length and size of a video; reads the file, but decodes the first frame only.
+    """Read the properties of a video; reads the whole file, but decodes the first frame only.
 
     Raises:
-        UserError: nothing in it can be decoded.
+        UserError: no frame can be decoded.
     """
     import av
 
@@ -109,7 +110,7 @@ def read_clip(path: Path) -> Clip:
         with open_video(path) as container:
             stream = container.streams.video[0]
             rate = float(stream.average_rate or 30)
-            # The header is trusted for this alone: to say how much of a damaged file is absent.
+            # The header is trusted only for this: to report how much of a damaged file is missing.
             promised = stream.frames
             aspect = float(stream.sample_aspect_ratio or 1)
             with suppress(av.FFmpegError):
@@ -124,7 +125,7 @@ def read_clip(path: Path) -> Clip:
         raise nothing_decodes(path, error) from None
     if first is None or not times:
         raise nothing_decodes(path, None)
-    if min(times) < 0 and -1.0 in times:  # a raw stream, without times
+    if min(times) < 0 and -1.0 in times:  # a raw stream without timestamps
         times = [i / rate for i in range(len(times))]
     length = max(times) - min(times)
     width, height = upright_size(first, aspect)
@@ -141,12 +142,12 @@ def read_clip(path: Path) -> Clip:
 
 
 def frames_wanted(clip: Clip, fps: float | None, frames: int | None) -> int:
-    """Into how many windows a video is divided.
+    """Number of time windows into which a video is divided; each yields at most one frame.
 
-    By default 2.5 a second: whoever films an object walks around it in 20 to 40 s, so neighbours
-    are some degrees apart, which SIFT matches safely. Of a short one at least 60, since it covers
-    as much; of a long one no more than 150, or one a second up to 300 if that is more: all that
-    follows costs time for each, on two cores about 2 s.
+    The default is 2.5 per second: walking around an object takes 20 to 40 s, so neighbouring frames
+    are a few degrees apart, which SIFT matches reliably. A short video has at least 60 windows,
+    since it may show as much. A long one has at most 150, or one per second up to 300 if that is
+    more: each frame costs about 2 s later, on two cores.
     """
     if frames is not None:
         wanted = float(frames)
@@ -154,21 +155,21 @@ def frames_wanted(clip: Clip, fps: float | None, frames: int | None) -> int:
         wanted = clip.seconds * fps
     else:
         wanted = max(min(max(2.5 * clip.seconds, 60), 150), min(clip.seconds, 300))
-        wanted = min(wanted, clip.packets / 2)  # something to choose from
+        wanted = min(wanted, clip.packets / 2)  # at least two frames per window to choose from
     return max(1, min(round(wanted), clip.packets))
 
 
 def upright_size(frame: VideoFrame, aspect: float) -> tuple[int, int]:
-    """Width and height that a frame is shown with: turned, and with square pixels."""
+    """Width and height at which a frame is displayed: rotated, with square pixels."""
     width, height = round(frame.width * aspect), frame.height
     return (height, width) if round(frame.rotation / 90) % 2 else (width, height)
 
 
 def open_video(path: Path) -> InputContainer:
-    """Open a file of a kind that cameras make; raises what `av.open` does.
+    """Open a video file of a format that cameras write; raises as `av.open` does.
 
-    FFmpeg knows many more kinds of files, among them lists of other files and addresses to play. Of
-    what is left, frames larger than any camera's are refused before memory is taken for them.
+    FFmpeg reads many more formats, among them playlists of other files and URLs; these are
+    disabled. Frames larger than any camera's are rejected before memory is allocated for them.
     """
     import av
 
@@ -178,17 +179,17 @@ def open_video(path: Path) -> InputContainer:
         "max_pixels": str(_MOST_PIXELS),
     }
     _check_boxes(path)
-    # A name may look like an address. Some tags of cameras are no UTF-8; they do not matter here.
+    # "file:", as a name may look like a URL. Some metadata of cameras is not UTF-8; it is not used.
     container = av.open(f"file:{path.absolute()}", options=options, metadata_errors="replace")
     for stream in container.streams.video:
-        if stream.codec_context is None:  # so PyAV says that nobody can decode it
-            raise ValueError("a codec that is not known")
+        if stream.codec_context is None:  # PyAV has no decoder
+            raise ValueError("unknown codec")
         stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
     return container
 
 
 def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
-    """All frames that can be decoded: what is damaged is left out, and the file may just end."""
+    """All frames that can be decoded; damaged ones are skipped, and the file may be truncated."""
     import av
 
     stream = container.streams.video[0]
@@ -197,7 +198,7 @@ def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
     while True:
         try:
             packet = next(packets, None)
-        except av.FFmpegError:  # cut off
+        except av.FFmpegError:  # truncated
             packet = None
         decoded: list[VideoFrame] = []
         with suppress(av.FFmpegError):
@@ -210,7 +211,7 @@ def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
 def nothing_decodes(path: Path, error: Exception | None) -> UserError:
     reason = f" ({getattr(error, 'strerror', None) or error})" if error else ""
     return UserError(
-        f"{shown(path)}: no frame of this video can be decoded{reason}; it may be cut off, "
-        f"damaged, or larger than {_MOST_PIXELS // 1_000_000} million pixels: copy it again, or "
-        "save it as mp4 (H.264)"
+        f"{shown(path)}: no frame of this video can be decoded{reason}; if it is truncated or "
+        f"damaged, copy it again; if it has more than {_MOST_PIXELS // 1_000_000} million pixels "
+        "or an unknown codec, convert it to mp4 (H.264)"
     )

@@ -1,4 +1,4 @@
-"""What a camera noted in a photo: itself, its focal length, where it was."""
+"""EXIF metadata of a photo: orientation, camera, focal length and location."""
 
 from __future__ import annotations
 
@@ -9,33 +9,44 @@ from typing import Any
 
 from PIL import Image
 
+# EXIF tags.
 ORIENTATION = 0x0112
-_MAKE, _MODEL = 0x010F, 0x0110
-_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_FOCAL_LENGTH, _FOCAL_35MM = 0x920A, 0xA405
-_PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
-_MAKER_NOTE, _USER_COMMENT, _PIXEL_WIDTH, _PIXEL_HEIGHT = 0x927C, 0x9286, 0xA002, 0xA003
+_MAKE = 0x010F
+_MODEL = 0x0110
+_EXIF_IFD = 0x8769
+_GPS_IFD = 0x8825
+_FOCAL_LENGTH = 0x920A  # mm
+_FOCAL_35MM = 0xA405  # equivalent on 35 mm film, mm
+_PLANE_X = 0xA20E  # pixels per unit on the sensor
+_PLANE_Y = 0xA20F
+_PLANE_UNIT = 0xA210
+_MAKER_NOTE = 0x927C
+_USER_COMMENT = 0x9286
+_PIXEL_WIDTH = 0xA002
+_PIXEL_HEIGHT = 0xA003
+
 _PLANE_UNITS_IN_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
+_JPEG_LIMIT = 65000  # bytes of EXIF that fit into a JPEG segment
 
 
 @dataclass(frozen=True)
-class Notes:
-    """What a photo says of the camera. ``focal`` is in pixels of the photo as stored."""
+class ExifInfo:
+    """The metadata that is used. ``focal`` is in pixels of the photo as stored."""
 
-    orientation: int = 1  # EXIF's 1 to 8
-    camera: str = ""  # make, model, and the focal lengths as noted: one zoom of one lens
+    orientation: int = 1  # EXIF value, 1 to 8
+    camera: str = ""  # make, model and focal lengths: identifies a lens at one zoom
     focal: float | None = None
-    location: tuple[float, float, float] | None = None  # latitude, longitude (degrees), m
+    location: tuple[float, float, float] | None = None  # latitude, longitude (°), altitude (m)
 
 
-def read_notes(exif: Image.Exif, width: int, height: int) -> Notes:
-    """The notes of a photo of this size. What is absent or makes no sense is left out."""
+def read_exif(exif: Image.Exif, width: int, height: int) -> ExifInfo:
+    """Read the metadata of a photo of this size; missing and implausible values are left out."""
     details, gps = _ifd(exif, _EXIF_IFD), _ifd(exif, _GPS_IFD)
     orientation = exif.get(ORIENTATION, 1)
     named = [str(exif.get(tag) or "").strip("\0 ") for tag in (_MAKE, _MODEL)]
     zoom = [_number(details.get(tag)) for tag in (_FOCAL_LENGTH, _FOCAL_35MM)]
-    return Notes(
+    return ExifInfo(
         orientation=orientation if orientation in range(1, 9) else 1,
         camera=" ".join([*filter(None, named), *(f"{f:g} mm" for f in zoom if f)]),
         focal=_focal(details, width, height),
@@ -44,11 +55,11 @@ def read_notes(exif: Image.Exif, width: int, height: int) -> Notes:
 
 
 def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
-    """Pixels, from what is reliable of the two ways in which cameras note it.
+    """Focal length in pixels, or None if it is unknown or implausible.
 
-    The equivalent on 35 mm film is taken by the diagonals, as COLMAP does. The other is the focal
-    length over the size of a pixel, which belongs to a picture of a noted size: one that was scaled
-    later keeps the notes of the original.
+    Cameras store it in one of two ways. The 35 mm equivalent is converted by the diagonals, as
+    COLMAP does. Otherwise, it is the focal length over the pixel size. The pixel size belongs to
+    the stored original width: if a photo was resized later, its metadata may still be the original.
     """
     focal = None
     equivalent, length = _number(details.get(_FOCAL_35MM)), _number(details.get(_FOCAL_LENGTH))
@@ -60,7 +71,7 @@ def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
         sizes = [_number(details.get(tag)) for tag in (_PIXEL_WIDTH, _PIXEL_HEIGHT)]
         original = max((size for size in sizes if size), default=max(width, height))
         focal = length * density / unit * max(width, height) / original
-    # Beyond a field of view of 150° or below 1.5° it is a number that somebody forgot to set.
+    # A field of view above 150° or below 1.5° is a value that was never set correctly.
     plausible = focal is not None and 0.13 < focal / max(width, height) < 40
     return focal if plausible else None
 
@@ -70,7 +81,7 @@ def _location(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     longitude = _degrees(gps.get(4), gps.get(3), "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
         return None
-    if latitude == 0 and longitude == 0:  # what a receiver without satellites notes
+    if latitude == 0 and longitude == 0:  # stored by receivers without a position
         return None
     altitude = _number(gps.get(6)) or 0.0
     below_sea = gps.get(5) in (1, b"\x01")
@@ -88,7 +99,7 @@ def _degrees(value: Any, side: Any, negative: str) -> float | None:
 
 
 def _number(value: Any, zero: bool = False) -> float | None:
-    """A positive finite number (or 0, where that is one), else None: tags hold anything."""
+    """A positive finite number (or 0 if ``zero``), else None: tags may hold anything."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -99,22 +110,22 @@ def _number(value: Any, zero: bool = False) -> float | None:
 def _ifd(exif: Image.Exif, tag: int) -> Mapping[int, Any]:
     try:
         return exif.get_ifd(tag)
-    except Exception:  # damaged notes raise anything; the pixels may be good
+    except Exception:  # damaged metadata raises anything; the pixels may be valid
         return {}
 
 
-def notes_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
-    """The same notes for the picture turned upright, of this size; empty if they do not fit."""
+def exif_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
+    """EXIF data for a copy that is upright and of this size; empty if it does not fit."""
     try:
-        kept = Image.Exif()
-        kept.load(exif.tobytes())
-        kept[ORIENTATION] = 1
-        details = kept.get_ifd(_EXIF_IFD)
-        # A maker's note has offsets into the old file; the density of pixels was the old one's.
-        for tag in (_MAKER_NOTE, _USER_COMMENT, _PLANE_X, _PLANE_X + 1, _PLANE_UNIT):
+        copy = Image.Exif()
+        copy.load(exif.tobytes())
+        copy[ORIENTATION] = 1
+        details = copy.get_ifd(_EXIF_IFD)
+        # A maker note contains offsets into the old file; the pixel density may have changed.
+        for tag in (_MAKER_NOTE, _USER_COMMENT, _PLANE_X, _PLANE_Y, _PLANE_UNIT):
             details.pop(tag, None)
         details[_PIXEL_WIDTH], details[_PIXEL_HEIGHT] = width, height
-        content = kept.tobytes()
+        content = copy.tobytes()
     except Exception:  # as above
         return b""
-    return content if len(content) < 65000 else b""  # what fits into a JPEG
+    return content if len(content) < _JPEG_LIMIT else b""

@@ -1,4 +1,4 @@
-"""Photos -> ``input/``: planned by their headers, then checked and written on a few threads."""
+"""Photos -> ``input/``: names are chosen from the headers, then files are checked and copied."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Planned:
 def plan_photos(
     sources: Sequence[Source], longest: int | None, skipped: list[tuple[str, str]]
 ) -> list[Planned]:
-    """Each photo's name in ``input/``. Those that keep theirs come first to it."""
+    """Choose the name of each photo in ``input/``; unchanged names take precedence."""
     read = []
     for source in sources:
         try:
@@ -61,7 +61,10 @@ def write_photos(
     skipped: list[tuple[str, str]],
     report: Report,
 ) -> list[Photo]:
-    """On a few threads, each with one photo in memory; the order is that of ``planned``."""
+    """Write photos to ``input/`` in a few threads, each with one photo in memory; keeps the order.
+
+    Photos that cannot be used are appended to ``skipped``, with the reason.
+    """
 
     def work(plan: Planned) -> Photo | str:
         try:
@@ -108,7 +111,7 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
     if counts is not None:
         write_mask(dataset / "distorted" / "masks" / f"{plan.name}.png", counts)
     width, height = header.size(longest)
-    notes = header.notes
+    exif = header.exif
     scale = max(width, height) / max(header.width, header.height)
     folder = str(PurePosixPath(plan.name).parent)
     return Photo(
@@ -116,19 +119,19 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
         source=shown(source.path),
         width=width,
         height=height,
-        group=" ".join(filter(None, [f"{folder}/", notes.camera, f"{width}x{height}"])),
+        group=" ".join(filter(None, [f"{folder}/", exif.camera, f"{width}x{height}"])),
         sequence=None,
-        focal=None if notes.focal is None else notes.focal * scale,
-        location=notes.location,
+        focal=None if exif.focal is None else exif.focal * scale,
+        location=exif.location,
         mask=counts is not None,
         alpha=alpha,
     )
 
 
 def _check_content(image: Image.Image, counts: np.ndarray | None) -> None:
-    """Raises Unusable: nothing to be seen, or nothing that counts."""
+    """Raises Unusable if the photo shows nothing, or if the mask leaves nothing."""
     if counts is not None and not counts.any():
-        raise Unusable("is masked out all over")
+        raise Unusable("is completely masked out")
     grey = grey_copy(image.convert("RGB") if image.mode == "RGBA" else image, PICTURE_SIDE)
     reason = why_useless(grey)
     if reason:

@@ -1,7 +1,7 @@
-"""Photos and videos -> ``input/``: the pictures as SfM will see them, and their masks.
+"""Photos and videos -> ``input/``: the images that SfM reads, and their masks.
 
-What stands in ``input/`` is upright, COLMAP can read it, and it has been decoded once. What is no
-picture of anything is left out and named; what is left has to be enough.
+Files in ``input/`` are upright, in a format that COLMAP reads, and have been decoded once as a
+check. Images without content are skipped and reported; enough images must remain.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from snowsplat.util.files import shown
 
 logger = logging.getLogger(__name__)
 
-_FEWEST = 3  # pictures: two fix no scale between them and a third
+_FEWEST = 3  # photos: two do not determine a common scale with a third
 _SMALLEST_SIZE = 128  # pixels
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """The pictures that can be used, in the order of names; and what was left out, and why."""
+    """The usable photos, sorted by name, and what was skipped."""
 
     photos: list[Photo]
     skipped: list[tuple[str, str]]  # source, reason
@@ -41,18 +41,18 @@ class Gathered:
 
 @dataclass(frozen=True)
 class GatherOptions:
-    """What is asked of the pictures. Of ``fps`` and ``frames``, at most one."""
+    """Frames and sizes to use. At most one of ``fps`` and ``frames`` may be set."""
 
-    fps: float | None = None  # frames a second to take of videos
-    frames: int | None = None  # frames to take of each video, at most
-    size: int | None = None  # longest side in pixels to bring larger pictures to; None: as they are
+    fps: float | None = None  # frames per second to use of each video
+    frames: int | None = None  # number of frames to use of each video, at most
+    size: int | None = None  # resize to this longest side in pixels, if larger; None: keep
 
 
 def find_inputs(inputs: Sequence[Path]) -> list[Path]:
-    """All files that `gather` would read, masks too. A quick check: only names are looked at.
+    """All files that `gather` would read, with masks. Fast: mostly names are checked.
 
     Raises:
-        UserError: an input does not exist or is no photo or video; there is none in all of them.
+        UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
     """
     sources = find_sources(inputs).sources
     return [p for source in sources for p in (source.path, source.mask) if p is not None]
@@ -61,19 +61,19 @@ def find_inputs(inputs: Sequence[Path]) -> list[Path]:
 def gather(
     inputs: Sequence[Path], dataset: Path, options: GatherOptions, report: Report
 ) -> Gathered:
-    """Fill ``capture/input`` and, where there are masks or alpha, ``capture/distorted/masks``.
+    """Fill ``input/`` of a dataset and, for masks and transparency, ``distorted/masks``.
 
-    An input that is ``capture/input`` itself is used in place: nothing in it is changed, so all
-    that is in it has to be upright already, in a format that COLMAP reads, and of the size asked.
+    If the input is ``input/`` itself, it is used in place and never changed. Then all photos must
+    be upright, in a format that COLMAP reads, and not larger than the requested size.
 
-    Photos of one folder share a group, and so intrinsics, if they have the same size and the same
-    notes of camera and zoom. A portrait and a landscape photo of one phone do not: upright, their
-    width and height are exchanged, and a camera has one size. Each video is a group.
+    Photos of one folder form a group, which shares intrinsics, if they have the same size, camera
+    and focal length in EXIF. Portrait and landscape photos of one phone are in different groups:
+    when upright, their width and height differ. Each video is a group.
 
     Raises:
-        UserError: fewer than three pictures that can be used, a mask that does not fit its photo,
-            not enough room on the disk, photos in place that would have to be changed.
-        OSError: ``capture`` cannot be written to.
+        UserError: fewer than three usable photos, a mask whose size differs from its photo, not
+            enough disk space, or photos in place that would have to be changed.
+        OSError: the dataset cannot be written.
     """
     _check(options)
     found = find_sources(inputs)
@@ -85,7 +85,7 @@ def gather(
     if in_place:
         _refuse_changes(planned, [s for s, _ in clips], options)
     folder.mkdir(parents=True, exist_ok=True)
-    _check_room(dataset, planned, clips, options)
+    _check_disk_space(dataset, planned, clips, options)
     try:
         photos = write_photos(planned, dataset, options.size, in_place, skipped, report)
         for source, clip in clips:
@@ -93,11 +93,11 @@ def gather(
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
-                "the disk is full; make room, or take smaller pictures with --size 1600"
+                "disk: it is full; free some space, or set a smaller size, e.g. 1600"
             ) from None
         raise
     for mask in found.unused_masks:
-        logger.warning("%s: is the mask of no photo here; masks are named IMG.jpg.png", shown(mask))
+        logger.warning("%s: unused mask, no such photo; masks are named IMG.jpg.png", shown(mask))
     if len(photos) < _FEWEST:
         raise _too_few(len(photos), skipped)
     return Gathered(sorted(photos, key=lambda photo: photo.name), skipped)
@@ -105,28 +105,26 @@ def gather(
 
 def _check(options: GatherOptions) -> None:
     if options.fps is not None and options.frames is not None:
-        raise UserError("both --fps and --frames are given; one of them says how many to take")
+        raise UserError("fps, frames: both are set; set only one of them")
     if options.fps is not None and not (options.fps > 0 and math.isfinite(options.fps)):
-        raise UserError(f"--fps {options.fps:g} makes no sense; use e.g. 2")
+        raise UserError(f"fps: {options.fps:g} is not a positive number; use e.g. 2")
     if options.frames is not None and options.frames < _FEWEST:
-        raise UserError(f"--frames {options.frames} is too few; use {_FEWEST} or more, e.g. 60")
+        raise UserError(f"frames: {options.frames} is too few; use {_FEWEST} or more, e.g. 60")
     if options.size is not None and options.size < _SMALLEST_SIZE:
-        raise UserError(
-            f"--size {options.size} is too small to find anything in; use {_SMALLEST_SIZE} or more"
-        )
+        raise UserError(f"size: {options.size} is too small; use {_SMALLEST_SIZE} or more")
 
 
 def _refuse_changes(
     planned: Sequence[Planned], videos: Sequence[Source], options: GatherOptions
 ) -> None:
-    """Raises UserError for what cannot be used in place."""
+    """Raises UserError if a file cannot be used in place."""
     changed = [plan.source.path for plan in planned if not plan.header.is_ready(options.size)]
     others = [source.path for source in videos]
     others += [plan.source.path for plan in planned if plan.name != plan.source.name]
     for path in [*changed, *others]:
         raise UserError(
-            f"{shown(path)}: has to be converted, turned upright or scaled, and what stands in "
-            "input/ is never changed; use snowsplat sfm PHOTOS -o DATASET with a new folder"
+            f"{shown(path)}: must be converted, rotated or resized, but files in input/ are never "
+            "changed; make a dataset in a new folder instead"
         )
 
 
@@ -167,13 +165,13 @@ def _take_frames(
 # Refusals
 
 
-def _check_room(
+def _check_disk_space(
     dataset: Path,
     planned: Sequence[Planned],
     clips: Sequence[tuple[Source, Clip]],
     options: GatherOptions,
 ) -> None:
-    """Raises UserError if ``input/`` surely does not fit on the disk."""
+    """Raises UserError if ``input/`` does not fit on the disk, by a low estimate."""
     device = (dataset / "input").stat().st_dev
     needed = 0.0
     for plan in planned:
@@ -189,45 +187,47 @@ def _check_room(
     free = shutil.disk_usage(dataset).free
     if needed > free:
         raise UserError(
-            f"the photos need about {needed / 1e6:,.0f} MB and the disk has {free / 1e6:,.0f} MB "
-            "left; make room, or take smaller pictures with --size 1600"
+            f"disk: about {needed / 1e6:,.0f} MB are needed and {free / 1e6:,.0f} MB are free; "
+            "free some space, or set a smaller size, e.g. 1600"
         )
 
 
 def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
-    """The one line that helps most, by what most of the pictures suffer from."""
+    """The error that helps most: by the most frequent reason why images were skipped."""
     reasons = Counter(reason for _, reason in skipped)
     reason, often = reasons.most_common(1)[0] if reasons else ("", 0)
     everything = usable == 0 and often == len(skipped)
-    who = f"all {often} pictures" if everything else f"{often} of {usable + len(skipped)} pictures"
+    who = f"all {often} images" if everything else f"{often} of {usable + len(skipped)} images"
     if often < 2 or often < len(skipped) / 2:
         left_out = "".join(f"; {source} {why}" for source, why in skipped[:3])
         left_out += f"; and {len(skipped) - 3} more" if len(skipped) > 3 else ""
         return UserError(
-            f"{_count(usable)}, but poses need at least {_FEWEST}, better 20 or more "
+            f"photos: {_count(usable)}; use at least {_FEWEST}, better 20 or more "
             f"from different places around the scene{left_out}"
         )
     if reason == SAME_VIEW:
         video = skipped[0][0].partition(" at ")[0]
         return UserError(
-            f"{video}: the camera does not move in it ({who} show the same view), and depth can "
-            "only be seen by moving; film while walking around the scene"
+            f"{video}: the camera does not move ({who} show the same view), but depth needs "
+            "motion; film while walking around the scene"
         )
     if reason in (BLACK, WHITE, FLAT):
         what = {BLACK: "black", WHITE: "white", FLAT: "of one colour"}[reason]
-        return UserError(f"{who} are {what} all over; check the lens cap, the light and the files")
+        return UserError(
+            f"photos: {who} are completely {what}; check the lens cap, the light and the files"
+        )
     if reason == BLURRED:
         return UserError(
-            f"{who} are blurred all over, so nothing can be recognised in them; hold the camera "
-            "still for each photo, in good light and in focus"
+            f"photos: {who} are too blurred to be matched; hold the camera still for each photo, "
+            "in good light and in focus"
         )
     return UserError(
-        f"{_count(usable)}: {who}, {skipped[0][0]} first, {reason}; poses need at least "
+        f"photos: {_count(usable)}; {who}, {skipped[0][0]} first, {reason}; use at least "
         f"{_FEWEST}, better 20 or more"
     )
 
 
 def _count(usable: int) -> str:
-    return {0: "no usable picture", 1: "only 1 usable picture"}.get(
-        usable, f"only {usable} usable pictures"
+    return {0: "no usable image", 1: "only 1 usable image"}.get(
+        usable, f"only {usable} usable images"
     )

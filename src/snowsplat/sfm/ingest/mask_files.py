@@ -1,4 +1,4 @@
-"""Masks: which pixels of a photo do not count. Black or transparent: left out."""
+"""Masks of photos: black or transparent pixels are ignored by SfM and training."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from snowsplat.util.files import shown
 
 
 def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool, True where the photo counts, upright and of ``size``, the photo's in ``input/``.
+    """(H, W) bool, True where the photo is used; upright, in ``size``, that of ``input/``.
 
-    The mask may be upright, by itself or by its own note of orientation, or lie as the photo's
-    pixels are stored; where the sizes do not tell (turned by 180°, square), it is taken as stored.
-    A pixel of a smaller copy counts where all that it covers does.
+    The mask may be upright, by its pixels or by its own EXIF orientation, or it may be oriented as
+    the photo's stored pixels are. If the size does not distinguish these cases (photos rotated by
+    180°, square photos), it is taken as stored. A pixel of a smaller copy is used if all pixels
+    that it covers are used.
 
     Raises:
-        UserError: it cannot be decoded, or is not as large as the photo.
+        UserError: the mask cannot be decoded, or its size is not that of the photo.
     """
     try:
         with open_image(path) as opened:
@@ -33,11 +34,11 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
         ) from None
     stored, upright = (photo.width, photo.height), photo.size(None)
     if not noted and image.size == stored:
-        image = turned(image, photo.notes.orientation)
+        image = turned(image, photo.exif.orientation)
     elif image.size != upright:
         raise UserError(
             f"{shown(path)}: the mask is {image.width}x{image.height}, but its photo is "
-            f"{upright[0]}x{upright[1]}; make it as large"
+            f"{upright[0]}x{upright[1]}; make a mask of this size"
         )
     pixels = np.asarray(image)
     counts = (pixels[..., :3].max(axis=2) >= 128) & (pixels[..., 3] >= 128)
@@ -45,7 +46,7 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
 
 
 def shrunk(counts: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool to ``size`` (width, height): True where all that a pixel covers is."""
+    """(H, W) bool resized to ``size`` (width, height): True if all covered pixels are True."""
     if counts.shape == size[::-1]:
         return counts
     image = Image.fromarray(counts.astype(np.uint8) * 255)
@@ -53,6 +54,6 @@ def shrunk(counts: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def write_mask(path: Path, counts: np.ndarray) -> None:
-    """8-bit grey PNG, 0 or 255. Raises OSError: the disk is full."""
+    """Write an 8-bit grey PNG, 0 or 255. Raises OSError if the disk is full."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(counts.astype(np.uint8) * 255).save(path, "PNG", compress_level=3)

@@ -1,8 +1,8 @@
-"""One photo: from any file that cameras make to what COLMAP reads, upright.
+"""Converts a photo from any format that cameras write to one that COLMAP reads, upright.
 
-COLMAP reads pixels as they are stored (measured with pycolmap 4.2: it neither turns by EXIF nor
-knows WebP or HEIC), and so does all that follows. So what is not upright RGB or grey of 8 bits in a
-JPEG, PNG or TIFF is written anew; all else is linked, byte for byte.
+COLMAP reads pixels as they are stored: pycolmap 4.2 ignores the EXIF orientation and reads neither
+WebP nor HEIC. So every photo that is not upright 8-bit RGB or grey in a JPEG, PNG or TIFF file is
+converted. All others are linked or copied without a change.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from PIL import Image, ImageOps
 
 from snowsplat.data import image_file
 from snowsplat.data.image_file import reason_of
-from snowsplat.sfm.ingest.exif import ORIENTATION, Notes, notes_for_copy, read_notes
+from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
-# What COLMAP reads, and the endings that tell it so.
+# Formats that COLMAP reads, by file extension.
 _SUFFIXES = {
     "JPEG": (".jpg", ".jpeg"),
     "MPO": (".jpg", ".jpeg"),
@@ -30,41 +30,41 @@ _SUFFIXES = {
 }
 _LOSSY = ("JPEG", "MPO", "WEBP", "HEIF")
 _TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
-_SMALLEST_SIDE = 32  # pixels: icons
+_SMALLEST_SIDE = 32  # pixels; smaller images are icons
 
 
 class Unusable(Exception):
-    """This photo cannot be used, for the reason that it says; the others can."""
+    """The photo cannot be used; the message is the reason. Other photos are not affected."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a photo's file says of it without being decoded."""
+    """Properties of an image file that are known before it is decoded."""
 
     format: str  # Pillow's name
     width: int  # pixels, as stored
     height: int
     plain: bool  # 8 bits a channel: grey, RGB, or RGBA in a PNG
-    transparent: bool  # has a channel of alpha
-    notes: Notes
+    transparent: bool  # has an alpha channel
+    exif: ExifInfo
 
     @property
     def sideways(self) -> bool:
-        """Whether the picture is as wide as its file is high."""
-        return self.notes.orientation >= 5
+        """Whether width and height are exchanged to display the photo upright."""
+        return self.exif.orientation >= 5
 
     def size(self, longest: int | None) -> tuple[int, int]:
-        """Width and height of the picture upright, its longest side at most ``longest``."""
+        """Width and height of the upright photo, with its longest side at most ``longest``."""
         width, height = (self.height, self.width) if self.sideways else (self.width, self.height)
         return scaled_size(width, height, longest)
 
     def is_ready(self, longest: int | None) -> bool:
-        """Whether COLMAP can read the file as it is, and upright."""
+        """Whether COLMAP can read the file unchanged, and its pixels are upright."""
         as_stored = self.size(longest) == (self.width, self.height)
-        return self.format in _SUFFIXES and self.plain and self.notes.orientation == 1 and as_stored
+        return self.format in _SUFFIXES and self.plain and self.exif.orientation == 1 and as_stored
 
     def file_name(self, name: str, longest: int | None) -> str:
-        """The photo's name in ``input/``: its own, with the ending of the format it will have."""
+        """The name in ``input/``: the original name, with the extension of the new format."""
         target = self.format if self.is_ready(longest) else self._new_format()
         path = PurePosixPath(name)
         fits = path.suffix.lower() in _SUFFIXES[target]
@@ -75,7 +75,7 @@ class Header:
 
 
 def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
-    """A size with its longest side at most ``longest``; never made larger."""
+    """The size with its longest side at most ``longest``; never enlarged."""
     if longest is None or max(width, height) <= longest:
         return width, height
     scale = longest / max(width, height)
@@ -83,28 +83,28 @@ def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]
 
 
 def read_header(path: Path) -> Header:
-    """Of a photo; cheap.
+    """Read the header of a photo, without decoding it.
 
     Raises:
-        Unusable: not an image of a known format, or too small.
+        Unusable: unknown format, damaged, or too small.
     """
     try:
         with open_image(path, header_only=True) as image:
-            # Where a PNG has no such note up front, getexif() would decode all of it to find one.
+            # Without an EXIF chunk in front, getexif() would decode the whole PNG to find one.
             noted = "exif" in image.info or image.format == "TIFF"
             exif = image.getexif() if noted else Image.Exif()
             transparent = image.mode in _TRANSPARENT or "transparency" in image.info
-            png = image.format == "PNG"
+            plain_modes = ("L", "RGB", "RGBA") if image.format == "PNG" else ("L", "RGB")
             width, height = _stored_size(image)
             header = Header(
                 format=image.format or "",
                 width=width,
                 height=height,
-                plain=image.mode in ("L", "RGB", *(["RGBA"] if png else []))
+                plain=image.mode in plain_modes
                 and "transparency" not in image.info
                 and _bits(path, image) == 8,
                 transparent=transparent,
-                notes=read_notes(exif, width, height),
+                exif=read_exif(exif, width, height),
             )
     except Exception as error:  # Pillow's parsers raise anything on damaged files
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
@@ -114,7 +114,7 @@ def read_header(path: Path) -> Header:
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:
-    """Of the pixels in the file: Pillow turns TIFFs by itself, and gives their size turned."""
+    """Size of the stored pixels; of TIFF files, Pillow returns the rotated size."""
     tags = getattr(image, "tag_v2", {})
     if image.format == "TIFF" and 256 in tags and 257 in tags:
         return tags[256], tags[257]
@@ -122,10 +122,10 @@ def _stored_size(image: Image.Image) -> tuple[int, int]:
 
 
 def _bits(path: Path, image: Image.Image) -> int:
-    """Bits a channel in the file: Pillow gives 16 of colour as 8 without a word."""
+    """Bits per channel in the file; Pillow converts 16-bit colour to 8 bits silently."""
     if image.format == "PNG":
         with open(path, "rb") as file:
-            return file.read(25)[24]  # of the first chunk, IHDR
+            return file.read(25)[24]  # bit depth in the first chunk, IHDR
     if image.format == "TIFF":
         bits = getattr(image, "tag_v2", {}).get(258, 8)
         return max(bits) if isinstance(bits, tuple) else bits
@@ -133,7 +133,7 @@ def _bits(path: Path, image: Image.Image) -> int:
 
 
 def open_image(path: Path, *, header_only: bool = False) -> Image.Image:
-    """A lazily read image of a format that photos have; raises as `image_file.open_image`."""
+    """Open an image of a photo format, decoded lazily; raises as `image_file.open_image`."""
     from pillow_heif import register_heif_opener
 
     register_heif_opener()
@@ -141,7 +141,7 @@ def open_image(path: Path, *, header_only: bool = False) -> Image.Image:
 
 
 def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
-    """The picture, upright and scaled: mode L, RGB or, where it is somewhere transparent, RGBA.
+    """The photo, upright and resized: mode L, RGB or, with transparent pixels, RGBA.
 
     Raises:
         Unusable: damaged.
@@ -157,9 +157,9 @@ def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
 
 
 def decode_small(path: Path, side: int) -> Image.Image:
-    """The picture as stored, but of a JPEG a smaller copy at least twice ``side``: much faster.
+    """The photo as stored; a JPEG is reduced to at least twice ``side``, which is much faster.
 
-    Raises as `decode`: all of the file is read.
+    Raises as `decode`, since the whole file is read.
     """
     try:
         with open_image(path) as opened:
@@ -170,7 +170,7 @@ def decode_small(path: Path, side: int) -> Image.Image:
 
 
 def _eight_bits(image: Image.Image) -> Image.Image:
-    if image.mode.startswith("I"):  # 16-bit grey, which convert() would clip rather than scale
+    if image.mode.startswith("I"):  # 16-bit grey: convert() would clip it, not scale it
         values = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255)
         return Image.fromarray(values.astype(np.uint8))
     if image.mode == "F":
@@ -182,12 +182,12 @@ def _eight_bits(image: Image.Image) -> Image.Image:
 
 
 def resized(image: Image.Image, size: tuple[int, int]) -> Image.Image:
-    """By Lanczos; colours of what is transparent do not bleed."""
+    """Resize with a Lanczos filter; colours of transparent pixels do not bleed."""
     return image if image.size == size else image.resize(size, Image.Resampling.LANCZOS)
 
 
 def save(image: Image.Image, path: Path, source: Path | None = None) -> None:
-    """Write as its ending says: JPEG with hardly any loss, or PNG; with the notes of ``source``.
+    """Write as JPEG (nearly lossless) or PNG, by the extension, with the EXIF of ``source``.
 
     Raises:
         OSError: the disk is full.
@@ -195,11 +195,11 @@ def save(image: Image.Image, path: Path, source: Path | None = None) -> None:
     extra: dict[str, bytes] = {}
     if source is not None:
         with open_image(source, header_only=True) as original:
-            exif = notes_for_copy(original.getexif(), *image.size)
+            exif = exif_for_copy(original.getexif(), *image.size)
             profile = original.info.get("icc_profile")
             coloured = original.mode not in ("CMYK", "LAB", "I;16")
         extra = {"exif": exif} if exif else {}
-        if profile and coloured:  # one of CMYK does not fit what has become RGB
+        if profile and coloured:  # a CMYK profile is not valid for RGB pixels
             extra["icc_profile"] = profile
     if path.suffix.lower() == ".png":
         image.save(path, "PNG", compress_level=3, **extra)
@@ -208,16 +208,16 @@ def save(image: Image.Image, path: Path, source: Path | None = None) -> None:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """The same bytes under another name; a hard link where the disk allows it."""
+    """Create a hard link, or a copy if the file system does not support links."""
     source = source.resolve()
-    with suppress(OSError):  # another disk, or one without links
+    with suppress(OSError):  # another disk, or no hard links
         os.link(source, target)
         return
     shutil.copyfile(source, target)
 
 
 def turned(image: Image.Image, orientation: int) -> Image.Image:
-    """Upright, from pixels stored with this EXIF orientation."""
+    """Rotate pixels that are stored with this EXIF orientation, so that they are upright."""
     exif = image.getexif()
     exif[ORIENTATION] = orientation
     return ImageOps.exif_transpose(image)

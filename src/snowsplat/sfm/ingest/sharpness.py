@@ -1,6 +1,6 @@
-"""How sharp a picture is, whether it shows anything, and whether the camera moved between two.
+"""Sharpness of an image, tests for images without content, and a test for camera motion.
 
-All work on small grey copies (H, W) uint8: what SfM lives on is still there, noise is not.
+All functions use small grey copies (H, W) uint8, which contain what SfM needs and little noise.
 """
 
 from __future__ import annotations
@@ -8,32 +8,38 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
-#: Longest side of the copies on which frames are compared for sharpness: blur of half a pixel here
-#: is told from none, and the noise of the sensor and of compression is mostly averaged out.
+#: Longest side in pixels of the copies that are compared for sharpness. A blur of half a pixel of
+#: the copy is still detected, while noise of the sensor and of compression is mostly averaged out.
 FRAME_SIDE = 640
-#: Longest side of the copies on which a picture is judged by itself, and on which motion is found.
+#: Longest side in pixels of the copies that are tested for content and motion.
 PICTURE_SIDE = 320
 
-# Fine detail below which a picture is useless, on copies of two longest sides; see `_fine_detail`.
+# Fine detail below which an image is unusable, by the longest side of the copy; see `_fine_detail`.
 # Measured with pycolmap's SIFT on three real datasets of 1000 to 1280 pixels, blurred by Gaussians
-# saved as JPEG of 75 and 95: at σ = 8 pixels neighbours have 21 to 107 matches that fit, at 12 they
-# have 0 to 20, at 16 none.     sharp        σ = 8        12           16           24 and 32
-#   longest side of 160    0.60 to 0.74  0.18 to 0.24  0.09 to 0.14  0.06 to 0.12  0.04 to 0.15
+# and saved as JPEG of quality 75 and 95: at σ = 8 pixels neighbours have 21 to 107 inlier matches,
+# at 12 they have 0 to 20, at 16 none.
+#          longest side      sharp        σ = 8        12           16           24 and 32
+#                   160    0.60 to 0.74  0.18 to 0.24  0.09 to 0.14  0.06 to 0.12  0.04 to 0.15
 #                    80    0.60 to 0.75  0.39 to 0.47  0.24 to 0.32  0.17 to 0.23  0.07 to 0.14
-# What is seen again of heavily blurred ones at 160 are the squares of JPEG; at 80 they are gone.
+# The rise of heavily blurred images at 160 is due to JPEG blocks, which are not visible at 80.
 _BLURRED = {160: 0.09, 80: 0.16}
-# Grey levels between nearly the darkest and nearly the brightest. A lens cap has 2 to 5 of them.
-_BLANK = 8.0
-# Pixels of the copy; 0.6% of its longest side. A still camera gives 0 or 1, noisy as it may be; a
-# hand-held one that walks gives 3 to 10 within 0.4 s.
+_BLANK = 8.0  # range of grey levels (0.5% to 99.5% quantile); a lens cap has 2 to 5
+# Pixels of the copy, 0.6% of its longest side. A static camera measures 0 or 1, even with noise; a
+# camera that is carried while walking measures 3 to 10 within 0.4 s.
 _MOVED = 2.0
-_BLOCK = 32
+_BLOCK = 32  # pixels: side of the blocks of the phase correlation
+
+# Reasons why an image is unusable.
+BLACK = "is completely black"
+WHITE = "is completely white"
+FLAT = "is completely of one colour"
+BLURRED = "is too blurred"
 
 
 def grey_copy(image: Image.Image, side: int) -> np.ndarray:
-    """(H, W) uint8 grey of an image, its longest side at most about ``side``."""
+    """(H, W) uint8 grey copy of an image, with its longest side at most about ``side``."""
     factor = max(1, max(image.size) // (2 * side))
-    if factor > 1:  # a whole factor first: that is several times faster
+    if factor > 1:  # first by an integer factor, which is several times faster
         image = image.reduce(factor)
     scale = min(1.0, side / max(image.size))
     size = max(1, round(image.width * scale)), max(1, round(image.height * scale))
@@ -42,10 +48,11 @@ def grey_copy(image: Image.Image, side: int) -> np.ndarray:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Variance of the Laplacian. Compares frames of the same things; means nothing by itself.
+    """Variance of the Laplacian. Compares frames of one scene; it has no absolute meaning.
 
-    Of gradients' energy, their product over both axes, their mean and this, this one found an
-    unblurred frame the most often among frames of a real video, half of them with motion blur.
+    Compared with the energy of the gradients, with the product of both axes, and with a mean of
+    these: this measure selects an unblurred frame most often in a real video with half of its
+    frames motion-blurred.
     """
     g = grey.astype(np.float32)
     return float(
@@ -54,7 +61,7 @@ def sharpness(grey: np.ndarray) -> float:
 
 
 def why_useless(grey: np.ndarray) -> str | None:
-    """Why SfM cannot use a picture, certainly, of which this is a copy of `PICTURE_SIDE`."""
+    """Why an image is certainly unusable for SfM, or None. ``grey``: a copy of `PICTURE_SIDE`."""
     low, high = np.quantile(grey, [0.005, 0.995])
     if high - low < _BLANK:
         return BLACK if high < 64 else WHITE if low > 191 else FLAT
@@ -62,17 +69,11 @@ def why_useless(grey: np.ndarray) -> str | None:
     return BLURRED if blurred else None
 
 
-BLACK = "is black all over"
-WHITE = "is white all over"
-FLAT = "is of one colour all over"
-BLURRED = "is blurred all over"
-
-
 def _fine_detail(grey: np.ndarray, side: int) -> float:
-    """The share of the gradients' energy, 0..1, that a blur by 1/``side`` takes away.
+    """The share of the gradient energy, 0..1, that a blur at the scale of 1/``side`` removes.
 
-    Independent of contrast and nearly so of what is shown: pictures of things have detail at all
-    scales, except where the lens or the hand has removed it.
+    Independent of contrast and nearly independent of the content: images of real scenes have detail
+    at all scales, unless it was removed by defocus or motion blur.
     """
     small = grey_copy(Image.fromarray(grey), side).astype(np.float32)
     if min(small.shape) < 8:
@@ -84,15 +85,15 @@ def _fine_detail(grey: np.ndarray, side: int) -> float:
         before = float((np.diff(small[1:-1, 1:-1], axis=axis) ** 2).mean())
         after = float((np.diff(blurred, axis=axis) ** 2).mean())
         shares.append(1 - after / before if before > 0 else 0.0)
-    return max(shares)  # motion blur leaves the detail across it
+    return max(shares)  # motion blur keeps the detail across its direction
 
 
 def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether the camera moved between two frames, given copies of `PICTURE_SIDE`, equally large.
+    """Whether the camera moved between two frames, given equally large copies of `PICTURE_SIDE`.
 
-    The shift of each block is found by phase correlation; what counts is the median over those with
-    texture. So somebody who walks through the picture does not make it a different view, and
-    neither does noise or the light.
+    The shift of each block is estimated by phase correlation. The result is the median over blocks
+    with texture, so neither a person who walks through the scene nor noise nor a change of light
+    counts as motion.
     """
     if min(before.shape) < _BLOCK:
         return bool(np.abs(before.astype(np.float32) - after).mean() >= 1.0)
@@ -104,7 +105,7 @@ def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
     first, second = _windowed(first[textured]), _windowed(second[textured])
     cross = np.fft.rfft2(first) * np.conj(np.fft.rfft2(second))
     size = np.abs(cross)
-    # A floor under the size: frequencies that are hardly there do not vote.
+    # Normalise the spectrum to phases, but suppress frequencies with hardly any energy.
     cross /= size + 1e-3 * size.max(axis=(1, 2), keepdims=True) + 1e-9
     peaks = np.fft.irfft2(cross, s=(_BLOCK, _BLOCK)).reshape(len(cross), -1).argmax(axis=1)
     shifts = np.stack(np.divmod(peaks, _BLOCK))
@@ -113,7 +114,7 @@ def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _blocks(grey: np.ndarray) -> np.ndarray:
-    """(H, W) to (N, 32, 32) float32: the blocks that fit, around the middle."""
+    """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image."""
     rows, columns = grey.shape[0] // _BLOCK, grey.shape[1] // _BLOCK
     top = (grey.shape[0] - rows * _BLOCK) // 2
     left = (grey.shape[1] - columns * _BLOCK) // 2
@@ -122,6 +123,6 @@ def _blocks(grey: np.ndarray) -> np.ndarray:
 
 
 def _windowed(blocks: np.ndarray) -> np.ndarray:
-    """Without the mean and fading to the edges, which would correlate with themselves."""
+    """Blocks without their mean, fading out to the edges, which would correlate otherwise."""
     fade = np.hanning(_BLOCK + 2)[1:-1].astype(np.float32)
     return (blocks - blocks.mean(axis=(1, 2), keepdims=True)) * fade[:, None] * fade

@@ -1,4 +1,4 @@
-"""Which files are meant: photos and videos, the name each gets in ``input/``, its mask."""
+"""Finds the input files: photos and videos, their names in ``input/``, and their masks."""
 
 from __future__ import annotations
 
@@ -11,37 +11,35 @@ from typing import Literal
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
-PHOTO_SUFFIXES = {
-    *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".webp", ".tif", ".tiff"),
-    *(".heic", ".heif", ".hif", ".bmp", ".ppm"),
-}
-VIDEO_SUFFIXES = {
-    *(".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts"),
-    *(".3gp", ".3g2", ".wmv", ".ogv", ".mjpeg", ".flv", ".insv", ".gif"),
-}
-_RAW_SUFFIXES = {
-    *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".orf", ".rw2"),
-    *(".raf", ".pef", ".srw", ".x3f", ".raw"),
-}
+
+def _suffixes(names: str) -> frozenset[str]:
+    return frozenset(f".{name}" for name in names.split())
+
+
+PHOTO_SUFFIXES = _suffixes("jpg jpeg jpe jfif mpo png webp tif tiff heic heif hif bmp ppm")
+VIDEO_SUFFIXES = _suffixes(
+    "mp4 mov m4v mkv avi webm mpg mpeg mts m2ts ts 3gp 3g2 wmv ogv mjpeg flv insv gif"
+)
+_RAW_SUFFIXES = _suffixes("dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw")
 MASKS = "masks"
-# What our own output folders hold: one that lies among the photos is none of them.
+# Folders that contain one of these files are output folders of this program, and are skipped.
 _OUR_FILES = ("capture.json", "cfg_args")
 
 
 @dataclass(frozen=True)
 class Source:
-    """A file that pictures come from."""
+    """An input file."""
 
     path: Path
     kind: Literal["photo", "video"]
-    #: Relative, with "/": a photo's own; the folder of a video's frames, "" for none.
+    #: Relative to ``input/``, with "/": the file of a photo; the folder of a video's frames or "".
     name: str
     mask: Path | None = None  # of a photo
 
 
 @dataclass(frozen=True)
 class Found:
-    """All that the inputs hold, in the order of the inputs and of names within each."""
+    """All files in the inputs, in the order of the inputs and of the names within each."""
 
     sources: list[Source]
     left_out: list[tuple[str, str]]  # path, reason
@@ -49,22 +47,23 @@ class Found:
 
 
 def find_sources(inputs: Sequence[Path]) -> Found:
-    """Photos and videos of files and folders; folders are searched with all that is in them.
+    """Find photos and videos in files and folders; folders are searched recursively.
 
-    Hidden files, ``masks`` folders and our own output folders are left out, and so are videos
-    beside photos: phones put a film of three seconds beside every photo. A single input gives its
-    own names; of several, each folder and video gets a folder, so equal names do not collide.
+    Hidden files, ``masks`` folders and output folders of this program are skipped. So are videos in
+    a folder with photos, since phones save a video of three seconds with every photo. The names in
+    a single input are kept. With several inputs, each folder and video gets its own folder, so that
+    equal names do not collide.
 
     Raises:
-        UserError: an input does not exist or is no photo or video; there is none in all of them.
+        UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
     """
     if not inputs:
-        raise UserError("no photos given; name a folder of photos, photos or a video")
+        raise UserError("inputs: none given; name a folder of photos, photos or a video")
     found: list[Source] = []
     left_out: list[tuple[str, str]] = []
     unused: list[Path] = []
     seen: dict[Path, Path] = {}
-    folders = {MASKS}  # names that are taken
+    folders = {MASKS}  # names in use
 
     def add(source: Source) -> None:
         real = source.path.resolve()
@@ -93,7 +92,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
         unused += masks.unused
         for relative in videos:
             if photos:
-                reason = "is a video beside photos; give it as an input to take its frames"
+                reason = "is a video beside photos; name it as an input to use its frames"
                 left_out.append((shown(path / relative), reason))
             else:
                 stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
@@ -105,7 +104,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
 
 
 def _scan(root: Path) -> tuple[list[str], list[str]]:
-    """Photos and videos below a folder by their endings, relative with "/", sorted."""
+    """Photos and videos below a folder, by their extensions; relative with "/", sorted."""
     photos, videos = [], []
     for relative in _files_below(root):
         suffix = PurePosixPath(relative).suffix.lower()
@@ -117,7 +116,7 @@ def _scan(root: Path) -> tuple[list[str], list[str]]:
 
 
 def _files_below(root: Path, leave_out: Sequence[str] = (MASKS,)) -> list[str]:
-    """Not hidden, relative, with "/", sorted; symbolic links are followed, in circles once."""
+    """Files that are not hidden; relative with "/", sorted. Follows links, but each folder once."""
 
     def fail(error: OSError) -> None:
         raise error
@@ -145,7 +144,7 @@ def _files_below(root: Path, leave_out: Sequence[str] = (MASKS,)) -> list[str]:
 class Masks:
     """The masks of a folder of photos: ``masks/IMG.jpg.png`` or ``masks/IMG.png``.
 
-    Of a photo in a sub-folder also ``sub/masks/…``. Any image format and case of the ending.
+    For a photo in a sub-folder also ``sub/masks/…``. Any image format, extension in any case.
     """
 
     def __init__(self, root: Path) -> None:
@@ -154,7 +153,7 @@ class Masks:
         self._used: set[Path] = set()
 
     def of(self, relative: str) -> Path | None:
-        """The mask of a photo, given relative to the root."""
+        """The mask of a photo whose path is relative to the root, or None."""
         name = PurePosixPath(relative)
         for folder, key in (
             (self._root / MASKS, relative),
@@ -169,12 +168,12 @@ class Masks:
 
     @property
     def unused(self) -> list[Path]:
-        """Masks of no photo: misspelt, most likely."""
+        """Masks without a photo, probably misspelt."""
         there = {path for listed in self._by_folder.values() for path in listed.values()}
         return sorted(there - self._used)
 
     def _listed(self, folder: Path) -> dict[str, Path]:
-        """Masks by their name without the ending."""
+        """Paths of the masks in a folder, by their names without extension."""
         if folder not in self._by_folder:
             files = _files_below(folder, ()) if folder.is_dir() else []
             self._by_folder[folder] = {
@@ -186,10 +185,10 @@ class Masks:
 
 
 def kind_of_file(path: Path) -> Literal["photo", "video"]:
-    """What a file given by name is, by its content.
+    """The kind of a file that was given by name, by its content.
 
     Raises:
-        UserError: neither, or it may not be read.
+        UserError: neither photo nor video, or the file cannot be read.
     """
     from snowsplat.sfm.ingest.clip import is_video
 
@@ -199,24 +198,24 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
     except OSError as error:
         raise UserError(f"{shown(path)}: cannot be read ({error.strerror})") from None
     suffix = path.suffix.lower()
-    if suffix in _RAW_SUFFIXES:  # many are a kind of TIFF, with a thumbnail in front
+    if suffix in _RAW_SUFFIXES:  # many are TIFF files with a small preview
         raise UserError(f"{shown(path)}: is a raw photo; save it as JPEG or PNG first")
     if _is_photo(head):
         return "photo"
     if is_video(path):
         return "video"
     if suffix in PHOTO_SUFFIXES:
-        raise UserError(f"{shown(path)}: is no photo, whatever its name says; give another file")
+        raise UserError(f"{shown(path)}: not a photo, despite its extension; name another file")
     if suffix in VIDEO_SUFFIXES:
         raise UserError(
-            f"{shown(path)}: is no video that can be read, whatever its name says; it may be cut "
-            "off or damaged: copy it again, or give another file"
+            f"{shown(path)}: not a readable video, it may be truncated or damaged; copy it again, "
+            "or name another file"
         )
-    raise UserError(f"{shown(path)}: is neither a photo nor a video")
+    raise UserError(f"{shown(path)}: neither a photo nor a video; name another file")
 
 
 def _is_photo(head: bytes) -> bool:
-    """By the first bytes: formats of photos have a signature each."""
+    """Whether the first bytes are the signature of a photo format."""
     if head[4:8] == b"ftyp":  # HEIF shares its container with mp4
         return head[8:12] in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
     if head[:4] == b"RIFF":
@@ -231,13 +230,13 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
         if any(Path(file).suffix.lower() in _RAW_SUFFIXES for file in _files_below(path)):
             return UserError(f"{names}: only raw photos; save them as JPEG or PNG first")
     return UserError(
-        f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no video in it; name the folder "
-        "that holds them"
+        f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; name the folder "
+        "that contains them"
     )
 
 
 def free_names(names: Sequence[str]) -> Iterator[str]:
-    """The names, each changed where one before it is the same on a disk that ignores case."""
+    """The names, with a suffix where an earlier one is equal if letter case is ignored."""
     taken: set[str] = set()
     for name in names:
         yield _free(name, taken)

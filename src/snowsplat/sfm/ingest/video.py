@@ -1,8 +1,9 @@
-"""Video -> frames: the sharpest of each stretch of time, without those that show the same again.
+"""Video -> frames: the sharpest frame of each time window, without repeated views.
 
-One pass that decodes, since that is what costs: of each window the best frame so far is held, and
-written when the window has passed. A pass before it only reads the packets' times: what a file says
-of its length is absent in streams that a browser recorded, and wrong in files that were cut off.
+Decoding is the expensive part, so frames are decoded in a single pass. It keeps the sharpest frame
+of the current window, and writes it when the window ends. The length of the video is found first,
+from the times of the packets: the length in the header is missing in streams recorded by browsers,
+and wrong in truncated files.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-SAME_VIEW = "shows the same as the frame before it"
+SAME_VIEW = "shows the same view as the previous frame"
 
 
 @dataclass(frozen=True)
@@ -55,31 +56,32 @@ class Frame:
 
 @dataclass
 class Frames:
-    """What became of a video."""
+    """The result of extracting frames from a video."""
 
     kept: list[Frame] = field(default_factory=list)
-    skipped: list[tuple[float, str]] = field(default_factory=list)  # seconds, reason; of windows
-    read: int = 0  # frames that were decoded
+    skipped: list[tuple[float, str]] = field(default_factory=list)  # time (s) and reason
+    read: int = 0  # number of decoded frames
 
 
 def extract_frames(
     clip: Clip, folder: Path, windows: int, size: int | None, report: Report
 ) -> Frames:
-    """Write ``frame_00001.jpg`` … into a folder that exists: at most one of each window of time.
+    """Write ``frame_00001.jpg`` … to an existing folder: at most one frame per time window.
 
     Args:
-        size: the longest side in pixels to bring larger frames to.
+        windows: number of equal time windows.
+        size: resize larger frames to this longest side in pixels; None keeps the size.
 
     Raises:
-        UserError: nothing can be decoded.
+        UserError: no frame can be decoded.
         OSError: the disk is full.
     """
     import av
 
     frames = Frames()
     name = clip.path.name
-    best = _Best()
-    last: np.ndarray | None = None  # small copy of the frame kept last
+    best = _SharpestFrame()
+    last: np.ndarray | None = None  # small copy of the last frame that was written
     window = 0
 
     def close_window() -> None:
@@ -95,7 +97,7 @@ def extract_frames(
             last = small
         else:
             frames.skipped.append((best.seconds, reason))
-        best.forget()
+        best.reset()
 
     try:
         with open_video(clip.path) as container:
@@ -103,7 +105,7 @@ def extract_frames(
             for frame in decoded_frames(container):
                 timed = frame.time is not None
                 seconds = frame.time - clip.start if timed else frames.read / rate
-                # A little later, so that rounding does not bring two frames into one window.
+                # Slightly later, so that rounding does not put two frames into one window.
                 place = (max(seconds, 0.0) + 1e-6) / clip.seconds
                 index = min(int(place * windows), windows - 1)
                 if index > window:
@@ -119,19 +121,19 @@ def extract_frames(
     if not frames.read:
         raise nothing_decodes(clip.path, None)
     report(clip.packets, clip.packets, f"frames of {name}")
-    _say(clip, frames)
+    _log_summary(clip, frames)
     return frames
 
 
-class _Best:
-    """The sharpest frame of those that were offered."""
+class _SharpestFrame:
+    """The sharpest of the frames that were offered since the last reset."""
 
     def __init__(self) -> None:
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         self.frame: VideoFrame | None = None
-        self.grey: np.ndarray | None = None  # (H, W) uint8, not turned
+        self.grey: np.ndarray | None = None  # (H, W) uint8, not rotated
         self.seconds = 0.0
         self._sharpness = -1.0
 
@@ -149,12 +151,12 @@ def _grey(frame: VideoFrame) -> np.ndarray:
     return small.to_ndarray()
 
 
-def _write(best: _Best, clip: Clip, folder: Path, number: int, size: int | None) -> Frame:
+def _write(best: _SharpestFrame, clip: Clip, folder: Path, number: int, size: int | None) -> Frame:
     frame = best.frame
     assert frame is not None
     image = Image.fromarray(rgb_picture(frame))
     turns = round(frame.rotation / 90) % 4
-    if turns:  # counter-clockwise, as Pillow counts too
+    if turns:  # counter-clockwise, as in Pillow
         image = image.transpose(Image.Transpose(1 + turns))
     image = resized(image, scaled_size(*upright_size(frame, clip.aspect), size))
     name = f"frame_{number:05d}.jpg"
@@ -162,19 +164,19 @@ def _write(best: _Best, clip: Clip, folder: Path, number: int, size: int | None)
     return Frame(name, best.seconds, image.width, image.height)
 
 
-def _say(clip: Clip, frames: Frames) -> None:
+def _log_summary(clip: Clip, frames: Frames) -> None:
     if frames.read < 0.97 * clip.promised:
         logger.warning(
-            "%s: is damaged or cut off; %d of its %d frames could be read",
+            "%s: is damaged or truncated; %d of its %d frames could be decoded",
             shown(clip.path),
             frames.read,
             clip.promised,
         )
     same = sum(reason == SAME_VIEW for _, reason in frames.skipped)
     useless = len(frames.skipped) - same
-    line = f"{clip.path.name}: {frames.read} frames in {clip.seconds:.1f} s read, "
-    line += f"{len(frames.kept)} kept: the sharpest of each "
-    line += f"{clip.seconds / max(1, len(frames.kept) + len(frames.skipped)):.2f} s"
-    line += f"; {same} left out where the camera stood still" if same else ""
-    line += f"; {useless} left out that were black, white or blurred" if useless else ""
+    window = clip.seconds / max(1, len(frames.kept) + len(frames.skipped))
+    line = f"{clip.path.name}: {frames.read} frames in {clip.seconds:.1f} s decoded, "
+    line += f"{len(frames.kept)} selected: the sharpest of each {window:.2f} s"
+    line += f"; {same} skipped because the camera did not move" if same else ""
+    line += f"; {useless} skipped because they are black, white or blurred" if useless else ""
     logger.info("%s", line)

@@ -1,15 +1,15 @@
-"""The folder of a dataset, from photos: gather, find the poses, undistort, report.
+"""The folder of a dataset, made from photos in four stages: photos, poses, images, report.
 
-    DATASET/input/                the photos or frames, upright
-    DATASET/distorted/            database and models of the photos as they are, log of COLMAP
-    DATASET/images/, sparse/0/    what training reads: photos without lens distortion, their cameras
-    DATASET/masks/                where there are masks
-    DATASET/images_2/, _4, _8     smaller copies, if asked for
-    DATASET/capture.json          what was done with which settings, and what came of it
-    DATASET/capture_report.html   the same for people, with a picture of cameras and points
+    DATASET/input/                the photos or video frames, upright
+    DATASET/distorted/            COLMAP database, models of the original photos, log of COLMAP
+    DATASET/images/, sparse/0/    input of the training: undistorted images and their cameras
+    DATASET/masks/                masks, if there are any
+    DATASET/images_2/, _4, _8     smaller copies, if requested
+    DATASET/capture.json          settings and results of each stage
+    DATASET/capture_report.html   the same as a page, with a map of cameras and points
 
-This is the layout of the reference implementation's convert.py. A run that was stopped goes on
-where it was, see `stages`.
+The layout is that of the reference implementation's convert.py. An interrupted run resumes where
+it stopped; see `snowsplat.util.stages`.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class DatasetOptions:
     """How photos become a dataset.
 
     Attributes:
-        gather: which frames of a video, and their size.
-        sfm: how the poses are found.
+        gather: which frames of a video are used, and the image size.
+        sfm: how the poses are estimated.
         resize: also make images_2, images_4 and images_8.
-        skip_matching: take the model that is in distorted/sparse/0 rather than find the poses.
+        skip_matching: use the existing model in distorted/sparse/0 instead of estimating poses.
     """
 
     gather: GatherOptions = field(default_factory=GatherOptions)
@@ -59,16 +59,16 @@ class DatasetOptions:
 
 
 class Watcher(Protocol):
-    """Is told what goes on."""
+    """Receives the progress of the stages."""
 
     def begin(self, stage: str) -> Report:
-        """A stage begins, or a finished one is found; gives where it says how far it is."""
+        """Called when a stage begins, also a finished one; returns its progress callback."""
 
     def end(self, stage: str, outcome: Outcome) -> None:
-        """The stage has come to an end."""
+        """Called when the stage has finished."""
 
     def note(self, line: str) -> None:
-        """Something that the user should know."""
+        """Called with a line of information for the user."""
 
 
 def make_dataset(
@@ -78,31 +78,31 @@ def make_dataset(
     watcher: Watcher,
     overwrite: bool = False,
 ) -> dict[str, Outcome]:
-    """Make a dataset in ``folder`` from folders of photos, photos and videos.
+    """Make a dataset in ``folder`` from photos, videos and folders of them.
 
-    Stages that an earlier run with the same inputs and settings has finished are not done again.
-    ``folder / "input"`` may itself be the input; then it stays as it is.
+    Stages that an earlier run with the same inputs and settings has finished are skipped. If
+    ``folder / "input"`` itself is the input, it is not changed.
 
     Args:
-        overwrite: replace a dataset of other inputs that is in ``folder``.
+        overwrite: replace a dataset in ``folder`` that was made from other inputs.
 
     Returns:
-        the outcome of each stage: "photos" is a `Gathered`, "poses" an `SfmResult`, "images" an
-        `Undistorted`, as JSON values; "report" names the file.
+        the outcome of each stage, as JSON values: "photos" is a `Gathered`, "poses" an
+        `SfmResult`, "images" an `Undistorted`; "report" has the name of the file.
 
     Raises:
-        UserError: unusable photos, a folder that is taken, poses that cannot be found: then what
-            this run began is removed; or the disk is full.
+        UserError: the photos cannot be used, ``folder`` holds other files, or no poses were found
+            (what this run created is then removed); or the disk is full.
         OSError: a file cannot be read or written.
     """
     sources = find_inputs(inputs)
     in_place = any(path.resolve() == (folder / "input").resolve() for path in inputs)
     _check_free(folder, in_place, inputs, options, overwrite)
-    with _nothing_half_made(folder):
+    with _remove_on_failure(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stages = Stages(folder / RECORD, STAGES)
         stages.about = {"inputs": [str(path.absolute()) for path in inputs]}
-        stages.save()  # from here on the folder is known to be ours
+        stages.save()  # from here on the folder is recognised as a dataset
         return _run(stages, inputs, sources, folder, options, watcher, in_place)
 
 
@@ -124,7 +124,7 @@ def _run(
             settings,
             [folder / output for output in outputs],
             lambda: work(report),
-            lambda reason: watcher.note(f"{name}: done again ({reason})"),
+            lambda reason: watcher.note(f"{name}: repeated ({reason})"),
         )
         watcher.end(name, outcomes[name])
 
@@ -180,7 +180,7 @@ def _run(
 def _gather(
     inputs: Sequence[Path], folder: Path, options: GatherOptions, report: Report, in_place: bool
 ) -> dict[str, Any]:
-    """Into a new folder first: an older `input/` is replaced by a whole one."""
+    """Gather into a temporary folder first, then replace an older `input/` as one."""
     masks = Path("distorted") / "masks"
     if in_place:
         shutil.rmtree(folder / masks, ignore_errors=True)
@@ -237,16 +237,16 @@ def _check_free(
         before = Stages(record, STAGES).about.get("inputs")
         if not in_place and _were_in_place(before, folder):
             raise UserError(
-                f"{folder / 'input'}: holds the photos that were given for the dataset here, not "
-                "copies that could be replaced; name another folder"
+                f"{folder / 'input'}: holds the original photos of this dataset, not copies; "
+                "name another folder"
             )
         if before != [str(path.absolute()) for path in inputs] and not overwrite:
-            what = ", ".join(map(str, before)) if isinstance(before, list) else "something else"
+            what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
-                f"{folder}: holds a dataset of {what}; name another folder, or add --overwrite"
+                f"{folder}: holds a dataset made from {what}; name another folder, or set overwrite"
             )
         return
-    allowed = {".new"}  # what a run that was killed in its first stage leaves
+    allowed = {".new"}  # left by a run that was killed in its first stage
     if in_place:
         allowed |= {"input"} | ({"distorted"} if options.skip_matching else set())
     others = sorted(entry.name for entry in folder.iterdir() if entry.name not in allowed)
@@ -258,18 +258,18 @@ def _check_free(
 
 
 def _were_in_place(inputs: Any, folder: Path) -> bool:
-    """``inputs``: those of a dataset in ``folder``, as they are written down."""
+    """Whether one of the recorded ``inputs`` is the ``input`` folder of the dataset itself."""
     names = inputs if isinstance(inputs, list) else []
     there = (folder / "input").resolve()
     return any(isinstance(name, str) and Path(name).resolve() == there for name in names)
 
 
 @contextmanager
-def _nothing_half_made(folder: Path) -> Iterator[None]:
-    """Take back what was begun in a new folder when the input is of no use.
+def _remove_on_failure(folder: Path) -> Iterator[None]:
+    """Remove what was created in a new folder if the inputs turn out to be unusable.
 
-    After Ctrl-C, or where the disk is full, the stages that are finished stay: the same command
-    goes on.
+    After Ctrl-C, or if the disk is full, finished stages are kept, so that the same command can
+    resume.
     """
     existed = folder.exists()
     there = {entry.name for entry in folder.iterdir()} if existed else set()
@@ -285,7 +285,7 @@ def _nothing_half_made(folder: Path) -> Iterator[None]:
                 folder.rmdir()
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
-                f"{folder}: the disk is full; make room, then give the same command again"
+                f"{folder}: the disk is full; free some space, then run the same command again"
             ) from None
         raise
 
@@ -301,7 +301,7 @@ def _remove(path: Path) -> None:
 
 
 def _fingerprint(files: Sequence[Path]) -> str:
-    """Of names, sizes and times: changes when a photo is added, taken away or edited."""
+    """A hash of names, sizes and times: changes if a photo is added, removed or edited."""
     entries = []
     for file in files:
         status = file.stat()
@@ -310,13 +310,13 @@ def _fingerprint(files: Sequence[Path]) -> str:
 
 
 def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
-    """Raises UserError: they are not what was written down."""
+    """The photos of the first stage. Raises UserError if the record is damaged."""
     try:
         photos = from_json(Gathered, gathered).photos
         if not all(inside(folder / "input", photo.name) for photo in photos):
-            raise ValueError("a photo elsewhere")
+            raise ValueError("a photo outside of input/")
     except ValueError:
-        raise UserError(f"{folder / RECORD}: damaged; delete it to begin anew") from None
+        raise UserError(f"{folder / RECORD}: damaged; delete it to start again") from None
     return photos
 
 
