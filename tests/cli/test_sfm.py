@@ -112,7 +112,7 @@ def test_photos_in_place(captured, photos, run, refused, tmp_path):
     # They are not ours to replace, not even by some of them.
     for inputs in (sorted((place / "input").iterdir())[:5], [photos]):
         line = refused("sfm", *inputs, "-o", place, "--overwrite", *QUICK)
-        assert f"{place / 'input'}: holds the photos that were given" in line
+        assert f"{place / 'input'}: holds the original photos" in line
     assert times(place / "input") == before
 
     # A model that is there already is undistorted as it is.
