@@ -118,7 +118,7 @@ def test_an_existing_model_is_described(done):
     assert "other.png" in describe_model(dataset, [*photos, other]).unregistered
     with pytest.raises(UserError, match="none of the photos"):
         describe_model(dataset, [other])
-    with pytest.raises(UserError, match="no COLMAP model"):
+    with pytest.raises(UserError, match="skip_matching: there is no COLMAP model"):
         describe_model(dataset / "input", photos)
 
 

@@ -294,7 +294,7 @@ def test_too_few_photos(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"fps": 2.0, "frames": 60}, "fps, frames: both are set"),
+        ({"fps": 2.0, "frames": 60}, "fps: cannot be combined with frames"),
         ({"fps": 0.0}, "fps: 0 is not a positive number"),
         ({"fps": float("nan")}, "fps: nan is not a positive number"),
         ({"frames": 2}, "frames: 2 is too few"),

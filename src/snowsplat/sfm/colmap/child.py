@@ -20,7 +20,7 @@ from typing import Any
 from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import Report
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 
 # Bytes that a growing database may need for its next transaction.
 _DATABASE_GROWTH = 8_000_000
@@ -64,9 +64,9 @@ def estimate_poses(
     if len(photos) < 3:
         raise UserError(f"photos: {len(photos)} are not enough; take at least 3, better 30 or more")
     if options.camera_model not in ("auto", *CAMERA_MODELS):
-        raise UserError(
-            f"camera_model: unknown value {options.camera_model!r}; use one of auto, "
-            + ", ".join(CAMERA_MODELS)
+        raise SettingError(
+            "camera_model",
+            f"unknown value {options.camera_model!r}; use one of auto, " + ", ".join(CAMERA_MODELS),
         )
     distorted = dataset.absolute() / "distorted"
     distorted.mkdir(parents=True, exist_ok=True)

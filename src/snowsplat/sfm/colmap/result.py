@@ -10,7 +10,7 @@ import pycolmap
 from snowsplat.sfm.colmap.check_model import can_be_read
 from snowsplat.sfm.colmap.options import SfmResult
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import inside, quoted
 
 
@@ -67,29 +67,29 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
         (p for p in sparse.glob("*") if p.name.isdecimal()), key=lambda p: int(p.name)
     )
     if not numbered or numbered[0].name != "0":
-        raise UserError(f"{sparse / '0'}: no COLMAP model; set skip_matching to False")
+        raise _cannot_skip(f"there is no COLMAP model in {sparse / '0'}")
     models = []
     for folder in numbered:
         if not can_be_read(folder):
-            raise UserError(
-                f"{folder}: the COLMAP model is damaged or not supported; set skip_matching to "
-                "False"
-            )
+            raise _cannot_skip(f"the COLMAP model in {folder} is damaged or not supported")
         models.append(pycolmap.Reconstruction(folder))
         models[-1].update_point_3d_errors()
     names = names_in(models[0])
     for name in names:
         # `undistort` uses these names as paths.
         if inside(dataset / "input", name) is None:
-            raise UserError(
-                f"{numbered[0]}: has a photo {quoted(name)} outside of {dataset / 'input'}; set "
-                "skip_matching to False"
+            raise _cannot_skip(
+                f"the model in {numbered[0]} has a photo {quoted(name)} outside of "
+                f"{dataset / 'input'}"
             )
     if not names & {photo.name for photo in photos}:
-        raise UserError(
-            f"{numbered[0]}: the COLMAP model has none of the photos in {dataset / 'input'}; "
-            "set skip_matching to False"
+        raise _cannot_skip(
+            f"the model in {numbered[0]} has none of the photos in {dataset / 'input'}"
         )
     missing = {p.name: "it is not in the existing model" for p in photos}
     unregistered = {name: why for name, why in missing.items() if name not in names}
     return result_of(models, photos, unregistered, "not matched: the model existed already", [])
+
+
+def _cannot_skip(reason: str) -> UserError:
+    return SettingError("skip_matching", f"{reason}; run without this setting")

@@ -22,7 +22,7 @@ from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.sources import Source, find_sources
 from snowsplat.sfm.ingest.video import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import Report
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import shown
 
 logger = logging.getLogger(__name__)
@@ -105,13 +105,13 @@ def gather(
 
 def _check(options: GatherOptions) -> None:
     if options.fps is not None and options.frames is not None:
-        raise UserError("fps, frames: both are set; set only one of them")
+        raise SettingError("fps", "cannot be combined with frames; set only one of them")
     if options.fps is not None and not (options.fps > 0 and math.isfinite(options.fps)):
-        raise UserError(f"fps: {options.fps:g} is not a positive number; use e.g. 2")
+        raise SettingError("fps", f"{options.fps:g} is not a positive number; use e.g. 2")
     if options.frames is not None and options.frames < _FEWEST:
-        raise UserError(f"frames: {options.frames} is too few; use {_FEWEST} or more, e.g. 60")
+        raise SettingError("frames", f"{options.frames} is too few; use {_FEWEST} or more, e.g. 60")
     if options.size is not None and options.size < _SMALLEST_SIZE:
-        raise UserError(f"size: {options.size} is too small; use {_SMALLEST_SIZE} or more")
+        raise SettingError("size", f"{options.size} is too small; use {_SMALLEST_SIZE} or more")
 
 
 def _refuse_changes(
