@@ -36,8 +36,8 @@ def _import_all() -> None:
     import snowsplat.pipeline.make
     import snowsplat.pipeline.memory
     import snowsplat.scene.edit
-    import snowsplat.sfm.orient
     import snowsplat.sfm.dataset_folder
+    import snowsplat.sfm.orient
     import snowsplat.sfm.report
     import snowsplat.sfm.undistort
     import snowsplat.training.checkpoint

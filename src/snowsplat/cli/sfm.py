@@ -111,8 +111,8 @@ class Sfm:
 
     def _options(self) -> DatasetOptions:
         from snowsplat.sfm.colmap import SfmOptions
-        from snowsplat.sfm.ingest.inputs import GatherOptions
         from snowsplat.sfm.dataset_folder import DatasetOptions
+        from snowsplat.sfm.ingest.inputs import GatherOptions
 
         check_threads(self.threads)
         lens: dict[str, Any] = {}

@@ -123,8 +123,8 @@ class Making:
         from snowsplat.cli.sfm import SfmProgress
         from snowsplat.cli.stages import StageProgress
         from snowsplat.sfm.colmap import SfmOptions
-        from snowsplat.sfm.ingest.inputs import GatherOptions
         from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
+        from snowsplat.sfm.ingest.inputs import GatherOptions
 
         options = DatasetOptions(
             gather=GatherOptions(size=PRESETS[self.quality].photos),
