@@ -166,7 +166,7 @@ def test_a_full_disk_loses_nothing_that_is_finished(captured, photos, run, tmp_p
     monkeypatch.setattr("snowsplat.sfm.undistort.undistort", full)
     result = run("sfm", photos, "-o", out, *QUICK)
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert "the disk is full; make room, then give the same command again" in result.err
+    assert "the disk is full; free some space, then run the same command again" in result.err
     monkeypatch.undo()
     result = run("sfm", photos, "-o", out, *QUICK)
     assert result.code == 0
