@@ -90,7 +90,7 @@ def test_refused(refused, trained, tmp_path):
         "render", trained, "--path", "helix"
     )
     assert "no such file" in refused("render", trained, "--path", tmp_path / "absent.json")
-    assert "take an ellipse" in refused("render", trained, "--path", "spiral")
+    assert "use an ellipse" in refused("render", trained, "--path", "spiral")
     assert "must end in .mp4" in refused(*film, "--film", tmp_path / "a.gif")
     assert "must be like 1280x720" in refused(*film, "--size", "large")
     assert "16 to 8192" in refused(*film, "--size", "64x9000")

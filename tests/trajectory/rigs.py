@@ -1,4 +1,4 @@
-"""Arrangements of cameras, as datasets have them, and what a film's cameras do."""
+"""Arrangements of cameras as in datasets, and measurements of camera paths."""
 
 import math
 from collections.abc import Sequence
@@ -19,14 +19,14 @@ def camera_at(position: Sequence[float], target: Tensor = FOCUS, up: Tensor = UP
 
 
 def ring(count: int, a: float = 4.0, b: float = 3.0, turn: float = 2 * math.pi) -> list[Camera]:
-    """Around the focus, 1 above it."""
+    """Cameras on an ellipse around the focus, 1 above it, over an angle of ``turn`` radians."""
     angles = [turn * i / count for i in range(count)]
     x, y, z = FOCUS.tolist()
     return [camera_at((x + a * math.cos(t), y - 1.0, z + b * math.sin(t))) for t in angles]
 
 
 def wall(columns: int = 6, rows: int = 4) -> list[Camera]:
-    """A grid of cameras that look ahead, row by row."""
+    """A grid of parallel cameras, row by row."""
     return [
         camera_at((0.2 * i, 0.15 * j, 0.0), torch.tensor([0.2 * i, 0.15 * j, 5.0]).double())
         for j in range(rows)
@@ -44,7 +44,7 @@ def speeds(cameras: Sequence[Camera], closed: bool) -> Tensor:
 
 
 def turns(cameras: Sequence[Camera], closed: bool) -> Tensor:
-    """Angles between neighbours, radians."""
+    """Rotation angles between neighbouring cameras in radians."""
     rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
     following = rotations.roll(-1, 0)
     traces = (rotations * following).sum((1, 2))
@@ -53,12 +53,12 @@ def turns(cameras: Sequence[Camera], closed: bool) -> Tensor:
 
 
 def rolls(cameras: Sequence[Camera], up: Tensor = UP) -> Tensor:
-    """Sines of the angles by which the pictures' lower edges are out of level."""
+    """Sines of the roll angles of the cameras."""
     return torch.stack([camera.cam_from_world[0, :3] @ up for camera in cameras])
 
 
 def misses(cameras: Sequence[Camera], target: Tensor) -> Tensor:
-    """Distances in pixels from the picture's middle to where a point is seen."""
+    """Distances in pixels from the middle of the image to the projection of ``target``."""
     seen = [camera.project(target[None]) for camera in cameras]
     assert all(float(depth[0]) > 0 for _, depth in seen)
     middle = torch.tensor([cameras[0].cx, cameras[0].cy], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What cameras see: how far it is, and other shapes of the picture."""
+"""Viewing distance, focus, and cameras with other image sizes."""
 
 import math
 
@@ -10,14 +10,14 @@ from snowsplat.trajectory.focus import focus_of, resized, viewing_distance
 from .rigs import FOCUS, camera_at, ring, wall
 
 
-def test_viewing_distance_is_that_of_what_is_seen():
+def test_viewing_distance_counts_visible_points():
     cameras = ring(20, 4.0, 4.0)
     random = torch.Generator().manual_seed(0)
     thing = FOCUS.float() + 0.1 * torch.randn(500, 3, generator=random)
     behind = torch.tensor([[0.0, -1000.0, 0.0]]).expand(400, 3)
     expected = math.hypot(4.0, 1.0)
     assert viewing_distance(cameras, torch.cat([thing, behind])) == pytest.approx(expected, abs=0.1)
-    assert viewing_distance(cameras, behind) == pytest.approx(1000, rel=0.01)  # none is seen
+    assert viewing_distance(cameras, behind) == pytest.approx(1000, rel=0.01)  # none is visible
     assert viewing_distance(cameras, torch.zeros(0, 3)) == 1.0
 
 
@@ -35,7 +35,7 @@ def test_focus_of_parallel_and_outward_cameras():
     assert float(focus_of(outward, 5.0).norm()) < 1e-6
 
 
-def test_resized_pictures_have_square_pixels_and_as_much_in_them():
+def test_resized_cameras_have_square_pixels_and_the_same_area_of_view():
     camera = ring(1)[0]
     same = resized(camera, 128, 96)
     assert (same.fx, same.fy, same.cx, same.cy) == (120.0, 120.0, 64.0, 48.0)

@@ -1,4 +1,4 @@
-"""The way of the training, smoothed, and ways through key cameras."""
+"""The smoothed path of the training cameras, and paths through key cameras."""
 
 import math
 
@@ -14,6 +14,7 @@ from .rigs import FOCUS, UP, camera_at, misses, positions, ring, rolls, speeds, 
 
 
 def shaken(cameras: list[Camera], by: float) -> list[Camera]:
+    """The cameras with random offsets, normally distributed with standard deviation ``by``."""
     random = torch.Generator().manual_seed(3)
     result = []
     for camera in cameras:
@@ -22,7 +23,7 @@ def shaken(cameras: list[Camera], by: float) -> list[Camera]:
     return result
 
 
-def test_training_path_is_the_way_without_the_shaking():
+def test_training_path_removes_hand_shake():
     truth = ring(60, 3.0, 3.0, turn=4.0)
     names = [f"frame_{i}" for i in range(60)]
     given = shaken(truth, 0.05)
@@ -32,7 +33,7 @@ def test_training_path_is_the_way_without_the_shaking():
     away = offsets[:, [0, 2]].norm(dim=1) - 3.0
     shaking = (positions(given) - FOCUS)[:, [0, 2]].norm(dim=1) - 3.0
     assert float(away.square().mean().sqrt()) < 0.6 * float(shaking.square().mean().sqrt())
-    # It goes from the first to the last, looks where they look, and stays level.
+    # The path leads from the first to the last camera, looks at their focus, and stays level.
     assert float((path[0].position - truth[0].position).norm()) < 0.15
     assert float((path[-1].position - truth[-1].position).norm()) < 0.15
     assert float(misses(path, FOCUS).max()) < 3.0
@@ -43,7 +44,7 @@ def test_training_path_is_the_way_without_the_shaking():
     assert float(angles.max()) < 2 * float(angles.median())
 
 
-def test_training_path_takes_a_tour_where_names_jump():
+def test_training_path_uses_a_tour_if_names_are_not_in_order():
     cameras = ring(30, 3.0, 3.0, turn=5.0)
     names = [f"{(7 * i) % 30:02d}" for i in range(30)]
     path = training_path(cameras, names, 100, 3.0)
@@ -51,7 +52,7 @@ def test_training_path_takes_a_tour_where_names_jump():
     assert length == pytest.approx(3.0 * 5.0 * 29 / 30, rel=0.05)
 
 
-def test_photos_held_sideways_do_not_roll_the_film():
+def test_portrait_photos_do_not_roll_the_path():
     quarter = rotation_from_quat(torch.tensor([0.5**0.5, 0, 0, 0.5**0.5]).double())
     cameras = ring(30, 3.0, 3.0, turn=3.0)
     for i in (4, 5, 6, 17):
@@ -68,7 +69,7 @@ def keys() -> list[Camera]:
     return [camera_at(place) for place in places]
 
 
-def test_key_path_goes_through_its_keys():
+def test_key_path_passes_through_its_keys():
     given = keys()
     path = key_path(given, 400, 3.0)
     for key in given:
@@ -82,13 +83,13 @@ def test_key_path_goes_through_its_keys():
     assert float(moved.max() / moved.min()) < 1.02
 
 
-def test_key_path_that_ends_where_it_began_is_a_loop():
+def test_key_path_that_ends_at_its_start_is_a_loop():
     given = [keys()[i] for i in (0, 1, 2, 3)]
     given += [camera_at((-2.5, -0.4, 1.0)), given[0]]
     path = key_path(given, 100, 3.0)
     steps = speeds(path, closed=True)
     assert float(steps[-1]) == pytest.approx(float(steps[0]), rel=0.1)
-    # No corner: the direction changes there as little as elsewhere.
+    # There is no corner: the direction changes at the start as little as elsewhere.
     places = positions(path)
     ways = torch.nn.functional.normalize(places.roll(-1, 0) - places, dim=1)
     bends = (ways * ways.roll(1, 0)).sum(1)
@@ -96,8 +97,8 @@ def test_key_path_that_ends_where_it_began_is_a_loop():
     assert float(bends.min()) > math.cos(0.3)
 
 
-def test_key_path_turns_the_short_way_and_zooms():
-    """From −170° to 170° are 20 degrees; and the angles of view are those of the keys."""
+def test_key_path_takes_the_shortest_rotation_and_zooms():
+    """From −170° to 170° the path rotates by 20°. The fields of view are those of the keys."""
     origin = torch.zeros(3).double()
 
     def looking(degrees: float, fx: float) -> Camera:
@@ -113,7 +114,7 @@ def test_key_path_turns_the_short_way_and_zooms():
     assert widths == sorted(widths)
 
 
-def test_equal_keys_are_one_and_one_is_refused():
+def test_equal_keys_count_once_and_a_single_key_is_rejected():
     one, two = keys()[:2]
     with pytest.raises(UserError, match="needs two that differ"):
         key_path([one, one, one], 10, 3.0)

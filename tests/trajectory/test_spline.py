@@ -1,4 +1,4 @@
-"""The smoothing spline, against what is known of it."""
+"""The smoothing spline: its known mathematical properties."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 from snowsplat.trajectory.spline import Spline
 
 
-def test_goes_through_its_samples_without_smoothing():
+def test_interpolates_without_smoothing():
     random = torch.Generator().manual_seed(0)
     times = torch.rand(12, generator=random, dtype=torch.float64).sort().values
     values = torch.randn(12, 3, generator=random, dtype=torch.float64)
@@ -23,7 +23,7 @@ def test_follows_a_smooth_curve_between_its_samples():
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 1.0, 1e6])
-def test_a_straight_line_stays_one(smoothing):
+def test_a_straight_line_is_unchanged(smoothing):
     times = torch.tensor([0.0, 1.0, 1.5, 4.0, 4.2], dtype=torch.float64)
     line = torch.stack([2 * times - 1, -times], 1)
     middle = torch.tensor([0.2, 2.0, 4.1], dtype=torch.float64)
@@ -31,15 +31,15 @@ def test_a_straight_line_stays_one(smoothing):
     torch.testing.assert_close(Spline(times, line, smoothing)(middle), expected)
 
 
-def test_makes_its_penalty_least():
-    """Nothing near it has a smaller sum of misses and bending, by numbers."""
+def test_minimises_its_penalty():
+    """No curve nearby has a smaller penalty; the penalty is integrated numerically."""
     random = torch.Generator().manual_seed(1)
     times = torch.arange(9, dtype=torch.float64)
     values = torch.randn(9, 1, generator=random, dtype=torch.float64)
     fine = torch.linspace(0, 8, 8001, dtype=torch.float64)
 
     def penalty(at_knots: torch.Tensor) -> float:
-        curve = Spline(times, at_knots)(fine)  # the least bent one through these values
+        curve = Spline(times, at_knots)(fine)  # the curve through these values that bends least
         bending = float((curve.diff(n=2, dim=0) / 0.001**2).square().sum() * 0.001)
         return float((values - at_knots).square().sum()) + 0.7 * bending
 
@@ -52,9 +52,9 @@ def test_makes_its_penalty_least():
             assert penalty(other) > least
 
 
-def test_waves_longer_than_the_smoothing_stay_and_shorter_ones_go():
+def test_long_waves_are_kept_and_short_waves_are_removed():
     times = torch.arange(400, dtype=torch.float64)
-    smoothing = (8 / (2 * math.pi)) ** 4  # half of a wave of 8 steps
+    smoothing = (8 / (2 * math.pi)) ** 4  # halves a wave with a period of 8 steps
     middle = times[100:300]
     for wavelength, kept in ((3, 0.03), (8, 0.5), (40, 0.998)):
         wave = (2 * math.pi * times / wavelength).sin()[:, None]
@@ -63,8 +63,8 @@ def test_waves_longer_than_the_smoothing_stay_and_shorter_ones_go():
         assert share == pytest.approx(kept, abs=0.05)
 
 
-def test_many_samples_take_no_more_time_each():
-    """A film may be asked for through all cameras of a long video, or a list that anybody wrote."""
+def test_time_is_linear_in_the_number_of_samples():
+    """A path may follow all frames of a long video, or an untrusted camera list."""
     times = torch.arange(20_000.0, dtype=torch.float64)
     values = torch.stack([torch.sin(times / 100), torch.cos(times / 100)], 1)
     assert torch.allclose(
@@ -74,7 +74,7 @@ def test_many_samples_take_no_more_time_each():
     )
 
 
-def test_refused():
+def test_invalid_times_are_rejected():
     for times in ([0.0], [0.0, 0.0], [1.0, 0.0]):
-        with pytest.raises(ValueError, match="times that increase"):
+        with pytest.raises(ValueError, match="increasing times"):
             Spline(torch.tensor(times), torch.zeros(len(times), 2))

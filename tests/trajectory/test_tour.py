@@ -1,4 +1,4 @@
-"""The order in which cameras are visited."""
+"""The order in which a path visits cameras."""
 
 import itertools
 
@@ -24,26 +24,26 @@ def test_short_tours_are_nearly_the_shortest():
         assert length(lengths, tour) < 1.15 * best
 
 
-def test_a_tour_of_few():
+def test_tours_of_few_places():
     for count in range(4):
         assert sorted(short_tour(torch.rand(count, count))) == list(range(count))
 
 
-def test_names_of_a_walk_are_its_order():
-    """frame_10 comes after frame_9, and the list may be in any order."""
+def test_cameras_of_a_walk_are_ordered_by_name():
+    """frame_10 comes after frame_9. The order of the list does not matter."""
     cameras = ring(30, turn=5.0)
     mixed = torch.randperm(30, generator=torch.Generator().manual_seed(0)).tolist()
     order = in_order([cameras[i] for i in mixed], [f"frame_{i}" for i in mixed], 3.0)
     assert [mixed[i] for i in order] == list(range(30))
 
 
-def test_names_that_jump_are_not():
+def test_names_that_are_not_in_order_are_ignored():
     cameras = ring(30, turn=5.0)
     order = in_order(cameras, [f"{(7 * i) % 30:02d}" for i in range(30)], 3.0)
     assert order in (list(range(30)), list(range(29, -1, -1)))
 
 
-def test_many_cameras_are_thinned_out():
+def test_many_cameras_are_subsampled():
     count = 3 * MOST_CAMERAS
     cameras = [camera_at((0.01 * i, 0.0, -3.0)) for i in range(count)]
     order = in_order(cameras, [f"{i:05d}" for i in range(count)], 3.0)

@@ -1,4 +1,4 @@
-"""Films: what is decoded is what was written, and there is no half of one."""
+"""Videos: decoding returns the written frames, and no partial file is left."""
 
 import itertools
 from pathlib import Path
@@ -14,8 +14,8 @@ from snowsplat.util.errors import UserError
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
 
 
-def picture(i: int) -> np.ndarray:
-    """Colours that change slowly over the picture and with time."""
+def image(i: int) -> np.ndarray:
+    """Colours that change slowly across the image and with time."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     red, green, blue = x * 255 // WIDTH, y * 255 // HEIGHT, 0 * x + 20 * i
     return np.stack([red, green, blue], 2).astype(np.uint8)
@@ -24,7 +24,7 @@ def picture(i: int) -> np.ndarray:
 def write(path: Path) -> None:
     with film(path, WIDTH, HEIGHT, 24) as add:
         for i in range(FRAMES):
-            add(picture(i))
+            add(image(i))
 
 
 def decoded(path: Path) -> list[np.ndarray]:
@@ -33,14 +33,14 @@ def decoded(path: Path) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("encoder", ["libx264", "mpeg4"])
-def test_what_is_decoded_is_what_was_written(tmp_path, monkeypatch, encoder):
+def test_decoded_frames_equal_written_frames(tmp_path, monkeypatch, encoder):
     monkeypatch.setattr(film_module, "_ENCODERS", (encoder,))
     write(tmp_path / "a.mp4")
     frames = decoded(tmp_path / "a.mp4")
     assert len(frames) == FRAMES
     for i, frame in enumerate(frames):
-        error = frame[4:-4, 4:-4].astype(int) - picture(i)[4:-4, 4:-4]
-        # The colours too: neither their range nor their matrix is mistaken.
+        error = frame[4:-4, 4:-4].astype(int) - image(i)[4:-4, 4:-4]
+        # A wrong colour range or matrix would change the mean colour.
         assert abs(error.mean(axis=(0, 1))).max() < 4
         assert abs(error).mean() < 6
 
@@ -60,7 +60,7 @@ def test_size_rate_length_and_index(tmp_path):
 
 def interrupted(path: Path, stop: type[BaseException]) -> None:
     with film(path, WIDTH, HEIGHT, 24) as add:
-        add(picture(0))
+        add(image(0))
         raise stop
 
 
@@ -73,43 +73,43 @@ def test_a_block_that_raises_leaves_no_file(tmp_path, stop):
     assert (tmp_path / "a.mp4").read_bytes() == b"the old one"
 
 
-def test_a_file_that_cannot_be_written_whole_is_told(tmp_path):
-    """As on a full disk, by a limit of the process."""
+def test_a_full_disk_raises_and_leaves_no_file(tmp_path):
+    """The full disk is simulated by a limit of the file size."""
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
-        with pytest.raises(UserError, match="a.mp4: the film cannot be written"):
+        with pytest.raises(UserError, match="a.mp4: the video cannot be written"):
             write(tmp_path / "a.mp4")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not list(tmp_path.iterdir())
 
 
-def test_refused(tmp_path, monkeypatch):
+def test_invalid_arguments_are_rejected(tmp_path, monkeypatch):
     for size, fps in (((63, 48), 24), ((64, 47), 24), ((0, 0), 24), ((64, 48), 0)):
-        with pytest.raises(ValueError, match="a film has"), film(tmp_path / "a.mp4", *size, fps):
+        with pytest.raises(ValueError, match="a video needs"), film(tmp_path / "a.mp4", *size, fps):
             pass
     with (
         pytest.raises(ValueError, match="does not fit"),
         film(tmp_path / "a.mp4", 66, HEIGHT, 24) as add,
     ):
-        add(picture(0))
+        add(image(0))
     monkeypatch.setattr(film_module, "_ENCODERS", ("no_such_encoder",))
-    with pytest.raises(UserError, match="writes no films"):
+    with pytest.raises(UserError, match="cannot encode videos"):
         write(tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())
 
 
-def test_memory_does_not_grow_with_the_film(tmp_path):
-    """Pictures are taken one by one, not gathered first."""
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
+    """Frames are encoded one by one and not collected first."""
     import tracemalloc
 
     def peak(count: int) -> int:
         tracemalloc.start()
         with film(tmp_path / "a.mp4", WIDTH, HEIGHT, 24) as add:
             for i in itertools.islice(itertools.cycle(range(10)), count):
-                add(picture(i))
+                add(image(i))
         memory = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return memory

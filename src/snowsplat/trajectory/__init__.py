@@ -1,4 +1,4 @@
-"""Ways of a camera through a scene: lists of cameras, one a frame, moving evenly."""
+"""Camera paths through a scene: lists with one camera per frame, at a constant speed."""
 
 from snowsplat.trajectory.focus import resized, viewing_distance
 from snowsplat.trajectory.follow import key_path, training_path

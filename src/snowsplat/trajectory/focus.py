@@ -1,4 +1,4 @@
-"""What some cameras see: which way is up for them, what they look at, from how far."""
+"""Properties of a set of cameras: up direction, focus, viewing distance."""
 
 from __future__ import annotations
 
@@ -12,51 +12,63 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.orientation import up_direction
 
-#: Up in a scene that stands upright.
-HOUSE_UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+#: The up direction of an oriented scene.
+DEFAULT_UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 
-_LEVEL = math.sin(math.radians(5))  # as people hold cameras, or better
+# Sine of the roll up to which a camera is level. People hold cameras at least as level as this.
+_LEVEL = math.sin(math.radians(5))
+# Optical axes within about this angle of each other are parallel (compared to an eigenvalue).
 _PARALLEL = math.sin(math.radians(8)) ** 2
-_CAMERAS = 16  # enough for a median
-_POINTS = 20_000
+# Number of cameras and points that are used for medians.
+_CAMERAS_SAMPLED = 16
+_POINTS_SAMPLED = 20_000
 
 
 def positions_of(cameras: Sequence[Camera]) -> Tensor:
-    """(N, 3) world."""
+    """(N, 3) float64: the camera centres in the world frame."""
     return torch.stack([camera.position.detach() for camera in cameras]).to(torch.float64)
 
 
 def rotations_of(cameras: Sequence[Camera]) -> Tensor:
-    """(N, 3, 3) of cam_from_world: the rows are the cameras' right, down and forward."""
+    """(N, 3, 3) float64: rotations of cam_from_world; rows are the right, down and forward axes."""
     poses = torch.stack([camera.cam_from_world.detach() for camera in cameras])
     return poses[:, :, :3].to(torch.float64)
 
 
 def typical(cameras: Sequence[Camera]) -> Camera:
-    """The one whose angle of view is the median."""
+    """The camera with the median field of view."""
     return sorted(cameras, key=lambda camera: camera.fx / camera.width)[len(cameras) // 2]
 
 
 def up_of(cameras: Sequence[Camera]) -> Tensor:
-    """(3,) unit: −y where most cameras are level in that frame, else what they make of it.
+    """The up direction, a unit vector (3,) in the world frame.
 
-    Many datasets of COLMAP do not stand upright.
+    It is −y if most cameras are level with respect to it. Otherwise it is estimated from the
+    cameras, because many COLMAP datasets are not oriented.
     """
     rotations = rotations_of(cameras)
     right, upper = rotations[:, 0], -rotations[:, 1].mean(0)
-    if float((right @ HOUSE_UP).abs().median()) < _LEVEL and float(upper @ HOUSE_UP) > 0:
-        return HOUSE_UP
+    if float((right @ DEFAULT_UP).abs().median()) < _LEVEL and float(upper @ DEFAULT_UP) > 0:
+        return DEFAULT_UP
     return torch.from_numpy(up_direction(rotations.cpu().numpy()))
 
 
 def viewing_distance(cameras: Sequence[Camera], points: Tensor) -> float:
-    """World units: how far is, for most cameras, most of what they see of points (P, 3).
+    """The median over cameras of the median depth of the points that a camera sees.
 
-    Where they see none, it is the mean distance between the cameras' middle and the points'.
+    If no camera sees a point, it is the distance between the median camera centre and the median
+    point. Without points it is 1.
+
+    Args:
+        cameras: at least one.
+        points: (P, 3) in the world frame.
+
+    Returns:
+        The distance in world units.
     """
-    points = points.detach().to(torch.float64)[:: -(-len(points) // _POINTS) or 1]
+    points = points.detach().to(torch.float64)[:: -(-len(points) // _POINTS_SAMPLED) or 1]
     medians = []
-    for camera in cameras[:: -(-len(cameras) // _CAMERAS)]:
+    for camera in cameras[:: -(-len(cameras) // _CAMERAS_SAMPLED)]:
         pixels, depth = camera.project(points)
         size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
         seen = depth[(depth > 0) & ((pixels >= 0) & (pixels < size)).all(1)]
@@ -71,37 +83,47 @@ def viewing_distance(cameras: Sequence[Camera], points: Tensor) -> float:
 
 
 def focus_of(cameras: Sequence[Camera], distance: float) -> Tensor:
-    """(3,) what the cameras look at: the point nearest to their optical axes.
+    """The focus: the point (3,) that is nearest to the optical axes, in the world frame.
 
-    Where these are nearly parallel or meet behind the cameras, it is ``distance`` ahead of their
-    middle.
+    If the axes are nearly parallel or intersect behind the cameras, the focus is ``distance`` in
+    front of the mean camera centre. If the cameras look in all directions, it is the mean centre.
+
+    Args:
+        cameras: at least one.
+        distance: world units from the cameras to what they see.
     """
     centres, forward = positions_of(cameras), rotations_of(cameras)[:, 2]
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
     if float(torch.linalg.eigvalsh(across.mean(0))[0]) > _PARALLEL:
         weights = torch.ones(len(centres), dtype=torch.float64)
-        for _ in range(20):  # towards the least sum of distances: a few odd ones do not count
+        # Reweighted least squares minimises the sum of distances, which is robust to outliers.
+        for _ in range(20):
             matrix = (weights[:, None, None] * across).sum(0)
             at_centres = (across @ centres[:, :, None])[:, :, 0]
             point = torch.linalg.solve(matrix, (weights[:, None] * at_centres).sum(0))
-            misses = ((point - centres)[:, None] @ across)[:, 0].norm(dim=1)
-            weights = 1 / misses.clamp_min(0.01 * distance)
+            errors = ((point - centres)[:, None] @ across)[:, 0].norm(dim=1)
+            weights = 1 / errors.clamp_min(0.01 * distance)
         ahead = ((point - centres) * forward).sum(1)
         if float((ahead > 0.1 * distance).double().mean()) > 0.75:
             return point
     mean = forward.mean(0)
-    if float(mean.norm()) < 0.1:  # they look every way, outwards
+    if float(mean.norm()) < 0.1:  # the cameras look outwards in all directions
         return centres.mean(0)
     return centres.mean(0) + distance * mean / mean.norm()
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with a picture of another size and shape, which shows as much of the scene.
+    """The camera with another image size and aspect ratio, and with square pixels.
 
-    The pixels are square. As wide a field as before gets another shape: what is won to the sides
-    of a picture that becomes wider is lost above and below.
+    The area of the field of view does not change: a wider image shows more at the sides and less
+    above and below.
+
+    Args:
+        camera: the original camera.
+        width: pixels.
+        height: pixels.
     """
-    # The focal length in units of the picture's mean side stays.
+    # Keep the ratio of the focal length to the geometric mean of width and height.
     focal = math.sqrt(camera.fx * camera.fy * (width * height) / (camera.width * camera.height))
     return dataclasses.replace(
         camera, width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2

@@ -1,4 +1,4 @@
-"""Smooth ways through given cameras: near those of the training, or exactly through key cameras."""
+"""Smooth paths that follow given cameras: near the training cameras, or exactly through keys."""
 
 from __future__ import annotations
 
@@ -16,62 +16,76 @@ from snowsplat.trajectory.spline import Spline
 from snowsplat.trajectory.tour import in_order
 from snowsplat.util.errors import UserError
 
-# What goes to and fro within so many photos is how a hand shakes, and half of it is left out.
+# Oscillations with this period, in photos, are considered hand shake. The spline halves them.
 _SMOOTHED_PHOTOS = 10
 _SMOOTHING = (_SMOOTHED_PHOTOS / (2 * math.pi)) ** 4
-_DENSE = 20  # places a frame at which the way is measured
+# Samples per frame for measuring the length of a path.
+_SAMPLES_PER_FRAME = 20
 
 
 def training_path(
     cameras: Sequence[Camera], names: Sequence[str], frames: int, distance: float
 ) -> list[Camera]:
-    """The way of whoever took the photos, smoothed.
+    """The smoothed path of the photographer.
 
-    Photos held sideways are turned as their neighbours; all frames have one angle of view.
+    Photos that were taken in portrait format are rotated to match their neighbours. All frames have
+    the field of view of the median photo.
 
     Args:
-        names: of the photos; where they do not follow a way, a short tour takes their place.
+        cameras: the training cameras.
+        names: the names of the photos. If they are not in the order of a path, a short tour
+            through the cameras is used.
+        frames: number of frames.
         distance: world units from the cameras to what they see.
 
     Raises:
-        UserError: all cameras are in one place and look one way.
+        UserError: all cameras have the same position and direction.
     """
     order = in_order(cameras, names, distance)
     lens = typical(cameras)
-    ways = [cameras[i] for i in order]
-    rotations = _turned_alike(rotations_of(ways), up_of(cameras))
-    zooms = torch.full((len(ways), 1), math.log(lens.fx / lens.width), dtype=torch.float64)
-    return _path(lens, positions_of(ways), rotations, zooms, frames, distance, _SMOOTHING)
+    ordered = [cameras[i] for i in order]
+    rotations = _same_roll(rotations_of(ordered), up_of(cameras))
+    zooms = torch.full((len(ordered), 1), math.log(lens.fx / lens.width), dtype=torch.float64)
+    return _path(lens, positions_of(ordered), rotations, zooms, frames, distance, _SMOOTHING)
 
 
 def key_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Camera]:
-    """A smooth way through key cameras, in their order and with their angles of view.
+    """A smooth path through key cameras, in their order and with their fields of view.
 
-    If the last one is as the first, the way is a loop and has no corner there. The frames have the
-    size of the first camera.
+    If the last key is the same as the first, the path is a closed loop without a corner. The frames
+    have the image size of the first camera.
+
+    Args:
+        cameras: the keys.
+        frames: number of frames.
+        distance: world units from the cameras to what they see.
 
     Raises:
-        UserError: fewer than two that differ.
+        UserError: fewer than two keys differ.
     """
     lens = cameras[0]
-    zooms = [math.log(camera.fx / camera.width) for camera in cameras]
-    zooms_column = torch.tensor(zooms, dtype=torch.float64)[:, None]
+    zooms = [[math.log(camera.fx / camera.width)] for camera in cameras]
     return _path(
-        *(lens, positions_of(cameras), rotations_of(cameras), zooms_column, frames, distance)
+        lens,
+        positions_of(cameras),
+        rotations_of(cameras),
+        torch.tensor(zooms, dtype=torch.float64),
+        frames,
+        distance,
     )
 
 
-def _turned_alike(rotations: Tensor, up: Tensor) -> Tensor:
-    """(N, 3, 3): each turned by quarters about its line of sight to be like the one before it."""
+def _same_roll(rotations: Tensor, up: Tensor) -> Tensor:
+    """Rotations (N, 3, 3), each rolled by a multiple of 90° to be closest to the one before."""
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     turns = torch.stack([torch.linalg.matrix_power(turn, k) for k in range(4)])
     first = turns @ rotations[0]
-    alike = [first[int((-first[:, 1] @ up).argmax())]]
+    result = [first[int((-first[:, 1] @ up).argmax())]]
     for rotation in rotations[1:]:
-        turned = turns @ rotation
-        # The trace of R Sᵀ is the larger, the smaller the angle between R and S.
-        alike.append(turned[int((turned * alike[-1]).sum((1, 2)).argmax())])
-    return torch.stack(alike)
+        candidates = turns @ rotation
+        # The smaller the angle between R and S, the larger the trace of R Sᵀ.
+        result.append(candidates[int((candidates * result[-1]).sum((1, 2)).argmax())])
+    return torch.stack(result)
 
 
 def _path(
@@ -83,27 +97,37 @@ def _path(
     distance: float,
     smoothing: float = 0.0,
 ) -> list[Camera]:
-    """Frames along the spline of positions (K, 3), rotations and zooms (K, 1), even in `_steps`.
+    """Frames along a spline, at equal distances in terms of `_steps`.
 
-    Rotations are splines of quaternions of one sign, normalised after it: smooth to the second
-    derivative, and near the shortest turn as neighbours are less than half a turn apart.
+    Rotations are interpolated as a spline of quaternions whose signs agree, which is normalised
+    afterwards. The result has a continuous second derivative. It is close to the shortest rotation,
+    because neighbours differ by less than 180°.
+
+    Args:
+        lens: the camera whose image size and pixel aspect ratio all frames get.
+        positions: (K, 3) camera centres in the world frame.
+        rotations: (K, 3, 3) of cam_from_world.
+        zooms: (K, 1) logarithms of focal length / image width.
+        frames: number of frames.
+        distance: world units from the cameras to what they see.
+        smoothing: see `Spline`.
     """
     quats = quat_from_rotation(rotations)
     differ = torch.cat([torch.tensor([True]), _steps(positions, quats, distance) > 1e-6])
     positions, quats, zooms = positions[differ], quats[differ], zooms[differ]
     if len(positions) < 2:
         raise UserError(
-            "all cameras are at one place and look one way; a film needs two that differ"
+            "all cameras have the same position and direction; a video needs two that differ"
         )
     ends = torch.tensor([0, -1])
-    from_end_to_end = float(_steps(positions[ends], quats[ends], distance))
-    closed = len(positions) > 3 and from_end_to_end < 1e-6
-    # Times of the square roots of distances ("centripetal") keep the curve from overshooting.
+    first_to_last = float(_steps(positions[ends], quats[ends], distance))
+    closed = len(positions) > 3 and first_to_last < 1e-6
+    # Time steps are square roots of distances ("centripetal"), which prevents overshooting.
     steps = _steps(positions, quats, distance).sqrt()
     steps = (steps / steps.mean()).clamp_min(0.05)
     times = torch.cat([steps.new_zeros(1), steps.cumsum(0)])
     start, end = 0.0, float(times[-1])
-    if closed:  # once more before and after it, so that the ends do not matter
+    if closed:  # repeat the loop before and after, so that the ends of the spline have no effect
         times = torch.cat([times[:-1] - end, times[:-1], times + end])
         positions, quats, zooms = (
             torch.cat([p[:-1], p[:-1], p]) for p in (positions, quats, zooms)
@@ -112,26 +136,27 @@ def _path(
     quats = torch.cat([quats[:1], quats[1:] * signs[:, None].to(quats.dtype)])
     spline = Spline(times, torch.cat([positions, quats, zooms], 1), smoothing)
 
-    dense = torch.linspace(start, end, _DENSE * max(frames, 50), dtype=torch.float64)
-    way = spline(dense)
-    length = torch.cat([way.new_zeros(1), _steps(way[:, :3], way[:, 3:7], distance).cumsum(0)])
+    dense = torch.linspace(start, end, _SAMPLES_PER_FRAME * max(frames, 50), dtype=torch.float64)
+    rows = spline(dense)
+    length = torch.cat([rows.new_zeros(1), _steps(rows[:, :3], rows[:, 3:7], distance).cumsum(0)])
     shares = torch.arange(frames, dtype=torch.float64) / max(1, frames if closed else frames - 1)
     at = spline(_interpolate(shares * length[-1], length, dense))
     return [_camera(lens, *row.split([3, 4, 1])) for row in at]
 
 
 def _steps(positions: Tensor, quats: Tensor, distance: float) -> Tensor:
-    """(K − 1,) by what angle, in radians, the picture moves from each camera to the next."""
+    """(K − 1,) the angle in radians by which the image moves from each camera to the next."""
     moved = (positions.diff(dim=0) / distance).norm(dim=1)
     unit = torch.nn.functional.normalize(quats, dim=1)
-    # |p ± q| is the chord of a quarter of the turn each way: exact for small angles, too.
+    # A rotation by θ moves a unit quaternion by θ / 2, so the chord min |p ± q| is 2 sin(θ / 4).
+    # This is accurate for small angles too.
     chords = torch.minimum((unit[1:] - unit[:-1]).norm(dim=1), (unit[1:] + unit[:-1]).norm(dim=1))
     turned = 4 * torch.asin((chords / 2).clamp_max(1.0))
     return (moved.square() + turned.square()).sqrt()
 
 
 def _interpolate(x: Tensor, xs: Tensor, ys: Tensor) -> Tensor:
-    """Linear, of the samples (xs, ys); xs ascends."""
+    """Linear interpolation of the samples (xs, ys) at x; xs is ascending."""
     i = torch.searchsorted(xs, x).clamp(1, len(xs) - 1)
     share = (x - xs[i - 1]) / (xs[i] - xs[i - 1]).clamp_min(1e-300)
     return ys[i - 1] + share * (ys[i] - ys[i - 1])

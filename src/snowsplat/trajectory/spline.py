@@ -8,31 +8,33 @@ from torch import Tensor
 
 
 class Spline:
-    """The curve g that makes Σ |yᵢ − g(tᵢ)|² + smoothing · ∫ |g″|² least.
+    """The curve g that minimises Σ |yᵢ − g(tᵢ)|² + smoothing · ∫ |g″|².
 
-    A natural cubic spline with knots at the samples: with ``smoothing`` 0 it goes through them. See
-    P. J. Green, B. W. Silverman, "Nonparametric Regression and Generalized Linear Models", 1994,
-    section 2.3 (Reinsch's algorithm; their γ is `_bend`).
+    It is a natural cubic spline with knots at the samples. With ``smoothing`` 0 it interpolates
+    them. See P. J. Green, B. W. Silverman, "Nonparametric Regression and Generalized Linear
+    Models", 1994, section 2.3 (Reinsch's algorithm; their γ is `_second`).
     """
 
     def __init__(self, times: Tensor, values: Tensor, smoothing: float = 0.0) -> None:
         """
         Args:
-            times: (K,) increasing, at least two.
+            times: (K,) increasing, K ≥ 2.
             values: (K, D).
+            smoothing: ≥ 0, in units of time³.
 
         Raises:
-            ValueError: fewer than two samples, or times that do not increase.
+            ValueError: there are fewer than two samples, or the times do not increase.
         """
         times, values = times.to(torch.float64), values.to(torch.float64)
         steps = times.diff()
         if len(times) < 2 or not bool((steps > 0).all()):
-            raise ValueError("a spline needs two samples or more, at times that increase")
+            raise ValueError("a spline needs at least two samples, at increasing times")
         count = len(times)
-        bend = torch.zeros_like(values)  # second derivatives at the knots
+        second = torch.zeros_like(values)  # second derivatives at the knots
         if count > 2:
-            # Second divided differences are Qᵀ y, and R takes the bend at the inner knots to them.
-            # Q has three entries a column, so R + smoothing · Qᵀ Q has five diagonals.
+            # The second divided differences are Qᵀ y. Multiplied by R, the second derivatives at
+            # the inner knots equal them. Q has three entries per column, so the matrix
+            # R + smoothing · Qᵀ Q has five diagonals.
             first, last = 1 / steps[:-1], 1 / steps[1:]
             middle = -first - last
             diagonal = (steps[:-1] + steps[1:]) / 3
@@ -43,35 +45,38 @@ class Spline:
             first, middle, last = first[:, None], middle[:, None], last[:, None]
             differences = first * values[:-2] + middle * values[1:-1] + last * values[2:]
             inner = _solve(diagonal, beside, beyond, differences)
-            bend[1:-1] = inner
+            second[1:-1] = inner
             values = values.clone()
             values[:-2] -= smoothing * first * inner
             values[1:-1] -= smoothing * middle * inner
             values[2:] -= smoothing * last * inner
-        self._times, self._values, self._bend = times, values, bend
+        self._times = times
+        self._values = values
+        self._second = second
 
     def __call__(self, times: Tensor) -> Tensor:
-        """(N, D) at ``times`` (N,), which lie within those of the samples."""
+        """Values (N, D) at ``times`` (N,), which must be within the range of the samples."""
         t = times.to(torch.float64)
         i = torch.searchsorted(self._times, t, right=True).clamp(1, len(self._times) - 1) - 1
         step = (self._times[i + 1] - self._times[i])[:, None]
-        b = (t - self._times[i])[:, None] / step  # 0 at the knot before, 1 at the one after
+        b = (t - self._times[i])[:, None] / step  # 0 at the knot before t, 1 at the knot after t
         a = 1 - b
         line = a * self._values[i] + b * self._values[i + 1]
-        cubic = (a**3 - a) * self._bend[i] + (b**3 - b) * self._bend[i + 1]
+        cubic = (a**3 - a) * self._second[i] + (b**3 - b) * self._second[i + 1]
         return line + cubic * step**2 / 6
 
 
 def _solve(diagonal: Tensor, beside: Tensor, beyond: Tensor, right: Tensor) -> Tensor:
-    """(M, D): x of A x = right, A symmetric and positive, given by three of its five diagonals.
+    """Solve A x = right for x, (M, D).
 
-    By A = L D Lᵀ, a row at a time: time and memory grow with M, not with its square.
+    A is symmetric and positive definite with five diagonals; three of them are given. The
+    factorisation A = L D Lᵀ is computed row by row, so time and memory are linear in M.
     """
     rows = right.numpy().copy()
     near, far = [*beside.tolist(), 0.0], [*beyond.tolist(), 0.0, 0.0]
     pivots = diagonal.tolist()
     for i in range(len(pivots)):
-        # What row i takes from the two below it.
+        # Eliminate column i from the two rows below row i.
         a, b = near[i] / pivots[i], far[i] / pivots[i]
         if i + 1 < len(pivots):
             pivots[i + 1] -= a * near[i]

@@ -1,4 +1,4 @@
-"""In which order to visit cameras: as their names go, or by a short tour."""
+"""The order in which a path visits cameras: the order of their names, or a short tour."""
 
 from __future__ import annotations
 
@@ -11,17 +11,23 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.trajectory.focus import positions_of, rotations_of
 
-#: More cameras than this are thinned out: the tour would take long, and shows nothing more.
+#: Of more cameras than this, every n-th is used. A tour through all would take long to compute and
+#: would not look different.
 MOST_CAMERAS = 400
-# Names go along a path if that is at most so many times as long as a short tour.
-_AS_GOOD = 1.6
+# The order of names is used if its length is at most this many times that of a short tour.
+_LONGEST_BY_NAME = 1.6
 
 
 def in_order(cameras: Sequence[Camera], names: Sequence[str], distance: float) -> list[int]:
-    """Indices of the cameras along a way; ``distance`` (world units) is that to what they see.
+    """Indices of the cameras in the order of a path.
 
-    Photos of a walk and frames of a video have names in their order. Others are visited by a tour
-    that turns and moves the picture little.
+    Photos of a walk and frames of a video are named in the order in which they were taken. Other
+    cameras are visited by a tour with small changes of position and direction.
+
+    Args:
+        cameras: the cameras.
+        names: their names.
+        distance: world units from the cameras to what they see.
     """
     by_name = sorted(range(len(names)), key=lambda i: _natural(names[i]))
     step = -(-len(by_name) // MOST_CAMERAS)
@@ -31,18 +37,18 @@ def in_order(cameras: Sequence[Camera], names: Sequence[str], distance: float) -
     lengths = torch.cdist(places, places)
     tour = short_tour(lengths)
     as_named = list(range(len(by_name)))
-    best = as_named if _length(lengths, as_named) <= _AS_GOOD * _length(lengths, tour) else tour
-    return [by_name[i] for i in best]
+    use_names = _length(lengths, as_named) <= _LONGEST_BY_NAME * _length(lengths, tour)
+    return [by_name[i] for i in (as_named if use_names else tour)]
 
 
 def short_tour(lengths: Tensor) -> list[int]:
-    """A short way through all of N places, from one end to the other; ``lengths`` is (N, N).
+    """A short open tour through N places, from their distances ``lengths`` (N, N).
 
-    Always to the nearest place not yet visited; then pieces are turned round as long as that makes
-    the way shorter (2-opt).
+    The tour always continues to the nearest place that is not yet visited. Then sections are
+    reversed as long as that makes the tour shorter (2-opt).
     """
     count = len(lengths)
-    # Begin at the place that is the farthest from the others: an end, if there is one.
+    # Start at the place that is farthest from the others; on a line of places it is an end.
     tour = [int(lengths.sum(1).argmax())] if count else []
     left = lengths.clone()
     while len(tour) < count:
@@ -50,7 +56,8 @@ def short_tour(lengths: Tensor) -> list[int]:
         tour.append(int(left[tour[-1]].argmin()))
     order = torch.tensor(tour, dtype=torch.int64)
     while count > 2:
-        # Turning round places i … j replaces the steps into i and out of j; the ends have none.
+        # Reversing places i … j replaces the step into i and the step out of j. At the ends of the
+        # tour there is no such step.
         between = lengths[order][:, order]
         steps = torch.diagonal(between, 1)
         into = torch.cat([steps.new_zeros(1), steps])
@@ -71,6 +78,6 @@ def _length(lengths: Tensor, tour: list[int]) -> float:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """img_9 comes before img_10."""
+    """A sort key with which img_9 comes before img_10."""
     parts = re.split(r"(\d+)", name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

@@ -1,4 +1,4 @@
-"""`film`: pictures, one after the other, into an mp4 file."""
+"""`film`: writes images as the frames of an mp4 file."""
 
 from __future__ import annotations
 
@@ -12,47 +12,54 @@ import numpy as np
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
-# The best one that this build of FFmpeg has. The first two make H.264, which everything plays.
+# In order of preference; the first that this build of FFmpeg has is used. The first two write
+# H.264, which all players support.
 _ENCODERS = ("libx264", "libopenh264", "mpeg4")
-_CRF = "18"  # hardly to be told from the pictures by eye
-_BITS_A_PIXEL = 0.25  # for those that know no such scale
-_BT709 = 1  # the colours of HD: primaries, curve and matrix have this number each
+# Quality of libx264. The compression is hardly visible.
+_CRF = "18"
+# Bit rate of the other encoders, which have no such quality setting.
+_BITS_PER_PIXEL = 0.25
+# FFmpeg's number for the primaries, the transfer curve and the colour matrix of HD video.
+_BT709 = 1
+# FFmpeg's number for the usual range of video, 16 to 235.
 _LIMITED_RANGE = 1
 
 
 @contextmanager
 def film(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Gives the function that adds a picture, (height, width, 3) uint8, to a new film.
+    """Write a video: the context is a function that adds a frame, (height, width, 3) uint8 RGB.
 
         with film(Path("walk.mp4"), 640, 480, 30) as add:
             add(pixels)
 
-    The file appears under its name when the block ends well; if it raises (Ctrl-C), there is none.
-    Some pictures are in memory at a time, however many there are. The index lies at the beginning,
-    so that a browser plays the file while it loads it.
+    The file appears under its name when the block ends. If the block raises (also on Ctrl-C), an
+    existing file stays unchanged. Memory does not grow with the number of frames. The
+    index is at the start of the file, so that browsers can play it while loading it.
 
     Args:
-        path: its folder is there.
-        width, height: even, as colours are stored for 2×2 pixels.
+        path: the mp4 file, in an existing folder.
+        width: pixels, even, because colours are stored per 2×2 pixels.
+        height: pixels, even.
+        fps: frames per second.
 
     Raises:
-        ValueError: an odd size, no positive rate, or a picture of another size.
-        UserError: the film cannot be encoded or written.
+        ValueError: the size is odd, the rate is not positive, or a frame has another size.
+        UserError: the video cannot be encoded or written.
     """
     import av
     from av.video.reformatter import ColorRange, Colorspace
 
     if width < 2 or height < 2 or width % 2 or height % 2:
-        raise ValueError(f"a film has an even width and height, not {width}x{height}")
+        raise ValueError(f"a video needs an even width and height, not {width}x{height}")
     if not 0 < fps < float("inf"):
-        raise ValueError(f"a film has a positive number of frames a second, not {fps}")
+        raise ValueError(f"a video needs a positive number of frames per second, not {fps}")
     rate = Fraction(fps).limit_denominator(1001)
     count = 0
 
     def add(pixels: np.ndarray) -> None:
         nonlocal count
         if pixels.shape != (height, width, 3):
-            raise ValueError(f"a picture of {pixels.shape} does not fit a film {width}x{height}")
+            raise ValueError(f"a frame of {pixels.shape} does not fit a video {width}x{height}")
         frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(
             format="yuv420p",
             dst_colorspace=Colorspace.ITU709,
@@ -79,13 +86,13 @@ def film(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[
             if encoder == "libx264":
                 stream.options = {"crf": _CRF}
             else:
-                stream.bit_rate = round(_BITS_A_PIXEL * width * height * rate)
+                stream.bit_rate = round(_BITS_PER_PIXEL * width * height * rate)
             yield add
             container.mux(stream.encode(None))
     except av.FFmpegError as error:
         reason = error.strerror or str(error)
         raise UserError(
-            f"{path}: the film cannot be written ({reason}); is the disk full?"
+            f"{path}: the video cannot be written ({reason}); check the free disk space"
         ) from None
 
 
@@ -99,4 +106,4 @@ def _encoder() -> str:
         except UnknownCodecError:
             continue
         return name
-    raise UserError("this build of PyAV writes no films; install av from PyPI (pip install av)")
+    raise UserError("this build of PyAV cannot encode videos; run pip install av")
