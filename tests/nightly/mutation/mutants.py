@@ -123,10 +123,16 @@ class _Visitor(cst.CSTVisitor):
     def __init__(self) -> None:
         super().__init__()
         self.changes: list[tuple[cst.CSTNode, cst.CSTNode]] = []
+        self._of_a_gpu: set[cst.CSTNode | None] = set()
 
     def on_visit(self, node: cst.CSTNode) -> bool:
         if isinstance(node, _SKIPPED) or _is_docstring(node) or _asks_for_device(node):
             return False
+        if node in self._of_a_gpu:
+            return False
+        if isinstance(node, cst.If | cst.IfExp) and _asks_for_device(node.test):
+            self._of_a_gpu |= {_branch_of_a_gpu(node), node.test}
+            return True
         whole = isinstance(node, cst.Call) and getattr(node.func, "value", None) in _WHOLE_CALLS
         for kind, operator in _OPERATORS:
             if isinstance(node, kind) and not whole:
@@ -141,16 +147,17 @@ def _is_docstring(node: cst.CSTNode) -> bool:
 
 
 def _asks_for_device(node: cst.CSTNode) -> bool:
-    """``x.device.type == "cpu"``: of its two answers the tests see one."""
-    return m.matches(
-        node,
-        m.Comparison(
-            left=m.Attribute(
-                attr=m.Name("type"),
-                value=m.Name("device") | m.Attribute(attr=m.Name("device")),
-            )
-        ),
-    )
+    """``x.device.type == "cpu"``: of its two answers the tests, which run on the CPU, see one."""
+    device = m.Name("device") | m.Attribute(attr=m.Name("device"))
+    return m.matches(node, m.Comparison(left=m.Attribute(attr=m.Name("type"), value=device)))
+
+
+def _branch_of_a_gpu(node: cst.If | cst.IfExp) -> cst.CSTNode | None:
+    comparison = cst.ensure_type(node.test, cst.Comparison).comparisons[0]
+    is_cpu = m.matches(comparison, m.ComparisonTarget(m.Equal(), m.SimpleString('"cpu"')))
+    is_gpu = m.matches(comparison, m.ComparisonTarget(m.NotEqual(), m.SimpleString('"cpu"')))
+    is_gpu |= m.matches(comparison, m.ComparisonTarget(m.Equal(), m.SimpleString('"cuda"')))
+    return node.orelse if is_cpu else node.body if is_gpu else None
 
 
 def _mutated(
