@@ -40,10 +40,15 @@ class Room:
 _OPS = ("adam_step", "neighbours", "photometric", "project", "rasterize", "statistic", "tiling")
 ROOMS = {
     "density": Room(("training/density/*.py",), ("tests/training/density",)),
-    "optim": Room(("training/optim.py",), ("tests/training/test_optim.py",)),
+    "optim": Room(
+        ("training/optim.py", "training/lr_schedule.py"), ("tests/training/test_optim.py",)
+    ),
     "config": Room(("training/config.py",), ("tests/training/test_recipes.py",)),
     "losses": Room(("training/losses.py",), ("tests/training/test_losses.py",)),
-    "trainer": Room(("training/trainer.py",), ("tests/training/test_trainer.py",)),
+    "trainer": Room(
+        tuple(f"training/{name}.py" for name in ("trainer", "step_runner", "view_gradient")),
+        ("tests/training/test_trainer.py", "tests/training/test_step_runner.py"),
+    ),
     "scene": Room(("scene/*.py",), ("tests/scene",)),
     "trajectory": Room(("trajectory/*.py",), ("tests/trajectory",)),
     "reference": Room(("ops/reference.py",), tuple(f"tests/ops/test_{op}.py" for op in _OPS)),

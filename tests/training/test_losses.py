@@ -1,5 +1,6 @@
 """The loss of one view: masks and transparent photos."""
 
+import pytest
 import torch
 
 from snowsplat import ops
@@ -14,11 +15,12 @@ def rendering(height: int = 20, width: int = 24) -> torch.Tensor:
     return planes.permute(1, 2, 0).requires_grad_()
 
 
-def test_opaque_photos_give_the_photometric_loss():
+@pytest.mark.parametrize("ssim_weight", [0.2, 0.7])
+def test_opaque_photos_give_the_photometric_loss(ssim_weight):
     image = rendering()
     planes = torch.randint(0, 256, (3, 20, 24), dtype=torch.uint8)
-    loss = view_loss(image, LoadedImage(planes), BLACK, 0.2)
-    assert torch.equal(loss, ops.photometric_loss(image, planes.permute(1, 2, 0), 0.2))
+    loss = view_loss(image, LoadedImage(planes), BLACK, ssim_weight)
+    assert torch.equal(loss, ops.photometric_loss(image, planes.permute(1, 2, 0), ssim_weight))
 
 
 def test_transparent_photos_show_the_background():
@@ -43,3 +45,12 @@ def test_masked_pixels_have_no_loss_and_no_gradient():
     assert image.grad is not None
     assert not image.grad[~mask].any()
     assert image.grad[mask].any()
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_view_without_a_pixel_that_counts_has_no_loss(channels):
+    """The loss compares the photo with itself, also one composited over the background."""
+    planes = torch.full((channels, 20, 24), 200, dtype=torch.uint8)
+    photo = LoadedImage(planes, torch.zeros(20, 24, dtype=torch.bool))
+    background = torch.tensor([0.25, 0.5, 1.0])
+    assert float(view_loss(rendering(), photo, background, 0.2).detach()) < 1e-6

@@ -5,10 +5,14 @@ import math
 import pytest
 import torch
 
+from snowsplat.ops import reference
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import project
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.view_gradient import ViewGradient
 
 
 def some_gaussians(n: int = 5, rest: int = 3) -> Gaussians:
@@ -70,6 +74,96 @@ def test_moments_follow_the_rows_and_new_rows_start_at_zero():
         for name, parameter in selected.parameters().items():
             assert torch.equal(moments[name][:3], parameter[:3])
             assert not moments[name][3].any()
+
+
+def some_camera() -> Camera:
+    """No two of its numbers are equal. It looks along a slanted axis at the origin."""
+    pose = torch.eye(4)[:3]
+    pose[:, :3] = torch.linalg.qr(torch.tensor([[9.0, 1, 2], [-1, 8, 1], [-2, 1, 9]]))[0]
+    pose[:, :3] *= pose[:, :3].det()
+    pose[:, 3] = torch.tensor([0.2, -0.1, 3.0])
+    return Camera(64, 48, 50.0, 60.0, 30.0, 25.0, pose.double())
+
+
+def optimizer_and_gradient(**options: bool) -> tuple[Gaussians, Adam, ViewGradient]:
+    """Gaussians of which the camera sees some, with moments, and a gradient of that view."""
+    generator = torch.Generator().manual_seed(5)
+    gaussians = some_gaussians(40)
+    gaussians.log_scales -= 2.0
+    adam = Adam(gaussians, LearningRates(), schedule=Schedule(30), extent=2.0, **options)
+    for name in gaussians.parameters():
+        adam.exp_avg[name].normal_(std=0.1, generator=generator)
+        adam.exp_avg_sq[name].uniform_(0.01, 0.1, generator=generator)
+    splats = project(gaussians, some_camera(), 1)
+    assert 10 < len(splats) < 40
+    splats.packed.grad = torch.randn(splats.packed.shape, generator=generator)
+    counts = torch.zeros(6, dtype=torch.int32)
+    return gaussians, adam, ViewGradient(splats, some_camera(), 1, torch.tensor([True]), counts)
+
+
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_a_step_is_that_of_adam(visible_only):
+    gaussians, adam, gradient = optimizer_and_gradient(visible_only=visible_only)
+    # As a regulariser leaves it: on the parameter itself.
+    gaussians.log_scales.grad = torch.ones_like(gaussians.log_scales)
+    expected = {name: p.clone() for name, p in gaussians.parameters().items()}
+    expected["log_scales"].grad = torch.ones_like(gaussians.log_scales)
+    means, squares = (
+        {name: moment.clone() for name, moment in moments.items()}
+        for moments in (adam.exp_avg, adam.exp_avg_sq)
+    )
+    splats = gradient.splats
+    reference.adam_step(
+        expected,
+        means,
+        squares,
+        splats.ids,
+        splats.packed.grad,
+        some_camera().cam_from_world,
+        width=64,
+        height=48,
+        fx=50.0,
+        fy=60.0,
+        cx=30.0,
+        cy=25.0,
+        sh_degree=1,
+        lr=adam.rates_at(7),
+        step=7,
+        visible_only=visible_only,
+    )
+    adam.step(gaussians, gradient, 7)
+    for name, parameter in gaussians.parameters().items():
+        torch.testing.assert_close(parameter, expected[name], rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(adam.exp_avg[name], means[name], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(adam.exp_avg_sq[name], squares[name], rtol=1e-3, atol=1e-3)
+        assert parameter.grad is None
+    assert not gradient.nonfinite_rows.any()
+
+
+def test_unless_told_otherwise_unseen_rows_move_too():
+    gaussians, adam, gradient = optimizer_and_gradient()
+    before = gaussians.means.clone()
+    adam.step(gaussians, gradient, 1)
+    unseen = torch.ones(len(gaussians), dtype=torch.bool)
+    unseen[gradient.splats.ids.long()] = False
+    assert (gaussians.means[unseen] != before[unseen]).all()
+
+
+def test_a_step_that_is_not_valid_changes_nothing():
+    gaussians, adam, gradient = optimizer_and_gradient()
+    before = gaussians.clone()
+    gradient.valid.fill_(False)
+    adam.step(gaussians, gradient, 1)
+    for name, parameter in before.parameters().items():
+        assert torch.equal(gaussians.parameters()[name], parameter)
+
+
+def test_rows_that_are_not_finite_are_counted():
+    gaussians, adam, gradient = optimizer_and_gradient()
+    gradient.splats.packed.grad[3, 0] = math.nan  # of the position in the image
+    adam.step(gaussians, gradient, 1)
+    assert gradient.nonfinite_rows[0] == 1
+    assert gradient.nonfinite_rows[3] == 0  # the opacity does not depend on it
 
 
 def test_zero_forgets_one_parameter_alone():
