@@ -1,10 +1,10 @@
-# make demo     takes photos of a small scene and makes it anew from them, with `snowsplat make`
-# make test     all that must hold: format, lint, types, layers, tests on every instruction set, and
-#               the kernels of a GPU, on the CPU
-# make dev      the environment to work in; then, quickly: make test, make format, make native
+# make demo     photographs a small synthetic scene and reconstructs it with `snowsplat make`
+# make quick    format, lint, types, layers and the fast tests: under a minute once built
+# make test     everything: all tests, on every instruction set, and the kernels of a GPU on the CPU
+# make dev      the development environment; then: make quick, make test, make format, make native
 #
-# Each works by itself on a fresh clone and needs Python >= 3.10 and a C++ compiler. Everything goes
-# into .venv, made by BOOTSTRAP (python3); PYTHON=path/to/python uses a ready environment instead.
+# Each target works on a fresh clone and needs Python >= 3.10 and a C++ compiler. Everything is installed
+# into .venv, made by BOOTSTRAP (python3); PYTHON=path/to/python uses an existing environment instead.
 
 SHELL := /bin/sh
 BOOTSTRAP ?= python3
@@ -21,6 +21,8 @@ endif
 # cmake, ninja, ruff and the rest are those of the environment; the package is that of this checkout.
 export PATH := $(abspath $(dir $(PYTHON))):$(PATH)
 export PYTHONPATH := $(CURDIR)/src
+# Tests start Python often: without the cached bytecode each start would compile all modules.
+unexport PYTHONDONTWRITEBYTECODE
 
 BUILD := build/native
 # Two builds in one checkout wait for each other.
@@ -29,10 +31,13 @@ LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock
 SANITIZED := emulated-float32
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo test dev format native compiler lint types layers pytest pytest-others pytest-ops sanitized clean
+.PHONY: demo quick test dev format native compiler lint types layers pytest-quick pytest sanitized clean
 
 demo: native
 	$(PYTHON) examples/demo.py out/demo
+
+quick: lint
+	@$(MAKE) --no-print-directory -j2 types layers pytest-quick
 
 test: lint types layers pytest
 
@@ -79,31 +84,35 @@ types: $(ENVIRONMENT)
 layers: $(ENVIRONMENT)
 	lint-imports --no-logo
 
-# All tests on the best instruction set, then those of the ops on each of the others, less those of
-# a GPU's kernels, which have none. Two at a time, since most tests keep one core busy.
+# Tests run in one process per core: make test JOBS=1 runs them one after the other. Those that can take
+# seconds carry a mark, which `quick` leaves out (pyproject.toml lists them).
+JOBS ?= auto
+PYTEST = $(PYTHON) -m pytest -n $(JOBS) --dist worksteal
+QUICK := not (sfm or browser or build or emulated or gpu or kill or slow)
+
+pytest-quick: native
+	$(PYTEST) -m '$(QUICK)'
+
+# All tests on the best instruction set, then on each of the others those that depend on it, then the
+# kernels of a GPU on the CPU once more, under the sanitizers.
 pytest: native
-	@$(MAKE) --no-print-directory -j2 pytest-others pytest-ops sanitized
-
-pytest-others: native
-	$(PYTHON) -m pytest --ignore tests/ops
-
-pytest-ops: native
-	$(PYTHON) -m pytest tests/ops
+	$(PYTEST)
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
 	    for isa in $$isas; do \
-	        echo "SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops"; \
-	        SNOWSPLAT_ISA=$$isa $(PYTHON) -m pytest tests/ops -m 'not emulated and not gpu' || exit 1; \
+	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m isa tests/ops tests/training"; \
+	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m isa tests/ops tests/training || exit 1; \
 	    done
+	@$(MAKE) --no-print-directory sanitized
 
 # The kernels of a GPU, on the CPU, under AddressSanitizer and UndefinedBehaviorSanitizer, and with the
-# threads of a block in the other order: what misses a barrier can be right in one of the two alone.
-# GCC's sanitizers, since they can be loaded into a Python that was built without them.
+# threads of a block in the other order: a missing barrier may show in one of the two orders only.
+# With GCC's sanitizers, which can be loaded into a Python that was built without them.
 sanitized: native
 	@if [ -f "$$(g++ -print-file-name=libasan.so)" ]; then \
-	    echo "sanitized: $(PYTHON) -m pytest tests/ops -m emulated -k $(SANITIZED)"; \
+	    echo "sanitized: $(PYTEST) tests/ops -m emulated -k $(SANITIZED)"; \
 	    LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" \
 	    ASAN_OPTIONS=detect_leaks=0 CXX=g++ SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
-	        $(PYTHON) -m pytest tests/ops -m emulated -k $(SANITIZED); \
+	        $(PYTEST) tests/ops -m emulated -k $(SANITIZED); \
 	else \
 	    echo "sanitized: skipped; it needs g++ with its sanitizers"; \
 	fi

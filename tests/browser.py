@@ -6,6 +6,7 @@
         pixels = page.screenshot()
 
 What pages write to their console, and errors that they do not catch, are in `Page.console`.
+Tests that use it carry the mark `browser`, which skips them where there is no Chromium.
 """
 
 from __future__ import annotations
@@ -28,7 +29,6 @@ from queue import Empty, Queue
 from typing import Any
 
 import numpy as np
-import pytest
 from PIL import Image
 
 _FLAGS = [
@@ -55,12 +55,6 @@ def chromium() -> str | None:
     return next((found for name in names if (found := shutil.which(name))), None)
 
 
-needs_chromium = pytest.mark.skipif(
-    chromium() is None,
-    reason="needs Chromium (apt install chromium), or SNOWSPLAT_CHROMIUM with its path",
-)
-
-
 class BrowserError(Exception):
     """The browser refused a command, a script in a page failed, or nothing came in time."""
 
@@ -73,7 +67,7 @@ class Browser:
 
     def __enter__(self) -> Browser:
         program = chromium()
-        assert program is not None, "ask needs_chromium first"
+        assert program is not None, "the test lacks the mark browser"
         self._profile = tempfile.mkdtemp(prefix="snowsplat-chromium-")
         to_browser, self._commands = _pipe()
         self._replies, from_browser = _pipe()

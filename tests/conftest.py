@@ -1,7 +1,43 @@
-"""What all tests take for granted of their process."""
+"""What all tests share: signals, threads of parallel processes, and marks set automatically.
 
+`make quick` leaves out the marks sfm, browser, build, emulated, kill, slow and gpu; pyproject.toml
+describes them.
+"""
+
+import os
 import signal
+from pathlib import Path
+
+import pytest
 
 # A shell starts background jobs with Ctrl-C ignored, and their children inherit that. Tests that
 # press it mean it to work, here and in the processes that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # There is a process per core. Torch's threads spin while they wait, and would take the cores
+    # from each other. Set before torch is imported; results do not depend on it.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+_HERE = Path(__file__).parent
+#: Marks that follow from the folder of a test, and from the fixtures that it uses.
+_OF_FOLDERS = {"kill": "kill"}
+_OF_FIXTURES = {"recorder": "build"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        folder = item.path.relative_to(_HERE).parts[0]
+        if folder in _OF_FOLDERS:
+            item.add_marker(_OF_FOLDERS[folder])
+        for fixture in _OF_FIXTURES.keys() & getattr(item, "fixturenames", ()):
+            item.add_marker(_OF_FIXTURES[fixture])
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    from .browser import chromium
+
+    if item.get_closest_marker("browser") and chromium() is None:
+        pytest.skip(
+            "needs Chromium (apt install chromium), or its path in the variable SNOWSPLAT_CHROMIUM"
+        )

@@ -19,6 +19,8 @@ from snowsplat.ops.cuda import nvrtc
 REPOSITORY = Path(__file__).resolve().parents[1]
 THIRD_PARTY = REPOSITORY / "third_party"
 VIEWER_FILES = ("index.html", "index.css", "index.js", "LICENSE")
+pytestmark = pytest.mark.build
+
 NO_COMPILER = "snowsplat: no C++ compiler found; install one (Debian/Ubuntu: apt install g++)"
 
 

@@ -56,7 +56,7 @@ def state(out: Path) -> dict[str, int]:
     return {name: (out / name).stat().st_mtime_ns for name in made}
 
 
-@pytest.mark.slow
+@pytest.mark.sfm
 def test_from_photos_to_files_and_what_is_done_again(
     run, refused, quick, photos, tmp_path, monkeypatch
 ):
@@ -142,7 +142,7 @@ def killed(photos, tmp_path) -> Callable[..., str]:
     return killed
 
 
-@pytest.mark.slow
+@pytest.mark.sfm
 def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
     """Each time the same command goes on; what was finished is not done again."""
     out = tmp_path / "out"

@@ -21,6 +21,8 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[
 STAGES = ("photos", "poses", "images", "report")
 QUICK = ("--quality", "draft", "--threads", "1")
 
+pytestmark = pytest.mark.sfm
+
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
@@ -174,7 +176,6 @@ def test_a_full_disk_loses_nothing_that_is_finished(captured, photos, run, tmp_p
 
 
 @pytest.mark.parametrize("stage", ["photos", "poses", "images"])
-@pytest.mark.slow
 def test_killed_at_any_stage_the_same_command_goes_on(stage, photos, run, tmp_path):
     out = tmp_path / "garden"
     command = [sys.executable, "-m", "snowsplat", "sfm", photos, "-o", out, *QUICK]

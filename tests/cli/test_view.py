@@ -15,7 +15,7 @@ from snowsplat.cli import view
 from snowsplat.cli.main import main
 from snowsplat.formats import read_gaussians, write_gaussians
 
-from ..browser import Browser, needs_chromium
+from ..browser import Browser
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_serves_until_it_is_told_to_end(start, out, sign):
     assert process.stderr.read() == ""
 
 
-@needs_chromium
+@pytest.mark.browser
 def test_a_real_browser_at_the_printed_address(start, out):
     process = start("view", out, "--no-browser")
     process.stdout.readline()

@@ -34,17 +34,14 @@ def test_convert(killer, tmp_path):
     assert not killer.kill(convert_jobs(tmp_path / "in.ply", tmp_path / "other.ply"), 4)
 
 
-@pytest.mark.slow
 def test_train(killer, dataset):
     assert not killer.kill(train_jobs(dataset), 4)
 
 
-@pytest.mark.slow
 def test_dataset(killer, photos):
     assert not killer.kill(sfm_jobs(photos), 3)
 
 
-@pytest.mark.slow
 def test_make(killer, photos):
     assert not killer.kill(make_jobs(photos), 3)
 
@@ -121,7 +118,6 @@ def test_a_training_with_a_time_that_took_more_steps_than_planned(zygote, datase
     assert done.code == 0, done.text
 
 
-@pytest.mark.slow
 def test_make_keeps_its_checkpoints_until_the_scene_is_written_down(zygote, photos, tmp_path):
     """Killed as soon as they are gone: what is made from them is finished, and stays so."""
     out = tmp_path / "made"

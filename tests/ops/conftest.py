@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pytest
 import torch
 
+from snowsplat.ops.cuda.kernels import Argument
 from snowsplat.ops.native import LAUNCHERS
 
 from .engines import launcher
@@ -31,9 +32,28 @@ def _one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
+@pytest.fixture(autouse=True)
+def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A test that runs the CPU's kernels fails unless it is repeated on each instruction set."""
+    exempt = {"isa", "emulated", "gpu"}.intersection(
+        mark.name for mark in request.node.iter_markers()
+    )
+    if exempt or "recorder" in request.fixturenames:  # the recorder is no kernel
+        return
+
+    def unmarked(name: str, n: int, args: Sequence[Argument]) -> int:
+        pytest.fail(f"runs the kernel {name} of the CPU; mark the test `isa`")
+
+    monkeypatch.setitem(LAUNCHERS, "cpu", unmarked)
+
+
 def variants(*among: Variant) -> list:
-    """As parameters of a fixture; those for a GPU carry its mark."""
-    marks = {"cuda": pytest.mark.gpu, "emulated": pytest.mark.emulated}
+    """As parameters of a fixture, with the marks of their engines.
+
+    Only the CPU's kernels depend on the instruction set, so only they are marked `isa`: the
+    reference and the kernels of a GPU would repeat the same check.
+    """
+    marks = {"native": pytest.mark.isa, "cuda": pytest.mark.gpu, "emulated": pytest.mark.emulated}
     return [
         pytest.param(v, id=str(v), marks=[marks[v.engine]] if v.engine in marks else [])
         for v in among

@@ -25,8 +25,6 @@ from .scenes import (
     uniform,
 )
 
-pytestmark = pytest.mark.isa
-
 RATES = {
     "means": 0.1,
     "log_scales": 5e-3,

@@ -28,6 +28,8 @@ ARCHITECTURES = re.search(
 # few registers. Kernels for float64 are for tests, and may have more.
 LOCAL_BYTES = 16
 
+pytestmark = pytest.mark.build
+
 
 @pytest.fixture(scope="module")
 def compiler() -> nvrtc.Nvrtc:

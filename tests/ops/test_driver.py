@@ -250,10 +250,10 @@ def test_launching_costs_little(gpus):
     gpus.cuLaunchKernel = lambda *args: (0,)
 
     def batch() -> float:
-        start = time.perf_counter()
+        start = time.thread_time()
         for _ in range(200):
             driver.run(KERNEL, "one", 1, args)
-        return (time.perf_counter() - start) / 200
+        return (time.thread_time() - start) / 200
 
     assert min(batch() for _ in range(10)) < 30e-6  # 7 to 9 µs on a busy machine
 
@@ -356,6 +356,7 @@ except driver.UserError as error:
 """
 
 
+@pytest.mark.build
 def test_the_way_through_the_real_bindings(tmp_path):
     pytest.importorskip("cuda.bindings.driver")
     source = Path(__file__).with_name("driver_stub.cpp")

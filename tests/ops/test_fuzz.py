@@ -30,8 +30,6 @@ from .scenes import (
     uniform,
 )
 
-pytestmark = pytest.mark.isa
-
 COUNT = 64
 
 

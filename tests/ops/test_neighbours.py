@@ -13,8 +13,6 @@ from snowsplat.ops import reference
 
 from .scenes import Variant, as_float32, assert_close, generator, normal, one_line, uniform
 
-pytestmark = pytest.mark.isa
-
 
 def grid(*counts: int, spacing: float = 1.0) -> Tensor:
     axes = [torch.arange(n, dtype=torch.float64) * spacing for n in counts]

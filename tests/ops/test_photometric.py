@@ -21,8 +21,6 @@ from .scenes import (
     uniform,
 )
 
-pytestmark = pytest.mark.isa
-
 SIZES = [(1, 1), (5, 3), (3, 5), (11, 11), (17, 23), (16, 16), (33, 64), (70, 41)]
 # About the tiles of a GPU: 32 columns, 24 rows of float or 12 of double.
 TILES = [(11, 31), (12, 32), (13, 33), (23, 63), (24, 64), (25, 65), (1, 300), (300, 1)]

@@ -31,8 +31,6 @@ from .scenes import (
     world_points,
 )
 
-pytestmark = pytest.mark.isa
-
 IDENTITY = torch.eye(3, 4, dtype=torch.float64)
 VIEW = view_of(40, 30, focal=50.0, sh_degree=0)
 

@@ -30,8 +30,6 @@ from .scenes import (
     uniform,
 )
 
-pytestmark = pytest.mark.isa
-
 
 def flat_stack(
     opacities: list[float], depths: list[float] | None = None, colors: Tensor | None = None

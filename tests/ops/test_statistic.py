@@ -13,8 +13,6 @@ from snowsplat.ops import Splats2D, reference
 
 from .scenes import Variant, assert_close
 
-pytestmark = pytest.mark.isa
-
 
 def splats_of(ids: Tensor, packed: Tensor, grad: Tensor) -> Splats2D:
     packed = packed.clone().requires_grad_()

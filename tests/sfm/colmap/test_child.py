@@ -37,6 +37,8 @@ estimate_poses(Path(sys.argv[1]), photos, SfmOptions(threads=2), report)
 print("finished", flush=True)
 """
 
+pytestmark = pytest.mark.sfm
+
 needs_proc = pytest.mark.skipif(
     not CHILDREN.exists(), reason="needs /proc, to find the child process"
 )

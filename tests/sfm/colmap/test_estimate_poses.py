@@ -23,6 +23,8 @@ from . import scenes
 DRAFT = SfmOptions(effort="draft", threads=2)
 BLACK = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
 
+pytestmark = pytest.mark.sfm
+
 
 @pytest.fixture(scope="module")
 def pictures():
@@ -181,7 +183,6 @@ def test_photos_of_another_scene_are_named(tmp_path, pictures):
     assert len(result.attempts) == 1
 
 
-@pytest.mark.slow
 def test_two_scenes_yield_the_larger_one_after_a_second_attempt(tmp_path, pictures):
     other = [scenes.photograph(scenes.boards(9), pose, i) for i, pose in enumerate(scenes.arc(5))]
     photos = scenes.write(tmp_path, [*other, *pictures[:7]])

@@ -14,7 +14,7 @@ from snowsplat.sfm.progress import silent
 
 CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "captures"
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.sfm
 
 
 def photos_of(images, sequence=None):

@@ -17,9 +17,9 @@ from snowsplat.scene.camera_json import read_cameras
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.viewer.live.server import free_port
 
-from ...browser import Browser, Page, needs_chromium
+from ...browser import Browser, Page
 
-pytestmark = needs_chromium
+pytestmark = pytest.mark.browser
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
 BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() === '{}')"

@@ -15,7 +15,7 @@ from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web import html
 
-from ...browser import Browser, needs_chromium
+from ...browser import Browser
 
 
 def three_balls() -> Gaussians:
@@ -67,7 +67,7 @@ def test_what_makes_no_page(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@needs_chromium
+@pytest.mark.browser
 def test_a_real_browser_opens_it_from_the_disk(tmp_path):
     path = tmp_path / "scene.html"
     html.write_html(path, three_balls(), FRONT)

@@ -20,7 +20,7 @@ from snowsplat.scene.render import render
 from snowsplat.viewer.web.scene import ready, site
 from snowsplat.viewer.web.server import StaticServer
 
-from ...browser import Browser, Page, needs_chromium
+from ...browser import Browser, Page
 
 WIDTH, HEIGHT = 480, 360
 LOADED = "!!window.app"  # the viewer sets it after its first whole picture
@@ -121,7 +121,7 @@ def test_the_page_and_its_policy(trained):
     assert "http" not in policy
 
 
-@needs_chromium
+@pytest.mark.browser
 def test_a_real_browser_shows_what_we_render(trained, tmp_path):
     gaussians, start = ready(trained.gaussians, trained.cameras)
     ours = picture(gaussians, camera_of(start))
