@@ -30,7 +30,7 @@ from snowsplat.training.config import TrainConfig
 from snowsplat.training.density import AdaptiveDensity
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.optim import Adam
-from snowsplat.training.step_runner import StepRunner
+from snowsplat.training.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
 from snowsplat.training.trainer import Trainer
 
 GPU = torch.device("cuda")
@@ -85,8 +85,9 @@ class Step:
             device=device,
         )
         trainer._runner = StepRunner(len(gaussians), device)
-        if capacity is not None:
-            trainer._runner.capacity.instances = capacity
+        trainer._runner.capacity.instances = (
+            INITIAL_INSTANCES_PER_GAUSSIAN * len(gaussians) if capacity is None else capacity
+        )
         self.view = view
         self.camera = camera.to(device)
         self.background = torch.zeros(3, device=device)

@@ -35,7 +35,7 @@ ENGINES = [
     pytest.param("emulated", marks=pytest.mark.emulated),
     pytest.param("cuda", marks=pytest.mark.gpu),
 ]
-#: Its regularizer has a huge gradient at huge scales, whether or not they are visible.
+#: Its regulariser has a huge gradient at huge scales, whether or not they are visible.
 HUGE_GRADIENTS = replace(
     CALM, density=McmcDensity(densify_from=10, densify_interval=10, max_gaussians=50)
 )

@@ -1,4 +1,4 @@
-"""`initial_gaussians`: initialization, from the points of the dataset or at random."""
+"""`initial_gaussians`: initialisation, from the points of the dataset or at random."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class Adam:
     def step(self, gaussians: Gaussians, gradient: ViewGradient, step: int) -> None:
         """Update ``gaussians`` in place; ``step`` counts from 1.
 
-        A ``.grad`` on a parameter (of a regularizer) is added to its gradient, then cleared.
+        A ``.grad`` on a parameter (of a regulariser) is added to its gradient, then cleared.
         """
         parameters = gaussians.parameters()
         splats, camera = gradient.splats, gradient.camera

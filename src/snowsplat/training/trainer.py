@@ -185,7 +185,7 @@ class Trainer:
         """Rasterize, compare with the photo, and update the Gaussians."""
         sh_degree = self.config.sh_degree_at(step)
         splats = project(self.gaussians, camera, sh_degree)
-        with torch.enable_grad():  # from the splats on; the optimizer differentiates the projection
+        with torch.enable_grad():  # from the splats on; the optimiser differentiates the projection
             image = self._runner.rasterize(splats, camera, background)
             loss = view_loss(image, photo, background, self.config.ssim_weight)
         gradient = self._runner.backward(loss, splats, camera, sh_degree)

@@ -27,15 +27,15 @@ class DensityControl(Protocol):
     """The state of a density control: statistics in the order of the rows, and two hooks."""
 
     def after_backward(self, step: int, gaussians: Gaussians, gradient: ViewGradient) -> None:
-        """Before the optimizer: accumulate statistics, or add the gradients of regularizers.
+        """Before the optimiser: accumulate statistics, or add the gradients of regularisers.
 
         Statistics are accumulated by `ViewGradient.add_statistics`, which changes nothing if the
-        step turns out to be invalid. The gradient of a regularizer is assigned to ``.grad`` of the
-        parameters, which the optimizer adds and clears. On a GPU nothing here may wait for it.
+        step turns out to be invalid. The gradient of a regulariser is assigned to ``.grad`` of the
+        parameters, which the optimiser adds and clears. On a GPU nothing here may wait for it.
         """
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
-        """After the optimizer: refine. Returns the Gaussians to continue with, possibly the same.
+        """After the optimiser: refine. Returns the Gaussians to continue with, possibly the same.
 
         The trainer calls this as late as possible, at the beginning of step + 1, so that a scene
         that was just cloned or reset is never evaluated or saved.

@@ -2,9 +2,9 @@
 Splatting as Markov Chain Monte Carlo".
 
 The Gaussians are samples of a distribution whose density is high where they explain the photos.
-Noise on their positions makes the optimizer explore (stochastic gradient Langevin dynamics, section
+Noise on their positions makes the optimiser explore (stochastic gradient Langevin dynamics, section
 3.2); dead ones are relocated to live ones such that the rendered image does not change (section
-3.3); and a regularizer of opacity and scale removes those that are not needed (section 3.4). The
+3.3); and a regulariser of opacity and scale removes those that are not needed (section 3.4). The
 number of Gaussians grows by a fixed fraction up to a limit, so memory is known before training.
 """
 
