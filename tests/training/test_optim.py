@@ -1,4 +1,4 @@
-"""Learning rates, and the bookkeeping of Adam's moments."""
+"""The update of Adam, and the bookkeeping of its moments."""
 
 import math
 
@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from snowsplat.ops import reference
+from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
@@ -21,41 +22,29 @@ def some_gaussians(n: int = 5, rest: int = 3) -> Gaussians:
     return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
 
 
-def test_the_papers_rates():
-    rates = LearningRates()
-    first, last = (
-        rates.at(0, Schedule(30_000), extent=2.0),
-        rates.at(30_000, Schedule(30_000), extent=2.0),
-    )
-    assert first["means"] == pytest.approx(2 * 1.6e-4)
-    assert last["means"] == pytest.approx(2 * 1.6e-6)
-    assert rates.at(15_000, Schedule(30_000), extent=2.0)["means"] == pytest.approx(
-        2 * 1.6e-5
-    )  # log-linear
-    assert {name: rate for name, rate in first.items() if name != "means"} == {
-        "log_scales": 5e-3,
-        "quats": 1e-3,
-        "opacity_logits": 0.05,
-        "sh_dc": 2.5e-3,
-        "sh_rest": 1.25e-4,
-    }
+def one_step(adam: Adam, gaussians: Gaussians, step: int, regulariser: float) -> None:
+    """A step whose view sees no Gaussian: the gradient is that of a regulariser alone."""
+    gaussians.opacity_logits.grad = torch.full_like(gaussians.opacity_logits, regulariser)
+    splats = Splats2D(torch.zeros(0, 16), torch.zeros(0, dtype=torch.int32), 3)
+    splats.packed.grad = torch.zeros(0, 16)
+    camera = Camera(10, 10, 10.0, 10.0, 5.0, 5.0, torch.eye(3, 4).double())
+    adam.step(gaussians, ViewGradient(splats, camera, 0), step)
 
 
-def test_the_means_rate_ends_at_its_own_step_and_stays():
-    absolute = LearningRates(means_steps=1000)
-    assert absolute.at(1000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-6)
-    assert absolute.at(4000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-6)
-    relative = LearningRates(means_steps=0.5)
-    assert relative.at(1000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-5)
-    assert relative.at(2000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-6)
-
-
-def test_scaled_spares_the_final_rate():
-    rates = LearningRates().scaled(3.0)
-    assert rates.means == pytest.approx(4.8e-4)
-    assert rates.opacity_logits == pytest.approx(0.15)
-    assert rates.means_final == 1.6e-6
-    assert rates.means_steps == 30_000
+def test_two_steps_of_kingma_and_ba():
+    """With a gradient g, then 0: Δ₁ = −lr; m̂₂ = 0.09 g / 0.19, v̂₂ = 0.000999 g² / 0.001999."""
+    gaussians = some_gaussians()
+    before = gaussians.clone()
+    adam = Adam(gaussians, LearningRates(), schedule=Schedule(10), extent=1.0)
+    one_step(adam, gaussians, 1, regulariser=3.0)
+    first = gaussians.opacity_logits - before.opacity_logits
+    torch.testing.assert_close(first, torch.full((5,), -0.05))
+    assert gaussians.opacity_logits.grad is None
+    one_step(adam, gaussians, 2, regulariser=0.0)
+    second = gaussians.opacity_logits - before.opacity_logits - first
+    expected = -0.05 * (0.09 / 0.19) / math.sqrt(0.000999 / 0.001999)
+    torch.testing.assert_close(second, torch.full((5,), expected), rtol=1e-4, atol=1e-7)
+    assert torch.equal(gaussians.means, before.means)
 
 
 def test_moments_follow_the_rows_and_new_rows_start_at_zero():
@@ -63,9 +52,7 @@ def test_moments_follow_the_rows_and_new_rows_start_at_zero():
     adam = Adam(gaussians, LearningRates(), schedule=Schedule(10), extent=1.0)
     for moments in (adam.exp_avg, adam.exp_avg_sq):
         for name, parameter in gaussians.parameters().items():
-            moments[name] = (
-                parameter.clone()
-            )  # recognisable: row i of the moment is that of Gaussian i
+            moments[name] = parameter.clone()  # row i of the moment identifies Gaussian i
     index = torch.tensor([4, 0, 2, 2])
     fresh = torch.tensor([False, False, False, True])
     selected = gaussians.select(index)
@@ -77,7 +64,7 @@ def test_moments_follow_the_rows_and_new_rows_start_at_zero():
 
 
 def some_camera() -> Camera:
-    """No two of its numbers are equal. It looks along a slanted axis at the origin."""
+    """A camera whose parameters all differ, looking along a slanted axis at the origin."""
     pose = torch.eye(4)[:3]
     pose[:, :3] = torch.linalg.qr(torch.tensor([[9.0, 1, 2], [-1, 8, 1], [-2, 1, 9]]))[0]
     pose[:, :3] *= pose[:, :3].det()
@@ -86,7 +73,7 @@ def some_camera() -> Camera:
 
 
 def optimizer_and_gradient(**options: bool) -> tuple[Gaussians, Adam, ViewGradient]:
-    """Gaussians of which the camera sees some, with moments, and a gradient of that view."""
+    """Gaussians, some of them visible; an optimiser with moments; the gradient of one view."""
     generator = torch.Generator().manual_seed(5)
     gaussians = some_gaussians(40)
     gaussians.log_scales -= 2.0
@@ -102,9 +89,9 @@ def optimizer_and_gradient(**options: bool) -> tuple[Gaussians, Adam, ViewGradie
 
 
 @pytest.mark.parametrize("visible_only", [False, True])
-def test_a_step_is_that_of_adam(visible_only):
+def test_a_step_equals_the_reference(visible_only):
     gaussians, adam, gradient = optimizer_and_gradient(visible_only=visible_only)
-    # As a regulariser leaves it: on the parameter itself.
+    # The gradient of a regulariser.
     gaussians.log_scales.grad = torch.ones_like(gaussians.log_scales)
     expected = {name: p.clone() for name, p in gaussians.parameters().items()}
     expected["log_scales"].grad = torch.ones_like(gaussians.log_scales)
@@ -140,7 +127,7 @@ def test_a_step_is_that_of_adam(visible_only):
     assert not gradient.nonfinite_rows.any()
 
 
-def test_unless_told_otherwise_unseen_rows_move_too():
+def test_rows_that_the_view_does_not_see_move_by_default():
     gaussians, adam, gradient = optimizer_and_gradient()
     before = gaussians.means.clone()
     adam.step(gaussians, gradient, 1)
@@ -149,7 +136,7 @@ def test_unless_told_otherwise_unseen_rows_move_too():
     assert (gaussians.means[unseen] != before[unseen]).all()
 
 
-def test_a_step_that_is_not_valid_changes_nothing():
+def test_an_invalid_step_changes_nothing():
     gaussians, adam, gradient = optimizer_and_gradient()
     before = gaussians.clone()
     gradient.valid.fill_(False)
@@ -158,15 +145,15 @@ def test_a_step_that_is_not_valid_changes_nothing():
         assert torch.equal(gaussians.parameters()[name], parameter)
 
 
-def test_rows_that_are_not_finite_are_counted():
+def test_nonfinite_rows_are_counted():
     gaussians, adam, gradient = optimizer_and_gradient()
-    gradient.splats.packed.grad[3, 0] = math.nan  # of the position in the image
+    gradient.splats.packed.grad[3, 0] = math.nan  # ∂L/∂mean2d
     adam.step(gaussians, gradient, 1)
     assert gradient.nonfinite_rows[0] == 1
     assert gradient.nonfinite_rows[3] == 0  # the opacity does not depend on it
 
 
-def test_zero_forgets_one_parameter_alone():
+def test_zero_clears_the_moments_of_one_parameter():
     gaussians = some_gaussians()
     adam = Adam(gaussians, LearningRates(), schedule=Schedule(10), extent=1.0)
     for moments in (adam.exp_avg, adam.exp_avg_sq):
@@ -178,19 +165,22 @@ def test_zero_forgets_one_parameter_alone():
         assert zeroed == {"opacity_logits"}
 
 
-def test_state_comes_back_as_copies():
+def test_state_is_loaded_as_copies():
     adam = Adam(some_gaussians(5), LearningRates(), schedule=Schedule(10), extent=1.0)
     adam.exp_avg["means"].normal_()
+    adam.exp_avg_sq["quats"].normal_()
     state = adam.state_tensors()
     assert len(state) == 12
     other = Adam(some_gaussians(3), LearningRates(), schedule=Schedule(10), extent=1.0)
     other.load_state(state)
-    assert torch.equal(other.exp_avg["means"], adam.exp_avg["means"])
+    for name in adam.exp_avg:
+        assert torch.equal(other.exp_avg[name], adam.exp_avg[name])
+        assert torch.equal(other.exp_avg_sq[name], adam.exp_avg_sq[name])
     adam.exp_avg["means"].zero_()
     assert other.exp_avg["means"].any()
 
 
-def test_rates_reach_the_end_of_the_training():
+def test_rates_follow_the_schedule_of_the_training():
     adam = Adam(
         some_gaussians(), LearningRates(means_steps=1.0), schedule=Schedule(200), extent=5.0
     )

@@ -1,4 +1,4 @@
-"""MCMC density control: eq. 8 and 9 of Kheradmand et al. 2024, and the cap."""
+"""MCMC density control: eq. 8 and 9 of Kheradmand et al. 2024, regularisers, growth and limit."""
 
 import math
 
@@ -8,8 +8,14 @@ import torch
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import rotation_from_quat
-from snowsplat.training.density.mcmc import McmcDensity, McmcDensityControl, shared_opacity
+from snowsplat.scene.geometry import morton_order, rotation_from_quat
+from snowsplat.training.density.mcmc import (
+    NOISE_SHARPNESS,
+    McmcDensity,
+    McmcDensityControl,
+    shared_opacity,
+)
+from snowsplat.training.finite import Diverged
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule
@@ -60,21 +66,21 @@ def test_equation_9_as_the_paper_writes_it(opacity, copies):
     assert float(shrink) == pytest.approx(opacity / total, rel=1e-6)
 
 
-def test_alone_nothing_changes():
+def test_a_single_copy_is_unchanged():
     opacities = torch.tensor([0.1, 0.5, 0.99])
     new, shrink = shared_opacity(opacities, torch.ones(3, dtype=torch.int64))
     torch.testing.assert_close(new, opacities)
     torch.testing.assert_close(shrink, torch.ones(3))
 
 
-def test_opaque_ones_and_crowds_stay_finite():
+def test_opaque_gaussians_and_many_copies_stay_finite():
     new, shrink = shared_opacity(torch.tensor([1.0, 1.0, 1e-6]), torch.tensor([51, 1000, 1000]))
     assert ((new > 0) & (new < 1)).all()
     assert ((shrink > 0) & (shrink <= 1.001)).all()
 
 
-def test_a_ray_through_the_copies_keeps_its_integral():
-    """What eq. 9 stands for: along a line, N copies together block as much as the one did."""
+def test_copies_keep_the_integral_along_a_line():
+    """The derivation of eq. 9: along a line, N copies together absorb as much as the original."""
     opacity, copies = 0.8, 4
     new, shrink = shared_opacity(
         torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies])
@@ -90,7 +96,7 @@ def test_dead_are_relocated_onto_live_ones():
     gaussians = some_gaussians(200)
     dead = torch.arange(200) % 4 == 0
     gaussians.opacity_logits[dead] = -6.0
-    gaussians.means[0] = torch.nan  # broken counts as dead
+    gaussians.means[0] = torch.nan  # dead ones may be non-finite
     control, adam = set_up(gaussians, max_gaussians=200)
     total = gaussians.opacities[~dead].double()
     refined = control._relocate(gaussians, adam)
@@ -101,7 +107,7 @@ def test_dead_are_relocated_onto_live_ones():
     assert refined.means.isfinite().all()
     copies = torch.bincount(sources, minlength=200)
     assert (copies[~dead] >= 1).all()
-    # Together, those in one place are as opaque as the one that was there; with no momentum.
+    # The copies in one place are together as opaque as the original, and have no momentum.
     together = 1 - (1 - refined.opacities.double()) ** copies[sources]
     torch.testing.assert_close(together, total.new_full((200,), 0.5), atol=1e-5, rtol=0)
     crowded = copies[sources] > 1
@@ -122,7 +128,7 @@ def test_sources_are_drawn_by_opacity():
     assert share == pytest.approx(0.9, abs=0.04)
 
 
-def test_growth_and_the_hard_cap():
+def test_growth_up_to_the_limit():
     gaussians = some_gaussians(100)
     control, adam = set_up(gaussians, max_gaussians=112, densify_from=0)
     counts = []
@@ -134,7 +140,7 @@ def test_growth_and_the_hard_cap():
 
 
 def test_noise_follows_the_covariance_of_transparent_gaussians():
-    """Eq. 8: deviations of Σ η are those of Σ: R diag(s²) Rᵀ applied to unit noise."""
+    """Eq. 8: the noise is Σ η = R diag(s²) Rᵀ η, with standard normal η."""
     n = 4000
     one = some_gaussians(1, opacity=0.001)
     one.log_scales[0] = torch.tensor([0.3, 0.1, 0.02]).log()
@@ -146,11 +152,91 @@ def test_noise_follows_the_covariance_of_transparent_gaussians():
     control, _ = set_up(gaussians)
     control._add_noise(gaussians, rate=1e-5)
     moved = gaussians.means - before.means
-    assert not moved[n].any()  # the opaque one stays
+    assert not moved[n].any()  # the opaque one has no noise
     gate = 1 / (1 + math.exp(-100 * (0.005 - 0.001)))
     rotation = rotation_from_quat(one.quats[0])
     deviations = ((moved[:n] @ rotation) / (1e-5 * 5e5 * gate)).std(dim=0)
     torch.testing.assert_close(deviations, one.scales[0] ** 2, rtol=0.06, atol=0)
+
+
+def test_the_constants_of_the_paper():
+    settings = McmcDensity()
+    assert (settings.densify_from, settings.densify_until) == (500, 25_000)
+    assert settings.densify_interval == 100
+    assert settings.growth == 0.05
+    assert settings.prune_opacity == 0.005
+    assert settings.noise == 5e5
+    assert (settings.opacity_regularizer, settings.scale_regularizer) == (0.01, 0.01)
+    assert NOISE_SHARPNESS == 100.0
+
+
+@pytest.mark.parametrize(
+    ("step", "relocates"),
+    [(400, False), (500, True), (550, False), (25_000, True), (25_100, False)],
+)
+def test_when_gaussians_are_relocated(step, relocates):
+    gaussians = some_gaussians(100)
+    control, adam = set_up(gaussians)
+    assert len(control.after_step(step, gaussians, adam)) == (105 if relocates else 100)
+
+
+def test_noise_is_scaled_by_the_learning_rate_of_the_means():
+    """At every step, also those that do not relocate."""
+    moved = []
+    for step in (7, 30_000):
+        gaussians = some_gaussians(50, opacity=0.001)
+        before = gaussians.means.clone()
+        control, adam = set_up(gaussians)
+        control.after_step(step, gaussians, adam)
+        moved.append((gaussians.means - before) / adam.rates_at(step)["means"])
+    assert moved[0].any()
+    torch.testing.assert_close(moved[0], moved[1], rtol=1e-3, atol=0.5)
+
+
+def test_gaussians_at_the_opacity_limit_are_dead():
+    """With only dead ones there is nothing to relocate to."""
+    gaussians = some_gaussians(10)
+    gaussians.opacity_logits[:] = 0.0
+    control, adam = set_up(gaussians, prune_opacity=0.5)
+    assert control._relocate(gaussians, adam) is gaussians
+    gaussians.opacity_logits[3] = 1e-3
+    refined = control._relocate(gaussians, adam)
+    assert refined.sh_dc[:, 0, 0].tolist() == [3.0] * 10
+
+
+def test_nothing_to_relocate_and_no_growth_changes_nothing():
+    gaussians = some_gaussians(10)
+    control, adam = set_up(gaussians, max_gaussians=10)
+    assert control._relocate(gaussians, adam) is gaussians
+    assert (adam.exp_avg["means"] == 1).all()
+
+
+def test_the_opacity_of_copies_stays_above_the_limit():
+    """Else they would be dead at once: o_new of eq. 9 is below it for many copies."""
+    gaussians = some_gaussians(60)
+    gaussians.opacity_logits[1:] = -9.0
+    gaussians.opacity_logits[0] = math.log(0.02 / 0.98)
+    control, adam = set_up(gaussians, max_gaussians=60)
+    refined = control._relocate(gaussians, adam)
+    assert float(refined.opacities.min()) == pytest.approx(0.005, rel=1e-4)
+
+
+def test_relocated_rows_are_in_morton_order():
+    gaussians = some_gaussians(500)
+    control, adam = set_up(gaussians)
+    adam.exp_avg["means"].copy_(gaussians.means)
+    refined = control._relocate(gaussians, adam)
+    assert torch.equal(morton_order(refined.means), torch.arange(len(refined)))
+    untouched = adam.exp_avg["means"].any(dim=1)
+    assert torch.equal(adam.exp_avg["means"][untouched], refined.means[untouched])
+
+
+def test_nonfinite_parameters_stop_a_relocation():
+    gaussians = some_gaussians(10)
+    gaussians.quats[4, 1] = math.inf
+    control, adam = set_up(gaussians)
+    with pytest.raises(Diverged, match=r"^step 500: non-finite Gaussians, quats \(1 row\)"):
+        control.after_step(500, gaussians, adam)
 
 
 def test_regularisers_are_the_gradients_of_mean_opacity_and_scale():
@@ -168,6 +254,6 @@ def test_regularisers_are_the_gradients_of_mean_opacity_and_scale():
     torch.testing.assert_close(gaussians.log_scales.grad, leaves.log_scales.grad)
 
 
-def test_without_a_cap_there_is_a_clear_error():
+def test_a_limit_is_required():
     with pytest.raises(SettingError, match="^max_gaussians: MCMC density control needs a limit"):
         set_up(some_gaussians(3), max_gaussians=0)
