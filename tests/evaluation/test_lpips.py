@@ -1,4 +1,4 @@
-"""LPIPS against the same networks put together anew, layer by layer, with random weights."""
+"""LPIPS compared with the same networks built from torch.nn layers, with random weights."""
 
 import pytest
 import torch
@@ -11,11 +11,18 @@ from snowsplat.util.errors import UserError
 
 def alexnet_features() -> nn.Sequential:
     return nn.Sequential(
-        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
-        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
-        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
-        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
-        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
+        nn.Conv2d(3, 64, 11, stride=4, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(384, 256, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(256, 256, 3, padding=1),
+        nn.ReLU(),
     )
 
 
@@ -38,7 +45,7 @@ BACKBONES = {
 
 @pytest.fixture(params=["alex", "vgg"])
 def network(request):
-    """Name, backbone, taps, heads, and the state under torchvision's names."""
+    """Name, backbone, taps, heads, and the state with torchvision's names."""
     build, taps, channels = BACKBONES[request.param]
     torch.manual_seed(0)
     features = build()
@@ -68,7 +75,7 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
     return a, (a + 0.2 * torch.randn(41, 53, 3, generator=generator)).clamp(0, 1)
 
 
-def test_equals_the_networks_layer_by_layer(network, tmp_path):
+def test_equals_the_reference_networks(network, tmp_path):
     name, features, taps, heads, state = network
     save(state, tmp_path / "weights.safetensors")
     lpips = Lpips.load(tmp_path / "weights.safetensors")
@@ -81,7 +88,7 @@ def test_equals_the_networks_layer_by_layer(network, tmp_path):
     assert lpips(a, a) == 0.0
 
 
-def test_the_names_of_the_lpips_package(network, tmp_path):
+def test_names_of_the_lpips_package_are_read(network, tmp_path):
     _, _, _, _, state = network
     save(state, tmp_path / "plain")
     renamed = {
@@ -96,7 +103,7 @@ def test_the_names_of_the_lpips_package(network, tmp_path):
     assert plain(a, b) == ours(a, b)
 
 
-def test_files_that_will_not_do(network, tmp_path):
+def test_invalid_files_are_rejected(network, tmp_path):
     name, _, _, _, state = network
     path = tmp_path / "weights.safetensors"
     with pytest.raises(UserError, match="cannot be read"):

@@ -1,4 +1,4 @@
-"""Figures of images: analytic answers, the twin, and views on disk."""
+"""Image metrics: analytic values, the reference implementation, and views on disk."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from snowsplat.scene.gaussians import Gaussians
 
 
 def planar(height: int, width: int, seed: int) -> torch.Tensor:
-    """(H, W, 3) as all images of the program are: planes in memory."""
+    """A random image (H, W, 3), planar in memory like all images of the program."""
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(3, height, width, generator=generator).permute(1, 2, 0)
 
@@ -34,54 +34,57 @@ def test_psnr_of_known_errors():
     assert psnr(one_pixel, target, torch.zeros_like(mask)) == math.inf
 
 
-def test_compare_clamps_and_agrees_with_the_twin():
+def test_compare_clamps_and_agrees_with_the_reference():
     image, target = 1.5 * planar(23, 31, 0) - 0.25, planar(23, 31, 1)
-    figures = compare(image, target, name="a")
+    metrics = compare(image, target, name="a")
     clamped = image.clamp(0, 1)
-    assert figures.psnr == pytest.approx(
+    assert metrics.psnr == pytest.approx(
         -10 * math.log10(float((clamped - target).square().mean()))
     )
-    assert figures.ssim == pytest.approx(
+    assert metrics.ssim == pytest.approx(
         float(reference.ssim(clamped.double(), target.double())), rel=1e-4
     )
-    assert figures.lpips is None
-    assert figures.name == "a"
+    assert metrics.lpips is None
+    assert metrics.name == "a"
 
 
-def test_what_a_mask_hides_does_not_count():
+def test_masked_pixels_are_ignored():
     target = planar(20, 20, 2)
     image = target.clone()
     image[:, :10] = 0.0
     mask = torch.ones(20, 20, dtype=torch.bool)
     assert compare(image, target, mask).psnr < 20
     mask[:, :10] = False
-    figures = compare(image, target, mask)
-    assert figures.psnr == math.inf
-    assert figures.ssim == pytest.approx(1.0)
+    metrics = compare(image, target, mask)
+    assert metrics.psnr == math.inf
+    assert metrics.ssim == pytest.approx(1.0)
 
 
-def test_views_against_the_bare_background(tmp_path):
-    """No Gaussian in sight: the render is the background, so every figure is known."""
+def test_views_without_visible_gaussians(tmp_path):
+    """The rendered image is the background, so all metrics are known."""
     pose = torch.eye(3, 4, dtype=torch.float64)
     views = []
     for i, color in enumerate([(255, 255, 255), (204, 204, 204), (102, 102, 102)]):
         Image.new("RGB", (16, 12), color).save(tmp_path / f"{i}.png")
         camera = Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)
         views.append(View(f"{i}.png", camera, ImageSource(tmp_path / f"{i}.png", 16, 12)))
-    # One that is transparent shows the background itself.
+    # A transparent photo shows the background.
     Image.new("RGBA", (16, 12), (9, 9, 9, 0)).save(tmp_path / "3.png")
     views.append(View("3.png", views[0].camera, ImageSource(tmp_path / "3.png", 16, 12)))
     behind = Gaussians(
-        torch.tensor([[0.0, 0.0, -5.0]]),
-        *(torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1)),
-        *(torch.zeros(1, 1, 3), torch.zeros(1, 0, 3)),
+        means=torch.tensor([[0.0, 0.0, -5.0]]),
+        log_scales=torch.zeros(1, 3),
+        quats=torch.ones(1, 4),
+        opacity_logits=torch.zeros(1),
+        sh_dc=torch.zeros(1, 1, 3),
+        sh_rest=torch.zeros(1, 0, 3),
     )
     seen = []
     evaluation = evaluate_views(behind, views, background=(1.0, 1.0, 1.0), on_view=seen.append)
-    figures = [view.psnr for view in evaluation.views]
-    assert figures[0] == figures[3] == math.inf
-    assert figures[1] == pytest.approx(-20 * math.log10(0.2), abs=1e-4)
-    assert figures[2] == pytest.approx(-20 * math.log10(0.6), abs=1e-4)
+    metrics = [view.psnr for view in evaluation.views]
+    assert metrics[0] == metrics[3] == math.inf
+    assert metrics[1] == pytest.approx(-20 * math.log10(0.2), abs=1e-4)
+    assert metrics[2] == pytest.approx(-20 * math.log10(0.6), abs=1e-4)
     assert seen == evaluation.views
     assert [view.name for view in seen] == ["0.png", "1.png", "2.png", "3.png"]
 

@@ -1,20 +1,21 @@
 """LPIPS, a learned perceptual distance of images (Zhang, Isola, Efros, Shechtman, Wang, CVPR 2018).
 
-It needs the weights of a network trained on photographs and of its five linear heads, which are not
-ours to carry: the user names a file that holds both. Such a file is made, wherever the `lpips`
-package is installed, with
+It needs the weights of a network that was trained on photos, and of its five linear heads. Their
+licence does not allow us to include them, so the user provides a file with both. Where the `lpips`
+package is installed, this code writes such a file:
 
     weights = {name: w.clone() for name, w in lpips.LPIPS(net="vgg").state_dict().items()}
     safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
 
-Not what `torch.save` writes: that is a program (a pickle), and even where torch holds it to a few
-harmless functions, a hundred bytes of it can ask for any amount of memory. Names in the file:
+Files of `torch.save` are not read: they are pickles, that is, programs. Even if torch restricts
+them to a few harmless functions, a pickle of a hundred bytes can allocate any amount of memory.
+Names in the file:
 
     features.N.weight, features.N.bias    backbone, N as in torchvision's AlexNet or VGG16
     (or net.sliceM.N.weight, …)           the same, as the `lpips` package spells it
     linK.model.1.weight                   (1, C, 1, 1), K = 0..4, the heads
 
-Which of the two backbones it is shows in the shape of its first layer.
+The shape of the first layer tells AlexNet from VGG16.
 """
 
 from __future__ import annotations
@@ -31,27 +32,28 @@ from torch.nn import functional as F
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import check_header
 
-# The mean and deviation of ImageNet's colours, as [-1, 1] has them: ((0.485, …) − 0.5) · 2 and
-# 0.229 · 2.
+# Mean and standard deviation of ImageNet's colours, converted from the range [0, 1] to [-1, 1]:
+# (0.485 − 0.5) · 2 … and 0.229 · 2 …
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-_MIN_SIDE = 32  # of an image, in pixels: the backbones halve it several times
+# Smallest width and height of an image in pixels. The backbones halve it several times.
+_MIN_SIDE = 32
 _BACKBONE = re.compile(r"(?:.*\.)?(?:features|net\.slice\d)\.(\d{1,3})\.(weight|bias)")
 _HEAD = re.compile(r"lin(\d)\.model\.1\.weight")
 
 
 @dataclass(frozen=True)
 class _Conv:
-    """A convolution and its ReLU. ``tap``: its output is one of the five that are compared."""
+    """A convolution, followed by a ReLU."""
 
-    index: int  # N of the weights' names
-    inputs: int
-    outputs: int
-    size: int = 3
+    index: int  # N in the names of the weights
+    inputs: int  # channels
+    outputs: int  # channels
+    size: int = 3  # side of the kernel
     stride: int = 1
     padding: int = 1
-    tap: bool = False
-    pool: int = 0  # side of the max pooling (stride 2) before it; 0 is none
+    tap: bool = False  # the output is one of the five that are compared
+    pool: int = 0  # kernel size of the max pooling (stride 2) before this layer; 0: no pooling
 
 
 _ALEX = (
@@ -80,23 +82,20 @@ _VGG16 = (
 
 @dataclass(frozen=True)
 class Lpips:
-    """A backbone and its heads; call it with two images.
+    """A backbone and its heads. Call it with two images to get their distance."""
 
-    ``name`` is "alex" or "vgg": figures of different backbones do not compare.
-    """
-
-    name: str
+    name: str  # "alex" or "vgg"; distances of different backbones are not comparable
     layers: tuple[_Conv, ...]
     weights: dict[int, tuple[Tensor, Tensor]]  # by layer index: weight, bias
-    heads: tuple[Tensor, ...]  # five of (C,)
+    heads: tuple[Tensor, ...]  # five tensors (C,)
 
     @staticmethod
     def load(path: Path | str) -> Lpips:
-        """Read a weights file, see the head of this module.
+        """Read a weights file; its format is described at the top of this module.
 
         Raises:
-            UserError: absent, not a weights file, or with layers that are missing or of another
-            shape.
+            UserError: the file is missing or has another format, or a layer is missing or has
+                another shape.
         """
         state = _read_state(Path(path))
         backbone: dict[tuple[int, str], Tensor] = {}
@@ -136,13 +135,13 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, image: Tensor, target: Tensor) -> float:
-        """The distance of two images (H, W, 3) in 0..1: 0 for the same image, larger is further.
+        """The distance of two images (H, W, 3) in 0..1. It is 0 for equal images.
 
-        d = Σ_k mean over pixels of Σ_c w_kc (f̂_kc(image) − f̂_kc(target))², f̂ the features of tap
-        k with unit length over the channels.
+        d = Σ_k mean over pixels of Σ_c w_kc (f̂_kc(image) − f̂_kc(target))², where f̂_k are the
+        features of tap k, normalised to unit length over the channels c.
 
         Raises:
-            UserError: images smaller than 32 pixels.
+            UserError: an image is smaller than 32 pixels.
         """
         if min(image.shape[:2]) < _MIN_SIDE:
             raise UserError(f"LPIPS needs images of at least {_MIN_SIDE} pixels a side")
@@ -154,7 +153,7 @@ class Lpips:
         return distance
 
     def _features(self, image: Tensor) -> list[Tensor]:
-        """The five taps, each (C, h, w)."""
+        """The outputs of the five taps, each (C, h, w)."""
         x = image.to(torch.float32).permute(2, 0, 1)[None] * 2.0 - 1.0
         shift, scale = (torch.tensor(values).reshape(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
         x = (x - shift) / scale
@@ -181,5 +180,5 @@ def _read_state(path: Path) -> dict[str, Tensor]:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (safetensors.SafetensorError, ValueError, KeyError):
         raise UserError(
-            f"{path}: not a safetensors file; see snowsplat evaluate --help for how one is made"
+            f"{path}: not a safetensors file; see snowsplat evaluate --help for how to make one"
         ) from None

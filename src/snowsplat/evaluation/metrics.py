@@ -1,10 +1,9 @@
-"""How near the renders of views are to their photos: PSNR, SSIM and, on request, LPIPS.
+"""Comparing rendered views with their photos: PSNR, SSIM and, on request, LPIPS.
 
-The image rendered is clamped to 0..1, as a screen or a file would, and is NOT rounded to 8 bits;
-the photo has 8 bits as it is. (The reference's `metrics.py` reads both back from PNG files, so its
-renders are rounded: that costs less than 0.01 dB at 30 dB.) Transparent photos are composed
-over the background colour. Where a view has a mask, PSNR is of the pixels that count, and the
-others are taken as perfect by SSIM and LPIPS.
+The rendered image is clamped to 0..1, as for a screen or a file, but it is not rounded to 8 bits.
+(The paper's evaluation reads rendered images from 8-bit PNG files. At 30 dB this rounding costs
+less than 0.01 dB.) Transparent photos are composited over the background colour. If a view has a
+mask, PSNR ignores the masked pixels. SSIM and LPIPS treat them as equal in both images.
 """
 
 from __future__ import annotations
@@ -24,44 +23,52 @@ from snowsplat.evaluation.lpips import Lpips
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 
-# Each photo is used once: memory for so many is enough to decode ahead.
+# Number of photos for which there is memory. Each photo is used once, so the memory only serves to
+# decode ahead.
 _PHOTOS_AHEAD = 6
 
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """Figures of one view."""
+    """The metrics of one view."""
 
     name: str
-    psnr: float  # dB; infinite for the same image
+    psnr: float  # dB; infinite for equal images
     ssim: float
     lpips: float | None = None
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Figures of every view and their means (of the figures, as is usual, not of the errors)."""
+    """The metrics of all views and their means.
+
+    As usual, the mean PSNR is the mean of the PSNR values, not the PSNR of the mean error. Means of
+    no views are NaN.
+    """
 
     views: list[ViewMetrics]
 
     @property
     def psnr(self) -> float:
+        """Mean PSNR in dB."""
         return _mean([view.psnr for view in self.views])
 
     @property
     def ssim(self) -> float:
+        """Mean SSIM."""
         return _mean([view.ssim for view in self.views])
 
     @property
     def lpips(self) -> float | None:
+        """Mean LPIPS; None if it was not measured."""
         values = [view.lpips for view in self.views if view.lpips is not None]
         return _mean(values) if values else None
 
     def as_json(self) -> dict[str, Any]:
-        """For `metrics.json`: the means, and each view by name."""
+        """The content of `metrics.json`: the means, and the metrics of each view by name."""
         views = {view.name: asdict(view) for view in self.views}
-        for figures in views.values():
-            del figures["name"]
+        for metrics in views.values():
+            del metrics["name"]
         return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips, "views": views}
 
 
@@ -70,9 +77,14 @@ def _mean(values: list[float]) -> float:
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, 10 log10(1 / mean squared error); images (H, W, C) in 0..1.
+    """Peak signal-to-noise ratio in dB: 10 log10(1 / mean squared error).
 
-    ``mask`` (H, W) bool: the pixels that count. Infinite if there is no error (or no pixel).
+    It is infinite if there is no error or no pixel.
+
+    Args:
+        image: (H, W, C) in 0..1.
+        target: (H, W, C) in 0..1.
+        mask: (H, W) bool, False for pixels to ignore.
     """
     error = (image.to(torch.float64) - target.to(torch.float64)).square()
     if mask is not None:
@@ -89,7 +101,15 @@ def compare(
     lpips: Lpips | None = None,
     name: str = "",
 ) -> ViewMetrics:
-    """Figures of one rendered image (H, W, 3), any range, against a photo in 0..1."""
+    """The metrics of one rendered image.
+
+    Args:
+        image: (H, W, 3), any range; it is clamped to 0..1.
+        target: the photo, (H, W, 3) in 0..1.
+        mask: (H, W) bool, False for pixels to ignore.
+        lpips: measures LPIPS too, unless None.
+        name: the name of the view.
+    """
     image = image.clamp(0.0, 1.0)
     if mask is not None:
         image = torch.where(mask[:, :, None], image, target)
@@ -114,13 +134,15 @@ def evaluate_views(
     """Render each view and compare it with its photo.
 
     Args:
-        background: colour in 0..1 behind the Gaussians and behind transparent photos.
-        lpips: measure LPIPS too.
-        sh_degree: render with this degree of the colours only.
+        gaussians: the scene.
+        views: the views, in the order of the result.
+        background: RGB in 0..1 behind the Gaussians and behind transparent photos.
+        lpips: measures LPIPS too, unless None.
+        sh_degree: the largest SH degree to render; None uses all.
         on_view: called after each view.
 
     Raises:
-        UserError: a photo is absent or damaged.
+        UserError: a photo is missing or damaged.
     """
     device = gaussians.means.device
     color = torch.tensor(background, dtype=torch.float32, device=device)
