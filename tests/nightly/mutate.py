@@ -43,7 +43,7 @@ ROOMS = {
     "optim": Room(
         ("training/optim.py", "training/lr_schedule.py"), ("tests/training/test_optim.py",)
     ),
-    "config": Room(("training/config.py",), ("tests/training/test_recipes.py",)),
+    "config": Room(("training/config.py",), ("tests/training/test_config.py",)),
     "losses": Room(("training/losses.py",), ("tests/training/test_losses.py",)),
     "trainer": Room(
         tuple(f"training/{name}.py" for name in ("trainer", "step_runner", "view_gradient")),
