@@ -122,8 +122,8 @@ def test_a_file_that_is_there(run, refused, ply, tmp_path):
 def test_mistakes(refused, ply, tmp_path):
     out = tmp_path / "b.ply"
     assert "name of a file" in refused("convert", ply)
-    assert "no format that I write" in refused("convert", ply, tmp_path / "b.obj")
-    assert "no format that I write" in refused("convert", ply, tmp_path / "b.ksplat")
+    assert "selects no scene format" in refused("convert", ply, tmp_path / "b.obj")
+    assert "selects no scene format" in refused("convert", ply, tmp_path / "b.ksplat")
     assert "cannot be read" in refused("convert", tmp_path / "absent.ply", out)
     assert "is a folder" in refused("convert", ply, tmp_path)
     assert "0 to 3" in refused("convert", ply, out, "--sh-degree", 4)
@@ -166,9 +166,9 @@ def test_info_tells_versions_and_what_it_does_not_know(run, refused, ply, tmp_pa
     assert run("convert", ply, tmp_path / "b.sog").code == 0
     assert json.loads(run("info", tmp_path / "b.sog", "--json").out)["format"] == "SOG 2"
     assert run("convert", ply, tmp_path / "b.html").code == 0
-    assert "written here, not read" in refused("info", tmp_path / "b.html")
+    assert "can be written, not read" in refused("info", tmp_path / "b.html")
     (tmp_path / "scene.obj").write_text("v 0 0 0")
-    assert "not a scene file I know" in refused("info", tmp_path / "scene.obj")
+    assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
 
 
 def test_a_page_of_a_training_starts_where_a_photo_was_taken(run, ply, tmp_path):

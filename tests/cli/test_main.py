@@ -8,10 +8,15 @@ import sys
 import warnings
 
 import pytest
+import torch
 
 from snowsplat.cli import main as module
+from snowsplat.formats import write_gaussians
+from snowsplat.scene.gaussians import Gaussians
 
 from .conftest import ENVIRONMENT
+
+UNIT_BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 
 
 @pytest.fixture
@@ -59,6 +64,13 @@ def test_help_and_mistakes_import_neither_torch_nor_other_subcommands():
     assert imported_by("info") == {"snowsplat.cli.info"}
     for arguments in (["train", "--help"], ["train", "--iterations", "many"], ["train"]):
         assert not {"torch", "numpy", "PIL"} & imported_by(*arguments)
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".ply", ".spz", ".sog", ".glb", ".splat"])
+def test_info_describes_a_scene_without_torch(tmp_path, suffix):
+    path = tmp_path / f"scene{suffix}"
+    write_gaussians(path, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator(), sh_degree=1))
+    assert "torch" not in imported_by("info", path)
 
 
 def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):
@@ -118,8 +130,6 @@ def test_errors_of_the_system_and_warnings_are_one_line(replace_run, run):
 
 
 def test_no_memory_is_one_line_that_says_what_helps(replace_run, refused):
-    import torch
-
     def torch_allocates(self):
         torch.empty(2**60, dtype=torch.uint8)
 

@@ -166,7 +166,7 @@ def test_info(run, refused, trained, dataset, tmp_path):
     assert "no such file" in refused("info", tmp_path / "absent.ply")
     assert "no camera poses" in refused("info", tmp_path)
     (tmp_path / "scene.obj").write_text("v 0 0 0")
-    assert "not a scene file I know" in refused("info", tmp_path / "scene.obj")
+    assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
 
 
 def test_info_says_nothing_that_a_terminal_obeys(run, refused, tmp_path):

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
+from snowsplat.formats.gaussian_arrays import GaussianArrays
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import Header, pack, unpack
 from snowsplat.scene.gaussians import Gaussians
@@ -77,7 +78,7 @@ def test_any_format(tmp_path, make_scene, survives, format, changes):
 def test_spz_without_the_checksum_of_gzip(tmp_path, make_scene, survives, changes):
     path, seed = tmp_path / "a.spz", tmp_path / "seed.spz"
     if not seed.exists():
-        write_spz(seed, make_scene(20, 2))
+        write_spz(seed, GaussianArrays.from_gaussians(make_scene(20, 2)))
         contents = unpack(seed, seed.read_bytes())
         head = struct.pack("<4sIIBBBB", b"NGSP", 3, 20, 2, contents.header.fractional_bits, 0, 0)
         seed.write_bytes(head + b"".join(contents.columns))
@@ -90,7 +91,7 @@ def test_spz_without_the_checksum_of_gzip(tmp_path, make_scene, survives, change
 def test_spz_of_version_4(tmp_path, make_scene, survives, changes):
     path, seed = tmp_path / "a.spz", tmp_path / "seed.spz"
     if not seed.exists():
-        write_spz(seed, make_scene(20, 1), 4)
+        write_spz(seed, GaussianArrays.from_gaussians(make_scene(20, 1)), 4)
     path.write_bytes(damaged(seed.read_bytes(), changes))
     survives(path)
 
@@ -115,7 +116,7 @@ def test_what_is_not_finite_is_left_out_with_a_note(tmp_path, make_scene, caplog
     scene.sh_rest[7, 1, 1] = torch.inf
     path = tmp_path / f"a{format.suffixes[0]}"
     write_gaussians(path, scene)
-    assert "5 Gaussians are not finite; left out" in caplog.text
+    assert "5 Gaussians are not finite; skipped" in caplog.text
     read = read_gaussians(path)
     assert len(read) == 15
     assert bool(read.finite_rows().all())
@@ -141,7 +142,7 @@ def test_a_bomb_takes_no_memory(tmp_path):
     assert path.stat().st_size < 100_000
     tracemalloc.start()
     try:
-        with pytest.raises(UserError, match="made to do harm"):
+        with pytest.raises(UserError, match="malicious"):
             read_gaussians(path)
         assert tracemalloc.get_traced_memory()[1] < 5_000_000
     finally:

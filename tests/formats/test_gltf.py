@@ -283,7 +283,7 @@ def test_linear_colours_are_told(tmp_path, seed, caplog):
     document, binary, _ = seed
     extension(document)["colorSpace"] = "lin_rec709_display"
     assert len(read_gaussians(assemble(tmp_path / "a.glb", document, binary))) == 30
-    assert "taken as sRGB" in caplog.text
+    assert "read as sRGB" in caplog.text
 
 
 @settings(

@@ -148,7 +148,7 @@ def test_other_versions_and_short_files_are_told(tmp_path, make_scene, one_line)
 
 
 def test_it_is_not_written(tmp_path, make_scene):
-    with pytest.raises(UserError, match="no format that I write"):
+    with pytest.raises(UserError, match="selects no scene format"):
         write_gaussians(tmp_path / "a.ksplat", make_scene(1))
 
 

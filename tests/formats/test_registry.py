@@ -64,10 +64,10 @@ def test_what_is_not_known_is_told_in_one_line(tmp_path):
     with pytest.raises(UserError, match=r"cannot be read \(No such file"):
         read_gaussians(path)
     path.write_bytes(b"v 1 2 3\n")
-    with pytest.raises(UserError, match=r"not a scene file I know; I read .*\.ply") as error:
+    with pytest.raises(UserError, match=r"not a known scene file; supported are .*\.ply") as error:
         read_gaussians(path)
     assert "\n" not in str(error.value)
-    with pytest.raises(UserError, match=r"says no format that I write; end it in .*\.ply"):
+    with pytest.raises(UserError, match=r"selects no scene format; use one of .*\.ply"):
         write_gaussians(path, one())
     with pytest.raises(UserError, match="cannot be read"):
         read_gaussians(tmp_path)
@@ -76,5 +76,5 @@ def test_what_is_not_known_is_told_in_one_line(tmp_path):
 def test_names_alone_never_raise_on_folders_with_dots(tmp_path):
     folder = tmp_path / "v1.ply"
     folder.mkdir()
-    with pytest.raises(UserError, match="says no format"):
+    with pytest.raises(UserError, match="selects no scene format"):
         format_for_writing(Path(folder) / "scene")

@@ -82,4 +82,4 @@ def test_fixtures(shared):
 
 def test_what_is_no_splat_file_is_told(tmp_path, one_line):
     (tmp_path / "a.splat").write_bytes(bytes(33))
-    assert "33 bytes are not a .splat file" in one_line(tmp_path / "a.splat")
+    assert "33 bytes are not a multiple of 32" in one_line(tmp_path / "a.splat")

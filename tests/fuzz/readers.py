@@ -31,7 +31,7 @@ from snowsplat.data.decode import ImageSource, load_image, load_mask
 from snowsplat.data.decode import read_header as read_image_header
 from snowsplat.data.points_ply import read_points, write_points
 from snowsplat.evaluation.lpips import Lpips
-from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats import GaussianArrays, read_gaussians, write_gaussians
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import unpack
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
@@ -126,7 +126,7 @@ def _scene(file: str, degree: int = 1, **more: Any) -> Reader:
 def _spz(name: str, version: int, pack: Callable[[bytes], bytes] | None = None) -> Reader:
     def make(folder: Path) -> None:
         path = folder / "a.spz"
-        write_spz(path, make_scene(30, 2), max(version, 3))
+        write_spz(path, GaussianArrays.from_gaussians(make_scene(30, 2)), max(version, 3))
         if version == 4:
             return
         columns = unpack(path, path.read_bytes()).columns

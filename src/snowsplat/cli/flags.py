@@ -1,4 +1,4 @@
-"""How a field of a verb's dataclass becomes a flag."""
+"""How a field of a subcommand's dataclass becomes a flag."""
 
 from typing import Any
 
@@ -6,9 +6,10 @@ import tyro
 
 
 def flag(metavar: str, *aliases: str, default: str = "") -> Any:
-    """A flag shown as ``metavar``, with other spellings, and words for what it is by default.
+    """A flag with the placeholder ``metavar`` for its value.
 
-    tyro takes hyphens and underscores alike in every spelling.
+    ``aliases`` are other spellings, and ``default`` describes the default in the help text. tyro
+    accepts hyphens and underscores alike in every spelling.
     """
     hint = f"(default: {default})" if default else ""
     return tyro.conf.arg(metavar=metavar, aliases=list(aliases) or None, help_behavior_hint=hint)

@@ -1,11 +1,11 @@
-"""`snowsplat info`: what is in a file or folder."""
+"""`snowsplat info`: the contents of a file or folder."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import tyro
 
@@ -16,8 +16,9 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import printable, read_json
 
 if TYPE_CHECKING:
-    from snowsplat.formats import Format
-    from snowsplat.scene.gaussians import Gaussians
+    import numpy as np
+
+    from snowsplat.formats import Format, GaussianArrays
 
 _PERCENTILES = (1, 50, 99)
 
@@ -34,13 +35,14 @@ class Info:
       snowsplat info garden
     """
 
-    path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT|DATASET")] = None
+    # Not `Path | None`, to check which tyro would import another package for a tenth of a second.
+    path: Annotated[Optional[Path], tyro.conf.Positional, flag("FILE|OUT|DATASET")] = None  # noqa: UP045
     """A scene of any format, a checkpoint, the output folder of `train` or `make`, or a dataset."""
     json: Annotated[bool, switch()] = False
     """Print JSON, for programs."""
 
     def run(self) -> int:
-        """Gives the exit code, 0."""
+        """Print the description; returns the exit code 0."""
         if self.path is None:
             raise UserError("info needs a file or folder; name one")
         facts = describe(self.path)
@@ -52,22 +54,24 @@ class Info:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Names and values, JSON values all of them, of whatever ``path`` is.
+    """Names and values, all of them JSON values, that describe the file or folder ``path``.
+
+    A scene file or an output folder is described without importing torch.
 
     Raises:
-        UserError: absent, damaged, or nothing that we know.
+        UserError: ``path`` is missing, damaged, or of an unknown kind.
     """
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
     if path.suffix == ".safetensors":
         return _checkpoint(path)
     if path.is_file():
-        from snowsplat.formats import format_for_reading
+        from snowsplat.pipeline.convert import format_for_reading
 
         try:
             format = format_for_reading(path)
         except UserError as error:
-            if path.suffix != ".json":  # which a dataset may be
+            if path.suffix != ".json":  # it may be a dataset
                 raise UserError(f"{error}, checkpoints and datasets") from None
         else:
             return _scene(path, format)
@@ -78,7 +82,8 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _scene(path: Path, format: Format) -> dict[str, Any]:
-    from snowsplat.formats import ply, read_gaussians
+    from snowsplat.formats import ply
+    from snowsplat.pipeline.convert import read_arrays
     from snowsplat.util.ply import open_table
 
     facts: dict[str, Any] = {"file": str(path), "bytes": path.stat().st_size}
@@ -90,41 +95,39 @@ def _scene(path: Path, format: Format) -> dict[str, Any]:
 
             xyz, _ = read_points(path)
             return {"kind": "point cloud", **facts, "points": len(xyz), **_bounds(xyz)}
-    gaussians = read_gaussians(path)
-    facts |= {"format": _format_and_version(path, format), "lost_in_it": format.loses}
+    gaussians = read_arrays(path)
+    version = f" {format.version(path)}" if format.version else ""
+    facts |= {"format": format.name + version, "lost_in_it": format.loses}
     return {"kind": "scene", **facts, **_gaussians(gaussians)}
 
 
-def _format_and_version(path: Path, format: Format) -> str:
-    from snowsplat.formats import sog
-    from snowsplat.formats.spz_container import unpack
+def _gaussians(gaussians: GaussianArrays) -> dict[str, Any]:
+    import numpy as np
 
-    if format.name == "SPZ":
-        return f"SPZ {unpack(path, path.read_bytes()).header.version}"
-    if format.name == "SOG":
-        return f"SOG {sog.version_of(path)}"
-    return "glTF 2, KHR_gaussian_splatting" if format.name == "glTF" else format.name
+    from snowsplat.scene.sh_constants import SH_REST_COUNTS
 
-
-def _gaussians(gaussians: Gaussians) -> dict[str, Any]:
-    good = gaussians.select(gaussians.finite_rows())
+    finite = gaussians.select(gaussians.finite_rows())
+    count, finite_count = len(gaussians.means), len(finite.means)
     facts: dict[str, Any] = {
-        "gaussians": len(gaussians),
-        "sh_degree": gaussians.sh_degree,
-        "bytes_in_memory": sum(t.nbytes for t in gaussians.parameters().values()),
+        "gaussians": count,
+        "sh_degree": SH_REST_COUNTS.index(gaussians.sh_rest.shape[1]),
+        "bytes_in_memory": sum(array.nbytes for array in gaussians),
     }
-    if len(good) < len(gaussians):
-        facts["not_finite"] = len(gaussians) - len(good)
-    if len(good):
-        facts |= _bounds(good.means.numpy())
-        facts["opacity"] = _percentiles(good.opacities)
-        facts["scale"] = _percentiles(good.scales.amax(1))
-        ratio = good.scales.amax(1) / good.scales.amin(1).clamp_min(1e-12)
+    if finite_count < count:
+        facts["not_finite"] = count - finite_count
+    if finite_count:
+        with np.errstate(over="ignore"):
+            opacities = 1 / (1 + np.exp(-finite.opacity_logits))
+            scales = np.exp(finite.log_scales)
+        facts |= _bounds(finite.means)
+        facts["opacity"] = _percentiles(opacities)
+        facts["scale"] = _percentiles(scales.max(1))
+        ratio = scales.max(1) / scales.min(1).clip(1e-12)
         facts["longest_to_shortest_axis"] = _percentiles(ratio)
     return facts
 
 
-def _bounds(xyz: Any) -> dict[str, Any]:
+def _bounds(xyz: np.ndarray) -> dict[str, Any]:
     import numpy as np
 
     xyz = xyz[np.isfinite(xyz).all(1)]
@@ -137,10 +140,10 @@ def _bounds(xyz: Any) -> dict[str, Any]:
     }
 
 
-def _percentiles(values: Any) -> dict[str, float]:
+def _percentiles(values: np.ndarray) -> dict[str, float]:
     import numpy as np
 
-    found = np.percentile(values.numpy(), _PERCENTILES)
+    found = np.percentile(values, _PERCENTILES)
     return {f"p{p}": float(f"{v:.4g}") for p, v in zip(_PERCENTILES, found, strict=True)}
 
 
@@ -174,8 +177,8 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
     metrics = folder.path / "metrics.json"
     if metrics.is_file():
         try:
-            figures = read_json(metrics)
-            facts["metrics"] = {name: v for name, v in figures.items() if name != "views"}
+            values = read_json(metrics)
+            facts["metrics"] = {name: v for name, v in values.items() if name != "views"}
         except (ValueError, AttributeError):
             raise UserError(f"{metrics}: damaged; it is not JSON") from None
     if facts["scenes"]:

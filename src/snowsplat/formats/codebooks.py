@@ -1,25 +1,33 @@
-"""Many values told by few: levels for single numbers, a palette for rows of them (k-means).
+"""Vector quantisation by k-means: 256 levels for single numbers, a palette for rows of numbers.
 
-Deterministic: the same values give the same books.
+The results are deterministic.
 """
 
 import numpy as np
 
 LEVELS = 256
-_ITERATIONS = 40  # of the levels; they move by less than float32 resolves long before
-_QUANTILES, _CAPPINGS, _MOST_LEVELS = 4096, 20, 4
+_ITERATIONS = 40  # for the levels, which converge to float32 precision long before
+_QUANTILES = 4096
+# The share of one interval between quantiles is limited to this many levels, by so many iterations.
+_MOST_LEVELS = 4
+_CAPPINGS = 20
 _PALETTE_ITERATIONS = 6
-_SAMPLE = 32_768  # rows that the coarse clusters are found with
-_CHUNK = 1 << 22  # distances held at a time
+_SAMPLE = 32_768  # rows from which the coarse clusters are computed
+_CHUNK = 1 << 22  # distances in memory at a time
 
 
 def levels_for(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """256 ascending levels (float32) for finite ``values`` of any shape, and the nearest's index.
+    """Quantise finite ``values`` of any shape to 256 levels.
 
-    Lloyd's iteration, each step exact: over sorted values a level's cell is an interval, and its
-    mean comes from running sums. It starts from levels as dense as the cube root of the density of
-    the values, which is where many levels are best (Panter and Dite, 1951): between quantiles,
-    where the density is one over their distance d, that gives a share of d · d^(-1/3).
+    Returns the levels (256,) float32, ascending, and the uint8 index of the nearest level for each
+    value.
+
+    This is Lloyd's iteration with exact steps: over sorted values, the cell of a level is an
+    interval, and its mean follows from cumulative sums. The initial density of levels is the cube
+    root of the density of values, which is optimal for many levels (P. Panter and W. Dite,
+    "Quantization distortion in pulse-count modulation with nonuniform spacing of levels", 1951).
+    Between two quantiles at distance d the density of values is proportional to 1/d, so this
+    interval receives a share of levels proportional to d · d^(-1/3).
     """
     if not values.size:
         return np.zeros(LEVELS, np.float32), np.zeros(values.shape, np.uint8)
@@ -27,7 +35,7 @@ def levels_for(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
     quantiles = ordered[np.linspace(0, len(ordered) - 1, _QUANTILES).round().astype(int)]
     share = np.diff(quantiles) ** (2 / 3)
-    for _ in range(_CAPPINGS):  # few values, far away, want few levels, not many
+    for _ in range(_CAPPINGS):  # a few distant values need few levels
         share = np.minimum(share, share.sum() * _MOST_LEVELS / LEVELS)
     total = np.concatenate([[0.0], np.cumsum(share)])
     levels = np.interp((np.arange(LEVELS) + 0.5) / LEVELS * total[-1], total, quantiles)
@@ -39,17 +47,19 @@ def levels_for(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         moved = np.where(inside > 0, means, levels)
         if np.array_equal(moved, levels):
             break
-        levels = np.maximum.accumulate(moved)  # rounding of the sums may swap neighbours
+        levels = np.maximum.accumulate(moved)  # rounded sums may swap neighbours
     levels = levels.astype(np.float32)
     middles = (levels[1:].astype(np.float64) + levels[:-1]) / 2
     return levels, np.searchsorted(middles, values).astype(np.uint8)
 
 
 def palette_for(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most ``count`` rows (P, D) that stand for ``rows`` (N, D) float32, and which one, (N,).
+    """Quantise ``rows`` (N, D) float32 to a palette of at most ``count`` entries.
 
-    In two levels, since N · P distances would take minutes: about √count clusters of the rows, each
-    with palette entries of its own, as many as its share of the rows.
+    Returns the palette (P, D) and the index (N,) of the entry of each row.
+
+    The clustering has two levels, since N · P distances would take minutes: first about √count
+    clusters of the rows, then palette entries for each cluster in proportion to its size.
     """
     if len(rows) <= count:
         return rows, np.arange(len(rows))
@@ -59,8 +69,8 @@ def palette_for(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     cluster = _nearest(rows, coarse)
     order = np.argsort(cluster, kind="stable")
     ends = np.cumsum(np.bincount(cluster, minlength=len(coarse)))
-    # One for each cluster; of the others shares by rounding the running total, so that all of them
-    # add up to the count.
+    # Each cluster has at least one entry. The remaining ones are divided by rounding a cumulative
+    # sum, so that the total is exactly the count.
     sizes = np.diff(ends, prepend=0)
     spare = count - np.count_nonzero(sizes)
     shares = (sizes > 0) + np.diff(np.rint(ends / len(rows) * spare).astype(int), prepend=0)
@@ -68,15 +78,15 @@ def palette_for(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     for members, share in zip(np.split(order, ends[:-1]), shares, strict=True):
         if not len(members):
             continue
-        own = _kmeans(rows[members], share, random)
-        labels[members] = start + _nearest(rows[members], own)
-        parts.append(own)
-        start += len(own)
+        entries = _kmeans(rows[members], share, random)
+        labels[members] = start + _nearest(rows[members], entries)
+        parts.append(entries)
+        start += len(entries)
     return np.concatenate(parts), labels
 
 
 def _kmeans(rows: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
-    """At most ``count`` centres (C, D) of the rows, by a few steps of Lloyd's iteration."""
+    """At most ``count`` cluster centres (C, D) of the rows, by a few Lloyd iterations."""
     if len(rows) <= count:
         return rows
     centres = rows[_choose(random, len(rows), count)]
@@ -91,7 +101,7 @@ def _kmeans(rows: np.ndarray, count: int, random: np.random.Generator) -> np.nda
 
 
 def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """(N,) index of the nearest centre, in pieces of bounded memory."""
+    """(N,) index of the nearest centre, computed in chunks to bound the memory."""
     half_norms = 0.5 * (centres * centres).sum(1)
     label = np.empty(len(rows), np.int64)
     step = max(1, _CHUNK // len(centres))

@@ -1,6 +1,6 @@
-"""The GLB container: glTF's JSON and its one binary chunk, accessors as arrays, nodes as matrices.
+"""The GLB container: the JSON and the binary chunk, accessors as arrays, nodes as matrices.
 
-Nothing is allocated from a number in the JSON before the binary chunk is known to hold it.
+Sizes in the JSON are compared with the size of the binary chunk before memory is allocated.
 Specification: Khronos, glTF 2.0, sections 3.6 and 4.4.
 """
 
@@ -13,16 +13,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import torch
 
-from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.safe_json import parse_json
 
 MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
-_MOST_NODES = 1 << 16  # each takes some microseconds
+_MOST_NODES = 1 << 16  # each takes several microseconds
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-#: numpy's name, and by what a normalised value is divided.
+#: The NumPy type, and the divisor of normalised values.
 _COMPONENTS = {
     5120: ("<i1", 127.0),
     5121: ("<u1", 255.0),
@@ -33,43 +31,43 @@ _COMPONENTS = {
 
 
 class Damaged(Exception):
-    """What is wrong with the file; its name is put before it further up."""
+    """The file is damaged or not supported. The caller adds the path to the message."""
 
 
 def unpack(data: bytes) -> tuple[dict[str, Any], memoryview]:
-    """The JSON and the binary chunk (empty where there is none).
+    """The JSON and the binary chunk (empty if there is none).
 
     Raises:
-        Damaged: not GLB 2, chunks beyond its end, or no JSON.
+        Damaged: not GLB 2, chunks that exceed the file, or invalid JSON.
     """
     if len(data) < 20 or data[:4] != MAGIC:
         raise Damaged("not a GLB file")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise Damaged(f"of GLB version {version}, of which I know 2")
+        raise Damaged(f"GLB version {version}; supported is 2")
     if length > len(data):
-        raise Damaged("the file ends before its contents")
+        raise Damaged("the file is truncated")
     chunks, position = [], 12
     while position + 8 <= length:
         size, kind = struct.unpack_from("<II", data, position)
         if size > length - position - 8:
-            raise Damaged("has a chunk that is larger than the file")
+            raise Damaged("one of its chunks exceeds the file")
         chunks.append((kind, memoryview(data)[position + 8 : position + 8 + size]))
         position += 8 + size
     if not chunks or chunks[0][0] != _JSON:
-        raise Damaged("does not begin with a chunk of JSON")
+        raise Damaged("its first chunk is not JSON")
     try:
         document = parse_json(bytes(chunks[0][1]))
     except ValueError:
         document = None
     if not isinstance(document, dict):
-        raise Damaged("its JSON is none")
+        raise Damaged("its JSON is invalid")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _BIN else memoryview(b"")
     return document, binary
 
 
 def pack(document: dict[str, Any], arrays: list[np.ndarray]) -> Iterator[bytes]:
-    """The pieces of a GLB file; the arrays, each of a multiple of 4 bytes, are its binary chunk."""
+    """The parts of a GLB file; ``arrays``, each a multiple of 4 bytes, are its binary chunk."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     size = sum(array.nbytes for array in arrays)
@@ -82,42 +80,42 @@ def pack(document: dict[str, Any], arrays: list[np.ndarray]) -> Iterator[bytes]:
 
 
 def accessor(document: dict[str, Any], binary: memoryview, index: int, kind: str) -> np.ndarray:
-    """(count, width) float32 of an accessor of ``kind`` (SCALAR, VEC3, VEC4).
+    """The (count, width) float32 values of an accessor of type ``kind`` (SCALAR, VEC3, VEC4).
 
     Raises:
-        Damaged: of another kind, or not all of it in the binary chunk.
-        KeyError, IndexError, TypeError, ValueError: JSON that is no glTF.
+        Damaged: another type, or data outside of the binary chunk.
+        KeyError, IndexError, TypeError, ValueError: the JSON is not valid glTF.
     """
     entry = _item(document, "accessors", index)
     if entry["type"] != kind or entry["componentType"] not in _COMPONENTS or "sparse" in entry:
-        raise Damaged(f"its accessor {index} is not one of splats")
+        raise Damaged(f"its accessor {index} does not have the type of its attribute")
     code, divisor = _COMPONENTS[entry["componentType"]]
     dtype, width, count = np.dtype(code), _WIDTHS[kind], _natural(entry["count"])
     view = _item(document, "bufferViews", entry["bufferView"])
     buffer = _item(document, "buffers", view["buffer"])
     if view["buffer"] != 0 or "uri" in buffer:
-        raise Damaged("keeps its splats in another file")
+        raise Damaged("its data is in another file, which is not supported")
     row = width * dtype.itemsize
     stride = _natural(view.get("byteStride", row))
     start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])
     offset = _natural(entry.get("byteOffset", 0))
     needed = offset + (stride * (count - 1) + row if count else 0)
     if stride < row or needed > length or start + length > len(binary):
-        raise Damaged(f"its accessor {index} is not all in the file")
+        raise Damaged(f"its accessor {index} exceeds the file")
     values = np.ndarray((count, width), dtype, binary, start + offset, (stride, dtype.itemsize))
     result = values.astype(np.float32)
     if entry.get("normalized", False) and divisor != 1.0:
-        # The most negative integer stands for -1 as well.
+        # The most negative integer also means -1.
         result = np.maximum(result / np.float32(divisor), np.float32(-1))
     return result
 
 
 def meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Each mesh of the scene with its ``world_from_mesh`` (4, 4), once a node that shows it.
+    """The meshes of the scene, each with ``world_from_mesh`` (4, 4) float64, for every node.
 
     Raises:
-        Damaged: nodes that are no trees.
-        KeyError, IndexError, TypeError, ValueError: JSON that is no glTF.
+        Damaged: the nodes do not form trees.
+        KeyError, IndexError, TypeError, ValueError: the JSON is not valid glTF.
     """
     nodes = document.get("nodes", [])
     if document.get("scenes"):
@@ -126,7 +124,7 @@ def meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarra
         inner = {child for node in nodes for child in node.get("children", [])}
         roots = [index for index in range(len(nodes)) if index not in inner]
     if max(len(nodes), len(roots)) > _MOST_NODES:
-        raise Damaged("has more nodes than I take")
+        raise Damaged(f"it has more than {_MOST_NODES} nodes")
     waiting = deque((root, np.eye(4)) for root in roots)
     visits = 0
     while waiting:
@@ -134,9 +132,9 @@ def meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarra
         node = _item(document, "nodes", index)
         visits += 1
         children = node.get("children", [])
-        # In a tree no node is met twice.
+        # In a tree no node is visited twice.
         if visits + len(waiting) + len(children) > len(nodes):
-            raise Damaged("its nodes are no trees")
+            raise Damaged("its nodes do not form trees")
         world_from_node = world_from_parent @ _local(node)
         if "mesh" in node:
             yield _item(document, "meshes", node["mesh"]), world_from_node
@@ -149,6 +147,10 @@ def _local(node: dict[str, Any]) -> np.ndarray:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # column-major
     local = np.eye(4)
     if "rotation" in node:
+        import torch  # such nodes are rare; `snowsplat info` does not wait for torch otherwise
+
+        from snowsplat.scene.geometry import rotation_from_quat
+
         x, y, z, w = (float(v) for v in node["rotation"])
         local[:3, :3] = rotation_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64)).numpy()
     local[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
@@ -157,7 +159,7 @@ def _local(node: dict[str, Any]) -> np.ndarray:
 
 
 def _item(document: dict[str, Any], name: str, index: Any) -> dict[str, Any]:
-    """An entry of one of the top-level arrays."""
+    """An element of one of the top-level arrays."""
     entry = document[name][_natural(index)]
     if not isinstance(entry, dict):
         raise TypeError

@@ -1,22 +1,23 @@
-"""`.ksplat` files, of the viewer GaussianSplats3D: read only.
+"""`.ksplat` files of the viewer GaussianSplats3D; they can be read, not written.
 
-A header of 4096 bytes, then one of 1024 bytes for each section, then the sections. A section holds
-the sizes of its partly filled buckets, the centres of all its buckets, and its Gaussians, bucket by
-bucket, each in one row:
+The file has a header of 4096 bytes, a header of 1024 bytes per section, and the sections. A section
+contains the sizes of its partly filled buckets, the centres of all its buckets, and one row per
+Gaussian, bucket by bucket:
 
 ==================  ===========================  ==========================================
 level 0             levels 1 and 2
 ==================  ===========================  ==========================================
-3 floats            3 uint16                     position; as uint16 from its bucket's centre
+3 floats            3 uint16                     position; uint16 relative to the bucket centre
 3 floats            3 halves                     standard deviations, not their logarithms
 4 floats            4 halves                     quaternion wxyz
 4 bytes             4 bytes                      RGBA
-0, 9, 24 floats     as many halves (1), bytes    SH degree by degree; in each all coefficients of
-                    between two bounds (2)       red, then of green, then of blue
+0, 9, 24 floats     as many halves (level 1)     SH degree by degree; in each all coefficients of
+                    or bytes between two bounds  red, then of green, then of blue
+                    (level 2)
 ==================  ===========================  ==========================================
 
-Little-endian, in the frame of the PLY files. Facts from github.com/mkkellogg/GaussianSplats3D
-(MIT).
+Values are little-endian, in the frame of the PLY files. The layout was taken from
+github.com/mkkellogg/GaussianSplats3D (MIT).
 """
 
 import struct
@@ -26,20 +27,21 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
-from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 
 _HEADER_BYTES = 4096
 _SECTION_HEADER_BYTES = 1024
 _DEFAULT_RANGE = 32767
 _DEFAULT_SH_BOUND = 1.5
-#: Types of position, scales and rotation, and SH by compression level.
+#: Types of position, of scales and rotation, and of SH, by compression level.
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 
 
 @dataclass
 class _Section:
-    """One section: how many Gaussians and buckets, and where they lie in the file."""
+    """One section: its numbers of Gaussians and buckets, and their offsets in the file."""
 
     count: int
     sh_degree: int
@@ -48,19 +50,19 @@ class _Section:
     full_buckets: int
     partial_buckets: int
     bucket_count: int
-    step: float  # of a uint16 position, world units
-    offset: int  # that stands for 0 in a uint16 position
+    step: float  # of a uint16 position, in world units
+    offset: int  # the uint16 that means a position of 0
     start: int
     centers_start: int
     rows_start: int
 
 
-@np.errstate(all="ignore")  # what is not finite is left out at the end
-def read_ksplat(path: Path | str) -> Gaussians:
-    """Read a scene of SH degree 0 to 3; sections of a lower degree than others get zeros.
+@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
+def read_ksplat(path: Path | str) -> GaussianArrays:
+    """Read a scene of SH degree 0 to 3; the SH of sections of a lower degree are padded with zeros.
 
     Raises:
-        UserError: not readable, of another version, damaged, or too short.
+        UserError: the file cannot be read, has another version, or is damaged or truncated.
     """
     path = Path(path)
     data = packing.read_file(path)
@@ -69,22 +71,22 @@ def read_ksplat(path: Path | str) -> Gaussians:
     major, minor, section_count, level = struct.unpack_from("<BB2xI12xH", data)
     if major != 0 or minor < 1 or level >= len(_TYPES):
         raise UserError(
-            f"{path}: not a .ksplat file that I know (version {major}.{minor}, compression level "
-            f"{level}; I read 0.1 with levels 0 to 2)"
+            f"{path}: not a supported .ksplat file (version {major}.{minor}, compression level "
+            f"{level}); supported is version 0.1 with levels 0 to 2"
         )
     low, high = struct.unpack_from("<2f", data, 36)
     bounds = low or -_DEFAULT_SH_BOUND, high or _DEFAULT_SH_BOUND
     sections = _sections(path, data, section_count, level)
     degree = max((section.sh_degree for section in sections), default=0)
-    # One empty part first, so that a file without sections is an empty scene.
-    parts = [_no_gaussians(SH_REST_COUNTS[degree])]
+    # Starts with an empty part, so that a file without sections is an empty scene.
+    parts = [GaussianArrays.empty(SH_REST_COUNTS[degree])]
     for section in sections:
         parts.append(_unpack(path, data, section, level, bounds, SH_REST_COUNTS[degree]))
-    return packing.to_gaussians(path, *(np.concatenate(c) for c in zip(*parts, strict=True)))
+    return decoded(path, *(np.concatenate(c) for c in zip(*parts, strict=True)))
 
 
 def _sections(path: Path, data: bytes, section_count: int, level: int) -> list[_Section]:
-    """The sections, all of which lie within the file."""
+    """The sections; each of them is completely inside the file."""
     start = _HEADER_BYTES + section_count * _SECTION_HEADER_BYTES
     if start > len(data):
         raise _damaged(path)
@@ -141,7 +143,7 @@ def _unpack(
     level: int,
     bounds: tuple[float, float],
     rest: int,
-) -> packing.Arrays:
+) -> GaussianArrays:
     rows = np.frombuffer(data, section.row, section.count, section.rows_start)
     means: np.ndarray = rows["means"].astype(np.float32)
     if level:
@@ -159,7 +161,7 @@ def _unpack(
         band = harmonics[:, 3 * first : 3 * (first + width)].reshape(-1, 3, width)
         sh_rest[:, first : first + width] = band.transpose(0, 2, 1)
         first += width
-    return (
+    return GaussianArrays(
         means,
         packing.log_scales(rows["scales"].astype(np.float32)),
         packing.unit_quats(rows["quats"].astype(np.float32)),
@@ -170,7 +172,7 @@ def _unpack(
 
 
 def _buckets(path: Path, data: bytes, section: _Section) -> np.ndarray:
-    """Which bucket each Gaussian of a section is in: the full ones first, then the others."""
+    """(N,) index of the bucket of each Gaussian: the full buckets come first, then the others."""
     sizes = np.frombuffer(data, "<u4", section.partial_buckets, section.start)
     ends = section.bucket_size * np.arange(1, section.full_buckets + 1, dtype=np.int64)
     filled = section.bucket_size * section.full_buckets
@@ -180,15 +182,7 @@ def _buckets(path: Path, data: bytes, section: _Section) -> np.ndarray:
     return np.searchsorted(ends, np.arange(section.count), side="right")
 
 
-def _no_gaussians(rest: int) -> packing.Arrays:
-    shapes = ((0, 3), (0, 3), (0, 4), (0,), (0, 1, 3), (0, rest, 3))
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = (
-        np.zeros(shape, np.float32) for shape in shapes
-    )
-    return means, log_scales, quats, opacity_logits, sh_dc, sh_rest
-
-
 def _damaged(path: Path) -> UserError:
     return UserError(
-        f"{path}: a damaged .ksplat file: its sections do not fit its size; copy or export it again"
+        f"{path}: damaged .ksplat file: its sections do not match its size; copy or export it again"
     )

@@ -1,34 +1,27 @@
-"""What the compact formats share: the file as bytes, parameters as bytes.
+"""Conversions that the compact formats share: opacity and colour as bytes, rotations in few bits.
 
-They hold opacity and colour in bytes and rotations in a few, and none of them can hold what is not
-finite. Arrays here are numpy, float32 where nothing else is said, one row a Gaussian, in the order
-and with the meaning of `Gaussians.parameters`.
+Arrays are NumPy, float32 unless stated otherwise, one row per Gaussian, with the meaning of the
+fields of `GaussianArrays`.
 """
 
-import logging
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from snowsplat.scene.gaussians import SH_C0, Gaussians
+from snowsplat.formats.gaussian_arrays import GaussianArrays, skip_nonfinite
+from snowsplat.scene.sh_constants import SH_C0
 from snowsplat.util.errors import UserError
 
-logger = logging.getLogger(__name__)
-
-#: means, log_scales, quats, opacity_logits, sh_dc, sh_rest.
-Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-#: Gaussians that a file of any size may hold.
+#: A file of any size may declare this many Gaussians.
 ALWAYS_ALLOWED = 1 << 16
-_FLAT = 1e-12  # instead of a standard deviation of 0, which has no logarithm
+_SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no logarithm
 
 
 def read_file(path: Path) -> bytes:
-    """The whole file.
+    """The content of the file.
 
     Raises:
-        UserError: not readable.
+        UserError: the file cannot be read.
     """
     try:
         return path.read_bytes()
@@ -37,54 +30,44 @@ def read_file(path: Path) -> bytes:
 
 
 def check_count(path: Path, count: int, file_size: int) -> None:
-    """Hold what a packed file promises against its size, before memory is taken for it.
+    """Compare the number of Gaussians that a compressed file declares with its size in bytes.
 
-    Real scenes take five bytes a Gaussian or more in any format; of equal ones a few bytes can be
-    millions, and each takes up to 600 bytes of memory while it is read.
+    This is done before memory is allocated. Real scenes take five bytes per Gaussian or more in
+    any format. A few bytes can declare millions of equal Gaussians, and each takes up to 600 bytes
+    of memory while the file is read.
 
     Raises:
-        UserError: more Gaussians than bytes, and than a file may always have.
+        UserError: more Gaussians than bytes, and more than `ALWAYS_ALLOWED`.
     """
     if count > max(ALWAYS_ALLOWED, file_size):
         raise UserError(
-            f"{path}: a file of {file_size} bytes that promises {count} Gaussians; it is damaged "
-            "or made to do harm"
+            f"{path}: a file of {file_size} bytes declares {count} Gaussians; "
+            "it is damaged or malicious"
         )
 
 
-def to_arrays(path: Path, gaussians: Gaussians) -> Arrays:
-    """The parameters to be written to ``path``; rows that are not finite left out with a warning.
+def packable(path: Path, gaussians: GaussianArrays) -> GaussianArrays:
+    """The Gaussians that a compact format can store, with unit quaternions.
 
-    Quaternions are of unit length; the zero quaternion is the identity.
+    No compact format can store non-finite values: those Gaussians are skipped, with a warning that
+    names ``path``. The zero quaternion becomes the identity.
     """
-    kept = _finite(path, gaussians.detach().to("cpu", torch.float32))
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = (
-        tensor.numpy() for tensor in kept.parameters().values()
-    )
-    return means, log_scales, unit_quats(quats), opacity_logits, sh_dc, sh_rest
+    finite = skip_nonfinite(path, gaussians)
+    return finite._replace(quats=unit_quats(finite.quats))
 
 
-def to_gaussians(path: Path, *arrays: np.ndarray) -> Gaussians:
-    """The six arrays read from ``path``; rows that are not finite left out with a warning."""
-    tensors = (torch.from_numpy(np.array(array, np.float32)) for array in arrays)
-    return _finite(path, Gaussians(*tensors))
+def spatial_order(means: np.ndarray) -> np.ndarray:
+    """(N,) the permutation that sorts ``means`` (N, 3) along a Morton curve."""
+    import torch  # only writers need it
 
+    from snowsplat.scene.geometry import morton_order
 
-def _finite(path: Path, gaussians: Gaussians) -> Gaussians:
-    # Nearly always all of them are, which the sums say much faster.
-    if all(bool(tensor.sum().isfinite()) for tensor in gaussians.parameters().values()):
-        return gaussians
-    finite = gaussians.finite_rows()
-    count = int((~finite).sum())
-    if not count:
-        return gaussians
-    logger.warning("%s: %d Gaussians are not finite; left out", path, count)
-    return gaussians.select(finite)
+    return morton_order(torch.from_numpy(means)).numpy()
 
 
 def unit_quats(quats: np.ndarray) -> np.ndarray:
-    """Quaternions (N, 4) at unit length; the identity for those of length 0."""
-    # By the largest entry first: the squares of float32 over- and underflow.
+    """Quaternions (N, 4) scaled to unit length; those of length 0 become the identity."""
+    # Divided by the largest entry first: the squares of float32 values overflow and underflow.
     largest = np.abs(quats).max(1, keepdims=True)
     scaled = quats / np.where(largest == 0, 1, largest)
     scaled[largest[:, 0] == 0, 0] = 1
@@ -98,10 +81,10 @@ def opacity_bytes(opacity_logits: np.ndarray) -> np.ndarray:
 
 
 def opacity_logits(alpha: np.ndarray) -> np.ndarray:
-    """(N,) float32 of uint8 opacities.
+    """(N,) float32 logits of uint8 opacities.
 
-    0 and 255 have no logit: they become a quarter of a step inside, which renders the same, is
-    written back as the same byte, and can still be trained.
+    0 and 255 have no logit: they are moved by a quarter of a step towards the middle. The result
+    renders the same, is written back as the same byte, and can still be trained.
     """
     steps = np.arange(256, dtype=np.float64)
     steps[[0, 255]] = 0.25, 254.75
@@ -120,20 +103,21 @@ def color_sh(colors: np.ndarray) -> np.ndarray:
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """The nearest of 0 to 255, as uint8."""
+    """Rounded and clamped to 0 … 255, as uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def log_scales(scales: np.ndarray) -> np.ndarray:
-    """Logarithms of standard deviations; 0 and less, of a flat Gaussian, as of 1e-12."""
-    return np.log(np.where(scales <= 0, np.float32(_FLAT), scales))  # NaN stays NaN
+    """Logarithms of standard deviations; values up to 0, of flat Gaussians, count as 1e-12."""
+    return np.log(np.where(scales <= 0, np.float32(_SMALLEST_SCALE), scales))  # NaN stays NaN
 
 
 def largest_of_four(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which entry of each unit quaternion (N, 4) is largest; the three others (N, 3) in order.
+    """The "smallest three" encoding of unit quaternions (N, 4).
 
-    The sign is the one with which the largest is positive, so that the three say all: each lies
-    within ± 1/√2.
+    Returns the index (N,) of the largest entry and the three other entries (N, 3) in their order,
+    each within ±1/√2. The sign is chosen such that the largest entry is positive, so that it
+    follows from the three others.
     """
     largest = np.abs(quats).argmax(1)
     rows = np.arange(len(quats))

@@ -1,18 +1,18 @@
-"""PLY files: scenes in the reference implementation's layout.
+"""PLY files: scenes in the layout of the 3DGS reference implementation.
 
-A scene of SH degree 3 has 62 float properties a Gaussian, in this order: x y z, nx ny nz (zeros),
+A scene of SH degree 3 has 62 float properties per Gaussian, in this order: x y z, nx ny nz (zeros),
 f_dc_0..2, f_rest_0..44, opacity, scale_0..2, rot_0..3. Values are the optimised parameters, before
-their activations: opacity a logit, scale a logarithm, rot a quaternion wxyz of any length. f_rest
-is channel-major: all K coefficients of red, then of green, then of blue (`Gaussians.sh_rest` is (N,
-K, 3)). Lower degrees have fewer f_rest.
+their activations: opacity is a logit, scale a natural logarithm, rot a quaternion wxyz of any
+length. f_rest is channel-major: all K coefficients of red, then of green, then of blue (`sh_rest`
+of `GaussianArrays` is (N, K, 3)). Lower degrees have fewer f_rest properties.
 """
 
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.formats.gaussian_arrays import GaussianArrays
+from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.ply import PlyTable, header, open_table
@@ -33,28 +33,28 @@ _REQUIRED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 
 
 def is_ply(head: bytes) -> bool:
-    """Whether a file that begins so is a PLY file, of whatever."""
+    """Whether a file that begins with ``head`` is a PLY file, with any content."""
     return head.startswith((b"ply\n", b"ply\r\n"))
 
 
 def is_scene(table: PlyTable) -> bool:
-    """Whether the columns are those of Gaussians (else, at most, of a point cloud)."""
+    """Whether the table has the columns of Gaussians; if not, it may be a point cloud."""
     return all(name in table.columns for name in _REQUIRED)
 
 
-def read_gaussians(path: Path | str) -> Gaussians:
+def read_ply(path: Path | str) -> GaussianArrays:
     """Read a scene of any SH degree; properties in any order and of any type, others ignored.
 
-    Values are taken as they are: NaN and infinity, too, where the file holds them.
+    Values are not changed: NaN and infinity are read as they are.
 
     Raises:
-        UserError: absent, damaged, too short, or a PLY file of something else.
+        UserError: the file is missing, damaged, truncated, or a PLY file without Gaussians.
     """
     table = open_table(path)
     if not is_scene(table):
         missing = [name for name in _REQUIRED if name not in table.columns]
         shown = ", ".join(missing[:4]) + (", …" if len(missing) > 4 else "")
-        raise UserError(f"{path}: a PLY file, but not of 3D Gaussians: it has no {shown}")
+        raise UserError(f"{path}: a PLY file without 3D Gaussians; missing properties: {shown}")
     rest = [name for name in table.columns if name.startswith("f_rest_")]
     if (
         len(rest) % 3
@@ -62,8 +62,8 @@ def read_gaussians(path: Path | str) -> Gaussians:
         or set(rest) != set(_rest_names(len(rest) // 3))
     ):
         raise UserError(
-            f"{path}: {len(rest)} f_rest properties are no SH degree; 0, 9, 24 or 45, "
-            "numbered from 0, are possible"
+            f"{path}: {len(rest)} f_rest properties do not match an SH degree; "
+            "expected 0, 9, 24 or 45, numbered from 0"
         )
     k = len(rest) // 3
 
@@ -86,18 +86,16 @@ def read_gaussians(path: Path | str) -> Gaussians:
         for start, rows in table.rows():
             for name, target in columns:
                 target[start : start + len(rows)] = rows[name]
-    arrays = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
-    return Gaussians(*(torch.from_numpy(array) for array in arrays))
+    return GaussianArrays(means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
 
 
-def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
+def write_ply(path: Path | str, gaussians: GaussianArrays) -> None:
     """Write the layout above, binary little-endian, atomically.
 
     Raises:
-        OSError: the folder is absent or not writable, or the disk is full.
+        OSError: the folder is missing or not writable, or the disk is full.
     """
-    values = [t.detach().to("cpu", torch.float32).numpy() for t in gaussians.parameters().values()]
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = values
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = gaussians
     n, k = sh_rest.shape[:2]
     names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(k), "opacity", *_SCALES, *_QUATS]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:

@@ -1,19 +1,19 @@
-"""SOG files: every number of a scene as pixels of lossless pictures, in a zip file (`.sog`).
+"""SOG files: the parameters of a scene as pixels of lossless images, in a zip file (`.sog`).
 
-`meta.json` names the pictures and says how their bytes become numbers; the i-th pixel of each, row
-by row, belongs to the i-th Gaussian. Of version 2, which is what we write:
+`meta.json` lists the images and describes how their bytes are decoded; the i-th pixel of each, row
+by row, belongs to the i-th Gaussian. Version 2, which is the one written, has these images:
 
-- means_l, means_u: low and high bytes of 16 bits an axis, evenly between mins and maxs, of
+- means_l, means_u: low and high bytes of 16 bits per axis, evenly between mins and maxs, of
   sign(x) · log(1 + |x|);
 - scales: logarithms of the standard deviations, by a codebook of 256 levels;
-- quats: the three entries that are not the largest, ± 1/√2 in a byte each; alpha is 252 + the index
-  (wxyz) of the largest;
+- quats: the three entries that are not the largest, ±1/√2 in one byte each; alpha is 252 + the
+  index (wxyz) of the largest;
 - sh0: the constant SH coefficients by a codebook; alpha is the opacity;
-- shN_labels, shN_centroids (above SH degree 0): 16 bits which entry of a palette, and that palette:
-  64 entries a row, a pixel a coefficient, by a codebook.
+- shN_labels, shN_centroids (above SH degree 0): the 16-bit index of a palette entry, and the
+  palette: 64 entries per row, one pixel per coefficient, by a codebook.
 
-Version 1 has even steps between mins and maxs instead of codebooks. It is mostly found as a folder;
-of those, name the `meta.json`. The frame is that of the PLY files. Specification:
+Version 1 has even steps between mins and maxs instead of codebooks. It is usually a folder, of
+which the `meta.json` is opened. The frame is that of the PLY files. Specification:
 developer.playcanvas.com, "The SOG Format".
 """
 
@@ -25,37 +25,37 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
 
 from snowsplat.formats import packing
 from snowsplat.formats.bundle import Bundle, Damaged
 from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
-from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.scene.geometry import morton_order
+from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
 _PALETTE_LIMIT = 1 << 16  # labels have 16 bits
 _PALETTE_COLUMNS = 64
 _SH_LIMIT = np.float32(1e6)
-_SIDE_LIMIT = 16_383  # of a WebP picture
+_SIDE_LIMIT = 16_383  # pixels, of a WebP image
 _STEPS = np.arange(256) / 255
 
 
 def is_sog(head: bytes) -> bool:
-    """Whether a file begins as a bundle, or as the `meta.json` of a folder."""
+    """Whether a file that begins with ``head`` is a zip file or the `meta.json` of a folder."""
     return head.startswith(b"PK\x03\x04") or (
         head.lstrip().startswith(b"{") and b'"means"' in head and b'"quats"' in head
     )
 
 
-@np.errstate(all="ignore")  # what is not finite is left out at the end
-def read_sog(path: Path | str) -> Gaussians:
-    """Read a bundle, or a folder's `meta.json`, of version 1 or 2.
+@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
+def read_sog(path: Path | str) -> GaussianArrays:
+    """Read a zip file, or the `meta.json` of a folder, of version 1 or 2.
 
     Raises:
-        UserError: not readable, damaged, or larger than its bytes can account for.
+        UserError: the file cannot be read, is damaged, or declares an implausible number of
+            Gaussians.
     """
     path = Path(path)
     try:
@@ -65,18 +65,18 @@ def read_sog(path: Path | str) -> Gaussians:
             arrays = _decode(files, layout)
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
-    return packing.to_gaussians(path, *arrays)
+    return decoded(path, *arrays)
 
 
-def version_of(path: Path) -> int:
-    """The version of a file that `read_sog` reads."""
+def sog_version(path: Path) -> str:
+    """The version of a file that `read_sog` accepts."""
     with Bundle(path) as files:
-        return 2 if files.meta().get("version") == 2 else 1
+        return "2" if files.meta().get("version") == 2 else "1"
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """`meta.json` of either version: every byte is looked up in a table."""
+    """`meta.json` of either version; the tables decode the bytes of the images."""
 
     count: int
     files: dict[str, str]
@@ -92,11 +92,11 @@ def _layout(meta: dict[str, Any]) -> _Layout:
     try:
         first = "version" not in meta or meta["version"] == 1
         if not first and meta["version"] != 2:
-            raise Damaged(f"of SOG version {str(meta['version'])[:20]}, of which I know 1 and 2")
+            raise Damaged(f"SOG version {str(meta['version'])[:20]}; supported are 1 and 2")
         means, scales, sh0, rest = meta["means"], meta["scales"], meta["sh0"], meta.get("shN")
         count = means["shape"][0] if first else meta["count"]
         if not isinstance(count, int) or count < 0:
-            raise Damaged("has a meta.json whose count is no number")
+            raise Damaged("its meta.json has no valid count")
         files = dict(zip(("means_l", "means_u"), means["files"], strict=True))
         files |= {"scales": scales["files"][0], "quats": meta["quats"]["files"][0]}
         files |= {"sh0": sh0["files"][0]}
@@ -113,7 +113,7 @@ def _layout(meta: dict[str, Any]) -> _Layout:
             rest_table = None if rest is None else _codes(rest)[:, 0]
         low, high = _numbers(means["mins"], 3), _numbers(means["maxs"], 3)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
-        raise Damaged("has a meta.json that is not that of a SOG scene") from None
+        raise Damaged("its meta.json is not that of a SOG scene") from None
     return _Layout(count, files, low, high, *tables, rest_table)
 
 
@@ -125,27 +125,28 @@ def _numbers(values: Any, count: int) -> np.ndarray:
 
 
 def _even(entry: dict[str, Any], channels: int) -> np.ndarray:
-    """(256, channels): even steps between mins and maxs."""
+    """(256, channels) even steps between mins and maxs."""
     low, high = _numbers(entry["mins"], channels), _numbers(entry["maxs"], channels)
     return low + (high - low) * _STEPS[:, None]
 
 
 def _codes(entry: dict[str, Any]) -> np.ndarray:
-    """(256, 3): a codebook, the same for each channel. Entries that it lacks are not finite."""
+    """(256, 3) a codebook, the same for each channel; missing entries are NaN."""
     book = np.full(LEVELS, np.nan)
     values = np.array(entry["codebook"], np.float64)  # null becomes NaN
     book[: len(values)] = values
-    if np.isnan(book[0]):  # some writers' first level got lost; the others tell where it was
+    if np.isnan(book[0]):  # some writers omit the first level; it is extrapolated from the others
         book[0] = book[1] + (book[1] - book[-1]) / (LEVELS - 1)
     return np.repeat(book[:, None], 3, axis=1)
 
 
-def _decode(files: Bundle, layout: _Layout) -> packing.Arrays:
+def _decode(files: Bundle, layout: _Layout) -> tuple[np.ndarray, ...]:
+    """The six arrays of `GaussianArrays`, some of them float64."""
     n, channel = layout.count, np.arange(3)
 
     def pixels(name: str) -> np.ndarray:
-        # The last row is seldom full; some writers add rows.
-        return files.picture(layout.files[name], n, 4 * n + (1 << 16)).reshape(-1, 4)[:n]
+        # The last row is usually not full, and some writers add rows.
+        return files.image(layout.files[name], n, 4 * n + (1 << 16)).reshape(-1, 4)[:n]
 
     steps = pixels("means_l")[:, :3] + 256.0 * pixels("means_u")[:, :3]
     logs = layout.low + (layout.high - layout.low) * (steps / 65535)
@@ -170,25 +171,27 @@ def _decode_rest(files: Bundle, layout: _Layout, labels: np.ndarray | None) -> n
         return np.zeros((layout.count, 0, 3), np.float32)
     index = labels[:, 0] + 256 * labels[:, 1].astype(np.int64)
     used = int(index.max(initial=0)) // _PALETTE_COLUMNS + 1  # rows of the palette
-    picture = files.picture(layout.files["centroids"], 1, _PALETTE_LIMIT * SH_REST_COUNTS[-1])
-    k, over = divmod(picture.shape[1], _PALETTE_COLUMNS)  # its width tells the degree
-    if over or k not in SH_REST_COUNTS[1:] or len(picture) < used:
-        raise Damaged(f"has a palette of {picture.shape[1]}×{len(picture)} pixels; it fits none")
+    image = files.image(layout.files["centroids"], 1, _PALETTE_LIMIT * SH_REST_COUNTS[-1])
+    k, over = divmod(image.shape[1], _PALETTE_COLUMNS)  # the width determines the degree
+    if over or k not in SH_REST_COUNTS[1:] or len(image) < used:
+        raise Damaged(
+            f"its palette of {image.shape[1]}×{len(image)} pixels does not match an SH degree"
+        )
     table = layout.rest.astype(np.float32)
-    return table[picture.reshape(-1, k, 4)[index, :, :3]]
+    return table[image.reshape(-1, k, 4)[index, :, :3]]
 
 
-def write_sog(path: Path | str, gaussians: Gaussians) -> None:
-    """Write a bundle of version 2, its Gaussians in Morton order, atomically.
+def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
+    """Write a zip file of version 2 with the Gaussians in Morton order, atomically.
 
     Raises:
-        UserError: too many Gaussians for a picture.
-        OSError: the folder is absent or not writable, or the disk is full.
+        UserError: too many Gaussians for an image.
+        OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    arrays = packing.to_arrays(path, gaussians)
-    order = morton_order(torch.from_numpy(arrays[0])).numpy()
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = (array[order] for array in arrays)
+    packable = packing.packable(path, gaussians)
+    order = packing.spatial_order(packable.means)
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packable.select(order)
     n = len(means)
     if n > (_SIDE_LIMIT - 3) ** 2:
         raise UserError(f"{path}: {n} Gaussians are too many for SOG; write .ply or .spz")
@@ -199,12 +202,12 @@ def write_sog(path: Path | str, gaussians: Gaussians) -> None:
     largest, others = packing.largest_of_four(quats)
     scale_levels, scales = levels_for(log_scales)
     color_levels, colors = levels_for(sh_dc[:, 0])
-    pictures = {
-        "means_l": _picture(steps & 255),
-        "means_u": _picture(steps >> 8),
-        "quats": _picture(packing.to_bytes(255 * (others / 2**0.5 + 0.5)), 252 + largest),
-        "scales": _picture(scales),
-        "sh0": _picture(colors, packing.opacity_bytes(opacity_logits)),
+    images = {
+        "means_l": _image(steps & 255),
+        "means_u": _image(steps >> 8),
+        "quats": _image(packing.to_bytes(255 * (others / 2**0.5 + 0.5)), 252 + largest),
+        "scales": _image(scales),
+        "sh0": _image(colors, packing.opacity_bytes(opacity_logits)),
     }
     meta: dict[str, Any] = {
         "version": 2,
@@ -216,26 +219,27 @@ def write_sog(path: Path | str, gaussians: Gaussians) -> None:
         "sh0": {"codebook": color_levels.tolist(), **_named("sh0")},
     }
     if n and sh_rest.shape[1]:
-        sh_rest = np.clip(sh_rest, -_SH_LIMIT, _SH_LIMIT)  # whose squares are floats
+        sh_rest = np.clip(sh_rest, -_SH_LIMIT, _SH_LIMIT)  # so that squares fit in float32
         palette, labels = palette_for(sh_rest.reshape(n, -1), _palette_size(n))
         levels, codes = levels_for(palette)
-        pictures["shN_centroids"] = _palette_picture(codes, sh_rest.shape[1])
-        pictures["shN_labels"] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1))
+        images["shN_centroids"] = _palette_image(codes, sh_rest.shape[1])
+        images["shN_labels"] = _image(np.stack([labels & 255, labels >> 8, 0 * labels], 1))
         meta["shN"] = {
             "count": len(palette),
-            "bands": gaussians.sh_degree,
+            "bands": SH_REST_COUNTS.index(sh_rest.shape[1]),
             "codebook": levels.tolist(),
             **_named("shN_centroids", "shN_labels"),
         }
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
-        # Stored: WebP is packed already. ZipInfo has a date of its own, so equal scenes are equal.
+        # Stored, since WebP is compressed already. ZipInfo has a fixed date, so that equal scenes
+        # result in equal files.
         bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
-        for name, pixels in pictures.items():
+        for name, pixels in images.items():
             bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
 
 
 def _palette_size(count: int) -> int:
-    """Entries for so many Gaussians: as many as 16 bits tell, or one for every fourth Gaussian."""
+    """Palette entries for ``count`` Gaussians: one per four, 64 to 65,536."""
     return min(_PALETTE_LIMIT, max(64, count // 4))
 
 
@@ -243,8 +247,8 @@ def _named(*names: str) -> dict[str, list[str]]:
     return {"files": [f"{name}.webp" for name in names]}
 
 
-def _picture(rgb: np.ndarray, alpha: np.ndarray | int = 255) -> np.ndarray:
-    """(H, W, 4) uint8, about square, sides multiples of 4: a pixel a row of ``rgb`` (N, 3)."""
+def _image(rgb: np.ndarray, alpha: np.ndarray | int = 255) -> np.ndarray:
+    """(H, W, 4) uint8: one pixel per row of ``rgb`` (N, 3), about square, sides multiples of 4."""
     n = len(rgb)
     width = max(4, int(np.ceil(n**0.5 / 4)) * 4)
     height = max(4, int(np.ceil(n / width / 4)) * 4)
@@ -254,8 +258,8 @@ def _picture(rgb: np.ndarray, alpha: np.ndarray | int = 255) -> np.ndarray:
     return pixels.reshape(height, width, 4)
 
 
-def _palette_picture(codes: np.ndarray, coefficients: int) -> np.ndarray:
-    """(H, 64 K, 4) uint8 of codes (P, 3 K)."""
+def _palette_image(codes: np.ndarray, coefficients: int) -> np.ndarray:
+    """(H, 64 K, 4) uint8 of the codes (P, 3 K) of P palette entries."""
     rows = -(-len(codes) // _PALETTE_COLUMNS)
     pixels = np.zeros((rows * _PALETTE_COLUMNS, coefficients, 4), np.uint8)
     pixels[:, :, 3] = 255
@@ -265,6 +269,6 @@ def _palette_picture(codes: np.ndarray, coefficients: int) -> np.ndarray:
 
 def _webp(pixels: np.ndarray) -> bytes:
     data = io.BytesIO()
-    # exact keeps the colours of pixels whose alpha is 0.
+    # exact preserves the colours of pixels whose alpha is 0.
     Image.fromarray(pixels).save(data, format="WEBP", lossless=True, exact=True)
     return data.getvalue()

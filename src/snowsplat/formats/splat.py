@@ -1,10 +1,10 @@
-"""`.splat` files: 32 bytes a Gaussian, no header, no view-dependent colour.
+"""`.splat` files: 32 bytes per Gaussian, no header, no view-dependent colour.
 
-Of each Gaussian, in this order: position, 3 floats; standard deviations, 3 floats, not their
-logarithms; colour and opacity RGBA, a byte each; the quaternion wxyz, a byte each, as 128 + 128 q.
-Little-endian, in the frame of the PLY files. The format is that of the first web viewer of splats
-(github.com/antimatter15/splat); the Gaussians that matter most come first there, so that a viewer
-shows something while it loads.
+The row of a Gaussian has, in this order: position, 3 floats; standard deviations (not their
+logarithms), 3 floats; colour and opacity RGBA, one byte each; quaternion wxyz, one byte each, as
+128 + 128 q. Values are little-endian, in the frame of the PLY files. The format is that of the
+first web viewer for Gaussian splats (github.com/antimatter15/splat). The most important Gaussians
+come first, so that a viewer can display a preview while the file loads.
 """
 
 from pathlib import Path
@@ -12,30 +12,30 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
-from snowsplat.scene.gaussians import Gaussians
+from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-_LOG_LIMIT = 87.0  # e to more is not a float
+_LOG_LIMIT = 87.0  # the exponential of a larger number exceeds float32
 
 
-@np.errstate(all="ignore")  # what is not finite is left out at the end
-def read_splat(path: Path | str) -> Gaussians:
+@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
+def read_splat(path: Path | str) -> GaussianArrays:
     """Read a scene of SH degree 0.
 
     Raises:
-        UserError: not readable, or of a size that is no multiple of 32.
+        UserError: the file cannot be read, or its size is not a multiple of 32.
     """
     path = Path(path)
     data = packing.read_file(path)
     if len(data) % _ROW.itemsize:
         raise UserError(
-            f"{path}: {len(data)} bytes are not a .splat file, which has {_ROW.itemsize} a "
-            "Gaussian; copy or export it again"
+            f"{path}: not a .splat file: {len(data)} bytes are not a multiple of {_ROW.itemsize}; "
+            "copy or export it again"
         )
     rows = np.frombuffer(data, _ROW)
-    return packing.to_gaussians(
+    return decoded(
         path,
         rows["means"],
         packing.log_scales(rows["scales"]),
@@ -46,19 +46,19 @@ def read_splat(path: Path | str) -> Gaussians:
     )
 
 
-@np.errstate(all="ignore")  # what is too large is clamped
-def write_splat(path: Path | str, gaussians: Gaussians) -> None:
+@np.errstate(all="ignore")  # values that are too large are clamped
+def write_splat(path: Path | str, gaussians: GaussianArrays) -> None:
     """Write the layout above, the largest and most opaque Gaussians first, atomically.
 
-    View-dependent colour (``sh_rest``) has no place in this format. The order is by volume times
-    opacity, as is customary.
+    The format cannot store view-dependent colour (``sh_rest``). Gaussians are sorted by volume
+    times opacity, as is usual for this format.
 
     Raises:
-        OSError: the folder is absent or not writable, or the disk is full.
+        OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    means, log_scales, quats, opacity_logits, sh_dc, _ = packing.to_arrays(path, gaussians)
-    # log(volume · opacity): the product itself would over- and underflow.
+    means, log_scales, quats, opacity_logits, sh_dc, _ = packing.packable(path, gaussians)
+    # log(volume · opacity): the product itself would overflow and underflow.
     importance = log_scales.sum(1) - np.logaddexp(0, -opacity_logits)
     order = np.argsort(-importance, kind="stable")
     rows = np.empty(len(means), _ROW)

@@ -1,21 +1,21 @@
-"""`.spz` files, of Niantic: about 20 bytes a Gaussian and one for each SH value, then compressed.
+"""`.spz` files of Niantic: about 20 bytes per Gaussian and one per SH value, then compressed.
 
-A header; then one column after the other for all Gaussians, each row of it
+The file has a header and then the columns, each for all Gaussians:
 
 =========  =======  ======================================================================
-position   9 bytes  3 signed 24-bit numbers with ``fractional_bits`` after the point;
+position   9 bytes  3 signed 24-bit fixed-point numbers with ``fractional_bits``;
                     version 1: 3 halves
 opacity    1        255 · opacity
-colour     3        127.5 + 38.25 · sh_dc, which leaves room outside of 0 to 1
+colour     3        127.5 + 38.25 · sh_dc, which also represents colours outside of 0 to 1
 scales     3        16 · (log scale + 10)
-rotation   4        2 bits: which of x, y, z, w is largest; the others 10 bits each: a sign and
-                    nine bits of 511 · √2 · |q|;
+rotation   4        2 bits: index of the largest of x, y, z, w; the others 10 bits each: a sign
+                    and nine bits of 511 · √2 · |q|;
                     versions 1 and 2: 3 bytes, 127.5 · (q + 1) of x, y, z
 SH         0 to 72  128 + 128 · sh_rest, coefficient by coefficient, r, g, b in each
 =========  =======  ======================================================================
 
-little-endian, in a frame of x right, y up, z back; `spz_container` has what is around them. Facts
-from github.com/nianticlabs/spz (MIT).
+Values are little-endian, in a frame with x right, y up, z back. `spz_container` handles the header
+and the compression. The layout was taken from github.com/nianticlabs/spz (MIT).
 """
 
 import logging
@@ -26,44 +26,53 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.frames import UP_BACK, flip_axes
-from snowsplat.formats.spz_container import ANTIALIASED, Header, is_spz, pack, unpack
-from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.spz_container import (
+    ANTIALIASED,
+    Header,
+    is_spz,
+    pack,
+    read_header,
+    unpack,
+)
+from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
-__all__ = ["is_spz", "read_spz", "write_spz"]
+__all__ = ["is_spz", "read_spz", "spz_version", "write_spz"]
 
 logger = logging.getLogger(__name__)
 
-#: An extension that names another frame by a number: these from 1 on, then others with y and z
-#: swapped.
+#: An extension that selects another frame by a number: 1 is the first of these; numbers beyond
+#: them have y and z swapped.
 _FRAME_EXTENSION = 0xADBE0003
 _FRAMES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 _COLOR_STEP = 0.15 * 255
-# Bytes of SH are rounded to multiples of these, of degree 1 and of the others, for the packer's
-# sake. The reference implementation takes 8 and 16, which costs a trained scene more than 1 dB
-# against its photos; with these it is 0.1 dB, and the file is half as large again.
+# SH bytes are rounded to multiples of these (degree 1, higher degrees), so that they compress
+# better. Niantic's implementation uses 8 and 16, which lowers the PSNR of a trained scene by more
+# than 1 dB; these values lower it by 0.1 dB, and the file is 1.5 times as large.
 _SH_STEPS = (2, 4)
 
 
-@np.errstate(all="ignore")  # what is not finite is left out at the end
-def read_spz(path: Path | str) -> Gaussians:
-    """Read a scene of version 1 to 4; of SH degree 4, which is not used here, degrees 0 to 3.
+@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
+def read_spz(path: Path | str) -> GaussianArrays:
+    """Read a scene of version 1 to 4. Coefficients of SH degree 4 are ignored.
 
     Raises:
-        UserError: not readable, of another version, damaged, too short, or promising absurdly much.
+        UserError: the file cannot be read, has another version, is damaged or truncated, or
+            declares an implausible number of Gaussians.
     """
     path = Path(path)
     contents = unpack(path, packing.read_file(path))
     header, columns = contents.header, contents.columns
     if header.flags & ANTIALIASED:
         logger.warning(
-            "%s: trained with the anti-aliasing of Mip-Splatting, which is not drawn here; "
-            "from afar it looks a little different",
+            "%s: trained with the anti-aliasing of Mip-Splatting, which is not supported; "
+            "distant views look slightly different",
             path,
         )
     if header.sh_degree > 3:
-        logger.warning("%s: has SH degree %d; 3 is kept", path, header.sh_degree)
+        logger.warning("%s: SH degree %d is reduced to 3", path, header.sh_degree)
     n = header.count
     position, alpha, color, scales, rotation, sh = (
         np.frombuffer(column, np.uint8).reshape(n, -1 if n else width)
@@ -76,7 +85,7 @@ def read_spz(path: Path | str) -> Gaussians:
         (sh_rest.astype(np.float32) - 128) / 128,
         _signs(path, contents.extensions),
     )
-    return packing.to_gaussians(
+    return decoded(
         path,
         means,
         scales.astype(np.float32) / 16 - 10,
@@ -87,8 +96,13 @@ def read_spz(path: Path | str) -> Gaussians:
     )
 
 
+def spz_version(path: Path) -> str:
+    """The version of a file that `read_spz` accepts."""
+    return str(read_header(path, packing.read_file(path)).version)
+
+
 def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
-    """What each axis of the file is to be multiplied with to give ours."""
+    """The factors that convert the axes of the file to ours."""
     start = 0
     while start + 8 <= len(extensions):
         kind, size = struct.unpack_from("<II", extensions, start)
@@ -96,8 +110,8 @@ def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
             (number,) = struct.unpack_from("<I", extensions, start + 8)
             if number > len(_FRAMES):
                 raise UserError(
-                    f"{path}: an .spz file whose y and z axes are swapped (coordinate system "
-                    f"{number}), which I do not read; export it with the usual one, RUB"
+                    f"{path}: coordinate system {number} of .spz, with swapped y and z axes, is "
+                    "not supported; export the file with the default one, RUB"
                 )
             axes = _FRAMES[number - 1] if number else "RUB"
             return 1 if "R" in axes else -1, 1 if "D" in axes else -1, 1 if "F" in axes else -1
@@ -108,7 +122,7 @@ def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
 def _unpack_positions(position: np.ndarray, header: Header) -> np.ndarray:
     if header.version == 1:
         return position.view("<f2").astype(np.float32)
-    # Into the upper three bytes of an int32, then shifted down: that keeps the sign.
+    # Placed in the upper three bytes of an int32 and shifted down, which extends the sign.
     words = np.zeros((len(position), 3, 4), np.uint8)
     words[:, :, 1:] = position.reshape(-1, 3, 3)
     fixed = words.view("<i4")[:, :, 0] >> 8
@@ -116,7 +130,7 @@ def _unpack_positions(position: np.ndarray, header: Header) -> np.ndarray:
 
 
 def _unpack_rotations(rotation: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz; the file has xyzw."""
+    """Quaternions wxyz (N, 4); the file stores xyzw."""
     if rotation.shape[1] == 3:
         xyz = rotation.astype(np.float32) / 127.5 - 1
         w = np.sqrt(np.maximum(1 - (xyz * xyz).sum(1, keepdims=True), 0))
@@ -129,18 +143,18 @@ def _unpack_rotations(rotation: np.ndarray) -> np.ndarray:
     return np.roll(xyzw, 1, axis=1)
 
 
-@np.errstate(all="ignore")  # what is too large is clamped
-def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
-    """Write version 3, which all readers know, or 4, which is smaller and faster; atomically.
+@np.errstate(all="ignore")  # values that are too large are clamped
+def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> None:
+    """Write version 3, which all readers support, or 4, which is smaller and faster; atomically.
 
     Raises:
         ValueError: another version.
-        OSError: the folder is absent or not writable, or the disk is full.
+        OSError: the folder is missing or not writable, or the disk is full.
     """
     if version not in (3, 4):
-        raise ValueError(f"version {version} of .spz is not written; 3 or 4")
+        raise ValueError(f"version {version} of .spz cannot be written; use 3 or 4")
     path = Path(path)
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.to_arrays(path, gaussians)
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.packable(path, gaussians)
     means, quats, sh_rest = flip_axes(means, quats, sh_rest, UP_BACK)
     bits = _fractional_bits(means)
     columns = [
@@ -159,10 +173,10 @@ def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
 
 
 def _fractional_bits(means: np.ndarray) -> int:
-    """12, as is usual; more where the scene is small, fewer where it would not fit in 24 bits.
+    """Usually 12; more for a small scene, fewer for one that would not fit in 24 bits.
 
-    A step is at most 2⁻¹⁵ of how far out 99% of the Gaussians lie; 2⁻¹² where stray ones lie so
-    far out that no number of bits would do for all.
+    A step is at most 2⁻¹⁵ of the distance from the origin within which 99% of the Gaussians lie,
+    or 2⁻¹² of it if a few Gaussians lie so far away that no number of bits suits all of them.
     """
     if not len(means):
         return 12
@@ -175,12 +189,12 @@ def _fractional_bits(means: np.ndarray) -> int:
 def _pack_positions(path: Path, means: np.ndarray, bits: int) -> np.ndarray:
     limit = (1 << 23) - 1
     steps = np.rint(means.astype(np.float64) * (1 << bits))
-    stray = int((np.abs(steps) > limit).any(1).sum())
-    if stray:
+    outliers = int((np.abs(steps) > limit).any(1).sum())
+    if outliers:
         logger.warning(
-            "%s: %d Gaussians lie farther out than .spz can tell; moved to %.6g from the origin",
+            "%s: %d Gaussians exceed the range of .spz; their coordinates are clamped to ±%.6g",
             path,
-            stray,
+            outliers,
             limit / (1 << bits),
         )
     fixed = np.clip(steps, -limit, limit)

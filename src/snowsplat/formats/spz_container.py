@@ -1,10 +1,10 @@
 """The container of an `.spz` file: its header and its columns as bytes, packed and unpacked.
 
-Versions 1 to 3 are a header of 16 bytes and the columns, in one gzip stream (or none: some tools
-leave that to others). Version 4 is a header of 32 bytes, extensions, a table of the sizes of each
-column, packed and unpacked, and the columns, each a zstd stream; empty ones are left out.
+Versions 1 to 3 have a header of 16 bytes and the columns, in one gzip stream (some tools write
+them uncompressed). Version 4 has a header of 32 bytes, extensions, a table with the packed and
+unpacked size of each column, and the columns, each in a zstd stream; empty columns are omitted.
 
-What a file promises is held against its size before memory is taken for it.
+The sizes that a file declares are compared with the size of the file before memory is allocated.
 """
 
 import struct
@@ -34,7 +34,7 @@ _ZSTD_LEVEL = 5
 
 @dataclass
 class Header:
-    """What the first 15 bytes say; the 16th is how many streams follow, 0 before version 4."""
+    """The first 15 bytes; the 16th is the number of streams, 0 before version 4."""
 
     version: int
     count: int
@@ -43,7 +43,7 @@ class Header:
     flags: int
 
     def columns(self) -> list[int]:
-        """Bytes a Gaussian of position, opacity, colour, scales, rotation, SH."""
+        """Bytes per Gaussian of position, opacity, colour, scales, rotation, SH."""
         position = 6 if self.version == 1 else 9
         rotation = 3 if self.version < 3 else 4
         return [position, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1) ** 2 - 1)]
@@ -51,9 +51,9 @@ class Header:
 
 @dataclass
 class Contents:
-    """A file, unpacked: a column each of position, opacity, colour, scales, rotation, SH.
+    """The unpacked columns of position, opacity, colour, scales, rotation, SH.
 
-    Invariant: each column has the size that the header says.
+    Invariant: each column has the size that follows from the header.
     """
 
     header: Header
@@ -62,7 +62,7 @@ class Contents:
 
 
 def is_spz(head: bytes) -> bool:
-    """Whether a file that begins so is an .spz file of any version."""
+    """Whether a file that begins with ``head`` is an .spz file of any version."""
     if head.startswith(_GZIP):
         try:
             head = zlib.decompressobj(31).decompress(head, 4)
@@ -71,11 +71,26 @@ def is_spz(head: bytes) -> bool:
     return head.startswith(_MAGIC)
 
 
-def unpack(path: Path, data: bytes) -> Contents:
-    """What is in the bytes of a file.
+def read_header(path: Path, data: bytes) -> Header:
+    """The header of the file content ``data``.
 
     Raises:
-        UserError: of another version, damaged, too short, or promising absurdly much.
+        UserError: another version, a damaged header, or an implausible number of Gaussians.
+    """
+    head = data
+    try:
+        if data.startswith(_GZIP):
+            head = zlib.decompressobj(31).decompress(data, _HEAD.size)
+        return _header(path, head, len(data))
+    except (zlib.error, struct.error):
+        raise _damaged(path) from None
+
+
+def unpack(path: Path, data: bytes) -> Contents:
+    """The columns of the file content ``data``.
+
+    Raises:
+        UserError: as `read_header`, or the file is damaged or truncated.
     """
     try:
         return _unpack(path, data)
@@ -95,7 +110,7 @@ def _unpack(path: Path, data: bytes) -> Contents:
         head = stream.decompress(data, _HEAD.size)
         header = _header(path, head, len(data))
         size = sum(header.columns()) * header.count
-        # A whole stream ends; only then its checksum has been compared.
+        # The checksum is only verified at the end of the stream.
         body = stream.decompress(stream.unconsumed_tail, size + _EXTENSION_LIMIT)
         if header.version > 3 or not stream.eof:
             raise _damaged(path)
@@ -110,11 +125,11 @@ def _unpack(path: Path, data: bytes) -> Contents:
 
 def _header(path: Path, head: bytes, file_size: int) -> Header:
     if not head.startswith(_MAGIC):
-        raise UserError(f"{path}: not an .spz file (it should begin with NGSP when unpacked)")
+        raise UserError(f"{path}: not an .spz file; its content does not begin with NGSP")
     _, *values, _ = _HEAD.unpack_from(head)
     header = Header(*values)
     if not 1 <= header.version <= 4:
-        raise UserError(f"{path}: version {header.version} of .spz; I read 1 to 4")
+        raise UserError(f"{path}: version {header.version} of .spz; supported are 1 to 4")
     if header.sh_degree > 4 or header.fractional_bits > 31:
         raise _damaged(path)
     check_count(path, header.count, file_size)
@@ -136,7 +151,7 @@ def _unpack_streams(path: Path, data: bytes, header: Header) -> Contents:
         packed, unpacked = struct.unpack_from("<QQ", data, entry)
         if unpacked != size or start + packed > len(data):
             raise _damaged(path)
-        # A reader, not decompress(): that believes the size that the stream itself promises.
+        # A reader, since decompress() trusts the size that the stream declares.
         unpacker = zstandard.ZstdDecompressor(max_window_size=1 << 27)
         column = unpacker.stream_reader(data[start : start + packed]).read(size + 1)
         if len(column) != size:
@@ -148,7 +163,7 @@ def _unpack_streams(path: Path, data: bytes, header: Header) -> Contents:
 
 
 def pack(header: Header, columns: Sequence[bytes]) -> bytes:
-    """The bytes of a file of version 3 or 4."""
+    """The content of a file of version 3 or 4."""
     streams = [column for column in columns if column]
     count = len(streams) if header.version > 3 else 0
     head = _HEAD.pack(

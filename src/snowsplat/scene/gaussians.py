@@ -15,11 +15,7 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.ops.scratch import take_rows
-
-#: The constant basis function of the spherical harmonics, Y_00 = 1 / (2 sqrt(pi)).
-SH_C0 = 0.28209479177387814
-#: Number of SH coefficients beyond the constant one, for degrees 0, 1, 2, 3.
-SH_REST_COUNTS = (0, 3, 8, 15)
+from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 
 
 class ColoredPoints(Protocol):

@@ -9,8 +9,8 @@ from __future__ import annotations
 import base64
 from pathlib import Path
 
-from snowsplat.formats import Format, register_format
-from snowsplat.formats.compressed_ply import compressed_ply
+from snowsplat.formats import GaussianArrays
+from snowsplat.formats.compressed_ply import encode_compressed_ply
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.initial_view import InitialView, overview
 from snowsplat.util.errors import UserError
@@ -51,7 +51,7 @@ def write_html(path: Path | str, gaussians: Gaussians, start: InitialView | None
     path = Path(path)
     if not len(gaussians):
         raise UserError(f"{path}: a scene without Gaussians shows nothing; no page is made of it")
-    scene = compressed_ply(path, gaussians)
+    scene = encode_compressed_ply(path, GaussianArrays.from_gaussians(gaussians))
     if len(scene) > _LARGEST:
         raise UserError(
             f"{path}: {len(gaussians):,} Gaussians are too many for one page; "
@@ -64,6 +64,3 @@ def write_html(path: Path | str, gaussians: Gaussians, start: InitialView | None
         "contentFilename": "scene.compressed.ply",
     }
     write_text(path, whole_page(path.stem, bootstrap, _SCENE.format(scene=encoded)))
-
-
-register_format(Format("HTML", (".html",), None, None, write_html, "what compressed PLY loses"))

@@ -19,7 +19,7 @@ from typing import Any
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 
-_FOLDER = Path(__file__).parent / "_viewer"
+_FOLDER = Path(__file__).parents[2] / "_viewer"
 _STYLESHEET = '<link rel="stylesheet" href="./index.css" />'
 _IMPORT = "import { createViewer } from './index.js';"
 # In the HTML that their script makes: event.stopPropagation() of two buttons.

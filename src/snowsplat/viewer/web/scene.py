@@ -9,7 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from snowsplat.formats.compressed_ply import compressed_ply
+from snowsplat.formats import GaussianArrays
+from snowsplat.formats.compressed_ply import encode_compressed_ply
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
@@ -39,7 +40,10 @@ def site(
         "": ServedFile(index.encode(), "text/html; charset=utf-8"),
         "index.css": ServedFile(asset("index.css").encode(), "text/css; charset=utf-8"),
         "index.js": ServedFile(asset("index.js").encode(), "text/javascript; charset=utf-8"),
-        _SCENE: ServedFile(compressed_ply(Path(_SCENE), gaussians), "application/octet-stream"),
+        _SCENE: ServedFile(
+            encode_compressed_ply(Path(_SCENE), GaussianArrays.from_gaussians(gaussians)),
+            "application/octet-stream",
+        ),
     }
     own = "'self'"
     policy = f"{content_policy(index, own)}; frame-ancestors 'none'"

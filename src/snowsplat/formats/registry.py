@@ -1,0 +1,177 @@
+"""The table of the scene file formats, and how a format is found for a file.
+
+The format of a file to read is recognised by its first bytes, whatever its name is; only formats
+without a signature are recognized by the suffix. The format of a file to write is selected by the
+suffix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from snowsplat.formats.compressed_ply import (
+    is_compressed_ply,
+    read_compressed_ply,
+    write_compressed_ply,
+)
+from snowsplat.formats.gaussian_arrays import GaussianArrays
+from snowsplat.formats.gltf import is_glb, read_glb, write_glb
+from snowsplat.formats.ksplat import read_ksplat
+from snowsplat.formats.ply import is_ply, read_ply, write_ply
+from snowsplat.formats.sog import is_sog, read_sog, sog_version, write_sog
+from snowsplat.formats.splat import read_splat, write_splat
+from snowsplat.formats.spz import is_spz, read_spz, spz_version, write_spz
+from snowsplat.util.errors import UserError
+
+_HEAD_BYTES = 16_384
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format of scene files.
+
+    Attributes:
+        name: what users know it as.
+        suffixes: lower case with their dots, as in ".compressed.ply"; the longest match counts.
+        recognises: whether a file with these first 16,384 bytes (fewer if it is shorter) has this
+            format; None for a format without a signature.
+        read: None for a format that cannot be read.
+        write: None for a format that cannot be written.
+        loses: what a scene loses in this format, for users.
+        version: the version of a file that ``recognises`` accepts, if the format has several.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    recognises: Callable[[bytes], bool] | None
+    read: Callable[[Path], GaussianArrays] | None
+    write: Callable[[Path, GaussianArrays], None] | None
+    loses: str
+    version: Callable[[Path], str] | None = None
+
+
+#: In the order in which ``recognises`` is called: a special format before the general one.
+FORMATS: list[Format] = [
+    Format(
+        "compressed PLY",
+        (".compressed.ply",),
+        is_compressed_ply,
+        read_compressed_ply,
+        write_compressed_ply,
+        "positions and scales have 10 to 11 bits, rotations 10, colours, opacity and SH 8",
+    ),
+    Format(
+        "PLY",
+        (".ply",),
+        is_ply,
+        read_ply,
+        write_ply,
+        "nothing",
+    ),
+    Format(
+        "SPZ",
+        (".spz",),
+        is_spz,
+        read_spz,
+        write_spz,
+        "positions have 24 bits, rotations 10, all else 8 and SH 4 to 8",
+        spz_version,
+    ),
+    Format(
+        "SOG",
+        (".sog",),
+        is_sog,
+        read_sog,
+        write_sog,
+        "positions have 16 bits, all else 8; SH are rows of a palette",
+        sog_version,
+    ),
+    Format(
+        "glTF",
+        (".glb",),
+        is_glb,
+        read_glb,
+        write_glb,
+        "nothing but rounding",
+        lambda _: "2, KHR_gaussian_splatting",
+    ),
+    Format(
+        "splat",
+        (".splat",),
+        None,
+        read_splat,
+        write_splat,
+        "SH, all of it; rotations, colours and opacity have 8 bits",
+    ),
+    Format(
+        "ksplat",
+        (".ksplat",),
+        None,
+        read_ksplat,
+        None,
+        "positions and all else have 16 or 32 bits, SH 8 to 32",
+    ),
+]
+
+
+def register_format(format: Format) -> None:
+    """Add a format that a package above this one implements, such as the HTML page.
+
+    Raises:
+        ValueError: a format of that name is already registered.
+    """
+    if any(known.name == format.name for known in FORMATS):
+        raise ValueError(f"format {format.name} is already registered")
+    FORMATS.append(format)
+
+
+def format_for_reading(path: Path | str) -> Format:
+    """The format of an existing file: by its first bytes, else by its suffix.
+
+    Raises:
+        UserError: the file cannot be read, or its format is unknown.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise UserError(f"{path}: is a pipe or a device; name a file")
+        with open(path, "rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+    for format in FORMATS:
+        if format.recognises is not None and format.recognises(head):
+            return format
+    named = _by_suffix(path, FORMATS)
+    if named is None:
+        known = _suffixes([format for format in FORMATS if format.read is not None])
+        raise UserError(f"{path}: not a known scene file; supported are {known}")
+    return named
+
+
+def format_for_writing(path: Path | str) -> Format:
+    """The format that the suffix of a file name selects.
+
+    Raises:
+        UserError: no format that can be written has this suffix.
+    """
+    path = Path(path)
+    writable = [format for format in FORMATS if format.write is not None]
+    format = _by_suffix(path, writable)
+    if format is None:
+        raise UserError(
+            f"{path}: the suffix selects no scene format; use one of {_suffixes(writable)}"
+        )
+    return format
+
+
+def _by_suffix(path: Path, formats: Sequence[Format]) -> Format | None:
+    name = path.name.lower()
+    matching = [(len(s), f) for f in formats for s in f.suffixes if name.endswith(s)]
+    return max(matching, key=lambda pair: pair[0])[1] if matching else None
+
+
+def _suffixes(formats: Sequence[Format]) -> str:
+    return ", ".join(suffix for format in formats for suffix in format.suffixes)
