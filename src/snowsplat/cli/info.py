@@ -66,7 +66,7 @@ def describe(path: Path) -> dict[str, Any]:
     if path.suffix == ".safetensors":
         return _checkpoint(path)
     if path.is_file():
-        from snowsplat.pipeline.convert import format_for_reading
+        from snowsplat.pipeline.scene_files import format_for_reading
 
         try:
             format = format_for_reading(path)
@@ -83,7 +83,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 def _scene(path: Path, format: Format) -> dict[str, Any]:
     from snowsplat.formats import ply
-    from snowsplat.pipeline.convert import read_arrays
+    from snowsplat.pipeline.scene_files import read_arrays
     from snowsplat.util.ply import open_table
 
     facts: dict[str, Any] = {"file": str(path), "bytes": path.stat().st_size}

@@ -1,33 +1,5 @@
-"""Scene files of every format, including the HTML page, which the viewer writes."""
+"""Scene files of every format, the HTML page included."""
 
-from __future__ import annotations
+from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
 
-from pathlib import Path
-
-from snowsplat.formats import (
-    Format,
-    GaussianArrays,
-    format_for_reading,
-    format_for_writing,
-    read_arrays,
-    read_gaussians,
-    register_format,
-    write_gaussians,
-)
-
-__all__ = [
-    "format_for_reading",
-    "format_for_writing",
-    "read_arrays",
-    "read_gaussians",
-    "write_gaussians",
-]
-
-
-def _write_html(path: Path, gaussians: GaussianArrays) -> None:
-    from snowsplat.viewer.web.html import write_html
-
-    write_html(path, gaussians.to_gaussians())
-
-
-register_format(Format("HTML", (".html",), None, None, _write_html, "what compressed PLY loses"))
+__all__ = ["format_for_writing", "read_gaussians", "write_gaussians"]

@@ -1,0 +1,36 @@
+"""Scene files of every format, including the HTML page, which the viewer writes.
+
+Importing this module registers the page as a format; it does not import torch.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from snowsplat.formats import (
+    Format,
+    GaussianArrays,
+    format_for_reading,
+    format_for_writing,
+    read_arrays,
+    read_gaussians,
+    register_format,
+    write_gaussians,
+)
+
+__all__ = [
+    "format_for_reading",
+    "format_for_writing",
+    "read_arrays",
+    "read_gaussians",
+    "write_gaussians",
+]
+
+
+def _write_html(path: Path, gaussians: GaussianArrays) -> None:
+    from snowsplat.viewer.web.html import write_html
+
+    write_html(path, gaussians.to_gaussians())
+
+
+register_format(Format("HTML", (".html",), None, None, _write_html, "what compressed PLY loses"))
