@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import importlib
+import io
 import json
 import os
 import resource
@@ -167,6 +169,10 @@ def serve() -> None:
     """Answer until stdin ends."""
     for name in _IMPORTS:
         importlib.import_module(name)
+    with contextlib.redirect_stdout(io.StringIO()):
+        pytest.main(["--version"])  # imports its plugins
+    gc.collect()
+    gc.freeze()  # pytest collects garbage at the end of a run: not again what is alive here
     # It must not outlive the script.
     ctypes.CDLL(None).prctl(1, signal.SIGTERM)
     for line in sys.stdin:
