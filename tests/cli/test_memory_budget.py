@@ -63,8 +63,14 @@ def test_a_dataset_of_ten_times_the_memory_trains(dataset: Path, tmp_path: Path)
 def test_too_little_is_said_before_anything_is_made(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for words, line in (
-        (("--memory", "40MB"), r"snowsplat: --memory 40 MB is too little for photos .* -r\n"),
-        (("--memory", "lots"), r"snowsplat: --memory is 'lots'; it must be like 4GB or 800MB\n"),
+        (
+            ("--memory", "40MB"),
+            r"snowsplat: --memory: 40 MB is too little for photos .* a lower resolution\n",
+        ),
+        (
+            ("--memory", "lots"),
+            r"snowsplat: --memory: 'lots' is not a size; use e.g. 4GB or 800MB\n",
+        ),
     ):
         run = snowsplat_cli("train", str(dataset), "-o", str(out), *words)
         assert run.returncode == 2

@@ -1,4 +1,4 @@
-"""What a training takes: words for it, what is given up for a budget, and that it is kept."""
+"""Estimates of the memory of a training, sizes as text, and reductions to fit a budget."""
 
 from __future__ import annotations
 
@@ -12,9 +12,16 @@ from snowsplat.data import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import DECODERS
 from snowsplat.scene.camera import Camera
-from snowsplat.training.memory_budget import CPU, GPU, in_words, parse_bytes, plan_memory
+from snowsplat.training.memory_budget import (
+    CPU,
+    GPU,
+    _SceneCost,
+    format_bytes,
+    parse_bytes,
+    plan_memory,
+)
 from snowsplat.training.recipes import recipe
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError
 
 DEVICE = torch.device("cpu")
 
@@ -39,23 +46,23 @@ def dataset_of(photos: int, width: int, height: int, stored: int = 0) -> Dataset
         (".5G", 5 * 10**8),
     ],
 )
-def test_bytes(text: str, count: int) -> None:
+def test_sizes_are_parsed(text: str, count: int) -> None:
     assert parse_bytes(text) == count
 
 
 @pytest.mark.parametrize("text", ["", "much", "-1GB", "0", "4 GBs", "4ib", "1e9", "nan", "GB"])
-def test_no_bytes(text: str) -> None:
-    with pytest.raises(UserError, match="must be like 4GB or 800MB"):
+def test_other_text_is_rejected(text: str) -> None:
+    with pytest.raises(SettingError, match="^memory: .* is not a size; use e.g. 4GB or 800MB"):
         parse_bytes(text)
 
 
-def test_words() -> None:
-    assert in_words(1_300_000_000) == "1.3 GB"
-    assert in_words(240_000_000) == "240 MB"
-    assert in_words(0) == "1 MB"
+def test_sizes_are_formatted() -> None:
+    assert format_bytes(1_300_000_000) == "1.3 GB"
+    assert format_bytes(240_000_000) == "240 MB"
+    assert format_bytes(0) == "1 MB"
 
 
-def test_without_a_budget_nothing_is_given_up() -> None:
+def test_without_a_budget_nothing_is_reduced() -> None:
     config = recipe("default")
     plan = plan_memory(dataset_of(100, 1000, 500), config, DEVICE, available=10**10)
     assert plan.given_up == ()
@@ -66,7 +73,7 @@ def test_without_a_budget_nothing_is_given_up() -> None:
     assert decoding == DECODERS * 18 * 500_000
 
 
-def test_without_a_limit_it_says_what_a_million_takes() -> None:
+def test_without_a_limit_a_million_gaussians_are_estimated() -> None:
     config = recipe("paper")
     assert config.density.max_gaussians == 0
     plan = plan_memory(dataset_of(9, 100, 100), config, DEVICE, available=10**10)
@@ -74,7 +81,7 @@ def test_without_a_limit_it_says_what_a_million_takes() -> None:
     assert "for each million Gaussians" in str(plan)
 
 
-def test_photos_go_first_then_gaussians() -> None:
+def test_photos_are_reduced_before_gaussians() -> None:
     dataset = dataset_of(200, 1000, 1000)  # 600 MB of photos
     config = recipe("default", max_gaussians=200_000)
     wide = plan_memory(dataset, config, DEVICE, available=10**10, budget=2 * 10**9)
@@ -90,36 +97,41 @@ def test_photos_go_first_then_gaussians() -> None:
         assert plan.total <= budget
 
 
-def test_files_are_decoded_whole_whatever_size_is_wanted() -> None:
+def test_files_are_decoded_at_full_size_for_any_resolution() -> None:
     config, large = recipe("default"), 24_000_000
     wanted = plan_memory(dataset_of(9, 400, 300), config, DEVICE, 10**10)
     plan = plan_memory(dataset_of(9, 400, 300, large), config, DEVICE, 10**10)
     assert plan.images - wanted.images == DECODERS * 18 * (large - 400 * 300)
-    with pytest.raises(UserError, match=r"give more, or make the files smaller$"):
+    with pytest.raises(SettingError, match=r"; use more, or smaller image files$"):
         plan_memory(dataset_of(9, 400, 300, large), config, DEVICE, 10**10, 300_000_000)
 
 
-def test_too_little_says_how_much_it_takes() -> None:
-    with pytest.raises(UserError, match=r"--memory 50 MB is too little .* take \d+ MB; .* -r"):
+def test_too_little_memory_names_the_required_amount() -> None:
+    with pytest.raises(
+        SettingError,
+        match=r"^memory: 50 MB is too little .* need \d+ MB; use more, or a lower resolution$",
+    ):
         plan_memory(dataset_of(9, 2000, 1000), recipe("default"), DEVICE, 10**10, 50_000_000)
 
 
-def test_what_is_there_already_has_to_fit() -> None:
+def test_gaussians_of_a_resumed_training_have_to_fit() -> None:
     dataset, config = dataset_of(9, 100, 100), recipe("default", max_gaussians=50_000)
     whole = plan_memory(dataset, config, DEVICE, 10**10)
     plan = plan_memory(dataset, config, DEVICE, 10**10, whole.total, present=50_000)
     assert plan.given_up == ()
-    with pytest.raises(UserError, match=r"go on with 50,000 Gaussians, which take \d+ MB .*more$"):
+    with pytest.raises(
+        SettingError, match=r"to resume with 50,000 Gaussians, which need \d+ MB; use more$"
+    ):
         plan_memory(dataset, config, DEVICE, 10**10, whole.total - 1_000_000, present=50_000)
 
 
-def test_a_gpu_takes_less_than_a_gigabyte_for_a_million() -> None:
+def test_a_million_gaussians_take_less_than_a_gigabyte_on_a_gpu() -> None:
     assert GPU.of(1_000_000, 0, 3) < 1_000_000_000
 
 
 @pytest.mark.parametrize("random", [20_000, 200_000])
-def test_random_gaussians_begin_wide(random: int) -> None:
-    """As many as are there at the start take three times the tiles; the later ones do not."""
+def test_random_gaussians_are_larger(random: int) -> None:
+    """The initial ones touch three times as many tiles; those added later do not."""
     with_points = dataset_of(9, 1000, 500)
     config = recipe("default", max_gaussians=140_000, initial_points=random)
     budget = 450_000_000
@@ -134,3 +146,10 @@ def test_random_gaussians_begin_wide(random: int) -> None:
     later = CPU.of(plans[1].limit, 0, 3) - CPU.fixed
     assert plans[1].scene == later + 2 * CPU.gaussian * min(random, plans[1].limit)
     assert plan_memory(replace(with_points, points=None), config, DEVICE, 10**10, budget, 140_000)
+
+
+@pytest.mark.parametrize("available", [0, 399, 400, 4000, 4399, 4400, 4500, 100_000])
+def test_the_number_of_gaussians_that_fit_is_the_largest(available: int) -> None:
+    cost = _SceneCost(each=100, random=10, extra=300)
+    count = cost.gaussians_in(available)
+    assert cost.of(count) <= available < cost.of(count + 1)

@@ -1,7 +1,7 @@
-"""How much memory a training takes, known before it starts, and how to make it take less.
+"""How much memory a training takes, estimated before it starts, and how to make it take less.
 
-What counts is what comes on top of a fresh import of PyTorch; on a GPU, on top of what the driver
-takes for itself.
+Counted is what comes on top of a fresh import of PyTorch; on a GPU, on top of what the driver
+allocates for itself.
 """
 
 from __future__ import annotations
@@ -15,59 +15,65 @@ from snowsplat.data.dataset import Dataset
 from snowsplat.data.image_loader import DECODERS
 from snowsplat.scene.gaussians import SH_REST_COUNTS
 from snowsplat.training.config import TrainConfig, changed
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError
+
+#: Bytes per pixel of a decoded photo, and of its mask.
+_RGB = 3
+_MASK = 1
+#: Photos that are decoded at any time: the one in use, and those of the next steps.
+_FEWEST_PHOTOS = 6
+#: Training a scene of fewer Gaussians than this is not worthwhile.
+_FEWEST_GAUSSIANS = 1000
+#: Random Gaussians are so large at first that each touches about three times as many tiles.
+_EXTRA_OF_RANDOM = 2
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a training takes on one kind of device.
+    """Memory that a training takes on one kind of device.
 
     Attributes:
-        fixed: bytes, whatever is trained.
-        pixel: bytes a pixel of the largest photo: renders and their gradients.
-        gaussian: bytes a Gaussian, beside its parameters and their two moments: its splat, the
-            gradient of that, the tiles that it touches, statistics.
+        fixed: bytes, for any training.
+        pixel: bytes per pixel of the largest photo: renderings and their gradients.
+        gaussian: bytes per Gaussian besides its parameters and their two moments: its splat, the
+            gradient of the splat, its instances, statistics.
+        decoding: bytes per pixel of the largest image file while photos are being decoded.
     """
 
     fixed: int
     pixel: int
     gaussian: int
+    decoding: int
 
     def of(self, gaussians: int, pixels: int, sh_degree: int) -> int:
-        """Bytes, without the photos that are kept."""
-        numbers = 11 + 3 + 3 * SH_REST_COUNTS[sh_degree]
-        return self.fixed + self.pixel * pixels + self.each(numbers) * gaussians
+        """Bytes, without the photos that stay decoded."""
+        return self.fixed + self.pixel * pixels + self.of_gaussian(sh_degree) * gaussians
 
-    def each(self, numbers: int) -> int:
-        """Bytes of a Gaussian of so many numbers, with two moments for each."""
-        return 3 * 4 * numbers + self.gaussian
+    def of_gaussian(self, sh_degree: int) -> int:
+        """Bytes per Gaussian, with its float32 parameters and two moments of each."""
+        parameters = 11 + 3 + 3 * SH_REST_COUNTS[sh_degree]
+        return 3 * 4 * parameters + self.gaussian
 
 
-# Measured on the CPU: 1.0 to 1.1 kB a Gaussian beside parameters and moments, where each touches
-# some seven tiles. On a GPU reckoned from what is allocated.
-CPU = Cost(fixed=66_000_000, pixel=170, gaussian=1150)
-GPU = Cost(fixed=50_000_000, pixel=70, gaussian=240)
-# Random ones begin so wide that each of them touches about three times as many tiles.
-_WIDE = 2
-# A photo that is being decoded, bytes a pixel of its file; on the CPU, and so many at a time.
-_DECODING = 18
-
-# Photos at hand at least: the one in use, and those that are decoded ahead.
-_FEWEST_PHOTOS = 6
-# A scene of fewer Gaussians than this is not worth its training.
-_FEWEST_GAUSSIANS = 1000
+#: Measured: 1.0 to 1.1 kB per Gaussian besides parameters and moments, where each touches some
+#: seven tiles. Photos are decoded by `DECODERS` threads at a time, at 18 bytes per pixel.
+CPU = Cost(fixed=66_000_000, pixel=170, gaussian=1150, decoding=18 * DECODERS)
+#: Computed from the sizes of the tensors that are allocated. Photos are decoded in the memory of
+#: the CPU.
+GPU = Cost(fixed=50_000_000, pixel=70, gaussian=240, decoding=0)
 
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """What `plan_memory` found.
+    """The result of `plan_memory`.
 
     Attributes:
-        config: with what holds the training to its memory.
-        scene, images, photos: bytes for Gaussians, for renders and their gradients, for photos
-            that stay decoded.
-        given_up: what there would have been with more memory, in words.
-        limit: the Gaussians reckoned with; None: there is no limit, and ``scene`` is of a million.
+        config: with settings that keep the training within its memory.
+        scene: bytes for Gaussians.
+        images: bytes for renderings and their gradients.
+        photos: bytes for photos that stay decoded.
+        given_up: what a larger budget would have allowed, as text.
+        limit: the number of Gaussians; None: there is no limit, and ``scene`` is that of a million.
     """
 
     config: TrainConfig
@@ -79,14 +85,39 @@ class MemoryPlan:
 
     @property
     def total(self) -> int:
+        """Bytes."""
         return self.scene + self.images + self.photos
 
     def __str__(self) -> str:
-        parts = f"images {in_words(self.images)}, photos {in_words(self.photos)}"
+        parts = f"images {format_bytes(self.images)}, photos {format_bytes(self.photos)}"
         if self.limit is None:
-            return f"{in_words(self.scene)} for each million Gaussians, {parts}"
-        scene = f"{self.limit:,} Gaussians {in_words(self.scene)}"
-        return f"{in_words(self.total)} at most ({scene}, {parts})"
+            return f"{format_bytes(self.scene)} for each million Gaussians, {parts}"
+        scene = f"{self.limit:,} Gaussians {format_bytes(self.scene)}"
+        return f"{format_bytes(self.total)} at most ({scene}, {parts})"
+
+
+@dataclass(frozen=True)
+class _SceneCost:
+    """Bytes of the Gaussians of one training.
+
+    Attributes:
+        each: bytes per Gaussian.
+        random: number of initial Gaussians that are random.
+        extra: additional bytes of each of these.
+    """
+
+    each: int
+    random: int
+    extra: int
+
+    def of(self, gaussians: int) -> int:
+        return self.each * gaussians + self.extra * min(gaussians, self.random)
+
+    def gaussians_in(self, available: int) -> int:
+        """The largest number of Gaussians for which `of` is at most ``available``."""
+        if_all_random = available // (self.each + self.extra)
+        if_more = (available - self.extra * self.random) // self.each
+        return max(min(self.random, if_all_random), if_more)
 
 
 def plan_memory(
@@ -97,88 +128,95 @@ def plan_memory(
     budget: int | None = None,
     present: int = 0,
 ) -> MemoryPlan:
-    """What a training of ``capture`` takes; with a ``budget``, made to take no more.
+    """Estimate the memory of a training on ``dataset``; with a ``budget``, make it take no more.
 
-    First fewer photos stay decoded, then there are fewer Gaussians.
+    First fewer photos stay decoded, then the number of Gaussians is limited.
 
     Args:
-        available: bytes that the device has left, which photos may have half of.
-        budget: bytes; None: as much as it takes.
-        present: Gaussians of a training that goes on: none of them is taken away.
+        available: bytes that the device has left, of which photos may have half.
+        budget: bytes; None: no limit.
+        present: number of Gaussians of a resumed training: none of them is removed.
 
     Raises:
-        UserError: too little for photos of this size, or for what is present.
+        SettingError: ``memory`` is too little for photos of this size, or for what is present.
     """
+    sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
+    largest, median = sizes[-1], sizes[len(sizes) // 2]
+    config = config.capped(median)
     cost = GPU if device.type == "cuda" else CPU
-    sizes = [view.camera.width * view.camera.height for view in dataset.train]
-    largest = max(sizes)
-    fewest = 3 * sum(sorted(sizes)[-_FEWEST_PHOTOS:])
-    masked = (size for view, size in zip(dataset.train, sizes, strict=True) if view.mask)
-    all_photos = 3 * sum(sizes) + sum(masked)
-    images = cost.of(0, largest, config.sh_degree)
+    starts_random = dataset.points is None and not present
+    scene = _SceneCost(
+        each=cost.of_gaussian(config.sh_degree),
+        random=config.initial_points if starts_random else 0,
+        extra=_EXTRA_OF_RANDOM * cost.gaussian,
+    )
     stored = max(largest, *(view.image.stored for view in dataset.train))
-    if cost is CPU:
-        images += DECODERS * _DECODING * stored
-    each = cost.of(1, 0, config.sh_degree) - cost.fixed
-    random = config.initial_points if dataset.points is None and not present else 0
-    wide = _WIDE * cost.gaussian
-
-    def scene(count: int) -> int:
-        return each * count + wide * min(count, random)
-
-    config = config.capped(sorted(sizes)[len(sizes) // 2])
-    cap = config.density.max_gaussians or None
+    images = cost.of(0, largest, config.sh_degree) + cost.decoding * stored
+    all_photos = _photo_bytes(dataset)
     photos = min(all_photos, config.image_memory or available // 2)
+    limit = config.density.max_gaussians or None
     given_up = []
     if budget is not None:
-        least = images + fewest + scene(max(_FEWEST_GAUSSIANS, present))
-        if budget < least and present > _FEWEST_GAUSSIANS:
-            raise UserError(
-                f"--memory {in_words(budget)} is too little to go on with {present:,} Gaussians, "
-                f"which take {in_words(least)} with photos of this size; give more"
-            )
+        fewest_photos = _RGB * sum(sizes[-_FEWEST_PHOTOS:])
+        least = images + fewest_photos + scene.of(max(_FEWEST_GAUSSIANS, present))
         if budget < least:
-            # -r leaves the files as they are, and each is decoded whole.
-            smaller = "the files smaller" if stored > largest else "them smaller with -r"
-            raise UserError(
-                f"--memory {in_words(budget)} is too little for photos of this size, which take "
-                f"{in_words(least)}; give more, or make {smaller}"
-            )
-        left = budget - images - min(photos, fewest)
-        room = max(min(random, left // (each + wide)), (left - wide * random) // each)
-        if cap is None or cap > room:
-            more = "no limit of them" if cap is None else f"{cap:,}"
-            given_up.append(f"at most {room:,} Gaussians instead of {more}")
-            cap = room
-            config = changed(config, max_gaussians=room)
-        left = max(fewest, budget - images - scene(cap))
+            raise _too_little(budget, least, present, files_too_large=stored > largest)
+        fitting = scene.gaussians_in(budget - images - min(photos, fewest_photos))
+        if limit is None or limit > fitting:
+            before = "no limit" if limit is None else f"{limit:,}"
+            given_up.append(f"at most {fitting:,} Gaussians instead of {before}")
+            limit = fitting
+            config = changed(config, max_gaussians=limit)
+        left = max(fewest_photos, budget - images - scene.of(limit))
         if photos > left:
             share = 100 * left // all_photos
-            given_up.append(f"{share}% of the photos stay decoded, the others are read again")
+            given_up.append(
+                f"{share}% of the photos stay decoded, the others are decoded each time"
+            )
             photos = left
         config = replace(config, image_memory=photos)
-    count = 1_000_000 if cap is None else cap
-    return MemoryPlan(config, scene(count), images, photos, tuple(given_up), cap)
+    gaussians = 1_000_000 if limit is None else limit
+    return MemoryPlan(config, scene.of(gaussians), images, photos, tuple(given_up), limit)
 
 
+def _photo_bytes(dataset: Dataset) -> int:
+    """Bytes of all decoded training photos with their masks."""
+    return sum(
+        (_RGB + (_MASK if view.mask else 0)) * view.camera.width * view.camera.height
+        for view in dataset.train
+    )
+
+
+def _too_little(budget: int, least: int, present: int, files_too_large: bool) -> SettingError:
+    needed = f"need {format_bytes(least)}"
+    if present > _FEWEST_GAUSSIANS:
+        problem = f"to resume with {present:,} Gaussians, which {needed}; use more"
+    else:
+        # The resolution does not help where the file is the problem: it is decoded completely.
+        smaller = "smaller image files" if files_too_large else "a lower resolution"
+        problem = f"for photos of this size, which {needed}; use more, or {smaller}"
+    return SettingError("memory", f"{format_bytes(budget)} is too little {problem}")
+
+
+#: Bytes of the prefixes of decimal units, in ascending order: the exponent of 1024 is the index.
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
 
 def parse_bytes(text: str) -> int:
-    """Bytes of "4GB", "800 MB", "1.5g" or a plain number; "GiB" and its like are powers of 1024.
+    """Bytes of "4GB", "800 MB", "1.5g" or a plain number; "GiB" and similar are powers of 1024.
 
     Raises:
-        UserError: anything else.
+        SettingError: ``memory`` is anything else.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]?)(i?)b?\s*", text.lower())
     if match is None or (match[3] and not match[2]) or float(match[1]) <= 0:
-        raise UserError(f"--memory is {text!r}; it must be like 4GB or 800MB")
+        raise SettingError("memory", f"{text!r} is not a size; use e.g. 4GB or 800MB")
     unit = _UNITS[match[2]]
     if match[3]:
         unit = 1024 ** (list(_UNITS).index(match[2]))
     return int(float(match[1]) * unit)
 
 
-def in_words(count: int) -> str:
-    """Such as "1.3 GB" or "240 MB"."""
+def format_bytes(count: int) -> str:
+    """As in "1.3 GB" or "240 MB"."""
     return f"{count / 1e9:.1f} GB" if count >= 0.95e9 else f"{max(1, round(count / 1e6))} MB"
