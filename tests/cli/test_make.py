@@ -93,7 +93,7 @@ def test_from_photos_to_files_and_what_is_done_again(
     # A file that is missing: that stage and the later ones.
     shutil.rmtree(out / "scene/test")
     again = run(*command)
-    assert "pictures: done again (files of it are missing)" in again.out
+    assert "pictures: done again (its files are missing)" in again.out
     assert state(out).keys() == before.keys()
     assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_120/point_cloud.ply"]
 

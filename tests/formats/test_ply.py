@@ -224,8 +224,8 @@ def test_counts_beyond_the_file_allocate_nothing(tmp_path, count, format):
     [
         ((b"ply\n", b"plz\n"), "not a PLY file"),
         ((b"format binary_little_endian 1.0\n", b""), "format"),
-        ((b"1.0", b"2.0"), "makes no sense"),
-        ((b"property float opacity", b"property quaternion opacity"), "makes no sense"),
+        ((b"1.0", b"2.0"), "invalid line"),
+        ((b"property float opacity", b"property quaternion opacity"), "invalid line"),
         ((b"property float opacity", b"property float x"), "twice"),
         ((b"property float opacity", b"property float alpha"), "no opacity"),
         ((b"property float f_rest_8", b"property float f_rest_9"), "SH degree"),

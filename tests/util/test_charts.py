@@ -1,4 +1,4 @@
-"""Charts: round ticks, curves within the frame, nothing that is not finite."""
+"""Charts: round ticks, curves within the frame, no values that are not finite."""
 
 import math
 import re
@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from snowsplat.util.charts import chart, smoothed, tick_words, ticks
+from snowsplat.util.charts import chart, smoothed, tick_labels, ticks
 
 
 @pytest.mark.parametrize(
@@ -31,11 +31,11 @@ def test_ticks_of_a_single_value(value):
 
 
 def test_tick_words():
-    assert tick_words([0, 20000, 40000]) == ["0", "20k", "40k"]
-    assert tick_words([0, 0.02, 0.04]) == ["0", "0.02", "0.04"]
-    assert tick_words([0, 500, 1000, 1500]) == ["0", "500", "1000", "1500"]
-    assert tick_words([1e6, 1.5e6]) == ["1.0M", "1.5M"]
-    assert tick_words([20, 25, 30]) == ["20", "25", "30"]
+    assert tick_labels([0, 20000, 40000]) == ["0", "20k", "40k"]
+    assert tick_labels([0, 0.02, 0.04]) == ["0", "0.02", "0.04"]
+    assert tick_labels([0, 500, 1000, 1500]) == ["0", "500", "1000", "1500"]
+    assert tick_labels([1e6, 1.5e6]) == ["1.0M", "1.5M"]
+    assert tick_labels([20, 25, 30]) == ["20", "25", "30"]
 
 
 def test_smoothed_keeps_lines_and_ends():
@@ -46,10 +46,10 @@ def test_smoothed_keeps_lines_and_ends():
     assert smoothed([], 3) == []
 
 
-def test_chart_draws_all_within_its_frame():
+def test_chart_draws_everything_within_its_frame():
     points = [(i, 1.0 / (i + 1)) for i in range(50)]
     raw = [(i, y + 0.1 * math.sin(i)) for i, y in points]
-    raw[7] = (7, 1e6)  # a step that went wild
+    raw[7] = (7, 1e6)  # an outlier
     svg = chart(points, raw=raw, x_label="steps", y_label="loss <L1>", dots=True)
     root = ET.fromstring(svg)
     assert root.find("{http://www.w3.org/2000/svg}title").text == "loss <L1>"
@@ -62,13 +62,13 @@ def test_chart_draws_all_within_its_frame():
         assert len(numbers) == 100
         assert 0 <= min(numbers[0::2]) <= max(numbers[0::2]) <= width
         assert 0 <= min(numbers[1::2]) <= max(numbers[1::2]) <= height
-        # The wild step does not flatten the curve.
+    # The outlier does not flatten the curve.
     ys = [float(y) for y in re.findall(r" ([\d.]+)", drawn[1])]
     assert max(ys) - min(ys) > height / 2
     assert sum(e.get("class") == "dot" for e in root.iter()) == 50
 
 
-def test_chart_of_little():
+def test_chart_of_few_points():
     assert chart([], x_label="x", y_label="y") == ""
     assert chart([(1, math.nan), (2, math.inf)], x_label="x", y_label="y") == ""
     for points in ([(5.0, 3.0)], [(0.0, 0.0)], [(1.0, 2.0), (2.0, 2.0)]):

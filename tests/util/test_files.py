@@ -1,4 +1,4 @@
-"""Files are whole or absent, and what a kill leaves beside them can be told and removed."""
+"""Files are complete or missing; temporary files of killed writers are recognised and removed."""
 
 import errno
 import json
@@ -24,7 +24,7 @@ def interrupted_write(path):
         raise KeyboardInterrupt(temporary.name)
 
 
-def test_a_failure_leaves_the_old_file_and_nothing_beside_it(tmp_path):
+def test_a_failure_leaves_only_the_old_file(tmp_path):
     write_text(tmp_path / "a.txt", "old")
     with pytest.raises(KeyboardInterrupt):
         interrupted_write(tmp_path / "a.txt")
@@ -32,7 +32,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_beside_it(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_files_are_for_others_to_read_as_any_file_is(tmp_path):
+def test_files_have_the_default_permissions(tmp_path):
     mask = os.umask(0o022)
     try:
         write_text(tmp_path / "a.txt", "x")
@@ -41,29 +41,29 @@ def test_files_are_for_others_to_read_as_any_file_is(tmp_path):
     assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == 0o644
 
 
-def test_json_knows_no_infinity(tmp_path):
+def test_json_has_null_for_infinity_and_nan(tmp_path):
     write_json(tmp_path / "a.json", {"a": [math.inf, (math.nan, 1.5)]})
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, [None, 1.5]]}
 
 
-def test_what_a_kill_left_is_removed_and_nothing_else(tmp_path):
+def test_only_temporary_files_of_killed_writers_are_removed(tmp_path):
     with pytest.raises(KeyboardInterrupt) as caught:
         interrupted_write(tmp_path / "job.json")
-    # As if the process had been killed before it could remove it.
+    # Restore the temporary file, as if the process had been killed before it could remove it.
     (tmp_path / str(caught.value)).write_text("a par")
-    mine = (".other.json.abcdefgh.tmp", ".other.json.tmp", ".job.json.bak", "job.json", "a.tmp")
-    for name in (".job.json.abcd_123.tmp", *mine):
+    others = (".other.json.abcdefgh.tmp", ".other.json.tmp", ".job.json.bak", "job.json", "a.tmp")
+    for name in (".job.json.abcd_123.tmp", *others):
         (tmp_path / name).write_text("")
     remove_temporaries(tmp_path, ["job.json"])
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(mine)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
 
 
-def test_the_next_write_takes_what_a_kill_left(tmp_path):
+def test_the_next_write_reuses_the_temporary_file_of_a_killed_writer(tmp_path):
     program = """
 import os, sys
 from snowsplat.util.files import atomic_path
 with atomic_path(sys.argv[1]) as temporary:
-    temporary.write_text("a part that is longer than the whole")
+    temporary.write_text("a part that is longer than the complete file")
     os._exit(9)
 """
     target = tmp_path / "scene.spz"
@@ -71,14 +71,14 @@ with atomic_path(sys.argv[1]) as temporary:
         done = subprocess.run([sys.executable, "-c", program, target], env=ENVIRONMENT, check=False)
         assert done.returncode == 9
         assert len(list(tmp_path.iterdir())) == 1
-    write_text(target, "whole")
+    write_text(target, "complete")
     assert [path.name for path in tmp_path.iterdir()] == ["scene.spz"]
-    assert target.read_text() == "whole"
+    assert target.read_text() == "complete"
 
 
-def test_writers_of_one_file_do_not_meet(tmp_path):
+def test_concurrent_writers_of_one_file_do_not_interfere(tmp_path):
     target = tmp_path / "a.txt"
-    whole = {letter * 100_000 for letter in "abcd"}
+    complete = {letter * 100_000 for letter in "abcd"}
     seen = set()
 
     def write(text):
@@ -86,24 +86,26 @@ def test_writers_of_one_file_do_not_meet(tmp_path):
             write_text(target, text)
 
     with ThreadPoolExecutor(4) as pool:
-        running = [pool.submit(write, text) for text in whole]
+        running = [pool.submit(write, text) for text in complete]
         while not all(future.done() for future in running):
             if target.exists():
                 seen.add(target.read_text())
         for future in running:
             future.result()
-    assert seen <= whole
+    assert seen <= complete
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_an_error_names_the_file_that_was_asked_for(tmp_path):
+def test_errors_name_the_target_and_not_the_temporary_file(tmp_path):
     with pytest.raises(FileNotFoundError) as absent:
         write_text(tmp_path / "absent" / "a.txt", "x")
     assert absent.value.filename == str(tmp_path / "absent" / "a.txt")
 
     def full():
         with atomic_path(tmp_path / "a.txt"):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write says it
+            raise OSError(
+                errno.ENOSPC, os.strerror(errno.ENOSPC)
+            )  # as a write raises it, without a name
 
     with pytest.raises(OSError, match="a.txt") as caught:
         full()

@@ -1,4 +1,4 @@
-"""The scaffolding of reports: well-formed, escaped, alone."""
+"""The parts of report pages: well-formed, escaped, self-contained."""
 
 import xml.etree.ElementTree as ET
 
@@ -8,7 +8,7 @@ from PIL import Image
 from snowsplat.util import html
 
 
-def test_page_is_xml_whatever_the_words_are():
+def test_page_is_xml_for_any_text():
     nasty = "a <b> & 'c' \"d\" \x00\x1b \udcff 雪"
     parts = [
         html.cards([(html.text(nasty), "words")]),
@@ -19,11 +19,11 @@ def test_page_is_xml_whatever_the_words_are():
     ]
     page = html.page(nasty, parts, ".own { color: red; }")
     root = ET.fromstring(page)
-    told = "".join(root.find("body").itertext())
-    assert told.count("a <b> & 'c' \"d\"") == 3
+    body = "".join(root.find("body").itertext())
+    assert body.count("a <b> & 'c' \"d\"") == 3
     assert root.find(".//table[@class='facts']/tbody/tr/th").text == "about"
     assert root.find("head/title").text.startswith("a <b> &")
-    assert "<b>" not in page.replace("<b>a &lt;b&gt;", "")  # but that of the card
+    assert "<b>" not in page.replace("<b>a &lt;b&gt;", "")  # except that of the card
     assert ".own { color: red; }" in page
     assert root.find(".//img").get("src").startswith("data:image/jpeg;base64,")
     assert root.find(".//img").get("alt").startswith("a <b>")

@@ -1,4 +1,4 @@
-"""The machine in words."""
+"""The description of the machine."""
 
 import contextlib
 import getpass
@@ -16,9 +16,9 @@ def test_machine():
     assert platform.python_version().startswith(system_name().split()[-1])
 
 
-def test_it_tells_not_whose():
-    told = f"{processor_name()} {system_name()}"
+def test_no_user_or_host_name():
+    text = f"{processor_name()} {system_name()}"
     names = [platform.node(), os.environ.get("HOSTNAME", "")]
     with contextlib.suppress(OSError, KeyError):
         names.append(getpass.getuser())
-    assert not [name for name in names if len(name) > 3 and name in told]
+    assert not [name for name in names if len(name) > 3 and name in text]

@@ -1,4 +1,4 @@
-"""Ctrl-C held back, and let through by those who wait."""
+"""Deferred Ctrl-C."""
 
 import os
 import signal
@@ -15,7 +15,7 @@ def press() -> None:
 
 
 def done_before_interrupt(*actions: Callable[[], None]) -> int:
-    """How many actions end before Ctrl-C comes through."""
+    """Number of actions that finish before KeyboardInterrupt is raised."""
     done = 0
     try:
         with interrupts_between_steps():
@@ -24,21 +24,21 @@ def done_before_interrupt(*actions: Callable[[], None]) -> int:
                 done += 1
     except KeyboardInterrupt:
         return done
-    raise AssertionError("no Ctrl-C came through")
+    raise AssertionError("no KeyboardInterrupt was raised")
 
 
-def test_it_is_held_until_it_is_let_through():
+def test_it_is_deferred_until_let_interrupt():
     let_interrupt()
     assert done_before_interrupt(let_interrupt, press, lambda: None, let_interrupt, press) == 3
-    let_interrupt()  # that was all of it
+    let_interrupt()  # nothing is pending any more
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_the_second_one_is_not_held():
+def test_the_second_one_is_not_deferred():
     assert done_before_interrupt(press, press) == 1
 
 
-def test_the_trainer_lets_it_through_by_what_it_was_given():
+def test_the_function_of_the_context_raises_it():
     with interrupts_between_steps() as let:
         let()
         press()
@@ -46,13 +46,13 @@ def test_the_trainer_lets_it_through_by_what_it_was_given():
             let()
 
 
-def test_what_came_after_the_last_step_is_forgotten_with_it():
+def test_a_pending_one_is_dropped_at_the_end_of_the_context():
     with interrupts_between_steps():
         press()
     let_interrupt()
 
 
-def test_elsewhere_nothing_is_held():
+def test_nothing_is_deferred_in_other_threads():
     found = []
 
     def run() -> None:

@@ -1,4 +1,4 @@
-"""JSON, names and values that anybody may have written."""
+"""Untrusted JSON, names and values."""
 
 import json
 import os
@@ -31,7 +31,7 @@ class Outer:
     on: bool = False
 
 
-def test_a_dataclass_comes_back():
+def test_a_dataclass_is_restored():
     values = {
         "count": 3,
         "share": 1,
@@ -48,7 +48,9 @@ def test_a_dataclass_comes_back():
     inner, parts = Inner("x", 0.5), [Inner("y")]
     expected = Outer(3, 1, "b", (1, 2.5), (1, 2, 3), inner, {"a": 1}, parts, [None, {"z": 1}], True)
     assert made == expected
-    assert isinstance(from_json(Inner, {"name": "x", "when": 1}).when, int)  # a step, no fraction
+    assert isinstance(
+        from_json(Inner, {"name": "x", "when": 1}).when, int
+    )  # not converted to float
 
 
 @pytest.mark.parametrize(
@@ -66,18 +68,18 @@ def test_a_dataclass_comes_back():
         {"more": 1},
     ],
 )
-def test_what_is_of_another_type_is_refused(changed):
-    with pytest.raises(ValueError):  # noqa: PT011 (the message is for whoever catches it)
+def test_values_of_another_type_are_rejected(changed):
+    with pytest.raises(ValueError):  # noqa: PT011 (callers write their own messages)
         from_json(Outer, {"count": 1, "share": 0.5, **changed})
 
 
-def test_what_is_no_dataclass_is_refused():
+def test_values_that_are_not_objects_or_incomplete_are_rejected():
     for values in (None, [], "x", 3, {"count": 1}):
         with pytest.raises(ValueError):  # noqa: PT011
             from_json(Outer, values)
 
 
-def test_json_with_and_without_a_mark():
+def test_json_with_and_without_byte_order_mark():
     for mark in (b"", b"\xef\xbb\xbf"):
         assert parse_json(mark + '{"é": [1, 2.5, null]}'.encode()) == {"é": [1, 2.5, None]}
 
@@ -95,7 +97,7 @@ def test_json_with_and_without_a_mark():
         b"[" + b"[]," * 10**7 + b"0]",
     ],
 )
-def test_json_that_is_none(data):
+def test_invalid_json_is_rejected(data):
     with pytest.raises(ValueError):  # noqa: PT011
         parse_json(data)
 
@@ -104,8 +106,8 @@ def test_json_may_be_a_single_value():
     assert [parse_json(data) for data in (b"3", b'"a"', b"null", b"[]")] == [3, "a", None, []]
 
 
-def test_json_as_programs_write_it_may_be_large():
-    """A dataset of 100,000 photos, without a space."""
+def test_large_json_of_programs_is_accepted():
+    """A dataset with 20,000 photos, written without spaces."""
     pose = [[round(0.123456 * i * k, 6) for i in range(4)] for k in range(4)]
     frame = json.dumps({"file_path": "images/frame_00001.jpg", "transform_matrix": pose})
     data = b'{"frames": [' + b",".join([frame.encode()] * 20_000) + b"]}"
@@ -120,20 +122,20 @@ def test_a_pipe_is_not_read(tmp_path):
         read_json(tmp_path / "absent.json")
 
 
-def test_names_that_stay_and_names_that_leave(tmp_path):
+def test_names_inside_and_outside_a_folder(tmp_path):
     for name in ("a", "a/b.png", "./a", "a/../b", str(tmp_path / "a"), "..a", "a..b"):
         assert inside(tmp_path, name) == tmp_path / name
     for name in ("..", "../a", "a/../../b", "/etc/passwd", str(tmp_path) + "x/a", "a\0b"):
         assert inside(tmp_path, name) is None
 
 
-def test_names_from_the_current_folder(tmp_path, monkeypatch):
+def test_names_in_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert inside(Path(), "a") == Path("a")
     assert inside(Path(), "../a") is None
 
 
-def test_what_is_a_file(tmp_path):
+def test_is_file(tmp_path):
     (tmp_path / "a").write_text("")
     os.mkfifo(tmp_path / "pipe")
     names = ("a", "pipe", "absent", ".", "a\0", "x" * 5000)
@@ -141,7 +143,7 @@ def test_what_is_a_file(tmp_path):
     assert not is_file(Path("/dev/zero"))
 
 
-def test_what_is_quoted_is_short_and_no_command():
+def test_quoted_values_are_short_and_without_control_characters():
     assert quoted("a'b") == '"a\'b"'
     assert quoted("\x1b[2J\udcd8") == "'\ufffd[2J?'"
     assert len(quoted("\udcd8\x00" * 1000)) <= 82

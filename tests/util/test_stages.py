@@ -1,4 +1,4 @@
-"""Stages are done once, and again when anything that they depend on has changed."""
+"""Stages are executed once, and repeated if anything that they depend on has changed."""
 
 import json
 
@@ -9,7 +9,7 @@ from snowsplat.util.stages import Stages
 
 
 class _Job:
-    """Two stages, the second made from the first; counts what it does."""
+    """A job of two stages, of which the second depends on the first; lists what it executes."""
 
     def __init__(self, folder):
         self.folder, self.done, self.reasons = folder, [], []
@@ -42,7 +42,7 @@ def job(tmp_path):
     return _Job(tmp_path)
 
 
-def test_finished_stages_are_not_done_again(job):
+def test_finished_stages_are_not_repeated(job):
     first = job.run()
     assert job.done == ["one", "two"]
     assert not any(outcome.again for outcome in first)
@@ -53,7 +53,7 @@ def test_finished_stages_are_not_done_again(job):
     assert [outcome.seconds for outcome in second] == [outcome.seconds for outcome in first]
 
 
-def test_a_changed_setting_is_named_and_later_stages_follow(job):
+def test_a_changed_setting_is_reported_and_later_stages_are_repeated(job):
     job.run()
     job.run(first="c")
     assert job.done == ["one", "two"]
@@ -63,15 +63,15 @@ def test_a_changed_setting_is_named_and_later_stages_follow(job):
 
 
 @pytest.mark.parametrize("lost", ["one.txt", "two/file.txt"])
-def test_missing_files_are_made_again(job, lost):
+def test_missing_files_are_written_again(job, lost):
     job.run()
     (job.folder / lost).unlink()
     job.run()
     assert job.done == (["one", "two"] if lost == "one.txt" else ["two"])
-    assert job.reasons == ["files of it are missing"]
+    assert job.reasons == ["its files are missing"]
 
 
-def test_a_stage_that_fails_is_not_finished_and_keeps_the_earlier_ones(job):
+def test_a_failed_stage_is_not_finished_and_earlier_ones_stay_finished(job):
     job.run()
     work = job._work
 
@@ -83,11 +83,11 @@ def test_a_stage_that_fails_is_not_finished_and_keeps_the_earlier_ones(job):
     with pytest.raises(KeyboardInterrupt):
         job.run(second="d")
     job._work = work
-    job.run()  # the old setting: but the files are no longer those of it
+    job.run()  # the setting is the old one again, but the files are not
     assert job.done == ["two"]
 
 
-def test_a_damaged_record_is_named(tmp_path):
+def test_a_damaged_record_is_reported(tmp_path):
     for content in ("{", "[]", json.dumps({"stages": {}})):
         (tmp_path / "job.json").write_text(content)
         with pytest.raises(UserError, match=r"job\.json: damaged"):

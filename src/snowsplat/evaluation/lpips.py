@@ -1,8 +1,8 @@
 """LPIPS, a learned perceptual distance of images (Zhang, Isola, Efros, Shechtman, Wang, CVPR 2018).
 
-It needs the weights of a network that was trained on photos, and of its five linear heads. Their
-licence does not allow us to include them, so the user provides a file with both. Where the `lpips`
-package is installed, this code writes such a file:
+It needs the weights of a network that was trained on photos, and of its five linear heads. They are
+not part of this package; the user provides a file with both. Where the `lpips` package is
+installed, this code writes such a file:
 
     weights = {name: w.clone() for name, w in lpips.LPIPS(net="vgg").state_dict().items()}
     safetensors.torch.save_file(weights, "lpips_vgg.safetensors")

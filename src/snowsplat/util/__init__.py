@@ -1,1 +1,1 @@
-"""Helpers without knowledge of Gaussians: files, errors, JSON, processes, HTML."""
+"""Helpers that do not depend on Gaussians: files, errors, JSON, processes, HTML."""

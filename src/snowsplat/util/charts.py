@@ -1,4 +1,4 @@
-"""Curves as SVG, for reports: axes with few round numbers, in the colours of the page."""
+"""Line charts as SVG for reports, with round numbers on the axes, in the colours of the page."""
 
 from __future__ import annotations
 
@@ -6,11 +6,19 @@ import math
 from collections.abc import Sequence
 from html import escape
 
-_WIDTH, _HEIGHT = 520, 230  # in units of the drawing
-_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 10, 34
-_TICKS_X, _TICKS_Y = 6, 5  # about as many
+# Size of the chart in SVG units.
+_WIDTH = 520
+_HEIGHT = 230
+# Margins around the plot area in SVG units; tick labels and the x label are in them.
+_LEFT = 58
+_RIGHT = 14
+_TOP = 10
+_BOTTOM = 34
+# Approximate number of ticks per axis.
+_TICKS_X = 6
+_TICKS_Y = 5
 
-#: CSS that the page needs.
+#: CSS for pages with charts.
 STYLE = """
 svg.chart { width: 100%; height: auto; display: block; }
 .chart text { fill: var(--soft); font-size: 12px; font-variant-numeric: tabular-nums; }
@@ -31,18 +39,21 @@ def chart(
     dots: bool = False,
     from_zero: bool = True,
 ) -> str:
-    """A curve through points (x, y); "" if there is none to draw.
+    """An SVG element with a curve; "" if no point is finite.
 
     Args:
-        x_label, y_label: what the axes are, and their units.
-        raw: the same before it was smoothed, drawn faintly behind.
-        dots: mark the points, which are few.
-        from_zero: the vertical axis begins at 0.
+        points: (x, y) with ascending x. Points that are not finite are skipped.
+        x_label: quantity and unit of the x axis.
+        y_label: quantity and unit of the y axis, for the title.
+        raw: the points before smoothing. They are drawn as a faint curve behind.
+        dots: draw a dot at each point.
+        from_zero: start the y axis at 0.
     """
     points, raw = _finite(points), _finite(raw)
     if not points:
         return ""
-    # What is not smoothed may go beyond the edge, lest a single step makes the curve flat.
+    # The axis leaves out the 2% most extreme raw values at each end, so that a single outlier does
+    # not flatten the curve.
     ys = [y for _, y in points] + sorted(y for _, y in raw)[len(raw) // 50 : -(len(raw) // 50) - 1]
     x_ticks = ticks(min(0.0, points[0][0]), max(points[-1][0], 1e-9), _TICKS_X)
     y_ticks = ticks(0.0 if from_zero else min(ys), max(ys), _TICKS_Y)
@@ -57,18 +68,18 @@ def chart(
         )
 
     parts = []
-    for tick, word in zip(y_ticks, tick_words(y_ticks), strict=True):
+    for tick, word in zip(y_ticks, tick_labels(y_ticks), strict=True):
         _, y = at(left, tick)
         parts.append(f'<path class="grid" d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}"/>')
         parts.append(f'<text x="{_LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{word}</text>')
     bottom = _HEIGHT - _BOTTOM
-    for tick, word in zip(x_ticks, tick_words(x_ticks), strict=True):
+    for tick, word in zip(x_ticks, tick_labels(x_ticks), strict=True):
         if tick > right:
             continue
         x, _ = at(tick, low)
         parts.append(f'<path class="grid" d="M{x:.1f} {bottom}v4"/>')
         parts.append(f'<text x="{x:.1f}" y="{bottom + 17}" text-anchor="middle">{word}</text>')
-    # At the end of its axis, below the numbers.
+    # The x label is at the end of the axis, below the tick labels.
     parts.append(
         f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 4}" text-anchor="end">{escape(x_label)}</text>'
     )
@@ -87,7 +98,7 @@ def chart(
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:
-    """About ``count`` round numbers, at equal steps, from ``low`` or below to ``high`` or above."""
+    """About ``count`` round numbers at equal steps that cover the range ``low`` to ``high``."""
     span = high - low
     if not span > 1e-9 * max(abs(low), abs(high), 1e-9):
         span = abs(high) or 1.0
@@ -99,8 +110,11 @@ def ticks(low: float, high: float, count: int) -> list[float]:
     return [i * step for i in range(first, last + 1)]
 
 
-def tick_words(values: Sequence[float]) -> list[str]:
-    """All with as many decimals as they need; from 10,000 on as k, from a million on as M."""
+def tick_labels(values: Sequence[float]) -> list[str]:
+    """Labels of ticks, all with the number of decimals that the step needs.
+
+    Values from 10,000 are shown in thousands (k), values from a million in millions (M).
+    """
     largest = max(abs(value) for value in values)
     step = values[1] - values[0] if len(values) > 1 else largest
     for least, unit, word in ((1e6, 1e6, "M"), (1e4, 1e3, "k")):
@@ -113,9 +127,10 @@ def tick_words(values: Sequence[float]) -> list[str]:
 
 
 def smoothed(points: _Points, window: int) -> list[tuple[float, float]]:
-    """Each y that of a line through those around it, less weighed up to ``window`` to each side.
+    """Smooth y by local linear regression.
 
-    (A mean would lag behind at the ends.)
+    The weights decrease linearly over ``window`` points on each side. A moving average would be
+    biased at the ends.
     """
     result = []
     for i, (x, _) in enumerate(points):

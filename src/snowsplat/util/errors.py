@@ -2,7 +2,10 @@
 
 
 class UserError(Exception):
-    """One line: what is wrong, and what to do about it. The command line exits with 2 after it."""
+    """An error with a one-line message: what is wrong, and what to do.
+
+    The command line prints the message and exits with status 2.
+    """
 
 
 class SettingError(UserError):

@@ -1,4 +1,4 @@
-"""Whole files or none: what the program writes appears under its name when it is complete."""
+"""Atomic writing: a file appears under its name only when it is complete."""
 
 import contextlib
 import json
@@ -11,7 +11,7 @@ from typing import Any
 
 try:
     import fcntl
-except ImportError:  # Windows has none
+except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 _TEMPORARY = re.compile(r"\.(.+?)(\.[a-z0-9_]{8})?\.tmp")
@@ -25,15 +25,15 @@ def _default_mode() -> int:
 
 @contextlib.contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Give a temporary name beside ``path``; rename it to ``path`` when the block ends well.
+    """Context with a temporary file that is renamed to ``path`` when the block ends.
 
-    The temporary lies in the same folder, so that the rename is one step of one file system, and is
-    synced before it: after a crash or a power cut ``path`` holds the old content or the new, never
-    a part. If the block raises, the temporary is removed and ``path`` is as it was. What a kill
-    leaves of it, the next write of ``path`` takes for its own.
+    The temporary file is in the same folder, so the rename is atomic, and it is synced before the
+    rename. After a crash or a power cut, ``path`` has either the old or the new content, never a
+    part of it. If the block raises, the temporary file is removed and ``path`` does not change. If
+    the process is killed, the temporary file stays; the next write of ``path`` reuses it.
 
     Raises:
-        OSError: the folder is absent or not writable, or the disk is full. It names ``path``.
+        OSError: the folder is missing or not writable, or the disk is full. It names ``path``.
     """
     path = Path(path)
     try:
@@ -42,7 +42,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             yield temporary
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
-            os.chmod(temporary, _default_mode())  # so far it is private
+            os.chmod(temporary, _default_mode())  # mkstemp and _lock create private files
             os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(OSError):
@@ -63,32 +63,33 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 
 def _temporary(path: Path) -> tuple[int | None, Path]:
-    """An empty file beside ``path``, and the handle that says that it is in use.
+    """An empty file beside ``path``, and the handle of its lock (None without a lock).
 
-    It has always the same name, and a lock as long as its writer lives: so one that a kill has left
-    is told from one that another process or thread writes now. Then, and where there are no locks,
-    it is one of a random name.
+    The name of the file is always the same, and the writer holds a lock on it. Without the lock, a
+    file that remains from a killed process is reused. If another process or thread holds the lock,
+    or if the system has no locks, the file gets a random name.
     """
     if fcntl is not None:
         temporary = path.with_name(f".{path.name}.tmp")
         with contextlib.suppress(OSError):
-            return _locked(temporary), temporary
+            return _lock(temporary), temporary
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     os.close(handle)
     return None, Path(name)
 
 
-def _locked(temporary: Path) -> int:
-    """The handle of an empty file that nobody else has.
+def _lock(temporary: Path) -> int:
+    """Create or open a file, lock and empty it; return its handle.
 
     Raises:
-        OSError: somebody else has it, there are no locks here, or no such file can be.
+        OSError: another writer holds the lock, locks are not supported, or the file cannot be
+            created.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     handle = os.open(temporary, flags, 0o600)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Its last writer may have renamed it between the two lines above.
+        # Between open and flock, the previous writer may have renamed the file.
         if not os.path.samestat(os.fstat(handle), os.stat(temporary)):
             raise FileNotFoundError(temporary)
         os.ftruncate(handle, 0)
@@ -99,21 +100,21 @@ def _locked(temporary: Path) -> int:
 
 
 def is_temporary(path: Path, names: Collection[str]) -> bool:
-    """Whether `atomic_path` gives this name to a file of one of these."""
+    """Whether ``path`` is a temporary file of `atomic_path` for a file with one of ``names``."""
     match = _TEMPORARY.fullmatch(path.name)
     return match is not None and match[1] in names
 
 
 def remove_temporaries(folder: Path, names: Collection[str]) -> None:
-    """Remove from ``folder`` what a kill has left of `atomic_path` for files of these names."""
+    """Remove the temporary files in ``folder`` that killed writers of these names have left."""
     for path in folder.glob(".*.tmp"):
         if is_temporary(path, names):
             path.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:
-    # Makes the rename itself durable. Windows cannot open a folder, and some network file systems
-    # refuse to sync one: there the rename is atomic all the same, only later on disk.
+    # Makes the rename durable. Windows cannot open folders, and some network file systems cannot
+    # sync them. There the rename is still atomic, but it may reach the disk later.
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -123,13 +124,16 @@ def _sync_folder(folder: Path) -> None:
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write a UTF-8 text file atomically."""
+    """Write a UTF-8 text file atomically. Raises OSError like `atomic_path`."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_json(path: Path | str, value: Any) -> None:
-    """Write a JSON file atomically. NaN and infinity become null, which strict readers accept."""
+    """Write a JSON file atomically. NaN and infinity are written as null, as JSON requires.
+
+    Raises OSError like `atomic_path`.
+    """
     write_text(path, json.dumps(_finite(value), indent=2, allow_nan=False) + "\n")
 
 
@@ -144,5 +148,5 @@ def _finite(value: Any) -> Any:
 
 
 def shown(path: Path | str) -> str:
-    """A path for people: bytes that are no text become "?"."""
+    """A path as printable text: bytes that are not valid text become "?"."""
     return str(path).encode("utf-8", "replace").decode()

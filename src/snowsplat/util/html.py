@@ -1,7 +1,7 @@
-"""Pages of HTML that need nothing else: one look, light and dark, for all reports.
+"""Self-contained HTML pages for reports, with a common style in light and dark.
 
-They are XML too. Arguments called ``html`` are markup already; whatever else comes from outside
-(names of files) goes through `text`.
+The pages are also well-formed XML. Arguments named ``html`` are markup. Any other text, such as
+file names, must be escaped with `text`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,13 @@ summary { cursor: pointer; color: var(--soft); } ol { margin: 6px 0; padding-lef
 
 
 def page(title: str, html: Iterable[str], style: str = "") -> str:
-    """The whole page: parts one below the other, empty ones left out; ``style`` is more CSS."""
+    """A complete page.
+
+    Args:
+        title: plain text.
+        html: the parts of the page, from top to bottom; empty parts are skipped.
+        style: additional CSS.
+    """
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
         '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
@@ -56,15 +62,18 @@ def page(title: str, html: Iterable[str], style: str = "") -> str:
 
 
 def cards(html: Iterable[tuple[str, str]]) -> str:
-    """Large figures, each with a word below it."""
+    """A row of cards from pairs (value, label): the value in large type, the label below."""
     inner = "".join(f'<div class="card"><b>{value}</b>{label}</div>' for value, label in html)
     return f'<div class="cards">{inner}</div>'
 
 
 def table(heads: Sequence[str], html: Iterable[Sequence[str]], kind: str = "plain") -> str:
-    """Rows of cells; ``kind`` "names" breaks long words anywhere.
+    """A table.
 
-    Without heads, the first cell of a row is what it is about.
+    Args:
+        heads: column headers. If empty, the first cell of each row is the header of the row.
+        html: the rows.
+        kind: the CSS class; with "names", long words may break anywhere.
     """
     if not heads:
         lines = (f"<tr><th>{row[0]}</th>{_cells(row[1:])}</tr>" for row in html)
@@ -79,14 +88,14 @@ def _cells(html: Sequence[str]) -> str:
 
 
 def bar(share: float) -> str:
-    """A bar for a cell of a table; of those in one column the longest has share 1."""
+    """A horizontal bar for a table cell; ``share`` is its length relative to the longest bar."""
     share = max(0.01, min(1.0, share))
     width = f"width:{35 * share:.1f}vw;max-width:{400 * share:.0f}px"
     return f'<span class="bar" style="{width}"></span>'
 
 
 def picture(image: Image.Image, alt: str, quality: int = 75) -> str:
-    """The picture (RGB) within the page, as JPEG."""
+    """An RGB image as an <img> element with embedded JPEG data."""
     data = io.BytesIO()
     image.save(data, "JPEG", quality=quality)
     source = base64.b64encode(data.getvalue()).decode("ascii")
@@ -104,5 +113,5 @@ def duration(seconds: float) -> str:
 
 
 def text(value: object) -> str:
-    """Anything as text of the page, also within quotes."""
+    """``value`` as escaped text, for elements and for quoted attributes."""
     return escape(printable(str(value)))

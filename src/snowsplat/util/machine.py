@@ -1,4 +1,4 @@
-"""What machine this is, in words: never whose, nor what it is called."""
+"""A description of this machine, without user name or host name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def processor_name() -> str:
-    """As the processor calls itself, else the name of its architecture."""
+    """The model name of the processor, or the architecture if there is no name."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -17,11 +17,11 @@ def processor_name() -> str:
         key, _, value = line.partition(":")
         if key.strip() in ("model name", "Model") and value.strip():
             return " ".join(value.split())
-    return platform.processor() or platform.machine() or "a processor without a name"
+    return platform.processor() or platform.machine() or "unknown processor"
 
 
 def memory_bytes() -> int:
-    """Memory of the machine; 0 where the system does not tell."""
+    """Memory of the machine in bytes; 0 if unknown."""
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -29,6 +29,6 @@ def memory_bytes() -> int:
 
 
 def system_name() -> str:
-    """Such as "Linux x86_64, Python 3.12"."""
+    """System, architecture and Python version, for example "Linux x86_64, Python 3.12"."""
     major, minor, *_ = platform.python_version_tuple()
     return f"{platform.system()} {platform.machine()}, Python {major}.{minor}"

@@ -1,8 +1,9 @@
-"""The PLY container: a header that declares elements, then their rows. Numbers only, no meaning.
+"""The PLY container: a header that declares elements, followed by their rows.
 
-Reads any property order and scalar type, ASCII and both byte orders, and other elements around the
-one wanted. Nothing is allocated from a count of the header before the file is known to be large
-enough for it, so that a damaged or hostile file costs one line.
+The reader supports any order and scalar type of properties, ASCII and both byte orders, and files
+with several elements. It does not interpret the values. Before it allocates memory for a count in
+the header, it checks that the file is large enough. So damaged and malicious files only cause a
+one-line error.
 """
 
 import os
@@ -16,9 +17,13 @@ import numpy as np
 
 from snowsplat.util.errors import UserError
 
+# Largest size of a header in bytes.
 _HEADER_LIMIT = 1 << 20
-_LINE_LIMIT, _NUMBER_LIMIT = 1 << 12, 1 << 10  # bytes of a row, and of each number in it
-_CHUNK_BYTES = 4 << 20  # rows are converted in pieces that stay in the cache
+# Largest size of an ASCII row in bytes: this, and the following for each number.
+_LINE_LIMIT = 1 << 12
+_NUMBER_LIMIT = 1 << 10
+# Rows are converted in blocks of this size, which fit into the CPU cache.
+_CHUNK_BYTES = 4 << 20
 _SCALARS = {
     "char": "i1",
     "uchar": "u1",
@@ -54,21 +59,21 @@ class _Element:
 
 @dataclass
 class PlyTable:
-    """One element of a PLY file: its columns are known, its rows are still in the file.
+    """One element of a PLY file whose header has been read. `rows` reads its rows.
 
-    Invariant: the file is large enough for ``count`` rows (for ASCII: for rows of the least size).
+    Invariant: the file is large enough for ``count`` rows; for ASCII, for rows of minimal size.
     """
 
     path: Path
-    format: str
-    count: int
-    columns: dict[str, str]
-    elements: tuple[str, ...]  # the names of all of the file
-    _before: list[_Element]
-    _data_start: int
+    format: str  # a key of `_BYTE_ORDERS`
+    count: int  # number of rows
+    columns: dict[str, str]  # name -> numpy type code, in the order of the file
+    elements: tuple[str, ...]  # the names of all elements in the file
+    _before: list[_Element]  # the elements before this one
+    _data_start: int  # size of the header in bytes
 
     def rows(self) -> Iterator[tuple[int, np.ndarray]]:
-        """The rows in pieces: ``(index of the first, structured array with the columns' names)``.
+        """The rows in blocks: pairs (index of the first row, structured array of the columns).
 
         Raises:
             UserError: the file ends early, or an ASCII value is not a number.
@@ -100,7 +105,7 @@ class PlyTable:
         lines = (self._line(file, limit) for _ in range(count))
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # numpy warns of no rows; the count below tells it
+                warnings.simplefilter("ignore")  # numpy warns if there are no rows; checked below
                 values = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
         except ValueError:
             raise UserError(
@@ -110,7 +115,7 @@ class PlyTable:
             raise self._truncated()
         if values.shape[1] != len(self.columns):
             raise UserError(
-                f"{self.path}: the PLY file has {values.shape[1]} numbers in a row, its header "
+                f"{self.path}: the PLY file has {values.shape[1]} numbers per row, but its header "
                 f"declares {len(self.columns)}"
             )
         rows = np.empty(count, dtype)
@@ -122,7 +127,7 @@ class PlyTable:
     def _line(self, file: BinaryIO, limit: int) -> bytes:
         line = file.readline(limit)
         if len(line) == limit:
-            raise UserError(f"{self.path}: a row of the PLY file is far too long; export it again")
+            raise UserError(f"{self.path}: a row of the PLY file is too long; export it again")
         return line
 
     def _truncated(self) -> UserError:
@@ -134,11 +139,10 @@ def _truncated(path: Path) -> UserError:
 
 
 def open_table(path: Path | str, element: str = "vertex") -> PlyTable:
-    """Read the header of a PLY file and check that the rows of ``element`` are there.
+    """Read the header of a PLY file and check that the file is large enough for ``element``.
 
     Raises:
-        UserError: absent, not a PLY file, a header that makes no sense, or a file that is too
-        short.
+        UserError: the file is missing, truncated, or not a PLY file, or its header is invalid.
     """
     path = Path(path)
     try:
@@ -160,7 +164,7 @@ def open_table(path: Path | str, element: str = "vertex") -> PlyTable:
     if wanted.has_list:
         raise UserError(f"{path}: the PLY file has a list property in its '{element}' element")
     if format == "ascii":
-        # A number and what separates it are two bytes at least; the last one may end the file.
+        # A number and its separator have at least two bytes. The last separator may be missing.
         needed = sum(e.count for e in before) + 2 * wanted.count * len(wanted.properties) - 1
     else:
         if any(e.has_list and e.count for e in before):
@@ -175,9 +179,9 @@ def open_table(path: Path | str, element: str = "vertex") -> PlyTable:
 
 
 def _header_lines(path: Path, file: BinaryIO) -> list[list[str]]:
-    """The words of each header line; leaves the file at the first byte after ``end_header``."""
+    """The words of each header line. The file position is then after the line ``end_header``."""
     if file.readline(16).rstrip(b"\r\n") != b"ply":
-        raise UserError(f"{path}: not a PLY file (its first line should be 'ply')")
+        raise UserError(f"{path}: not a PLY file (its first line must be 'ply')")
     lines: list[list[str]] = []
     while file.tell() < _HEADER_LIMIT:
         line = file.readline(4096)
@@ -218,19 +222,23 @@ def _parse_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Elemen
                 elements[-1].properties[name] = _SCALARS[kind]
             case _:
                 shown = " ".join(words)[:60]
-                raise UserError(f"{path}: the PLY header has a line that makes no sense: {shown!r}")
+                raise UserError(f"{path}: the PLY header has an invalid line: {shown!r}")
     if format is None:
-        raise UserError(f"{path}: the PLY header does not say its format")
+        raise UserError(f"{path}: the PLY header has no format line")
     return format, elements
 
 
 def header(count: int, properties: list[tuple[str, str]]) -> bytes:
-    """The header of a little-endian file of vertices; properties are pairs (PLY type, name)."""
+    """The header of a little-endian file of vertices; ``properties`` are pairs (PLY type, name)."""
     return header_of([("vertex", count, properties)])
 
 
 def header_of(elements: Sequence[tuple[str, int, list[tuple[str, str]]]]) -> bytes:
-    """The header of a little-endian file of elements: name, count, pairs (PLY type, name)."""
+    """The header of a little-endian file.
+
+    Args:
+        elements: for each element its name, its count, and pairs (PLY type, name).
+    """
     lines = ["ply", "format binary_little_endian 1.0"]
     for name, count, properties in elements:
         lines.append(f"element {name} {count}")

@@ -1,4 +1,4 @@
-"""What a training asks of its process: one thread of torch, and Ctrl-C in its place."""
+"""Settings of the process during a training: one torch thread, and deferred Ctrl-C."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ import torch
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Torch on one thread: its sums depend on the number of threads. Those of `ops` do not."""
+    """Run torch on one thread, so that its sums do not depend on the number of threads.
+
+    The results of `ops` never depend on the number of threads.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -21,33 +24,35 @@ def single_threaded() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-_held = threading.Event()  # a Ctrl-C that `interrupts_between_steps` holds back
+# Set while a Ctrl-C is deferred by `interrupts_between_steps`.
+_pending = threading.Event()
 
 
 def let_interrupt() -> None:
-    """Raise the Ctrl-C that is held back: for those who wait between two steps."""
-    if _held.is_set():
+    """Raise KeyboardInterrupt if a Ctrl-C is deferred. Called by code that waits between steps."""
+    if _pending.is_set():
         raise KeyboardInterrupt
 
 
 @contextmanager
 def interrupts_between_steps() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back until the function that this gives is called. The second one is not held.
+    """Defer Ctrl-C until the function that the context provides is called.
 
-    Where Python's own handler of SIGINT is not in place, whoever replaced it decides.
+    A second Ctrl-C is not deferred. If Python's own handler of SIGINT has been replaced, or outside
+    the main thread, nothing is changed.
     """
 
-    def hold(*_: object) -> None:
-        _held.set()
+    def defer(*_: object) -> None:
+        _pending.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     main_thread = threading.current_thread() is threading.main_thread()
     if not main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield lambda: None
         return
-    signal.signal(signal.SIGINT, hold)
+    signal.signal(signal.SIGINT, defer)
     try:
         yield let_interrupt
     finally:
-        _held.clear()
+        _pending.clear()
         signal.signal(signal.SIGINT, signal.default_int_handler)

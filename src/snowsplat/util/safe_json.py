@@ -1,4 +1,4 @@
-"""What anybody may have written: JSON that takes little memory, names that stay at home."""
+"""Reading untrusted JSON and file names: limited memory, no paths outside a folder."""
 
 from __future__ import annotations
 
@@ -13,71 +13,76 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 _Kind = TypeVar("_Kind")
 
-# What values take in memory, by the character that comes with each: generous figures of CPython.
+# Upper estimates of the memory of JSON values in CPython, in bytes per occurrence of a character.
 _BYTES_OF = {b"{": 240, b"[": 72, b",": 48, b":": 48, b'"': 28}
-_ALWAYS_ALLOWED = 48 << 20  # bytes of memory
-_RATIO = (
-    2  # bytes of memory for each of a larger file; those that programs write need about as much
-)
-_LARGEST_HEADER = 1 << 20  # bytes
-_DEEPEST = 100  # values within each other; what goes through them calls itself
-_WHOLE = 1 << 64  # whole numbers are smaller; of any size, they overflow what is reckoned with them
+# Memory that is always allowed for JSON values, in bytes.
+_ALWAYS_ALLOWED = 48 << 20
+# Additional memory per byte of the text. JSON files that programs write need about this much.
+_RATIO = 2
+# Largest header of a safetensors file in bytes.
+_MAX_HEADER = 1 << 20
+# Largest nesting depth. Code that walks through values is recursive.
+_MAX_DEPTH = 100
+# Limit of integers. Larger ones would overflow in computations.
+_MAX_INTEGER = 1 << 64
 
 
 def read_json(path: Path) -> Any:
     """The value in a JSON file.
 
     Raises:
-        OSError: absent, or not to be read.
-        ValueError: see `parse_json`; or it is no file at all, but a pipe or a device.
+        OSError: the file is missing or cannot be read.
+        ValueError: as `parse_json`, or ``path`` is a pipe or a device.
     """
-    if path.exists() and not path.is_file():  # a pipe never ends
+    if path.exists() and not path.is_file():  # reading a pipe may never end
         raise ValueError("not a file")
     return parse_json(path.read_bytes())
 
 
 def parse_json(data: bytes) -> Any:
-    """The value of a JSON text in UTF-8, with or without a mark of that.
+    """The value of a JSON text in UTF-8, with or without a byte order mark.
 
-    ``[[],[],[]`` takes twenty times as much memory as text: what would take too much is refused
-    before any is taken.
+    Some texts, such as ``[[],[],[]``, need twenty times their size in memory. A text that would
+    need too much is rejected before it is parsed.
 
     Raises:
-        ValueError: not JSON, nested too deep, or of absurdly many values. No other error.
+        ValueError: not JSON, nested too deeply, or too many values. There are no other errors.
     """
     needed = sum(data.count(sign) * size for sign, size in _BYTES_OF.items())
     if needed > _ALWAYS_ALLOWED + _RATIO * len(data):
-        raise ValueError("absurdly many values")
+        raise ValueError("too many values")
     try:
         value = json.loads(data.decode("utf-8-sig"))
     except RecursionError:
-        raise ValueError("nested too deep") from None
+        raise ValueError("nested too deeply") from None
     level = [value] if isinstance(value, dict | list) else []
-    for _ in range(_DEEPEST):
+    for _ in range(_MAX_DEPTH):
         inner = (each.values() if isinstance(each, dict) else each for each in level)
         level = [value for values in inner for value in values if isinstance(value, dict | list)]
         if not level:
             return value
-    raise ValueError("nested too deep")
+    raise ValueError("nested too deeply")
 
 
 def check_header(path: Path) -> None:
-    """Whether a safetensors file may be opened: each tensor takes ten times its part of the header.
+    """Check the header size of a safetensors file before the file is opened with its library.
+
+    In memory a tensor needs ten times the size of its entry in the header.
 
     Raises:
-        OSError: absent, or not to be read.
-        ValueError: a header that is absurdly large, or no file at all.
+        OSError: the file is missing or cannot be read.
+        ValueError: the header is too large, or ``path`` is a pipe or a device.
     """
     if path.exists() and not path.is_file():
         raise ValueError("not a file")
     with open(path, "rb") as file:
         size = int.from_bytes(file.read(8), "little")
-    if size > _LARGEST_HEADER:
-        raise ValueError("absurdly many tensors")
+    if size > _MAX_HEADER:
+        raise ValueError("too many tensors")
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is there, not a pipe nor a device; a name may be no name at all."""
+    """Whether ``path`` is a regular file. Invalid names, for example with a NUL, return False."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -85,54 +90,57 @@ def is_file(path: Path) -> bool:
 
 
 def inside(folder: Path, name: str) -> Path | None:
-    """``folder / name``; None where a name that a file gives leads out of the folder, or is none.
+    """``folder / name``; None if that is outside ``folder`` or ``name`` is not a valid name.
 
-    That is by names alone: a link that lies in the folder was put there by whoever keeps it.
+    Only names are compared. Symbolic links in the folder are followed, because only the owner of
+    the folder can create them.
     """
     if "\0" in name:
         return None
-    home = os.path.abspath(folder)
-    there = os.path.abspath(os.path.join(home, name))
-    return folder / name if Path(there).is_relative_to(home) else None
+    root = os.path.abspath(folder)
+    target = os.path.abspath(os.path.join(root, name))
+    return folder / name if Path(target).is_relative_to(root) else None
 
 
 def printable(text: str) -> str:
-    """A text for pages and terminals.
+    """A text that is safe for HTML pages and terminals.
 
-    Names may hold bytes that are no text, and control characters: XML refuses these, and terminals
-    obey them.
+    File names may contain invalid bytes and control characters. Control characters are invalid in
+    XML, and terminals execute them. They are replaced by U+FFFD, and invalid bytes by "?".
     """
     text = text.encode("utf-8", "replace").decode("utf-8")
     return "".join(c if c in "\n\t" or c.isprintable() else "\ufffd" for c in text)
 
 
 def quoted(value: object) -> str:
-    """What a file says there, for a message of one line: its beginning, in quotes."""
+    """The first 80 characters of an untrusted value, in quotes, for a one-line message."""
     return repr(printable(str(value))[:80])
 
 
 def from_json(kind: type[_Kind], values: Any) -> _Kind:
-    """A dataclass from JSON values, which have to be what its fields are declared as.
+    """A dataclass from JSON values, whose types must match the declared types of the fields.
 
-    A list is a tuple where one is meant, a whole number passes for any; fields may be left out if
-    they have a default.
+    Lists are accepted for tuples, and integers for floats. Fields with a default may be missing.
 
     Raises:
-        ValueError: of other types, of other fields, or not finite.
+        ValueError: a value has another type or is not finite, or a field is unknown or missing.
     """
     if not isinstance(values, dict):
-        raise ValueError(f"no {kind.__name__}")
+        raise ValueError(f"not a {kind.__name__}")
     hints = get_type_hints(kind)
     known = {field.name for field in fields(kind) if field.init}  # type: ignore[arg-type]
     if not values.keys() <= known:
-        raise ValueError(f"no {kind.__name__}: {quoted(sorted(values.keys() - known)[0])}")
+        raise ValueError(
+            f"unknown field of {kind.__name__}: {quoted(sorted(values.keys() - known)[0])}"
+        )
     try:
         return kind(**{name: _as(hints[name], value) for name, value in values.items()})
-    except TypeError as error:  # one is missing
+    except TypeError as error:  # a field is missing
         raise ValueError(str(error)) from None
 
 
 def _as(hint: Any, value: Any) -> Any:
+    """``value`` converted to the type ``hint``; raises `ValueError` if the types do not match."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         for part in parts:
@@ -155,10 +163,10 @@ def _as(hint: Any, value: Any) -> Any:
         if number and abs(value) <= sys.float_info.max:
             return value
     elif hint is int:
-        if type(value) is int and abs(value) < _WHOLE:
+        if type(value) is int and abs(value) < _MAX_INTEGER:
             return value
     elif isinstance(hint, type) and is_dataclass(hint):
         return from_json(hint, value)
     elif isinstance(hint, type) and type(value) is hint:
         return value
-    raise ValueError(f"{quoted(value)} is no {getattr(hint, '__name__', hint)}")
+    raise ValueError(f"{quoted(value)} is not of type {getattr(hint, '__name__', hint)}")

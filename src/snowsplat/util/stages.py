@@ -1,8 +1,8 @@
-"""Which stages of a job are finished, so that the same command goes on where it was stopped.
+"""A record of the finished stages of a job, so that the same command resumes an interrupted job.
 
-A stage is finished when it is written down here, with the same settings, and its files are there.
-What is written down depends on all that came before: a stage whose input or settings have changed
-is done again, and with it all later ones.
+A stage is finished if the record contains it with the same settings and its output files exist. The
+key of a stage also depends on all earlier stages. So if the input or the settings of a stage
+change, this stage and all later ones are repeated.
 """
 
 from __future__ import annotations
@@ -23,48 +23,52 @@ from snowsplat.util.safe_json import from_json, read_json
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a stage: its ``result``, and whether it was there already."""
+    """The result of a stage."""
 
-    result: dict[str, Any]
-    seconds: float  # what the stage took when it was done
-    again: bool  # finished in an earlier run, and left as it is
+    result: dict[str, Any]  # JSON values
+    seconds: float  # duration of the stage in the run that executed it
+    again: bool  # an earlier run finished this stage; it was not executed again
 
 
 @dataclass(frozen=True)
 class _Record:
-    """What is written down of a finished stage."""
+    """The record of a finished stage."""
 
-    key: str  # a hash of the settings, and of all that came before
+    key: str  # a hash of the settings, and of the keys of all earlier stages
     settings: dict[str, Any]
-    outputs: dict[str, int]  # how many files each has
+    outputs: dict[str, int]  # number of files of each output
     seconds: float
     result: dict[str, Any]
-    digest: str = ""  # of the result: what was damaged may still be JSON. None in older files
+    digest: str = ""  # hash of the result, to detect damage; empty in older files
 
 
 class Stages:
-    """The record of a job in a file ``file``; ``names`` are its stages in order.
+    """The record of a job.
+
+    Args:
+        file: the JSON file of the record; it need not exist.
+        names: the stages of the job in order.
 
     Raises:
-        UserError: the file is not a record of such a job.
+        UserError: the file is damaged.
     """
 
     def __init__(self, file: Path, names: Sequence[str]) -> None:
         self.file, self.names = file, list(names)
-        self.about: dict[str, Any] = {}  # facts about the whole job, kept in the same file
+        self.about: dict[str, Any] = {}  # facts about the job, stored in the same file
         self._records: dict[str, dict[str, Any]] = {}
         self._parent = ""
         if file.is_file():
             try:
-                whole = read_json(file)
-                records = dict(whole.pop("stages"))
+                content = read_json(file)
+                records = dict(content.pop("stages"))
                 self._records = {
                     name: asdict(from_json(_Record, record)) for name, record in records.items()
                 }
-                whole.pop("snowsplat")
-                self.about = whole
+                content.pop("snowsplat")
+                self.about = content
             except (ValueError, KeyError, TypeError, AttributeError):
-                raise UserError(f"{file}: damaged; delete it to begin anew") from None
+                raise UserError(f"{file}: damaged; delete it to start from the beginning") from None
 
     def run(
         self,
@@ -74,13 +78,14 @@ class Stages:
         work: Callable[[], dict[str, Any]],
         on_change: Callable[[str], None] | None = None,
     ) -> Outcome:
-        """Do a stage, unless it is finished. The stages of a job must run in their order.
+        """Execute a stage unless it is finished. The stages of a job must run in order.
 
         Args:
-            settings: JSON values on which the result depends, beside that of earlier stages.
-            outputs: files and folders that ``work`` makes.
-            work: gives the result, JSON values.
-            on_change: told, in words, why a stage that was finished is done again.
+            name: one of the names of the job.
+            settings: JSON values on which the result depends, besides the earlier stages.
+            outputs: files and folders that ``work`` writes.
+            work: executes the stage and returns its result, JSON values.
+            on_change: called with the reason if a finished stage must be repeated.
         """
         settings = json.loads(json.dumps(settings))
         key = hashlib.sha256(json.dumps([self._parent, name, settings]).encode()).hexdigest()
@@ -97,7 +102,7 @@ class Stages:
         if record is not None:
             self.save()
         start = time.monotonic()
-        # As it will be read again: with null for what is not finite.
+        # Convert the result to what a later run will read: numbers that are not finite become null.
         result = json.loads(json.dumps(work()), parse_constant=lambda _: None)
         seconds = round(time.monotonic() - start, 2)
         self._records[name] = {
@@ -112,27 +117,27 @@ class Stages:
         return Outcome(result, seconds, False)
 
     def is_finished(self, name: str) -> bool:
-        """Whether an earlier run has finished this stage, with whatever settings."""
+        """Whether an earlier run finished this stage, with any settings."""
         return name in self._records
 
     def save(self) -> None:
-        """Write the record; `run` does so after each stage."""
+        """Write the record. `run` calls this after each stage."""
         write_json(self.file, {"snowsplat": __version__} | self.about | {"stages": self._records})
 
     def _reason(
         self, record: dict[str, Any], key: str, settings: dict[str, Any], outputs: Sequence[Path]
     ) -> str:
-        """Why the stage must be done again; empty if it need not."""
+        """Why the stage must be repeated; empty if it need not be."""
         if record["digest"] not in ("", _digest(record["result"])):
-            return "what was written down of it is damaged"
+            return "its record is damaged"
         before = record["settings"]
         changed = [word for word in settings if settings[word] != before.get(word)]
         if changed or settings.keys() != before.keys():
             return "changed: " + ", ".join(word.replace("_", " ") for word in changed)
         if record["key"] != key:
-            return "what it is made from has changed"
+            return "an earlier stage has changed"
         if record["outputs"] != {_shown(p, self.file.parent): _count(p) for p in outputs}:
-            return "files of it are missing"
+            return "its files are missing"
         return ""
 
 
@@ -145,7 +150,7 @@ def _shown(path: Path, folder: Path) -> str:
 
 
 def _count(path: Path) -> int:
-    """How many files: of a folder those in it, of a file 1, and 0 of what is not there."""
+    """Number of files: of a folder those in it, 1 for a file, 0 if ``path`` does not exist."""
     if path.is_dir():
         return sum(1 for entry in path.rglob("*") if not entry.is_dir())
     return int(path.is_file())
