@@ -129,12 +129,13 @@ def test_merge_raises_the_degree():
     assert len(edit.merge([low])) == 3
 
 
-def test_with_sh_degree_changes_only_higher_coefficients():
-    gaussians = random_gaussians(5, 2)
+@pytest.mark.parametrize("before", range(4))
+def test_with_sh_degree_changes_only_higher_coefficients(before):
+    gaussians = random_gaussians(5, before)
     for degree in range(4):
         changed = edit.with_sh_degree(gaussians, degree)
         assert changed.sh_degree == degree
-        same = min(SH_REST_COUNTS[degree], SH_REST_COUNTS[2])
+        same = min(SH_REST_COUNTS[degree], SH_REST_COUNTS[before])
         torch.testing.assert_close(changed.sh_rest[:, :same], gaussians.sh_rest[:, :same])
         assert not changed.sh_rest[:, same:].any()
     assert len(edit.with_sh_degree(gaussians.select(torch.zeros(0).long()), 3)) == 0

@@ -119,8 +119,23 @@ def test_look_at_along_up_and_at_its_own_position():
     up = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
     pose = look_at(5 * up, 0 * up, up)
     assert torch.allclose(pose[:, :3] @ pose[:, :3].T, torch.eye(3, dtype=F64))
+    # The spare direction is the axis in which the viewing direction is smallest, here the first.
+    along_y = look_at(-5 * up.roll(-1), 0 * up, up.roll(-1))
+    assert torch.allclose(along_y[2, :3], up.roll(-1))
+    assert torch.allclose(along_y[1, :3], torch.tensor([-1.0, 0, 0], dtype=F64))
     with pytest.raises(ValueError, match="same point"):
         look_at(up, up, up)
+
+
+def test_look_at_of_several_cameras_is_look_at_of_each():
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
+    positions = torch.tensor([[3.0, -2, 1], [0, 0, 50], [1, 1, 4], [9, 9, 9]], dtype=F64)
+    targets = torch.tensor([[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0]], dtype=F64)
+    poses = look_at(positions, targets, up)
+    for pose, position, target in zip(poses, positions, targets, strict=True):
+        torch.testing.assert_close(pose, look_at(position, target, up))
+    with pytest.raises(ValueError, match="same point"):
+        look_at(positions, positions[[1, 1, 1, 1]], up)
 
 
 def random_points(n: int, seed: int = 0) -> torch.Tensor:
@@ -261,4 +276,5 @@ def test_morton_order_keeps_neighbours_together_despite_an_outlier():
 
 def test_morton_order_of_equal_points_and_of_no_points():
     assert torch.equal(morton_order(torch.ones(5, 3)), torch.arange(5))
-    assert len(morton_order(torch.empty(0, 3))) == 0
+    none = morton_order(torch.empty(0, 3))
+    assert (none.shape, none.dtype) == ((0,), torch.int64)

@@ -56,3 +56,54 @@ def test_overview_of_no_or_one_gaussian(n):
     view = overview(balls(torch.ones(n, 3)))
     assert all(map(math.isfinite, (*view.position, *view.target)))
     assert view.position != view.target
+
+
+def row_along_x(last: float, count: int) -> torch.Tensor:
+    """``count`` points at equal distances from −last to last."""
+    means = torch.zeros(count, 3)
+    means[:, 0] = torch.linspace(-last, last, count)
+    return means
+
+
+def distance_that_shows(radius: float) -> float:
+    """At 60° along the longer side, 1.6 times the shorter, which is to show the radius."""
+    return 1.6 * radius / math.tan(math.radians(30))
+
+
+@pytest.mark.parametrize(
+    ("means", "radius"),
+    [
+        # Distances 0, 0.1, 0.1, …, 2, 2: the radius of 95% is 1.9.
+        (row_along_x(2.0, 41), 1.9),
+        # The same with a background: half of all is within 1.5, and 2.5 times that is shown.
+        (torch.cat([row_along_x(2.0, 41), row_along_x(1000.0, 2).repeat(10, 1)]), 3.75),
+    ],
+    ids=["object", "background"],
+)
+def test_overview_contains_what_it_promises(means: torch.Tensor, radius: float):
+    shift = torch.tensor([10.0, 20.0, 30.0])
+    hidden = balls(torch.full((100, 3), 77.0), opacity_logit=math.log(0.19 / 0.81))
+    seen = balls(means + shift, opacity_logit=math.log(0.21 / 0.79))
+    view = overview(Gaussians.cat([seen, hidden]))
+    assert view.fov == 60
+    assert view.target == pytest.approx((10, 20, 30), abs=1e-4)
+    distance = distance_that_shows(radius)
+    length = math.hypot(0.35, 1)
+    expected = (10, 20 - distance * 0.35 / length, 30 - distance / length)
+    assert view.position == pytest.approx(expected, rel=1e-4)
+
+
+def test_overview_of_a_scene_without_opaque_gaussians_shows_the_others():
+    faint = balls(row_along_x(2.0, 41), opacity_logit=-5.0)
+    broken = balls(torch.full((50, 3), float("inf")), opacity_logit=-5.0)
+    view = overview(Gaussians.cat([faint, broken]))
+    assert math.dist(view.position, view.target) == pytest.approx(distance_that_shows(1.9))
+
+
+def test_overview_without_an_extent():
+    """No Gaussians: a radius of 1 around the origin. All in one place: not quite 0."""
+    nothing = overview(balls(torch.zeros(0, 3)))
+    assert nothing.target == (0, 0, 0)
+    assert math.dist(nothing.position, nothing.target) == pytest.approx(distance_that_shows(1.0))
+    one = overview(balls(torch.zeros(3, 3)))
+    assert math.dist(one.position, one.target) == pytest.approx(distance_that_shows(1e-6))

@@ -46,3 +46,25 @@ def test_photos_rolled_by_90_degrees_have_little_weight():
     some = rotations(0.3, math.radians(2), 6.0)
     some[::4] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ some[::4]
     assert float(up_direction(some) @ UP.numpy()) > math.cos(math.radians(3))
+
+
+@pytest.mark.parametrize("sector", [0.05, 0.5, 3.0])
+def test_the_result_is_the_most_likely_direction(sector):
+    """Of those near it: roll r has the density (σ² + (r/3)²)^(-9/2), the mean pitch a normal one.
+
+    The log-likelihood of ``up`` is −9/2 Σ log(σ² + (x·up / 3)²) + mean·up / σ_pitch².
+    """
+    found = rotations(0.4, math.radians(4), sector)
+    mean = -found[:, 1].mean(axis=0)
+
+    def cost(up: np.ndarray) -> float:
+        roll = found[:, 0] @ up
+        spread = math.radians(3) ** 2 + (roll / 3) ** 2
+        return float(4.5 * np.log(spread).sum() - mean @ up / math.radians(30) ** 2)
+
+    up = up_direction(found)
+    across = np.linalg.svd(up[None])[2][1:]
+    for angle in np.linspace(0, 2 * math.pi, 12):
+        other = up + 1e-3 * (math.cos(angle) * across[0] + math.sin(angle) * across[1])
+        assert cost(other / np.linalg.norm(other)) > cost(up)
+    assert float(np.linalg.norm(up)) == pytest.approx(1)

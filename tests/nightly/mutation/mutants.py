@@ -25,6 +25,8 @@ from mutmut.mutation import mutators
 #: Never mutated. Annotations and imports do nothing, or break the file at once. What a `raise`
 #: holds is the text of a message: a test checks that an error is raised, not how it reads.
 _SKIPPED = (cst.Annotation, cst.Decorator, cst.Import, cst.ImportFrom, cst.Raise, cst.Assert)
+#: Nor are these: names for `import *`, and `strict=True`, which is an assertion.
+_NEVER = m.Assign(targets=[m.AssignTarget(m.Name("__all__"))]) | m.Arg(keyword=m.Name("strict"))
 #: Calls whose arguments are not removed or replaced: each such call would fail.
 _WHOLE_CALLS = {"len", "isinstance", "range", "super", "zip"}
 
@@ -128,7 +130,7 @@ class _Visitor(cst.CSTVisitor):
     def on_visit(self, node: cst.CSTNode) -> bool:
         if isinstance(node, _SKIPPED) or _is_docstring(node) or _asks_for_device(node):
             return False
-        if node in self._of_a_gpu:
+        if node in self._of_a_gpu or m.matches(node, _NEVER):
             return False
         if isinstance(node, cst.If | cst.IfExp) and _asks_for_device(node.test):
             self._of_a_gpu |= {_branch_of_a_gpu(node), node.test}

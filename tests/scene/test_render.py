@@ -1,0 +1,81 @@
+"""`project` and `render` against the camera's own projection. For the operations see tests/ops."""
+
+import math
+
+import pytest
+import torch
+
+from snowsplat.ops import reference
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import project, render
+
+
+@pytest.fixture
+def camera() -> Camera:
+    """No two of its numbers are equal. It looks along z and stands beside the origin."""
+    pose = torch.eye(3, 4, dtype=torch.float64)
+    pose[:, 3] = torch.tensor([0.3, -0.2, 4.0])
+    return Camera(64, 48, 50.0, 70.0, 30.0, 26.0, pose)
+
+
+@pytest.fixture
+def gaussians() -> Gaussians:
+    """Three nearly opaque Gaussians, far apart, whose colours depend on the direction."""
+    generator = torch.Generator().manual_seed(0)
+    return Gaussians(
+        means=torch.tensor([[0.0, 0.0, 0.0], [0.9, 0.4, 0.5], [-1.0, -0.5, 1.0]]),
+        log_scales=torch.full((3, 3), math.log(0.1)),
+        quats=torch.randn(3, 4, generator=generator),
+        opacity_logits=torch.tensor([6.0, 7.0, 8.0]),
+        sh_dc=torch.rand(3, 1, 3, generator=generator),
+        sh_rest=0.1 * torch.randn(3, 8, 3, generator=generator),
+    )
+
+
+def test_splats_are_where_the_camera_projects_the_means(gaussians: Gaussians, camera: Camera):
+    splats = project(gaussians, camera)
+    position, depth = camera.project(gaussians.means)
+    assert splats.ids.tolist() == [0, 1, 2]
+    torch.testing.assert_close(splats.means2d, position)
+    torch.testing.assert_close(splats.depths, depth)
+
+
+@pytest.mark.parametrize(("degree", "used"), [(None, 2), (0, 0), (1, 1), (2, 2), (3, 2)])
+def test_the_degree_is_at_most_that_of_the_gaussians(
+    gaussians: Gaussians, camera: Camera, degree: int | None, used: int
+):
+    directions = torch.nn.functional.normalize(gaussians.means - camera.position.float(), dim=1)
+    coefficients = torch.cat([gaussians.sh_dc, gaussians.sh_rest], 1)[:, : (used + 1) ** 2]
+    basis = reference.sh_basis(directions, used)
+    expected = 0.5 + torch.einsum("nk,nkc->nc", basis, coefficients)
+    torch.testing.assert_close(project(gaussians, camera, degree).colors, expected.clamp_min(0))
+    color = render(gaussians, camera, sh_degree=degree).splats.colors
+    torch.testing.assert_close(color, expected.clamp_min(0))
+
+
+def test_a_render_shows_the_gaussians_over_the_background(gaussians: Gaussians, camera: Camera):
+    background = torch.tensor([0.2, 0.4, 0.6])
+    output = render(gaussians, camera, background, with_depth=True)
+    assert output.image.shape == (48, 64, 3)
+    assert output.alpha.shape == output.depth.shape == (48, 64)
+    # The upper right corner shows none of them; T is 1 there.
+    torch.testing.assert_close(output.image[0, -1], background)
+    assert float(output.alpha[0, -1]) == 0
+    assert float(output.depth[0, -1]) == 0
+    position, depth = camera.project(gaussians.means)
+    for i, (x, y) in enumerate(position.long().tolist()):
+        alpha = float(output.alpha[y, x])
+        assert 0.8 < alpha <= 1
+        assert float(output.depth[y, x]) / alpha == pytest.approx(float(depth[i]), rel=1e-5)
+        expected = alpha * output.splats.colors[i] + (1 - alpha) * background
+        torch.testing.assert_close(output.image[y, x], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_render_is_over_black_and_without_depth_by_default(gaussians: Gaussians, camera: Camera):
+    output = render(gaussians, camera)
+    assert output.depth is None
+    over_black = render(gaussians, camera, torch.zeros(3), with_depth=True)
+    assert torch.equal(output.image, over_black.image)
+    assert not output.image[0, -1].any()
+    assert len(output.splats) == 3
