@@ -217,6 +217,7 @@ def test_children_are_drawn_from_their_parent():
     """Whitened by the parent's covariance, 4000 children are standard normal."""
     n = 2000
     parent = gaussians_of([0.5])
+    parent.means[0] = torch.tensor([30.0, -20.0, 10.0])
     parent.log_scales[0] = torch.tensor([2.0, 0.4, 0.1]).log()
     gaussians = parent.select(torch.zeros(n, dtype=torch.int64))
     control, adam = set_up(gaussians)
@@ -227,6 +228,18 @@ def test_children_are_drawn_from_their_parent():
     white = (refined.means - parent.means[0]) @ rotation / parent.scales[0]
     torch.testing.assert_close(white.mean(dim=0), torch.zeros(3), atol=0.08, rtol=0)
     torch.testing.assert_close(white.T.cov(), torch.eye(3), atol=0.1, rtol=0)
+
+
+def test_children_depend_on_the_generator_of_the_control_alone():
+    """Not on that of torch, which other code uses as well."""
+    scenes = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        gaussians = gaussians_of([0.5])
+        control, adam = set_up(gaussians)
+        seen(control, [1.0])
+        scenes.append(control.after_step(600, gaussians, adam).means)
+    assert torch.equal(*scenes)
 
 
 @pytest.mark.parametrize("step", [500, 15_000])
@@ -342,6 +355,7 @@ def test_when_opacity_is_reset():
     assert resets(every_hundred[1:], random_init=True, iterations=900) == []
     assert resets(every_hundred[1:], densify_until=6400) == [3000]
     assert resets(every_hundred[1:], opacity_reset_interval=0) == []
+    assert resets(range(1, 4), opacity_reset_interval=1) == [1, 2, 3]
     # At least 500 steps remain for recovery: of densification, or of the training at the start.
     assert resets(every_hundred[1:], densify_until=3500) == [3000]
     assert resets(every_hundred[1:], densify_until=3499) == []

@@ -231,6 +231,17 @@ def test_relocated_rows_are_in_morton_order():
     assert torch.equal(adam.exp_avg["means"][untouched], refined.means[untouched])
 
 
+def test_noise_and_sources_depend_on_the_generator_of_the_control_alone():
+    scenes = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        gaussians = some_gaussians(50, opacity=0.001)
+        gaussians.opacity_logits[:9] = 1.0
+        control, adam = set_up(gaussians, max_gaussians=70)
+        scenes.append(control.after_step(500, gaussians, adam).means)
+    assert torch.equal(*scenes)
+
+
 def test_nonfinite_parameters_stop_a_relocation():
     gaussians = some_gaussians(10)
     gaussians.quats[4, 1] = math.inf
