@@ -16,7 +16,7 @@ def rendering(height: int = 20, width: int = 24) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("ssim_weight", [0.2, 0.7])
-def test_opaque_photos_give_the_photometric_loss(ssim_weight):
+def test_the_loss_of_opaque_photos_is_the_photometric_loss(ssim_weight):
     image = rendering()
     planes = torch.randint(0, 256, (3, 20, 24), dtype=torch.uint8)
     loss = view_loss(image, LoadedImage(planes), BLACK, ssim_weight)
@@ -38,7 +38,7 @@ def test_masked_pixels_have_no_loss_and_no_gradient():
     mask = torch.ones(20, 24, dtype=torch.bool)
     mask[5:, :9] = False
     planes = (255 * image.detach()).round().to(torch.uint8).permute(2, 0, 1).contiguous()
-    planes[:, ~mask] = 255 - planes[:, ~mask]  # it differs only where it does not count
+    planes[:, ~mask] = 255 - planes[:, ~mask]  # different only where it is masked
     loss = view_loss(image, LoadedImage(planes, mask), BLACK, 0.2)
     assert float(loss.detach()) < 3e-3  # the rounding to 8 bits
     loss.backward()

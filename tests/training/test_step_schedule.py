@@ -1,4 +1,4 @@
-"""The length of a training, and what stretching it on its way does to its moments."""
+"""The length of a training, and the effect of stretching it on its moments."""
 
 import pytest
 
@@ -13,7 +13,7 @@ def test_moments():
     assert schedule.step_of(1) == 1
 
 
-def test_shares_of_the_way():
+def test_fractions():
     schedule = Schedule(3000)
     assert schedule.share(0) == 0.0
     assert schedule.share(1) == 1 / 3000
@@ -26,7 +26,7 @@ def test_shares_of_the_way():
 
 @pytest.mark.parametrize("iterations", [501, 600, 1000, 1600, 9000])
 def test_stretching(iterations):
-    """Half-way through 1000 steps: no share jumps or goes back, each moment ahead still comes."""
+    """At half of 1000 steps: fractions are continuous and monotonic, future moments are reached."""
     schedule = Schedule(1000)
     moments = (0.2, 0.4999, 0.5, 0.7, 1.0)
     before = [schedule.share(500, when) for when in moments]
@@ -42,7 +42,7 @@ def test_stretching(iterations):
     assert shares[-1] == 1.0
 
 
-def test_stretching_again_and_again():
+def test_stretching_repeatedly():
     schedule = Schedule(100)
     shares = []
     for step in range(1, 100):
@@ -53,9 +53,9 @@ def test_stretching_again_and_again():
     assert schedule.share(schedule.iterations) == 1.0
 
 
-def test_the_past_is_not_to_be_changed():
+def test_the_past_cannot_be_changed():
     schedule = Schedule(100)
-    with pytest.raises(ValueError, match="40 steps, but 50 of 100 are done"):
+    with pytest.raises(ValueError, match="cannot change to 40 steps: 50 of 100 are completed"):
         schedule.stretch(50, 40)
-    with pytest.raises(ValueError, match="are done"):
+    with pytest.raises(ValueError, match="are completed"):
         schedule.stretch(100, 200)

@@ -1,4 +1,4 @@
-"""`TrainConfig`: the knobs of a training, how to change one by name, how to write them down."""
+"""`TrainConfig`: the settings of a training; changing them by name; storing them as JSON."""
 
 from __future__ import annotations
 
@@ -18,32 +18,38 @@ _SEED_LIMIT = 2**61
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides what a training does; the defaults are the paper's.
+    """All settings of a training; the defaults are the paper's.
 
     A moment (`When`) is an int, that step, or a float, that fraction of ``iterations``.
 
     Attributes:
-        iterations: steps in all, one view each.
-        seed: of every random choice. The same seed gives the same scene to the bit, on any number
-            of threads.
-        background: the colour behind the scene; "random" draws one a step, against fog in datasets
-            with a transparent background.
-        sh_degree: of the spherical harmonics in the end, 0 to 3.
-        sh_interval: steps between two degrees, beginning with 0.
+        iterations: number of steps, one view each.
+        seed: of every random choice. On a CPU, the same seed results in a bit-identical scene, for
+            any number of threads.
+        background: the colour behind the scene; "random" draws one per step, which prevents fog in
+            datasets with a transparent background.
+        sh_degree: final degree of the spherical harmonics, 0 to 3.
+        sh_interval: steps after which the degree in use increases by one, from 0; 0: use
+            ``sh_degree`` from the first step.
         ssim_weight: λ of (1 − λ) · L1 + λ · D-SSIM.
-        initial_points: how many random ones, for a dataset without points.
-        initial_opacity: of every Gaussian at the start.
-        initial_scale: of every Gaussian at the start, in mean distances to its 3 neighbours.
-        learning_rates, density: see there.
-        gaussians_per_pixel: together with ``density.max_gaussians``, a cap that follows the size of
-            the photos: small ones show no more. 0 is none.
-        visible_only: Gaussians that a view does not see skip the optimiser in its step. The paper
-            lets their momentum carry them on; this is faster and loses nothing measurable.
-        coarse_to_fine: the last moments at a quarter and at a half of the resolution. 0 is never.
-        image_memory: bytes for decoded images; 0 is half of what is available.
+        initial_points: number of random points for a dataset without points.
+        initial_opacity: of every Gaussian at initialisation.
+        initial_scale: of every Gaussian at initialisation, in units of the mean distance to its
+            three nearest neighbours.
+        learning_rates: see `LearningRates`.
+        density: settings of density control, `AdaptiveDensity` or `McmcDensity`.
+        gaussians_per_pixel: limits the number of Gaussians by the size of the photos, in addition
+            to ``density.max_gaussians``: small photos show no more. 0 is no limit.
+        visible_only: the optimiser skips Gaussians that the view of a step does not see. In the
+            paper their momentum moves them on; skipping is faster, at no measurable loss.
+        coarse_to_fine: the last moments at a quarter and at a half of the resolution; 0 is never.
+        image_memory: bytes for decoded images; 0 is half of the available memory.
         test_iterations: steps after which `Trainer.run` evaluates the test views.
-        checkpoint_every: steps between checkpoints, which the caller of `Trainer.run` writes; 0 is
-            none.
+        checkpoint_every: steps between checkpoints, which the caller of `Trainer.run` writes; 0
+            disables them.
+
+    Raises:
+        SettingError: a value is invalid.
     """
 
     iterations: int = 30_000
@@ -89,7 +95,7 @@ class TrainConfig:
                 raise SettingError(name, f"{when} is not a step; use e.g. 500, or a fraction, 0.5")
 
     def capped(self, pixels: int) -> TrainConfig:
-        """This configuration with the cap that ``gaussians_per_pixel`` means for such photos."""
+        """With ``gaussians_per_pixel`` applied to photos of ``pixels`` as a limit of Gaussians."""
         if self.gaussians_per_pixel <= 0:
             return self
         cap = max(1, round(self.gaussians_per_pixel * pixels))
@@ -98,30 +104,31 @@ class TrainConfig:
         return replace(self, density=replace(self.density, max_gaussians=cap))
 
     def downscale_at(self, step: int, schedule: Schedule) -> int:
-        """1, 2 or 4: by what the images of this step are reduced."""
+        """The factor by which images are reduced at this step: 1, 2 or 4."""
         quarter, half = (schedule.step_of(when) for when in self.coarse_to_fine)
         return 4 if step <= quarter else 2 if step <= half else 1
 
     def sh_degree_at(self, step: int) -> int:
-        """The degree in use at this step."""
+        """The degree of the spherical harmonics in use at this step."""
         return min(self.sh_degree, step // self.sh_interval) if self.sh_interval else self.sh_degree
 
 
-def changed(config: TrainConfig, **knobs: Any) -> TrainConfig:
-    """``config`` with other values for some knobs, wherever they are.
+def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
+    """``config`` with other values for some settings, by name.
 
     Args:
-        knobs: fields of `TrainConfig`; fields of its density control (``grad_threshold=4e-4``); and
-            fields of `LearningRates` after ``lr_`` (``lr_means=1e-4``). Those that are None stay.
+        settings: fields of `TrainConfig`; fields of its density control (``grad_threshold=4e-4``);
+            and fields of `LearningRates` with the prefix ``lr_`` (``lr_means=1e-4``). None leaves a
+            setting unchanged. ``max_gaussians`` replaces the limit by ``gaussians_per_pixel``.
 
     Raises:
-        UserError: a knob that this configuration does not have.
+        SettingError: the configuration has no such setting, or a value is invalid.
     """
-    given = {name: value for name, value in knobs.items() if value is not None}
+    given = {name: value for name, value in settings.items() if value is not None}
     if "max_gaussians" in given:
         given.setdefault("gaussians_per_pixel", 0.0)
-    whole = {f.name for f in fields(config)} & given.keys()
-    config = replace(config, **{name: given.pop(name) for name in whole})
+    direct = {f.name for f in fields(config)} & given.keys()
+    config = replace(config, **{name: given.pop(name) for name in direct})
     density = {f.name for f in fields(config.density)} & given.keys()
     rates = {f"lr_{f.name}" for f in fields(config.learning_rates)} & given.keys()
     for name in given.keys() - density - rates:
@@ -139,15 +146,15 @@ def changed(config: TrainConfig, **knobs: Any) -> TrainConfig:
 
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:
-    """JSON values from which `config_from_json` makes an equal configuration."""
+    """The configuration as JSON values, for `config_from_json`."""
     return asdict(config) | {"density_control": type(config.density).__name__}
 
 
 def config_from_json(values: dict[str, Any]) -> TrainConfig:
-    """What `config_to_json` wrote down.
+    """The configuration that `config_to_json` returned.
 
     Raises:
-        UserError: of another version of the program, or damaged.
+        UserError: written by another version of the program, or damaged.
     """
     controls: dict[str, Any] = {kind.__name__: kind for kind in (AdaptiveDensity, McmcDensity)}
     try:
@@ -158,5 +165,5 @@ def config_from_json(values: dict[str, Any]) -> TrainConfig:
         return replace(config, density=density, learning_rates=rates)
     except (KeyError, TypeError, ValueError):
         raise UserError(
-            "this configuration was written by another version of snowsplat; go on with that one"
+            "the configuration: written by another version of snowsplat; resume with that version"
         ) from None

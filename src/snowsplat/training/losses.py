@@ -1,4 +1,4 @@
-"""The training loss of one view: the paper's, where the photo counts."""
+"""The training loss of one view: eq. 7 of the paper, with masks and transparent photos."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from snowsplat.data.decode import LoadedImage
 def view_loss(image: Tensor, photo: LoadedImage, background: Tensor, ssim_weight: float) -> Tensor:
     """(1 − λ) · L1 + λ · (1 − SSIM), λ = ``ssim_weight``, as a scalar; gradient to ``image``.
 
-    A transparent photo is composed over ``background`` first. Where its mask is False the loss sees
-    the photo twice: no difference there, and no gradient.
+    A transparent photo is composited over ``background`` first. Where its mask is False, the image
+    is replaced by the photo: these pixels have no difference and no gradient.
 
     Args:
         image: (H, W, 3) rendering over ``background``.

@@ -1,8 +1,8 @@
-"""Named recipes: whole training configurations, and how single knobs of them are changed.
+"""Recipes: complete training configurations by name.
 
     config = recipe("paper", iterations=7000, max_gaussians=200_000)
 
-A recipe is a function that makes a `TrainConfig`; one more is a function more, entered in
+A recipe is a function that returns a `TrainConfig`. To add one, write a function and add it to
 `RECIPES`.
 """
 
@@ -15,16 +15,17 @@ from typing import Any
 from snowsplat.training.config import TrainConfig, changed
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.lr_schedule import LearningRates
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError
 
 
 def default() -> TrainConfig:
-    """The best scene for a few thousand steps, made for a plain CPU.
+    """The best quality for a few thousand steps on a CPU.
 
-    Rates are several times the paper's, those of the sizes most of all; colours follow the view
-    early; the first steps see small images; no more Gaussians than such photos can show. Too
-    short for opacity resets, from which a scene takes hundreds of steps to recover, and
-    for pruning by size. The moments are fractions, so they scale with ``iterations``.
+    Learning rates are several times the paper's, that of the scales most of all; view-dependent
+    colour starts early; the first steps use small images; the number of Gaussians is limited to
+    what the photos can show. The training is too short for opacity resets, from which a scene needs
+    hundreds of steps to recover, and for pruning by size. Moments are fractions, so they scale with
+    ``iterations``.
     """
     return TrainConfig(
         iterations=3000,
@@ -53,12 +54,12 @@ def default() -> TrainConfig:
 
 
 def paper() -> TrainConfig:
-    """The paper's schedule, complete: 30,000 steps.
+    """The complete schedule of the paper: 30,000 steps.
 
-    Where the paper's moment is the end of something (densification at 15,000, the rate of the means
-    at 30,000) it is a half or the whole of the training here: the same at 30,000 steps, and a
-    shorter training comes to an end too. The other moments stay steps. Pruning by screen size is
-    off: in pixels it depends on the resolution, and at 270×480 it costs half a dB.
+    The end of densification (step 15,000) and of the decay of the means' learning rate (step
+    30,000) are fractions here, 0.5 and 1: the same at 30,000 steps, and a shorter training reaches
+    both. Other moments are steps. Pruning by screen size is disabled: its limit in pixels depends
+    on the resolution, and at 270×480 it costs 0.5 dB.
     """
     return TrainConfig(
         learning_rates=LearningRates(means_steps=1.0),
@@ -67,10 +68,10 @@ def paper() -> TrainConfig:
 
 
 def mcmc() -> TrainConfig:
-    """The schedule of "3D Gaussian Splatting as Markov Chain Monte Carlo": 30,000 steps, a hard
-    cap.
+    """The schedule of "3D Gaussian Splatting as Markov Chain Monte Carlo": 30,000 steps and a fixed
+    limit of Gaussians.
 
-    Every Gaussian takes part in every step: the regularisers pull on those out of view as well.
+    The optimiser updates all Gaussians in every step: the regularisers act on invisible ones, too.
     """
     return TrainConfig(
         density=McmcDensity(max_gaussians=200_000), initial_opacity=0.5, initial_scale=0.1
@@ -80,12 +81,12 @@ def mcmc() -> TrainConfig:
 RECIPES: dict[str, Callable[[], TrainConfig]] = {"default": default, "paper": paper, "mcmc": mcmc}
 
 
-def recipe(name: str = "default", **knobs: Any) -> TrainConfig:
-    """A named recipe with some ``knobs`` changed, as `changed` does.
+def recipe(name: str = "default", **settings: Any) -> TrainConfig:
+    """A recipe by name, with other values for some settings: see `changed`.
 
     Raises:
-        UserError: no such recipe, or it has no such knob.
+        SettingError: there is no such recipe, it has no such setting, or a value is invalid.
     """
     if name not in RECIPES:
-        raise UserError(f"no recipe {name!r}; there are {', '.join(RECIPES)}")
-    return changed(RECIPES[name](), **knobs)
+        raise SettingError("recipe", f"{name!r} does not exist; use one of {', '.join(RECIPES)}")
+    return changed(RECIPES[name](), **settings)

@@ -1,10 +1,10 @@
-"""`Schedule`: how many steps a training has, and which of them is meant by "half-way through"."""
+"""`Schedule`: the number of steps of a training, and the step that a fraction of it means."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: A moment of the training: an int is that step, a float that fraction of the whole.
+#: A moment of the training: an int is that step, a float that fraction of all steps.
 When = int | float
 
 
@@ -12,14 +12,14 @@ When = int | float
 class Schedule:
     """The length of one training; trainer, optimiser and density control share this object.
 
-    ``stretch`` makes the training longer or shorter while it runs. What lies ahead is stretched
-    evenly, what is past stays past: learning rates go on from where they are, no stage comes twice,
-    and each still reaches its end.
+    `stretch` makes a training longer or shorter while it runs. It scales the remaining part of the
+    schedule evenly and leaves the past unchanged: learning rates continue from their current
+    values, no stage is repeated, and each still reaches its end.
 
     Attributes:
-        iterations: steps in all.
-        since: the step at which that was last changed.
-        passed: the fraction of the whole that was over then.
+        iterations: total number of steps.
+        since: the step at which that was changed last.
+        passed: the fraction of the schedule that was completed at that step.
     """
 
     iterations: int
@@ -27,7 +27,7 @@ class Schedule:
     passed: float = 0.0
 
     def step_of(self, when: When) -> int:
-        """The step that ``when`` means; of a moment that is over, some step that is over too."""
+        """The step that ``when`` means; for a past moment, a step in the past."""
         if not isinstance(when, float):
             return when
         if when < self.passed:
@@ -36,7 +36,7 @@ class Schedule:
         return self.since + round((when - self.passed) / (1.0 - self.passed) * ahead)
 
     def share(self, step: int, when: When = 1.0) -> float:
-        """How much of the way to ``when`` is over after ``step``, 0 to 1."""
+        """The fraction of the way to ``when`` that is completed after ``step``, 0 to 1."""
         if not isinstance(when, float):
             return min(1.0, step / max(1, when))
         start = min(1.0, self.passed / when) if when > 0.0 else 1.0
@@ -44,7 +44,13 @@ class Schedule:
         return min(1.0, start + (1.0 - start) * ((step - self.since) / steps))
 
     def stretch(self, step: int, iterations: int) -> None:
-        """Change the number of steps in all to ``iterations``, where ``step`` was the last one."""
-        if not step < self.iterations or not step < iterations:
-            raise ValueError(f"{iterations} steps, but {step} of {self.iterations} are done")
+        """Change the total number of steps to ``iterations``, after ``step``.
+
+        Raises:
+            ValueError: ``step`` is not before the old and the new end.
+        """
+        if step >= min(self.iterations, iterations):
+            raise ValueError(
+                f"cannot change to {iterations} steps: {step} of {self.iterations} are completed"
+            )
         self.passed, self.since, self.iterations = self.share(step), step, iterations

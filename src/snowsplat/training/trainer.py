@@ -26,8 +26,6 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import interrupts_between_steps, single_threaded
 
-__all__ = ["Progress", "TrainConfig", "Trainer"]
-
 #: Photos are decoded by other threads this many views ahead of their step.
 LOOKAHEAD = 16
 
