@@ -1,12 +1,12 @@
-"""Every scene format: how long it takes, how large it is, what the picture loses.
+"""Time, file size and image quality of every scene format.
 
     python benchmarks/formats.py SCENE
-    python benchmarks/formats.py SCENE --capture CAPTURE
+    python benchmarks/formats.py SCENE --dataset DATASET
 
-SCENE is a trained one, of any format that is read. Times are of a scene of `--gaussians` made of
-it, a copy beside the other; bytes a Gaussian are those of SCENE itself. With the dataset that it
-was trained on: PSNR of the renderings of what was read back against those of SCENE, and against
-the photos, mean over every 8th photo's camera.
+SCENE is a trained scene of any readable format. Times are measured with copies of it next to each
+other, `--gaussians` in total; bytes per Gaussian are those of SCENE itself. With the dataset of its
+training, two mean PSNRs are computed over the cameras of every 8th photo: renderings of the scene
+that was read back against renderings of SCENE, and against the photos.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ import torch
 
 from snowsplat import Gaussians, View, load_dataset, read_gaussians
 from snowsplat.evaluation.metrics import evaluate_views, psnr
-from snowsplat.formats import FORMATS
 from snowsplat.formats.spz import read_spz, write_spz
+from snowsplat.pipeline.scene_files import FORMATS, GaussianArrays
 from snowsplat.scene.render import render
 
-Read = Callable[[Path], Gaussians]
-Write = Callable[[Path, Gaussians], None]
+Read = Callable[[Path], GaussianArrays]
+Write = Callable[[Path, GaussianArrays], None]
 
 
 def rows() -> list[tuple[str, str, Write, Read | None]]:
-    """Name, suffix, writer and reader of each format that is written, and of other versions."""
+    """Name, suffix, writer and reader of each format that can be written, and of SPZ version 4."""
     found: list[tuple[str, str, Write, Read | None]] = []
     for format in FORMATS:
         if format.write is not None:
@@ -43,7 +43,7 @@ def rows() -> list[tuple[str, str, Write, Read | None]]:
 
 
 def enlarged(gaussians: Gaussians, count: int) -> Gaussians:
-    """``count`` Gaussians: as many copies as it takes, each a scene's width beside the last."""
+    """``count`` Gaussians: copies of the scene, each next to the previous one along x."""
     copies = math.ceil(count / len(gaussians))
     width = gaussians.means.amax(0) - gaussians.means.amin(0)
     parts = []
@@ -55,7 +55,7 @@ def enlarged(gaussians: Gaussians, count: int) -> Gaussians:
 
 
 def seconds(function: Callable[[], object], repeats: int) -> float:
-    """The least of some wall times."""
+    """The shortest wall time of ``repeats`` calls."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -67,22 +67,23 @@ def seconds(function: Callable[[], object], repeats: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--capture", type=Path, help="what the scene was trained on")
+    parser.add_argument("--dataset", "--capture", type=Path, help="what the scene was trained on")
     parser.add_argument("-r", "--resolution", type=int, default=1, help="1/r of the photos' size")
-    parser.add_argument("--gaussians", type=int, default=100_000, help="of the scene that is timed")
-    parser.add_argument("--repeats", type=int, default=3, help="of which the fastest is told")
+    parser.add_argument("--gaussians", type=int, default=100_000, help="in the scene that is timed")
+    parser.add_argument("--repeats", type=int, default=3, help="of which the fastest is printed")
     arguments = parser.parse_args()
 
     scene = read_gaussians(arguments.scene)
-    large = enlarged(scene, arguments.gaussians)
+    arrays = GaussianArrays.from_gaussians(scene)
+    large = GaussianArrays.from_gaussians(enlarged(scene, arguments.gaussians))
     views: list[View] = []
     if arguments.dataset:
         dataset = load_dataset(arguments.dataset, hold_out=8, resolution=arguments.resolution)
         views = dataset.test
     expected = [render(scene, view.camera).image for view in views]
     print(
-        f"{len(scene):,} Gaussians of SH degree {scene.sh_degree}; times of {len(large):,}; "
-        f"{len(views)} views"
+        f"{len(scene):,} Gaussians of SH degree {scene.sh_degree}; "
+        f"times of {arguments.gaussians:,}; {len(views)} views"
     )
     print(f"{'format':<16}{'write s':>9}{'read s':>9}{'bytes':>9}{'PSNR dB':>9}{'photos':>9}")
     if views:
@@ -92,18 +93,18 @@ def main() -> None:
             path = Path(folder) / f"scene{suffix}"
             line = f"{name:<16}{seconds(partial(write, path, large), arguments.repeats):>9.3f}"
             if read is None:
-                write(path, scene)
+                write(path, arrays)
                 print(f"{line}{'-':>9}{path.stat().st_size / len(scene):>9.1f}")
                 continue
             line += f"{seconds(partial(read, path), arguments.repeats):>9.3f}"
-            write(path, scene)
+            write(path, arrays)
             line += f"{path.stat().st_size / len(scene):>9.1f}"
             if views:
-                again = read(path)
-                pictures = [render(again, view.camera).image for view in views]
-                figures = [psnr(p, e) for p, e in zip(pictures, expected, strict=True)]
+                again = read(path).to_gaussians()
+                images = [render(again, view.camera).image for view in views]
+                values = [psnr(i, e) for i, e in zip(images, expected, strict=True)]
                 line += (
-                    f"{sum(figures) / len(figures):>9.2f}{evaluate_views(again, views).psnr:>9.2f}"
+                    f"{sum(values) / len(values):>9.2f}{evaluate_views(again, views).psnr:>9.2f}"
                 )
             print(line, flush=True)
 

@@ -40,7 +40,7 @@ def test_help_lists_the_subcommands_and_each_has_its_own(run):
 
 
 def imported_by(*arguments: object) -> set[str]:
-    """The heavy modules that a command imports, and all modules of subcommands."""
+    """The names of the heavy modules and of the subcommands that a command imports."""
     code = (
         "import sys\nfrom snowsplat.cli.main import main\n"
         "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
@@ -71,6 +71,14 @@ def test_info_describes_a_scene_without_torch(tmp_path, suffix):
     path = tmp_path / f"scene{suffix}"
     write_gaussians(path, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator(), sh_degree=1))
     assert "torch" not in imported_by("info", path)
+
+
+def test_info_describes_an_output_folder_without_torch(tmp_path):
+    scene = tmp_path / "out/point_cloud/iteration_7/point_cloud.ply"
+    scene.parent.mkdir(parents=True)
+    write_gaussians(scene, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator()))
+    (tmp_path / "out/cfg_args").write_text("Namespace(source_path='garden')")
+    assert "torch" not in imported_by("info", tmp_path / "out")
 
 
 def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):

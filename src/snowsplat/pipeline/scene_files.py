@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from snowsplat.formats import (
+    FORMATS,
     Format,
     GaussianArrays,
     format_for_reading,
@@ -19,6 +20,8 @@ from snowsplat.formats import (
 )
 
 __all__ = [
+    "FORMATS",
+    "GaussianArrays",
     "format_for_reading",
     "format_for_writing",
     "read_arrays",
