@@ -166,12 +166,12 @@ def test_missing_images_are_skipped_and_counted(dataset_copy, caplog):
 def test_no_images(dataset_copy):
     folder = dataset_copy("colmap-bin")
     with pytest.raises(
-        UserError, match=r"photos: no such folder.*set images.*existing folders: images, sparse"
+        UserError, match=r"images: no such folder: .*photos; .*existing folders: images, sparse"
     ):
         load_dataset(folder, images="photos")
     for image in (folder / "images").iterdir():
         image.unlink()
-    with pytest.raises(UserError, match="has none of the 9 images of the model"):
+    with pytest.raises(UserError, match="images: .* has none of the 9 images of the model"):
         load_dataset(folder)
 
 

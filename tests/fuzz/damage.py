@@ -1,4 +1,4 @@
-"""Damage to the bytes of a file, told by numbers: those of hypothesis, or of a random generator."""
+"""Damaging the bytes of a file, controlled by numbers from hypothesis or a random generator."""
 
 import json
 import random
@@ -7,26 +7,27 @@ from typing import Any
 
 from ..formats import json_damage
 
-#: What counts and sizes are set to: none, few, the edges of integers, more than there is.
+#: Values for counts and sizes: zero, few, the limits of integer types, more than the file has.
 WORDS = [0, 1, 2, 3, 255, 256, 2**15, 2**16 - 1, 2**16, 2**24, 10**7, 2**31 - 1, 2**31, 2**32 - 1]
 WORDS += [2**32, 2**40, 2**63 - 1, 2**63, 2**64 - 1, 0x7F800000, 0x7FC00000]
-#: What texts and JSON break at.
+#: Strings that are likely to break readers of text and JSON.
 TEXTS = [b"-1", b"1e400", b"nan", b"9" * 30, b"../../../x", b"/etc/passwd", b"\0", b"\xff", b"\n"]
 TEXTS += [b"[" * 3000, b"{}", b"null", b'"', b"'", b"true", b" ", b"#", b"\xf0\x9f\x98\x80"]
 KINDS = ["bit", "byte", "word", "big", "long", "text", "cut", "drop", "double", "swap", "fill"]
 
-#: How, whether near the beginning, where (0 to 1), two numbers (0 to 255).
+#: Kind, whether near the start of the file, position (0 to 1), two parameters (0 to 255).
 Change = tuple[str, bool, float, int, int]
 
 
 def random_change(generator: random.Random) -> Change:
+    """A random change."""
     head, where = generator.random() < 0.5, generator.random()
     numbers = generator.randrange(256), generator.randrange(256)
     return generator.choice(KINDS), head, where, *numbers
 
 
 def damaged(data: bytes, changes: list[Change]) -> bytes:
-    """The bytes with all changes made, one after the other."""
+    """The bytes after all changes, applied in order."""
     for change in changes:
         data = _changed(data, *change)
     return data
@@ -61,7 +62,7 @@ def _changed(data: bytes, kind: str, head: bool, where: float, a: int, b: int) -
 
 
 def damaged_json(data: bytes, changes: list[Change]) -> bytes:
-    """As JSON: values are replaced by others that do not belong there, or dropped."""
+    """The bytes parsed as JSON, with values replaced by unexpected ones or removed."""
     try:
         document: Any = json.loads(data)
     except (ValueError, RecursionError):

@@ -1,7 +1,7 @@
-"""What reading any file must keep to: time, memory, its folder; and that nothing is run.
+"""The limits of every reader: time, memory, its own folder, and no execution of programs.
 
-`guarded` runs a reader under these limits in this process. It raises `Broken` where the reader
-breaks one, and lets through what is no `UserError`.
+`guarded` runs a reader in this process under these limits. It raises `Broken` if the reader exceeds
+one. It returns a `UserError` of the reader; any other exception passes through.
 """
 
 import contextlib
@@ -20,11 +20,15 @@ from PIL import Image
 
 from snowsplat.util.errors import UserError
 
+#: Time limit.
 SECONDS = 10.0
-MEMORY, RATIO = 64 << 20, 4  # bytes, and for each byte of the file and of what is read from it
-_ADDRESS_SPACE = 6 << 30  # beyond what the process has: so that a defect does not end the machine
+#: Memory limit in bytes: MEMORY, and RATIO for each byte of the file and of the result.
+MEMORY = 64 << 20
+RATIO = 4
+# Address space in bytes beyond the current size, so that a defect does not exhaust the machine.
+_ADDRESS_SPACE = 6 << 30
 
-#: What a reader has no business with; `open` is looked at by itself.
+#: Audit events that readers must not cause. The event `open` is checked separately.
 _FORBIDDEN = (
     "pickle.find_class",
     "subprocess.Popen",
@@ -34,22 +38,22 @@ _FORBIDDEN = (
     "os.fork",
 )
 _FORBIDDEN += ("socket.connect", "socket.getaddrinfo", "urllib.Request", "ctypes.dlopen")
-# Where libraries look for parts of themselves.
+# Paths where libraries find their own files.
 _ALLOWED = tuple({sys.prefix, sys.base_prefix, "/usr", "/proc", "/sys", "/dev/null", "/lib"})
 _ALLOWED += tuple(os.path.realpath(path) for path in sys.path if path)
 _ALLOWED += ("/etc/ld.so.cache", "/etc/nsswitch.conf")
 
 
 class Broken(BaseException):
-    """A limit that was broken. No `Exception`: readers catch those."""
+    """A reader exceeded a limit. Not an `Exception`, because readers catch those."""
 
 
 class _Watch:
-    """What the interpreter reports of what is opened and run, by the one hook that there may be."""
+    """An audit hook: it finds forbidden events and opened files. Hooks cannot be removed."""
 
-    home: str | None = None
-    found: str | None = None
-    thread = 0
+    home: str | None = None  # the folder that may be read; None: the hook is inactive
+    found: str | None = None  # the first violation
+    thread = 0  # the thread to watch
 
     def __call__(self, event: str, arguments: tuple[Any, ...]) -> None:
         if self.home is None or self.thread != threading.get_ident() or self.found is not None:
@@ -65,7 +69,7 @@ class _Watch:
 _watch = _Watch()
 
 
-def _watch_from_now_on() -> None:
+def _install_watch() -> None:
     if not getattr(_watch, "hooked", False):
         sys.addaudithook(_watch)
         _watch.hooked = True  # type: ignore[attr-defined]
@@ -73,10 +77,10 @@ def _watch_from_now_on() -> None:
 
 @contextlib.contextmanager
 def _time_limit(seconds: float) -> Iterator[None]:
-    def ring(*_: object) -> None:
+    def expire(*_: object) -> None:
         raise Broken(f"takes more than {seconds:g} s")
 
-    before = signal.signal(signal.SIGALRM, ring)
+    before = signal.signal(signal.SIGALRM, expire)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
@@ -102,16 +106,16 @@ def _address_limit() -> Iterator[None]:
 
 
 def _status(name: str) -> int:
-    """Bytes, of a line of /proc/self/status."""
+    """The value of a line of /proc/self/status, in bytes."""
     with open("/proc/self/status", encoding="ascii") as file:
         return next(int(line.split()[1]) << 10 for line in file if line.startswith(name))
 
 
 def measured(read: Callable[[], Any]) -> tuple[Any, int]:
-    """What ``read`` gives, and how much more memory than before the process had meanwhile.
+    """The result of ``read``, and the increase of the peak memory of the process in bytes.
 
-    Of the whole process, by the kernel's own high-water mark: torch, Pillow, FFmpeg count. 0 where
-    the kernel does not tell.
+    The kernel measures the peak of the complete process, including torch, Pillow and FFmpeg. The
+    increase is 0 if the kernel does not support this.
     """
     try:
         with open("/proc/self/clear_refs", "w", encoding="ascii") as file:
@@ -124,7 +128,7 @@ def measured(read: Callable[[], Any]) -> tuple[Any, int]:
 
 
 def bytes_of(value: Any) -> int:
-    """Of the numbers, pixels and texts in it."""
+    """Approximate size of the numbers, pixels and texts in ``value``, in bytes."""
     if isinstance(value, torch.Tensor | np.ndarray):
         return int(value.nbytes)
     if isinstance(value, Image.Image):
@@ -141,19 +145,20 @@ def bytes_of(value: Any) -> int:
 
 
 def guarded(read: Callable[[], Any], home: Path, size: int, extra: int = 0) -> Any:
-    """What ``read`` gives, or the `UserError` that it raises, within all limits.
+    """The result of ``read``, or the `UserError` that it raised, if it respected all limits.
 
     Args:
-        home: the folder that it may read.
-        size: of the files in question.
-        extra: bytes of memory that it may take beyond the general limit.
+        read: calls the reader.
+        home: the folder that the reader may access.
+        size: size of its files in bytes.
+        extra: additional memory that is allowed, in bytes.
 
     Raises:
-        Broken: it took too long or too much memory, left its folder, ran something, or told a
-            mistake in more than one line.
-        Exception: whatever else the reader raised: a defect, too.
+        Broken: the reader took too long or too much memory, opened a file outside its folder,
+            executed a program, or its error message has more than one line or is too long.
+        Exception: any other exception of the reader; this is a defect too.
     """
-    _watch_from_now_on()
+    _install_watch()
 
     def run() -> Any:
         try:
@@ -172,11 +177,11 @@ def guarded(read: Callable[[], Any], home: Path, size: int, extra: int = 0) -> A
     if isinstance(result, UserError):
         line = str(result)
         if "\n" in line or len(line) > 400 + 2 * len(str(home)):
-            raise Broken(f"told at length: {line[:500]!r}")
+            raise Broken(f"long message: {line[:500]!r}")
     limit = MEMORY + RATIO * (size + bytes_of(result)) + extra
     if used > limit:
-        # Pages of libraries that came back from the disk count too, but do so once.
+        # Pages of libraries that were loaded from disk also count, but only in the first run.
         used = min(used, measured(run)[1])
     if used > limit:
-        raise Broken(f"took {used >> 20} MB for a file of {size} bytes, {limit >> 20} MB may be")
+        raise Broken(f"took {used >> 20} MB for a file of {size} bytes; allowed: {limit >> 20} MB")
     return result

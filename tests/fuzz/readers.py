@@ -1,6 +1,6 @@
-"""Every reader of the project, once: how a valid small file is made, and how it is read.
+"""A table of all readers of the project: how to make a small valid file, and how to read it.
 
-A new format is a new line in `READERS`. The tests of this folder damage the files in CI;
+Each format is one entry in `READERS`. The tests in this folder damage the files in CI;
 tests/nightly/fuzz_files.py does so for hours.
 """
 
@@ -52,20 +52,25 @@ from snowsplat.util.stages import Stages
 from ..formats.test_ksplat import ksplat, section
 from ..sfm.pictures import exif, pan, photo, write_video
 
-_IMAGE_BYTES = 16  # of memory for each pixel, while an image is decoded
-_FRAME_BYTES = 96  # of a video: frames that follow each other are decoded at once
+# Memory per pixel while an image is decoded, in bytes.
+_IMAGE_BYTES = 16
+# Memory per pixel of a video, in bytes. Several frames are decoded at the same time.
+_FRAME_BYTES = 96
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader, and files that it reads without complaint.
+    """A reader, and valid files for it.
 
     Attributes:
-        file: what is damaged, in the folder that ``make`` fills.
-        read: reads that folder; what it gives is weighed.
-        json: also damage it as JSON.
-        pack: ``file`` is damaged before it is packed: behind a checksum there is more to break.
-        extra: memory that it may take beyond the general limit, by the file as it is.
+        name: the id of the test.
+        file: the file to damage, in the folder that ``make`` fills.
+        make: writes valid files into a folder.
+        read: reads that folder. The size of the result counts for the memory limit.
+        json: also damage the file as JSON.
+        pack: packs or compresses the damaged content. Without it, a checksum would reject most
+            damage before the reader parses the content.
+        extra: memory that the reader may take beyond the general limit, from the current file.
     """
 
     name: str
@@ -78,24 +83,24 @@ class Reader:
 
     @functools.cached_property
     def folder(self) -> Path:
-        """Valid files, made once."""
+        """A folder with valid files, written once."""
         folder = Path(tempfile.mkdtemp(prefix="snowsplat-fuzz-", dir=_root().name))
         self.make(folder)
         return folder
 
     @functools.cached_property
     def valid(self) -> bytes:
-        """What is damaged."""
+        """The valid content of ``file``, not packed."""
         return (self.folder / self.file).read_bytes()
 
     def write(self, data: bytes) -> int:
-        """Put these bytes in place of the valid ones; gives the size of the file."""
+        """Write ``data`` to ``file``, packed; return the size of the file."""
         packed = data if self.pack is None else self.pack(data)
         (self.folder / self.file).write_bytes(packed)
         return len(packed)
 
     def memory(self) -> int:
-        """Bytes beyond the general limit, for the file as it is."""
+        """Memory beyond the general limit for the current file, in bytes."""
         return self.extra(self.folder / self.file)
 
 
@@ -170,7 +175,7 @@ def _sog_members() -> dict[str, bytes]:
 
 
 def _sog_bundle(name: str, data: bytes) -> bytes:
-    """A bundle with one member replaced, its sizes and checksums as they should be."""
+    """A bundle with one member replaced, with valid sizes and checksums."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as bundle:
         for member, content in (_sog_members() | {name: data}).items():
@@ -195,13 +200,13 @@ def _sog_folder(folder: Path) -> None:
 
 
 def _glb_json(data: bytes) -> bytes:
-    """A GLB file with this JSON, and the numbers of the valid one."""
+    """A GLB file with this JSON, and with the binary data of the valid file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.glb"
         write_gaussians(path, make_scene(30, 1))
-        whole = path.read_bytes()
-    (size,) = struct.unpack_from("<I", whole, 12)
-    rest = whole[20 + size :]
+        valid = path.read_bytes()
+    (size,) = struct.unpack_from("<I", valid, 12)
+    rest = valid[20 + size :]
     data += b" " * (-len(data) % 4)
     head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(data) + len(rest), len(data), 0x4E4F534A)
     return head + data + rest
@@ -209,9 +214,9 @@ def _glb_json(data: bytes) -> bytes:
 
 def _make_glb_json(folder: Path) -> None:
     write_gaussians(folder / "a.glb", make_scene(30, 1))
-    whole = (folder / "a.glb").read_bytes()
-    (size,) = struct.unpack_from("<I", whole, 12)
-    (folder / "a.glb").write_bytes(whole[20 : 20 + size])
+    valid = (folder / "a.glb").read_bytes()
+    (size,) = struct.unpack_from("<I", valid, 12)
+    (folder / "a.glb").write_bytes(valid[20 : 20 + size])
 
 
 def _reads(file: str) -> Callable[[Path], Any]:
@@ -228,7 +233,7 @@ def _dataset(format: str, file: str, **more: Any) -> Reader:
     def read(folder: Path) -> Any:
         return load_dataset(folder)
 
-    return Reader(f"capture {format}, its {Path(file).name}", file, make, read, **more)
+    return Reader(f"dataset {format}, its {Path(file).name}", file, make, read, **more)
 
 
 def _test_list(folder: Path) -> None:
@@ -244,9 +249,8 @@ def _image_memory(path: Path) -> int:
     try:
         header = read_image_header(path)
     except UserError:
-        with_heif = photo_files.open_image
         try:
-            with with_heif(path) as image:
+            with photo_files.open_image(path) as image:  # also opens HEIF
                 return _IMAGE_BYTES * image.width * image.height
         except Exception:
             return 0
@@ -283,7 +287,7 @@ def _save_image(path: Path, kind: str) -> None:
     image.save(path, **options)
 
 
-#: Kind and ending.
+#: Kind of image -> suffix of its file.
 IMAGES = {
     "jpg": "jpg", "progressive": "jpg", "png": "png", "rgba": "png", "palette": "png",
     "deep": "png", "webp": "webp", "lossless": "webp", "tif": "tif", "lzw": "tif", "bmp": "bmp",
@@ -292,7 +296,7 @@ IMAGES = {
 
 
 def _png_with_checksums(data: bytes) -> bytes:
-    """The chunks of a PNG with the right checksums, as far as they are chunks."""
+    """The bytes of a PNG with valid checksums, as far as its chunks can be parsed."""
     import zlib
 
     out, at = data[:8], 8
@@ -450,8 +454,8 @@ def _read_stages(folder: Path) -> Any:
 
 
 def _make_lpips(folder: Path) -> None:
-    # Too small to be one: as large as those are, a file in a thousand would be damaged where it
-    # matters. The header is all that there is to break.
+    # Real weights are much larger than the header, so random damage would rarely hit the header,
+    # which is the only part that can break. These weights are too small to be valid.
     names = [f"features.{i}.{kind}" for i in (0, 3, 6) for kind in ("weight", "bias")]
     tensors = {name: torch.zeros(2, 3) for name in names}
     safetensors.torch.save_file(tensors, folder / "a.safetensors")
@@ -486,7 +490,9 @@ READERS: tuple[Reader, ...] = (
     *(_dataset("colmap-txt", f"sparse/0/{part}.txt") for part in ("cameras", "images", "points3D")),
     _dataset("blender", "transforms_train.json", json=True),
     Reader(
-        *("list of test images", "test.txt", _test_list),
+        "list of test images",
+        "test.txt",
+        _test_list,
         lambda folder: load_dataset(folder, test_list=folder / "test.txt"),
     ),
     *(_image(kind, ending, "image", _read_image) for kind, ending in IMAGES.items()),
@@ -499,21 +505,27 @@ READERS: tuple[Reader, ...] = (
     _video("gif", "a.gif"),
     Reader("checkpoint", "step_000005.safetensors", _make_checkpoint, _read_checkpoint),
     Reader(
-        *("cameras.json", "cameras.json", _make_cameras),
+        "cameras.json",
+        "cameras.json",
+        _make_cameras,
         lambda folder: read_cameras(folder / "cameras.json"),
         json=True,
     ),
     Reader("cfg_args", "out/cfg_args", _make_cfg_args, _read_settings),
     Reader("config.json", "out/config.json", _output, _read_settings, json=True),
     Reader(
-        *("metrics.json", "out/metrics.json", _output),
+        "metrics.json",
+        "out/metrics.json",
+        _output,
         lambda folder: describe(folder / "out"),
         json=True,
     ),
     Reader("history.json", "out/history.json", _output, _read_history, json=True),
     Reader("capture.json", "capture.json", _make_stages, _read_stages, json=True),
     Reader(
-        *("LPIPS weights", "a.safetensors", _make_lpips),
+        "LPIPS weights",
+        "a.safetensors",
+        _make_lpips,
         lambda folder: Lpips.load(folder / "a.safetensors"),
     ),
 )

@@ -1,7 +1,7 @@
-"""Files made to do harm, one for each way that is known: refused in a line, at once, in no memory.
+"""Malicious files, one for each known attack: rejected quickly, with one line and little memory.
 
-Each of these once did what it says. Where the reader takes no notice of the trick, what it gives is
-looked at instead.
+Each of these attacks once worked. If a reader ignores an attack instead of rejecting the file, the
+test checks the result.
 """
 
 import io
@@ -43,16 +43,16 @@ from .readers import make_scene
 
 
 @pytest.fixture
-def refused(tmp_path):
-    """Reads ``tmp_path`` under guard; gives the line with which the reader refuses."""
+def rejected(tmp_path):
+    """A function that reads ``tmp_path`` with `guarded` and returns the reader's error message."""
 
-    def refused(read) -> str:
+    def rejected(read) -> str:
         size = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
         result = guarded(read, tmp_path, size)
         assert isinstance(result, UserError), result
         return str(result)
 
-    return refused
+    return rejected
 
 
 def decoded(path: Path):
@@ -63,7 +63,7 @@ def decoded(path: Path):
 
 
 def png(width: int, height: int) -> bytes:
-    """Black, of a thousandth of the bytes that it has pixels."""
+    """A black image whose file has about a thousandth of a byte per pixel."""
     packer = zlib.compressobj(9)
     rows = b"".join(packer.compress(bytes(1 + 3 * width)) for _ in range(height)) + packer.flush()
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), (b"IDAT", rows)]
@@ -74,7 +74,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def bmp_that_skips(width: int) -> bytes:
-    """Packed by run lengths, with skips of 255 rows each."""
+    """A run-length encoded image that skips 255 rows at a time."""
     head = struct.pack("<IiiHHIIiiII", 40, width, 1, 1, 8, 1, 0, 0, 0, 256, 0) + bytes(1024)
     return (
         b"BM" + struct.pack("<IHHI", 0, 0, 0, 14 + len(head)) + head + b"\0\2\0\xff" * 4 + b"\0\1"
@@ -94,7 +94,7 @@ def tiff_of_one_tile(side: int) -> bytes:
 
 
 def jpeg_of_scans(side: int, scans: int, between: bytes = b"") -> bytes:
-    """Progressive, its last scan again and again: few bytes, but all pixels are gone through."""
+    """A progressive JPEG that repeats its last scan. Each scan has few bytes but all pixels."""
     packed = io.BytesIO()
     Image.new("RGB", (side, side), (90, 99, 128)).save(packed, "JPEG", progressive=True, quality=50)
     data = packed.getvalue()
@@ -103,7 +103,7 @@ def jpeg_of_scans(side: int, scans: int, between: bytes = b"") -> bytes:
 
 
 def png_of_chunks(count: int) -> bytes:
-    """With empty ones before its pixels, each of which takes microseconds to skip."""
+    """A PNG with empty chunks before its pixels. Skipping a chunk takes microseconds."""
     data = png(64, 64)
     empty = struct.pack(">I", 0) + b"juNk" + struct.pack(">I", zlib.crc32(b"juNk"))
     return data[:33] + empty * count + data[33:]
@@ -126,7 +126,7 @@ def jpeg_after(junk: bytes) -> bytes:
         ("text.ppm", lambda: b"P3 2000 2000 255\n" + b"0 " * 12_000_000, "slow to read"),
         ("tile.tif", lambda: tiff_of_one_tile(46_000), "tiles larger than the image"),
         ("scans.jpg", lambda: jpeg_of_scans(4000, 2000), "too many scans"),
-        # A marker without a length, after which the next one looks like one.
+        # A marker without a length. A parser that expects a length misses the next marker.
         ("tem.jpg", lambda: jpeg_of_scans(4000, 2000, b"\xff\x01"), "too many scans"),
         ("chunks.png", lambda: png_of_chunks(5_000_000), "too many chunks"),
         (
@@ -142,16 +142,16 @@ def jpeg_after(junk: bytes) -> bytes:
     ],
 )
 @pytest.mark.filterwarnings("ignore")
-def test_images(tmp_path, refused, name, data, line):
+def test_images(tmp_path, rejected, name, data, line):
     path = tmp_path / name
     path.write_bytes(data())
-    assert line in refused(lambda: decoded(path))
+    assert line in rejected(lambda: decoded(path))
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("ending", ["jpg", "tif"])
-def test_notes_that_are_all_of_one_place(tmp_path, ending):
-    """Each of thousands of tags is as large as all of them. (Pillow itself looks after this.)"""
+def test_exif_tags_that_share_their_data(tmp_path, ending):
+    """Thousands of tags refer to the same large block of data. (Pillow itself handles this.)"""
     path = tmp_path / f"a.{ending}"
     if ending == "jpg":
         tags = [(0x9000 + i, 7, 60_000, 0) for i in range(5000)]
@@ -165,8 +165,8 @@ def test_notes_that_are_all_of_one_place(tmp_path, ending):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_large_flat_image_takes_no_more_than_its_pixels_deserve(tmp_path):
-    """16 bytes of each, whatever its file has."""
+def test_memory_of_a_large_uniform_image_is_limited_by_its_pixels(tmp_path):
+    """16 bytes per pixel, independent of the size of the file."""
     path = tmp_path / "a.png"
     path.write_bytes(png(6000, 6000))
     assert path.stat().st_size < 150_000
@@ -175,8 +175,8 @@ def test_a_large_flat_image_takes_no_more_than_its_pixels_deserve(tmp_path):
     assert planes.shape == (3, 64, 64)
 
 
-def test_a_photo_with_a_film_behind_it_has_the_scans_that_it_has(tmp_path):
-    """Phones append films to photos, in which any two bytes may stand."""
+def test_scans_are_not_counted_in_a_video_after_a_photo(tmp_path):
+    """Phones append videos to photos. A video may contain the bytes of a scan marker by chance."""
     path = tmp_path / "a.jpg"
     Image.new("RGB", (4000, 3000)).save(path)
     path.write_bytes(path.read_bytes() + b"\xff\xda\0\x08" * 1000)
@@ -186,13 +186,13 @@ def test_a_photo_with_a_film_behind_it_has_the_scans_that_it_has(tmp_path):
 # Scenes
 
 
-def test_spz_of_equal_gaussians(tmp_path, refused):
+def test_spz_of_equal_gaussians(tmp_path, rejected):
     path, n = tmp_path / "a.spz", 1_000_000
     columns = [bytes(width * n) for width in (9, 1, 3, 3, 4, 45)]
     for version in (3, 4):
         path.write_bytes(pack(Header(version, n, 3, 12, 0), columns))
         assert path.stat().st_size < 100_000
-        assert "declares 1000000 Gaussians" in refused(lambda: read_gaussians(path))
+        assert "declares 1000000 Gaussians" in rejected(lambda: read_gaussians(path))
 
 
 @pytest.fixture
@@ -209,48 +209,48 @@ def bundle(path: Path, members: dict[str, bytes]) -> bytearray:
     return bytearray(path.read_bytes())
 
 
-def test_sog_whose_member_is_larger_than_it_says(tmp_path, refused, members):
+def test_sog_whose_member_is_larger_than_declared(tmp_path, rejected, members):
     path, size = tmp_path / "a.sog", len(members["meta.json"])
     data = bundle(path, {**members, "meta.json": members["meta.json"] + b" " * (400 << 20)})
     for signature, offset in ((b"PK\3\4", 22), (b"PK\1\2", 24)):
         struct.pack_into("<I", data, data.find(signature) + offset, size)
     path.write_bytes(data)
-    assert "meta.json is damaged" in refused(lambda: read_gaussians(path))
+    assert "meta.json is damaged" in rejected(lambda: read_gaussians(path))
 
 
-def test_sog_whose_member_lies_beyond_any_file(tmp_path, refused, members):
+def test_sog_whose_member_has_a_huge_offset(tmp_path, rejected, members):
     path = tmp_path / "a.sog"
     data = bundle(path, {"meta.json": members["meta.json"]})
     entry, end = data.find(b"PK\1\2"), data.find(b"PK\5\6")
-    place = struct.pack("<HHQ", 1, 8, 2**64 - 1)  # in 64 bits, beside the entry
+    place = struct.pack("<HHQ", 1, 8, 2**64 - 1)  # a 64-bit offset in the extra field
     struct.pack_into("<H", data, entry + 30, len(place))
     struct.pack_into("<I", data, entry + 42, 0xFFFFFFFF)
     struct.pack_into("<I", data, end + 12, end - entry + len(place))
     path.write_bytes(data[:end] + place + data[end:])
-    assert "meta.json is damaged" in refused(lambda: read_gaussians(path))
+    assert "meta.json is damaged" in rejected(lambda: read_gaussians(path))
 
 
-def test_sog_of_countless_members(tmp_path, refused):
+def test_sog_with_too_many_members(tmp_path, rejected):
     path, entries = tmp_path / "a.sog", 300_000
     entry = b"PK\1\2" + struct.pack("<6H3I5H2I", *[20, 20], *[0] * 7, 1, *[0] * 6) + b"a"
     end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 65535, 65535, len(entry) * entries, 34, 0)
     path.write_bytes(b"PK\3\4" + bytes(30) + entry * entries + end)
-    assert "implausible number of members" in refused(lambda: read_gaussians(path))
+    assert "implausible number of members" in rejected(lambda: read_gaussians(path))
 
 
 @pytest.mark.parametrize(
     "text", ["[" * 100_000, '{"means": 1, "quats": [' + "[]," * 4_000_000 + "1]}"]
 )
-def test_sog_of_deep_or_endless_json(tmp_path, refused, members, text):
+def test_sog_with_deep_or_huge_json(tmp_path, rejected, members, text):
     path = tmp_path / "a.sog"
     bundle(path, {**members, "meta.json": text.encode()})
-    refused(lambda: read_gaussians(path))
+    rejected(lambda: read_gaussians(path))
     (tmp_path / "meta.json").write_text('{"means": 1, "quats": [' + text)
-    refused(lambda: read_gaussians(tmp_path / "meta.json"))
+    rejected(lambda: read_gaussians(tmp_path / "meta.json"))
 
 
 @pytest.mark.parametrize("name", ["../secret.webp", "/etc/hostname", "..", "", "a\0b", "pipe.webp"])
-def test_sog_folder_that_names_others(tmp_path, refused, members, name):
+def test_sog_folder_with_paths_outside(tmp_path, rejected, members, name):
     home = tmp_path / "home"
     home.mkdir()
     for member, data in members.items():
@@ -260,11 +260,11 @@ def test_sog_folder_that_names_others(tmp_path, refused, members, name):
     meta = json.loads(members["meta.json"])
     meta["means"]["files"][0] = name
     (home / "meta.json").write_text(json.dumps(meta))
-    refused(lambda: read_gaussians(home / "meta.json"))
+    rejected(lambda: read_gaussians(home / "meta.json"))
 
 
 def test_sog_folder_of_many_gaussians(tmp_path):
-    """Its pictures account for them, not the few bytes of meta.json."""
+    """The number of Gaussians is limited by the image files, not by the small meta.json."""
     write_gaussians(tmp_path / "a.sog", make_scene(70_000, 0))
     with zipfile.ZipFile(tmp_path / "a.sog") as packed:
         packed.extractall(tmp_path)
@@ -281,28 +281,28 @@ def test_sog_folder_of_many_gaussians(tmp_path):
         + "]}",
     ],
 )
-def test_glb_of_countless_nodes(tmp_path, refused, text):
+def test_glb_with_too_many_nodes(tmp_path, rejected, text):
     path, data = tmp_path / "a.glb", text.encode()
     data += b" " * (-len(data) % 4)
     head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(data), len(data), 0x4E4F534A)
     path.write_bytes(head + data)
-    refused(lambda: read_gaussians(path))
+    rejected(lambda: read_gaussians(path))
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.glb", "a.sog", "a.splat"])
-def test_a_pipe_is_no_scene(tmp_path, refused, name):
+def test_pipes_are_not_read_as_scenes(tmp_path, rejected, name):
     os.mkfifo(tmp_path / name)
-    assert "pipe" in refused(lambda: read_gaussians(tmp_path / name))
+    assert "pipe" in rejected(lambda: read_gaussians(tmp_path / name))
 
 
-def test_ply_of_one_endless_line(tmp_path, refused):
+def test_ply_with_a_huge_line(tmp_path, rejected):
     path = tmp_path / "a.ply"
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1"]
     names += ["scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     head = ["ply", "format ascii 1.0", "element vertex 1"]
     head += [f"property float {name}" for name in names] + ["end_header", ""]
     path.write_text("\n".join(head) + "1 " * 20_000_000)
-    assert "too long" in refused(lambda: read_gaussians(path))
+    assert "too long" in rejected(lambda: read_gaussians(path))
 
 
 # Datasets
@@ -310,7 +310,7 @@ def test_ply_of_one_endless_line(tmp_path, refused):
 
 @pytest.fixture
 def dataset(tmp_path):
-    """A function that makes a dataset in ``home``; a picture lies outside of it."""
+    """A function that writes a dataset to ``home``, and an image outside of it."""
 
     def make(format: str) -> Path:
         home = tmp_path / "home"
@@ -328,36 +328,36 @@ def outside(tmp_path: Path) -> list[str]:
 
 @pytest.mark.parametrize("number", range(3))
 @pytest.mark.parametrize("format", ["colmap-bin", "colmap-txt"])
-def test_colmap_that_names_an_image_elsewhere(tmp_path, refused, dataset, format, number):
+def test_colmap_with_an_image_outside(tmp_path, rejected, dataset, format, number):
     home = dataset(format)
     name = ["../../secret.png", str(tmp_path / "secret.png"), "a/../../../secret.png"][number]
     model = home / "sparse/0" / f"images.{format[-3:]}"
     model.write_bytes(model.read_bytes().replace(b"view_02.png", name.encode()))
-    assert "which is not in" in refused(lambda: load_dataset(home))
+    assert "which is not in" in rejected(lambda: load_dataset(home))
 
 
 @pytest.mark.parametrize("number", range(4))
 @pytest.mark.parametrize("key", ["file_path", "mask_path"])
-def test_transforms_that_name_a_file_elsewhere(tmp_path, refused, dataset, key, number):
+def test_transforms_with_a_file_outside(tmp_path, rejected, dataset, key, number):
     home = dataset("blender")
     path = home / "transforms_train.json"
     scene = json.loads(path.read_text())
     scene["frames"][1][key] = outside(tmp_path)[number]
     path.write_text(json.dumps(scene))
-    if (key, number) == ("mask_path", 3):  # taken as a name in the folder, where there is none
-        assert "is missing; add it" in refused(lambda: load_dataset(home))
+    if (key, number) == ("mask_path", 3):  # is a path inside the folder, but there is no such file
+        assert "is missing; add it" in rejected(lambda: load_dataset(home))
         return
-    assert "is not in the folder" in refused(lambda: load_dataset(home))
+    assert "is not in the folder" in rejected(lambda: load_dataset(home))
 
 
-def test_transforms_that_name_points_elsewhere(tmp_path, refused, dataset):
+def test_transforms_with_points_outside(tmp_path, rejected, dataset):
     home = dataset("blender")
     path = home / "transforms_train.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "../a.ply"}))
-    assert "is not in the folder" in refused(lambda: load_dataset(home))
+    assert "is not in the folder" in rejected(lambda: load_dataset(home))
 
 
-def test_an_absolute_path_that_stays_inside_is_one_of_the_dataset(dataset):
+def test_absolute_paths_inside_the_dataset_are_accepted(dataset):
     home = dataset("blender")
     path = home / "transforms_train.json"
     scene = json.loads(path.read_text())
@@ -367,26 +367,26 @@ def test_an_absolute_path_that_stays_inside_is_one_of_the_dataset(dataset):
     assert len(load_dataset(home, hold_out=None).train) == 5
 
 
-def test_colmap_text_of_one_endless_line(tmp_path, refused, dataset):
+def test_colmap_text_with_a_huge_line(tmp_path, rejected, dataset):
     home = dataset("colmap-txt")
     images = home / "sparse/0/images.txt"
     images.write_text("1 1 0 0 0 0 0 0 1 a.png\n" + "1 " * 10_000_000 + "\n")
-    assert "should hold its observations" in refused(lambda: load_dataset(home))
+    assert "should hold its observations" in rejected(lambda: load_dataset(home))
     cameras = home / "sparse/0/cameras.txt"
     cameras.write_text("1 PINHOLE " + "1 " * 10_000_000)
-    assert "damaged" in refused(lambda: load_dataset(home))
+    assert "damaged" in rejected(lambda: load_dataset(home))
     write_toy_dataset(home, "colmap-txt", 5, 32, 24, n_points=20)
     cameras.write_text(cameras.read_text().replace("PINHOLE", "x" * 100_000))
-    assert "lens distortion" in refused(lambda: load_dataset(home))
+    assert "lens distortion" in rejected(lambda: load_dataset(home))
 
 
-def test_colmap_of_countless_images(tmp_path, refused, dataset):
+def test_colmap_with_too_many_images(tmp_path, rejected, dataset):
     home = dataset("colmap-txt")
     (home / "sparse/0/images.txt").write_text("1 1 0 0 0 0 0 0 1 a\n\n" * 600_000)
-    assert "more than 200,000 images" in refused(lambda: load_dataset(home))
+    assert "more than 200,000 images" in rejected(lambda: load_dataset(home))
 
 
-def test_colmap_points_of_many_lines_take_little_memory(tmp_path, dataset):
+def test_colmap_text_with_many_points_takes_little_memory(tmp_path, dataset):
     home = dataset("colmap-txt")
     points = home / "sparse/0/points3D.txt"
     points.write_text("1 0 1 0 9 9 9 0\n" * 1_500_000)
@@ -394,17 +394,17 @@ def test_colmap_points_of_many_lines_take_little_memory(tmp_path, dataset):
     assert len(found.points) == 1_500_000
 
 
-def test_a_list_of_test_images_that_is_a_pipe(tmp_path, refused, dataset):
+def test_a_list_of_test_images_that_is_a_pipe(tmp_path, rejected, dataset):
     home = dataset("colmap-bin")
     os.mkfifo(home / "test.txt")
-    assert "not a file" in refused(lambda: load_dataset(home, test_list=home / "test.txt"))
+    assert "not a file" in rejected(lambda: load_dataset(home, test_list=home / "test.txt"))
 
 
 # Photos and videos
 
 
-def placed(folder: Path, names: list[str]) -> None:
-    """A model of photos of these names in ``folder``, which are not there."""
+def write_model_of(folder: Path, names: list[str]) -> None:
+    """Write a model of photos with these names to ``folder``; the photos do not exist."""
     generator = torch.Generator().manual_seed(0)
     poses = torch.eye(4)[:3].repeat(len(names), 1, 1)
     poses[:, 0, 3] = torch.arange(len(names)) * 0.3
@@ -415,15 +415,15 @@ def placed(folder: Path, names: list[str]) -> None:
 
 
 @pytest.mark.parametrize("name", ["../../x.png", "/tmp/x.png"])
-def test_a_model_whose_photos_lie_elsewhere(tmp_path, name):
-    """Its images would be written there."""
-    placed(tmp_path, ["a.png", name])
+def test_a_model_with_photos_outside(tmp_path, name):
+    """The undistorted images would be written outside too."""
+    write_model_of(tmp_path, ["a.png", name])
     with pytest.raises(UserError, match="which is not in .*input"):
         describe_model(tmp_path, [])
 
 
-def test_a_model_that_makes_colmap_take_all_memory(tmp_path):
-    placed(tmp_path, ["a.png", "b.png"])
+def test_a_model_for_which_colmap_would_allocate_all_memory(tmp_path):
+    write_model_of(tmp_path, ["a.png", "b.png"])
     points = tmp_path / "distorted/sparse/0/points3D.bin"
     data = bytearray(points.read_bytes())
     struct.pack_into("<Q", data, 8 + 8 + 24 + 3 + 8, 1 << 34)  # the length of the first track
@@ -440,7 +440,7 @@ def test_a_model_that_makes_colmap_take_all_memory(tmp_path):
         "v=0\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
     ],
 )
-def test_a_video_that_is_a_list_of_others(tmp_path, text):
+def test_a_video_that_is_a_playlist(tmp_path, text):
     write_video(tmp_path / "secret.mp4", pan(4))
     (tmp_path / "a.mp4").write_text(text)
     assert is_video(tmp_path / "secret.mp4")
@@ -449,57 +449,58 @@ def test_a_video_that_is_a_list_of_others(tmp_path, text):
         read_clip(tmp_path / "a.mp4")
 
 
-def test_a_video_whose_name_looks_like_an_address(tmp_path, monkeypatch):
+def test_a_video_whose_name_looks_like_a_url(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_video(tmp_path / "secret.mp4", pan(4))
     (tmp_path / "concat:secret.mp4").write_text("nothing")
     assert not is_video(Path("concat:secret.mp4"))
 
 
-def test_a_video_of_huge_frames(tmp_path, refused):
+def test_a_video_with_huge_frames(tmp_path, rejected):
     path = tmp_path / "a.gif"
     frames = [Image.new("P", (9000, 9000), i) for i in range(2)]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=100)
     assert path.stat().st_size < 1_000_000
-    assert "larger than 67 million pixels" in refused(lambda: read_clip(path))
+    assert "larger than 67 million pixels" in rejected(lambda: read_clip(path))
     data = write_video(path.with_suffix(".avi"), pan(4), codec="mjpeg").read_bytes()
     data = data.replace(struct.pack("<ii", 320, 240), struct.pack("<ii", 9000, 9000))
     data = data.replace(struct.pack(">HH", 240, 320), struct.pack(">HH", 9000, 9000))
     path.with_suffix(".avi").write_bytes(data)
-    assert "larger than 67" in refused(lambda: read_clip(path.with_suffix(".avi")))
+    assert "larger than 67" in rejected(lambda: read_clip(path.with_suffix(".avi")))
 
 
 @pytest.mark.parametrize("count", [3_000_000, 4_000_000_000])
-def test_a_video_of_countless_frames(tmp_path, refused, count):
-    """All of one size, so that none of them has to be told by itself."""
+def test_a_video_with_too_many_frames(tmp_path, rejected, count):
+    """All frames have the same size, so the file does not list their sizes."""
     path = write_video(tmp_path / "a.mp4", pan(4))
     assert is_video(path)
     data = bytearray(path.read_bytes())
     struct.pack_into(">II", data, data.find(b"stsz") + 8, 1, count)
-    struct.pack_into(">I", data, data.find(b"stsc") + 16, count)  # all of them in one piece
+    struct.pack_into(">I", data, data.find(b"stsc") + 16, count)  # all frames in one chunk
     path.write_bytes(data)
-    assert "promises more frames" in refused(lambda: read_clip(path))
+    assert "promises more frames" in rejected(lambda: read_clip(path))
     assert not guarded(lambda: is_video(path), tmp_path, path.stat().st_size)
 
 
 # Records
 
 
-DEEP, MANY = "[" * 100_000, "[" + "[]," * 4_000_000 + "0]"
+DEEP = "[" * 100_000
+MANY = "[" + "[]," * 4_000_000 + "0]"
 
 
 @pytest.mark.parametrize(
     "text", [DEEP, '{"a": ' + DEEP, MANY, '{"stages": ' + MANY + "}", "-" * 99]
 )
-def test_json_of_any_kind(tmp_path, refused, text):
+def test_json_files(tmp_path, rejected, text):
     out, path = tmp_path / "out", tmp_path / "a.json"
     out.mkdir()
     path.write_text(text)
     (out / "config.json").write_text(text)
-    refused(lambda: read_cameras(path))
-    refused(lambda: Stages(path, dataset_folder.STAGES))
-    refused(lambda: load_dataset(path))
-    refused(lambda: OutputFolder(out).settings())
+    rejected(lambda: read_cameras(path))
+    rejected(lambda: Stages(path, dataset_folder.STAGES))
+    rejected(lambda: load_dataset(path))
+    rejected(lambda: OutputFolder(out).settings())
     empty = guarded(lambda: History.read(path, 9), tmp_path, path.stat().st_size)
     assert empty.stretches == []
 
@@ -519,78 +520,78 @@ def test_json_of_any_kind(tmp_path, refused, text):
         "Namespace(source_path=__import__('os').system('touch ran'))",
     ],
 )
-def test_cfg_args_that_is_a_program(tmp_path, refused, monkeypatch, text):
+def test_cfg_args_with_code(tmp_path, rejected, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cfg_args").write_text(text)
-    assert "does not name the dataset" in refused(lambda: OutputFolder(tmp_path).settings())
+    assert "does not name the dataset" in rejected(lambda: OutputFolder(tmp_path).settings())
     assert not (tmp_path / "ran").exists()
 
 
-def test_weights_that_are_a_program(tmp_path, refused):
+def test_weights_in_a_pickle(tmp_path, rejected):
     class Large:
         def __reduce__(self):
-            return bytearray, (1 << 30,)  # which torch.load(weights_only=True) runs
+            return bytearray, (1 << 30,)  # torch.load(weights_only=True) executes this
 
     torch.save({"x": Large()}, tmp_path / "a.pth")
-    assert "not a safetensors file" in refused(lambda: Lpips.load(tmp_path / "a.pth"))
+    assert "not a safetensors file" in rejected(lambda: Lpips.load(tmp_path / "a.pth"))
 
 
-def test_a_checkpoint_whose_header_is_not_what_was_written(tmp_path, refused):
-    """Numbers that are whole, but of another shape, kind or meaning."""
+def test_a_checkpoint_whose_header_was_changed(tmp_path, rejected):
+    """The numbers are complete, but their shape, dtype or metadata has changed."""
     tensors = {"a": torch.arange(12.0).reshape(4, 3), "b": torch.ones(3)}
     path = checkpoint.save(tmp_path, 5, tensors, {"rate": 0.125})
-    whole = path.read_bytes()
+    content = path.read_bytes()
     for old, new in ((b"[4,3]", b"[3,4]"), (b'"F32"', b'"I32"'), (b"0.125", b"0.225")):
-        assert whole.count(old) >= 1, old
-        path.write_bytes(whole.replace(old, new))
-        assert "damaged" in refused(lambda: checkpoint.load(path))
-    path.write_bytes(whole)
+        assert content.count(old) >= 1, old
+        path.write_bytes(content.replace(old, new))
+        assert "damaged" in rejected(lambda: checkpoint.load(path))
+    path.write_bytes(content)
     assert checkpoint.load(path).meta == {"rate": 0.125}
 
 
 @pytest.mark.parametrize(
     ("tensor", "meta"),
     [
-        (torch.ones(4).to(torch.float8_e4m3fn), {}),  # of which torch has no sum
-        (torch.ones(4), [[1, 2]]),  # of which Python makes a dict
+        (torch.ones(4).to(torch.float8_e4m3fn), {}),  # torch cannot sum this dtype
+        (torch.ones(4), [[1, 2]]),  # Python can convert this to a dict
     ],
 )
-def test_a_checkpoint_of_another_program(tmp_path, refused, monkeypatch, tensor, meta):
+def test_a_checkpoint_of_another_program(tmp_path, rejected, monkeypatch, tensor, meta):
     monkeypatch.setattr(checkpoint, "check_finite", lambda *_: None)
     monkeypatch.setattr(checkpoint, "dict", lambda given: given, raising=False)
     path = checkpoint.save(tmp_path, 5, {"a": tensor}, meta)
     monkeypatch.undo()
-    assert "not a checkpoint" in refused(lambda: checkpoint.load(path))
+    assert "not a checkpoint" in rejected(lambda: checkpoint.load(path))
 
 
-def test_safetensors_of_countless_tensors(tmp_path, refused):
-    """Each takes a thousand bytes of memory, and fifty of the file."""
+def test_safetensors_with_too_many_tensors(tmp_path, rejected):
+    """Each tensor takes a thousand bytes of memory but only fifty bytes of the file."""
     empty = {"dtype": "U8", "shape": [0], "data_offsets": [0, 0]}
     head = json.dumps({f"{i:x}": empty for i in range(200_000)} | {"__metadata__": {}}).encode()
     path = tmp_path / "step_000005.safetensors"
     path.write_bytes(struct.pack("<Q", len(head)) + head)
-    assert "not a checkpoint" in refused(lambda: checkpoint.load(path))
-    assert "not a safetensors file" in refused(lambda: Lpips.load(path))
+    assert "not a checkpoint" in rejected(lambda: checkpoint.load(path))
+    assert "not a safetensors file" in rejected(lambda: Lpips.load(path))
 
 
-def test_weights_of_a_layer_of_a_thousand_digits(tmp_path, refused):
+def test_weights_with_a_huge_layer_number(tmp_path, rejected):
     path = tmp_path / "a.safetensors"
     save_file({f"features.{'1' * 5000}.weight": torch.zeros(1)}, path)
-    assert "is missing" in refused(lambda: Lpips.load(path))
+    assert "is missing" in rejected(lambda: Lpips.load(path))
 
 
-def test_history_of_things_that_are_no_numbers(tmp_path):
+def test_history_with_invalid_values(tmp_path):
     stretch = {"step": 1, "steps": 1, "loss": 0.5, "seconds": 0.1, "gaussians": 5}
     wrong = ({"loss": "a"}, {"seconds": None}, {"steps": 0}, {"step": True}, {"more": 1})
     absurd = ({"gaussians": 10**400}, {"loss": 1e308}, {"seconds": -1e308})
     for changed in (*wrong, *absurd):
-        whole = {"stretches": [stretch | changed], "measured": [], "stride": 1}
-        (tmp_path / "history.json").write_text(json.dumps(whole))
+        content = {"stretches": [stretch | changed], "measured": [], "stride": 1}
+        (tmp_path / "history.json").write_text(json.dumps(content))
         assert History.read(tmp_path / "history.json", 9).stretches == []
 
 
 def test_a_record_of_stages_that_was_edited(tmp_path, caplog):
-    """A result that is not what was written down is made anew."""
+    """A stage whose recorded result was changed is repeated."""
     path, done = tmp_path / "capture.json", []
 
     def run() -> dict:
@@ -607,8 +608,8 @@ def test_a_record_of_stages_that_was_edited(tmp_path, caplog):
         run()
 
 
-def test_an_image_list_does_not_grow_with_what_is_logged(tmp_path, caplog, dataset):
-    """Names of images stand in warnings and errors, but not megabytes of them."""
+def test_log_messages_are_short_for_huge_image_names(tmp_path, caplog, dataset):
+    """Warnings and errors contain image names, but only their beginning."""
     home = dataset("colmap-txt")
     images = home / "sparse/0/images.txt"
     images.write_text(images.read_text() + "9 1 0 0 0 0 0 0 1 " + "x" * 100_000 + "\n\n")

@@ -1,4 +1,4 @@
-"""The guard itself: a reader that breaks a limit is found out."""
+"""`guarded` detects readers that exceed a limit."""
 
 import subprocess
 import sys
@@ -25,13 +25,13 @@ BROKEN = {
     "for a file of": lambda home: bool(torch.ones(2 * MEMORY, dtype=torch.uint8).sum()),
     "opened": lambda home: (home.parent / "secret").read_bytes(),
     "subprocess.Popen": lambda home: evaluate("pass"),
-    "told at length: 'two": lambda home: refuse("two\nlines"),
-    "told at length: 'aaa": lambda home: refuse("a" * 5000),
+    "long message: 'two": lambda home: refuse("two\nlines"),
+    "long message: 'aaa": lambda home: refuse("a" * 5000),
 }
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_a_broken_limit_is_told(tmp_path, monkeypatch, what):
+def test_a_reader_that_exceeds_a_limit_is_detected(tmp_path, monkeypatch, what):
     if what == "takes more than":
         monkeypatch.setattr("tests.fuzz.limits.SECONDS", 1.0)
     home = tmp_path / "home"
@@ -41,11 +41,11 @@ def test_a_broken_limit_is_told(tmp_path, monkeypatch, what):
         guarded(lambda: BROKEN[what](home), home, 100)
 
 
-def test_what_keeps_to_them_passes(tmp_path):
+def test_a_reader_within_the_limits_passes(tmp_path):
     (tmp_path / "a").write_text("x")
     assert guarded(lambda: (tmp_path / "a").read_text(), tmp_path, 100) == "x"
     assert isinstance(guarded(lambda: refuse("no"), tmp_path, 100), UserError)
     large = guarded(lambda: torch.ones(2 * MEMORY, dtype=torch.uint8), tmp_path, 100)
-    assert large.nbytes == 2 * MEMORY  # what is given back counts as read
+    assert large.nbytes == 2 * MEMORY  # the size of the result is allowed
     with pytest.raises(ZeroDivisionError):
         guarded(lambda: 1 // 0, tmp_path, 100)

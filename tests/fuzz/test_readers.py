@@ -1,6 +1,7 @@
-"""Files of every kind, damaged: one line or a sound result, at once, in little memory, at home.
+"""Damaged files of every kind: a reader raises a one-line error or returns a valid result.
 
-SNOWSPLAT_FUZZ=2000 tries so many others a reader; without it they are few and the same each time.
+It does so within the limits of `guarded`. SNOWSPLAT_FUZZ=2000 tests 2000 random examples per
+reader. Without it there are few examples, the same in each run.
 """
 
 import logging
@@ -36,7 +37,7 @@ change = st.tuples(
 
 @pytest.fixture(autouse=True)
 def quiet():
-    """Warnings about what was left out are not the subject."""
+    """Hide warnings, for example about skipped points; they are not tested here."""
     logging.disable(logging.WARNING)
     warnings.filterwarnings("ignore", module=r"PIL\.")  # as the command line does
     yield
@@ -51,7 +52,7 @@ def survives(reader: Reader, data: bytes) -> object:
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_damaged(reader):
     valid = reader.valid
-    result = survives(reader, valid)  # else the table is wrong; and libraries are loaded now
+    result = survives(reader, valid)  # checks the table and loads libraries
     assert not isinstance(result, UserError) or reader.name == "LPIPS weights", result
 
     @pytest.mark.filterwarnings("ignore")
@@ -66,7 +67,7 @@ def test_damaged(reader):
 
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-def test_nothing_and_noise(reader):
+def test_empty_files_and_noise(reader):
     for data in (b"", b"\0", bytes(5000), bytes(range(256)) * 20, b"[" * 5000, b"\n" * 5000):
         survives(reader, data)
     reader.write(reader.valid)

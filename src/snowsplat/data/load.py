@@ -12,7 +12,7 @@ from snowsplat.data.colmap import find_models, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
 from snowsplat.data.transforms_json import find_transforms, read_transforms
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -51,6 +51,7 @@ def load_dataset(
     Raises:
         UserError: ``path`` is not a dataset; a file is damaged; a camera has lens distortion; an
             image is missing, damaged, or does not have the size of its camera.
+        SettingError: ``images`` is not the folder of the images, or ``resolution`` is invalid.
     """
     root = Path(path)
     posed, points, description = _read(root, images)
@@ -204,16 +205,17 @@ def _final_size(
     if resolution is None or resolution == -1:
         return width, height
     if resolution < 1:
-        raise UserError(f"resolution: {resolution} is not valid; use 1, 2, 4, 8 or a width")
+        raise SettingError("resolution", f"{resolution} is not valid; use 1, 2, 4, 8 or a width")
     if resolution in _DIVISORS:
         divisor = resolution / image.divided
     else:
         divisor = max(1.0, width / resolution)
     new_width, new_height = max(1, round(width / divisor)), max(1, round(height / divisor))
     if divisor > 1 and min(new_width, new_height) < _SMALLEST_SIDE:
-        raise UserError(
-            f"resolution: {resolution} makes images of {new_width}x{new_height} pixels; use 1, 2, "
-            "4 or 8 to divide their size, or a larger width"
+        raise SettingError(
+            "resolution",
+            f"{resolution} makes images of {new_width}x{new_height} pixels; use 1, 2, 4 or 8 to "
+            "divide their size, or a larger width",
         )
     return new_width, new_height
 

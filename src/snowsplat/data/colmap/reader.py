@@ -19,7 +19,7 @@ from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import rotation_from_quat
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -93,10 +93,8 @@ def _images_on_disk(root: Path, folder: Path, model: ColmapModel) -> list[PosedI
     """The images of a model whose files are in ``folder``; warns of those that are missing."""
     if not folder.is_dir():
         found = sorted(p.name for p in root.iterdir() if p.is_dir())
-        raise UserError(
-            f"{folder}: no such folder of images; set images to the right one"
-            + (f" (existing folders: {', '.join(found)})" if found else "")
-        )
+        existing = f" (existing folders: {', '.join(found)})" if found else ""
+        raise SettingError("images", f"no such folder: {folder}; use the right one{existing}")
     posed, missing = [], []
     for image in model.images:
         if inside(folder, image.name) is None:
@@ -111,9 +109,10 @@ def _images_on_disk(root: Path, folder: Path, model: ColmapModel) -> list[PosedI
         mask = _find_mask(root / "masks", image.name)
         posed.append(PosedImage(safe_name(image.name), camera, folder, image.name, mask))
     if not posed:
-        raise UserError(
-            f"{folder}: has none of the {len(missing)} images of the model (the first is "
-            f"{quoted(missing[0])}); set images to the right folder"
+        raise SettingError(
+            "images",
+            f"{folder} has none of the {len(missing)} images of the model (the first is "
+            f"{quoted(missing[0])}); use the right folder",
         )
     if missing:
         logger.warning(
