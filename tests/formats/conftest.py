@@ -1,4 +1,4 @@
-"""What the tests of all formats need: scenes, how they compare, how damage is told."""
+"""Fixtures for the tests of all formats: scenes, comparisons, and checks of error messages."""
 
 import math
 import os
@@ -22,16 +22,16 @@ Make = Callable[..., Gaussians]
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of scene files beside the project; without it the test is skipped."""
+    """The folder of scene files next to the project; the test is skipped if it is missing."""
     folder = Path(__file__).parents[2].parent / "shared/splats"
     if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+        pytest.skip(f"{folder} is missing")
     return folder
 
 
 @pytest.fixture(scope="session")
 def make_scene() -> Make:
-    """``make_scene(n, degree)``: as trained scenes are: small, thin, from faint to opaque."""
+    """``make_scene(n, degree)``: like a trained scene: small, thin, from faint to opaque."""
 
     def make(n: int, degree: int = 3, seed: int = 0) -> Gaussians:
         generator = torch.Generator().manual_seed(seed)
@@ -53,7 +53,7 @@ def make_scene() -> Make:
 
 @pytest.fixture(scope="session")
 def view() -> Callable[[Gaussians], torch.Tensor]:
-    """The picture (120, 160, 3) that a camera in front of such a scene takes."""
+    """``view(scene)``: the image (120, 160, 3) of a camera in front of such a scene."""
     cam_from_world = look_at(
         torch.tensor([0.5, -1.0, -5.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
     )
@@ -63,7 +63,7 @@ def view() -> Callable[[Gaussians], torch.Tensor]:
 
 @pytest.fixture(scope="session")
 def psnr(view) -> Callable[[Gaussians, Gaussians], float]:
-    """Of the pictures of two scenes, in dB."""
+    """``psnr(a, b)``: in dB, between the images of two scenes."""
 
     def compare(a: Gaussians, b: Gaussians) -> float:
         error = float(((view(a).clamp(0, 1) - view(b).clamp(0, 1)) ** 2).mean())
@@ -74,7 +74,7 @@ def psnr(view) -> Callable[[Gaussians, Gaussians], float]:
 
 @pytest.fixture(scope="session")
 def one_line() -> Callable[[Path], str]:
-    """Reads a file that must be refused; gives the line that says why."""
+    """``one_line(path)``: reads a file that must be refused; returns the error message."""
 
     def refused(path: Path) -> str:
         with pytest.raises(UserError) as error:
@@ -90,7 +90,9 @@ def one_line() -> Callable[[Path], str]:
 
 @pytest.fixture(scope="session")
 def survives() -> Callable[[Path], None]:
-    """Reads a file of random damage: one line, or finite Gaussians, not absurdly many."""
+    """``survives(path)``: a damaged file is a one-line error, or a plausible number of finite
+    Gaussians.
+    """
 
     def read(path: Path) -> None:
         try:
@@ -100,7 +102,7 @@ def survives() -> Callable[[Path], None]:
         else:
             lines = 1
             assert len(scene) <= max(1000, 100 * path.stat().st_size)
-            if format_for_reading(path).name != "PLY":  # which is read as it is
+            if format_for_reading(path).name != "PLY":  # a PLY is read unchanged
                 assert bool(scene.finite_rows().all())
         assert lines == 1
 
@@ -109,7 +111,7 @@ def survives() -> Callable[[Path], None]:
 
 @pytest.fixture(scope="session")
 def rotation_error() -> Callable[[Gaussians, Gaussians], float]:
-    """The largest difference of unit quaternions, whose sign says nothing."""
+    """The largest difference between unit quaternions, up to their sign."""
 
     def largest(a: Gaussians, b: Gaussians) -> float:
         p, q = a.rotations, b.rotations
@@ -121,12 +123,12 @@ def rotation_error() -> Callable[[Gaussians, Gaussians], float]:
 
 @pytest.fixture(scope="session")
 def splat_transform() -> Callable[..., None]:
-    """``splat_transform(source, target, *flags)``: PlayCanvas' converter, which shares no code
-    with ours. It needs Node; `npm ci --ignore-scripts` in tests/node installs it.
+    """``splat_transform(source, target, *flags)``: the converter of PlayCanvas, an independent
+    implementation. It needs Node; `npm ci --ignore-scripts` in tests/node installs it.
     """
     program = Path(__file__).parents[1] / "node/node_modules/.bin/splat-transform"
     if not program.exists() or shutil.which("node") is None:
-        pytest.skip(f"{program} or node is absent; `npm ci --ignore-scripts` in tests/node")
+        pytest.skip(f"{program} or node is missing; `npm ci --ignore-scripts` in tests/node")
 
     def convert(source: Path, target: Path, *flags: str) -> None:
         command = ["node", program, "--quiet", "--overwrite", source, *flags, target]

@@ -1,4 +1,4 @@
-"""JSON with some of its values replaced by others that do not belong there."""
+"""JSON with some values replaced by unsuitable ones."""
 
 import copy
 from typing import Any
@@ -17,7 +17,7 @@ changes = st.lists(
 
 
 def places(value: Any) -> list[tuple[Any, Any]]:
-    """Container and key of everything in ``value``; of long lists of numbers the first ones."""
+    """Container and key of every element of ``value``; of long lists of numbers, of the first."""
     found: list[tuple[Any, Any]] = []
     keys: list[Any] = []
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Compressed PLY: its words by hand, chunks that are full and not, its exactness."""
+"""Compressed PLY: words packed by hand, full and partial chunks, precision."""
 
 import struct
 
@@ -40,7 +40,7 @@ def test_one_gaussian_by_hand(tmp_path):
     read = read_gaussians(path)
     torch.testing.assert_close(read.means, torch.tensor([[5.0, 1.0, 2.0]]))
     torch.testing.assert_close(read.log_scales, torch.tensor([[0.0, -6.0, -7.0]]))
-    # y is largest; w, x, z are ±1/√2, which is more than a unit quaternion has room for.
+    # y is largest; w, x, z are ±1/√2, more than a unit quaternion allows.
     half = 0.5**0.5
     torch.testing.assert_close(
         read.rotations,
@@ -70,7 +70,7 @@ def test_an_sh_element_without_properties_is_degree_0(tmp_path, make_scene):
     assert read_gaussians(path).sh_degree == 0
 
 
-def test_the_bytes_that_are_written(tmp_path):
+def test_written_bytes(tmp_path):
     scene = Gaussians(
         torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 4.0]]),
         torch.tensor([[-1.0, -2.0, -3.0], [0.0, -2.0, -4.0]]),
@@ -105,7 +105,9 @@ def test_the_bytes_that_are_written(tmp_path):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 256, 700])
-def test_round_trip_is_as_exact_as_the_bits_allow(tmp_path, make_scene, rotation_error, n, degree):
+def test_round_trip_is_as_precise_as_the_bits_allow(
+    tmp_path, make_scene, rotation_error, n, degree
+):
     scene = make_scene(n, degree)
     write_gaussians(tmp_path / "a.compressed.ply", scene)
     read = read_gaussians(tmp_path / "a.compressed.ply")
@@ -124,7 +126,7 @@ def test_round_trip_is_as_exact_as_the_bits_allow(tmp_path, make_scene, rotation
     torch.testing.assert_close(read.sh_rest, scene.sh_rest, rtol=0, atol=4 / 256 + 1e-6)
 
 
-def test_the_picture_stays(tmp_path, make_scene, psnr):
+def test_the_rendered_image_is_nearly_the_same(tmp_path, make_scene, psnr):
     scene = make_scene(500, 3)
     write_gaussians(tmp_path / "a.compressed.ply", scene)
     assert psnr(scene, read_gaussians(tmp_path / "a.compressed.ply")) > 35
@@ -138,7 +140,7 @@ def test_fixture(shared):
     assert (high - low).max() < 10
 
 
-def test_damage_is_told(tmp_path, make_scene, one_line):
+def test_damage_is_reported(tmp_path, make_scene, one_line):
     path = tmp_path / "a.ply"
     write_gaussians(tmp_path / "a.compressed.ply", make_scene(300, 1))
     data = (tmp_path / "a.compressed.ply").read_bytes()

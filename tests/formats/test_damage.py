@@ -1,6 +1,6 @@
-"""Files of every format, damaged at random: one line or a sound scene, at once, in little memory.
+"""Randomly damaged files of every format: a one-line error or a valid scene, in little memory.
 
-SNOWSPLAT_FUZZ=5000 tries so many others a format; without it they are few and the same each time.
+SNOWSPLAT_FUZZ=5000 sets the number of random examples per format; the default is 60 fixed ones.
 """
 
 import os
@@ -28,10 +28,10 @@ FUZZ = settings(
     deadline=None,
     suppress_health_check=QUIET,
 )
-BOTH_WAYS = [f for f in FORMATS if f.read and f.write]
+READ_AND_WRITTEN = [f for f in FORMATS if f.read and f.write]
 WORDS = [0, 1, 2, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 0x7F800000, 0x7FC00000]
 
-#: Where (of the file's length or, half of the time, of its first 200 bytes), what, with what.
+#: Position (a fraction of the file or, half of the time, of its first 200 bytes), change, values.
 changes = st.lists(
     st.tuples(
         st.booleans(),
@@ -61,7 +61,7 @@ def damaged(data: bytes, changes: list[tuple[bool, float, str, int, int]]) -> by
     return data
 
 
-@pytest.mark.parametrize("format", BOTH_WAYS, ids=lambda format: format.name)
+@pytest.mark.parametrize("format", READ_AND_WRITTEN, ids=lambda format: format.name)
 @FUZZ
 @given(changes=changes)
 def test_any_format(tmp_path, make_scene, survives, format, changes):
@@ -97,17 +97,17 @@ def test_spz_of_version_4(tmp_path, make_scene, survives, changes):
 
 
 @pytest.mark.parametrize("format", [f for f in FORMATS if f.read], ids=lambda format: format.name)
-def test_nothing_and_noise(tmp_path, survives, format):
+def test_empty_files_and_noise(tmp_path, survives, format):
     path = tmp_path / f"a{format.suffixes[0]}"
     for data in (b"", b"\0", bytes(5000), bytes(range(256)) * 20):
         path.write_bytes(data)
         survives(path)
 
 
-@pytest.mark.parametrize("format", BOTH_WAYS, ids=lambda format: format.name)
-def test_what_is_not_finite_is_left_out_with_a_note(tmp_path, make_scene, caplog, format):
+@pytest.mark.parametrize("format", READ_AND_WRITTEN, ids=lambda format: format.name)
+def test_nonfinite_gaussians_are_skipped_with_a_warning(tmp_path, make_scene, caplog, format):
     if format.name == "PLY":
-        pytest.skip("a PLY is written and read as it is")
+        pytest.skip("PLY stores non-finite values")
     scene = make_scene(20, 1)
     scene.means[3, 1] = torch.nan
     scene.log_scales[4, 0] = torch.inf
@@ -122,7 +122,7 @@ def test_what_is_not_finite_is_left_out_with_a_note(tmp_path, make_scene, caplog
     assert bool(read.finite_rows().all())
 
 
-@pytest.mark.parametrize("format", BOTH_WAYS, ids=lambda format: format.name)
+@pytest.mark.parametrize("format", READ_AND_WRITTEN, ids=lambda format: format.name)
 def test_extreme_but_finite_scenes_are_written_and_read(tmp_path, make_scene, format):
     scene = make_scene(40, 3)
     for i, value in enumerate((1e38, -1e38, 1e20, 0.0, 1e-30)):
@@ -130,13 +130,13 @@ def test_extreme_but_finite_scenes_are_written_and_read(tmp_path, make_scene, fo
             tensor[i] = value
     path = tmp_path / f"a{format.suffixes[0]}"
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # of numpy
+        warnings.simplefilter("error")  # of NumPy
         write_gaussians(path, scene)
     assert 35 <= len(read_gaussians(path)) <= 40
 
 
-def test_a_bomb_takes_no_memory(tmp_path):
-    """What is refused is refused before memory is taken for what it promises."""
+def test_a_decompression_bomb_takes_no_memory(tmp_path):
+    """The file is refused before memory is allocated for its declared size."""
     path = tmp_path / "a.spz"
     path.write_bytes(pack(Header(4, 30_000_000, 0, 12, 0), [bytes(9 * 30_000_000)]))
     assert path.stat().st_size < 100_000
@@ -149,8 +149,8 @@ def test_a_bomb_takes_no_memory(tmp_path):
         tracemalloc.stop()
 
 
-def test_gaussians_without_rows_stay_so(tmp_path):
-    for format in BOTH_WAYS:
+def test_a_scene_without_gaussians_is_written_and_read(tmp_path):
+    for format in READ_AND_WRITTEN:
         path = tmp_path / f"a{format.suffixes[0]}"
         shapes = ((0, 3), (0, 3), (0, 4), (0,), (0, 1, 3), (0, 15, 3))
         write_gaussians(path, Gaussians(*(torch.zeros(shape) for shape in shapes)))

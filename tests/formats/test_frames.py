@@ -1,4 +1,4 @@
-"""Axes that change their signs: a camera that does the same sees the same."""
+"""Sign changes of axes: a camera with the same change sees the same image."""
 
 import itertools
 
@@ -18,24 +18,24 @@ def flipped(scene: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
     return Gaussians(means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
 
 
-def test_y_up_z_back_is_seen_the_same_by_a_camera_turned_with_it(make_scene):
+def test_a_camera_converted_to_y_up_z_back_sees_the_same_image(make_scene):
     scene = make_scene(300, 3)
     pose = look_at(torch.tensor([1.0, -2.0, -4.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
     turned = pose.clone()
     turned[:, 1:3] *= -1
-    pictures = [
+    images = [
         render(g, Camera(160, 120, 150.0, 150.0, 80.0, 60.0, p)).image
         for g, p in ((scene, pose), (flipped(scene, UP_BACK), turned))
     ]
-    assert pictures[0].amax() > 0.5
-    torch.testing.assert_close(pictures[1], pictures[0], rtol=0, atol=1e-4)
+    assert images[0].amax() > 0.5
+    torch.testing.assert_close(images[1], images[0], rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("signs", list(itertools.product((1, -1), repeat=3)))
-def test_a_camera_in_the_axis_sees_mirror_images(make_scene, signs):
+def test_a_reflected_scene_has_a_mirrored_image(make_scene, signs):
     scene = make_scene(300, 3)
     x, y, z = signs
-    # Where z is mirrored the camera looks from behind; its own x axis then points the other way.
+    # If z is mirrored, the camera looks from behind; its x axis then points the other way.
     pose = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5]])
     behind = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 5]])
     first, second = (
@@ -49,7 +49,7 @@ def test_a_camera_in_the_axis_sees_mirror_images(make_scene, signs):
     torch.testing.assert_close(second, first, rtol=0, atol=1e-3)
 
 
-def test_twice_is_not_at_all(make_scene):
+def test_two_equal_sign_changes_cancel(make_scene):
     scene = make_scene(9, 2)
     again = flipped(flipped(scene, UP_BACK), UP_BACK)
     for name, tensor in scene.parameters().items():

@@ -1,4 +1,4 @@
-"""glTF: nothing is lost but rounding; nodes place the splats; hostile JSON gives one line."""
+"""glTF: lossless up to rounding; nodes place the splats; malicious JSON is a one-line error."""
 
 import json
 import math
@@ -40,7 +40,7 @@ def assemble(path, document, binary: bytes):
 
 @pytest.fixture
 def seed(tmp_path, make_scene):
-    """JSON and binary chunk of a small file, and the scene."""
+    """JSON and binary chunk of a small file, and its scene."""
     scene = make_scene(30, 2)
     write_gaussians(tmp_path / "seed.glb", scene)
     return (*parts(tmp_path / "seed.glb"), scene)
@@ -86,7 +86,7 @@ def test_the_layout_is_that_of_the_specification(seed, tmp_path):
         )
 
     means, scales = values("POSITION"), values(PREFIX + "SCALE")
-    # y up, z toward the viewer, x as it is.
+    # y up, z toward the viewer, x unchanged.
     np.testing.assert_array_equal(means * [1, -1, -1], scene.means.numpy())
     entry = document["accessors"][primitive["attributes"]["POSITION"]]
     np.testing.assert_array_equal(entry["min"], means.min(0))
@@ -97,7 +97,7 @@ def test_the_layout_is_that_of_the_specification(seed, tmp_path):
     unit = scene.rotations.numpy()
     np.testing.assert_allclose(np.stack([w, x, -y, -z], 1), unit, atol=1e-6)
     np.testing.assert_array_equal(values(PREFIX + "SH_DEGREE_0_COEF_0"), scene.sh_dc[:, 0])
-    # (-y, z, -x) at y, z turned about: the first two of degree 1 change their signs.
+    # With y and z negated, (-y, z, -x) changes the signs of the first two of degree 1.
     for n, sign in enumerate((-1, -1, 1)):
         coefficient = values(f"{PREFIX}SH_DEGREE_1_COEF_{n}")
         np.testing.assert_array_equal(coefficient, sign * scene.sh_rest[:, n].numpy())
@@ -105,7 +105,7 @@ def test_the_layout_is_that_of_the_specification(seed, tmp_path):
     assert np.abs(values("COLOR_0")[:, :3] / 255 - color**2.2).max() < 0.02
 
 
-def test_half_a_turn_about_x_is_what_the_frames_differ_by(seed, tmp_path):
+def test_the_frames_differ_by_180_degrees_about_x(seed, tmp_path):
     document, binary, scene = seed
     document["nodes"][0]["rotation"] = [1.0, 0.0, 0.0, 0.0]
     read = read_gaussians(assemble(tmp_path / "a.glb", document, binary))
@@ -139,7 +139,7 @@ def test_nodes_place_the_splats(seed, tmp_path):
 
 
 def test_quantised_attributes(seed, tmp_path):
-    """As the table of the specification allows, interleaved."""
+    """The types that the specification allows, interleaved."""
     document, _, scene = seed
     del document["accessors"][7:], document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
     rows = np.zeros(
@@ -188,11 +188,11 @@ def test_quantised_attributes(seed, tmp_path):
     assert float((1 - (read.rotations * scene.rotations).sum(1).abs()).max()) < 1e-6
 
 
-def test_nothing(tmp_path, make_scene, one_line):
+def test_an_empty_scene_and_a_file_without_splats(tmp_path, make_scene, one_line):
     write_gaussians(tmp_path / "a.glb", make_scene(0, 3))
     assert len(read_gaussians(tmp_path / "a.glb")) == 0
     document, _ = parts(tmp_path / "a.glb")
-    assert "meshes" not in document  # an accessor of nothing would not be valid
+    assert "meshes" not in document  # an empty accessor is not valid glTF
     del document["extensionsUsed"]
     assert "without Gaussian splats" in one_line(assemble(tmp_path / "b.glb", document, b""))
 
@@ -232,7 +232,7 @@ BROKEN = {
     "no position": lambda d: primitive(d)["attributes"].pop("POSITION"),
     "no scale": lambda d: primitive(d)["attributes"].pop(PREFIX + "SCALE"),
     "part of a degree": lambda d: primitive(d)["attributes"].pop(PREFIX + "SH_DEGREE_2_COEF_3"),
-    "a degree left out": lambda d: [
+    "a missing degree": lambda d: [
         primitive(d)["attributes"].pop(f"{PREFIX}SH_DEGREE_1_COEF_{n}") for n in range(3)
     ],
     "triangles": lambda d: primitive(d).update(mode=4),
@@ -254,32 +254,32 @@ BROKEN = {
     "infinite": lambda d: d["nodes"][0].update(translation=[1e999, 0, 0]),
     "meshes a word": lambda d: d.update(meshes="m"),
     "nodes numbers": lambda d: d.update(nodes=[1, 2]),
-    "accessors absent": lambda d: d.pop("accessors"),
+    "accessors missing": lambda d: d.pop("accessors"),
     "extension a list": lambda d: primitive(d).update(extensions=[]),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_json_that_makes_no_sense(tmp_path, seed, one_line, name):
+def test_invalid_json_is_reported(tmp_path, seed, one_line, name):
     document, binary, _ = seed
     BROKEN[name](document)
     one_line(assemble(tmp_path / "a.glb", document, binary))
 
 
-def test_chunks_that_make_no_sense(tmp_path, seed, one_line):
+def test_invalid_chunks_are_reported(tmp_path, seed, one_line):
     document, binary, _ = seed
-    whole = assemble(tmp_path / "a.glb", document, binary).read_bytes()
+    data = assemble(tmp_path / "a.glb", document, binary).read_bytes()
     for at, word in ((4, 1), (8, 2**32 - 1), (12, 2**32 - 1), (12, 8), (16, 7)):
-        (tmp_path / "a.glb").write_bytes(whole[:at] + struct.pack("<I", word) + whole[at + 4 :])
+        (tmp_path / "a.glb").write_bytes(data[:at] + struct.pack("<I", word) + data[at + 4 :])
         one_line(tmp_path / "a.glb")
-    for length in (4, 12, 19, 200, len(whole) - 1):
-        (tmp_path / "a.glb").write_bytes(whole[:length])
+    for length in (4, 12, 19, 200, len(data) - 1):
+        (tmp_path / "a.glb").write_bytes(data[:length])
         one_line(tmp_path / "a.glb")
     for text in (b"[" * 100_000, b"7", b"{]", b'{"a":' + b"9" * 10_000 + b"}"):
         one_line(assemble(tmp_path / "a.glb", text, binary))
 
 
-def test_linear_colours_are_told(tmp_path, seed, caplog):
+def test_linear_colours_are_a_warning(tmp_path, seed, caplog):
     document, binary, _ = seed
     extension(document)["colorSpace"] = "lin_rec709_display"
     assert len(read_gaussians(assemble(tmp_path / "a.glb", document, binary))) == 30
@@ -293,6 +293,6 @@ def test_linear_colours_are_told(tmp_path, seed, caplog):
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(changes=json_damage.changes)
-def test_json_of_random_damage(tmp_path, seed, survives, changes):
+def test_randomly_damaged_json(tmp_path, seed, survives, changes):
     document, binary, _ = seed
     survives(assemble(tmp_path / "a.glb", json_damage.damaged(document, changes), binary))

@@ -1,4 +1,4 @@
-"""`.ksplat`: files built here by its description, of each level, with full and partial buckets."""
+"""`.ksplat`: files built by the test for each level, with full and partial buckets."""
 
 import os
 import struct
@@ -92,7 +92,7 @@ def test_two_sections_of_different_degree(tmp_path, make_scene):
     assert torch.equal(read.sh_rest[5:], b.sh_rest)
 
 
-def test_of_a_section_that_was_not_loaded_whole_the_first_rows_count(tmp_path, make_scene):
+def test_a_partly_loaded_section_has_its_first_rows(tmp_path, make_scene):
     scene = make_scene(6, 0)
     data = bytearray(ksplat([section(scene, 0, 0, [])], 0, 6))
     struct.pack_into("<I", data, 4096, 2)
@@ -115,24 +115,24 @@ def test_fixture(shared):
     ("offset", "value"),
     [
         (4, 2**32 - 1),  # sections
-        (4096, 2**32 - 1),  # Gaussians, more than there is room for
-        (4100, 2**32 - 1),  # room
+        (4096, 2**32 - 1),  # Gaussians, more than the capacity
+        (4100, 2**32 - 1),  # capacity
         (4108, 2**32 - 1),  # buckets
         (4096 + 32, 2**32 - 1),  # full buckets
         (4096 + 36, 2**32 - 1),  # partial buckets
         (4096 + 36, 0),
         (4096 + 40, 99),  # SH degree
-        (4104, 0),  # size of a bucket
+        (4104, 0),  # bucket size
     ],
 )
-def test_counts_that_do_not_fit_are_told(tmp_path, make_scene, one_line, offset, value):
+def test_inconsistent_counts_are_reported(tmp_path, make_scene, one_line, offset, value):
     data = bytearray(ksplat([section(make_scene(13, 1), 1, 2, [3, 2])], 1, 13))
     struct.pack_into("<I", data, offset, value)
     (tmp_path / "a.ksplat").write_bytes(data)
     assert "damaged" in one_line(tmp_path / "a.ksplat")
 
 
-def test_other_versions_and_short_files_are_told(tmp_path, make_scene, one_line):
+def test_other_versions_and_short_files_are_reported(tmp_path, make_scene, one_line):
     data = bytearray(ksplat([section(make_scene(13, 1), 1, 2, [3, 2])], 1, 13))
     path = tmp_path / "a.ksplat"
     path.write_bytes(data[:4000])
@@ -147,7 +147,7 @@ def test_other_versions_and_short_files_are_told(tmp_path, make_scene, one_line)
     assert "level 3" in one_line(path)
 
 
-def test_it_is_not_written(tmp_path, make_scene):
+def test_it_cannot_be_written(tmp_path, make_scene):
     with pytest.raises(UserError, match="selects no scene format"):
         write_gaussians(tmp_path / "a.ksplat", make_scene(1))
 
@@ -169,7 +169,7 @@ def test_it_is_not_written(tmp_path, make_scene):
         max_size=4,
     ),
 )
-def test_damage_at_random(tmp_path, make_scene, survives, level, changes):
+def test_random_damage(tmp_path, make_scene, survives, level, changes):
     data = bytearray(ksplat([section(make_scene(13, 1), level, 2, [3, 2])], level, 13))
     for at, value in changes:
         struct.pack_into("<H", data, at, value)

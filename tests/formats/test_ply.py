@@ -1,4 +1,4 @@
-"""PLY: read back to the bit what was written, any dialect alike, damage as one line."""
+"""PLY: bit-identical round trips, all dialects, one-line errors for damaged files."""
 
 import contextlib
 import struct
@@ -43,11 +43,11 @@ def property_names(degree: int) -> list[str]:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 257, 20_000])
-def test_round_trip_to_the_bit(tmp_path, degree, n):
+def test_round_trip_is_bit_identical(tmp_path, degree, n):
     gaussians = random_gaussians(n, degree)
     write_gaussians(tmp_path / "scene.ply", gaussians)
     assert_same(gaussians, read_gaussians(tmp_path / "scene.ply"))
-    assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]  # no temporary stays
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]  # no temporary file remains
 
 
 def test_layout_is_the_62_properties_in_order(tmp_path):
@@ -70,7 +70,7 @@ def test_layout_is_the_62_properties_in_order(tmp_path):
 
 def test_reference_file_reads_and_writes_back_the_same_bytes(tmp_path):
     if not REFERENCE.exists():
-        pytest.skip(f"{REFERENCE} is absent")
+        pytest.skip(f"{REFERENCE} is missing")
     gaussians = read_gaussians(REFERENCE)
     assert len(gaussians) == 9080
     assert gaussians.sh_degree == 3
@@ -81,7 +81,7 @@ def test_reference_file_reads_and_writes_back_the_same_bytes(tmp_path):
     assert_same(gaussians, read_gaussians(tmp_path / "again.ply"))
 
 
-# Dialects: the same Gaussians written in other ways, by a writer that shares nothing with ours.
+# Dialects: the same Gaussians in other variants of PLY, by an independent writer.
 
 TYPES = {
     "float": "f",
@@ -172,7 +172,7 @@ def test_dialects_read_the_same(tmp_path, name, degree):
     assert_same(gaussians, read_gaussians(tmp_path / "scene.ply"))
 
 
-def test_missing_normals_are_no_matter_and_nan_is_kept(tmp_path):
+def test_normals_are_optional_and_nan_is_preserved(tmp_path):
     gaussians = random_gaussians(3, 0)
     gaussians.means[1, 2] = float("nan")
     gaussians.log_scales[2, 0] = float("inf")
@@ -197,14 +197,14 @@ def one_line(path: Path) -> str:
 
 @pytest.mark.parametrize("format", ["binary_little_endian", "binary_big_endian", "ascii"])
 def test_every_truncation_is_one_line(tmp_path, format):
-    whole = dialect(random_gaussians(3, 1), format=format)
+    data = dialect(random_gaussians(3, 1), format=format)
     path = tmp_path / "scene.ply"
-    # ASCII may lose its last line's end, and digits of its last number, and still be whole rows.
-    end = len(whole.rstrip().rsplit(b" ", 1)[0]) if format == "ascii" else len(whole) - 1
+    # An ASCII file without its last line break, or without the last digits, still has all rows.
+    end = len(data.rstrip().rsplit(b" ", 1)[0]) if format == "ascii" else len(data) - 1
     for length in range(0, end, 7):
-        path.write_bytes(whole[:length])
+        path.write_bytes(data[:length])
         one_line(path)
-    path.write_bytes(whole[:end])
+    path.write_bytes(data[:end])
     one_line(path)
 
 
@@ -213,9 +213,9 @@ def test_every_truncation_is_one_line(tmp_path, format):
 )
 @pytest.mark.parametrize("format", ["binary_little_endian", "ascii"])
 def test_counts_beyond_the_file_allocate_nothing(tmp_path, count, format):
-    whole = dialect(random_gaussians(3, 0), format=format)
+    data = dialect(random_gaussians(3, 0), format=format)
     path = tmp_path / "scene.ply"
-    path.write_bytes(whole.replace(b"element vertex 3", f"element vertex {count}".encode()))
+    path.write_bytes(data.replace(b"element vertex 3", f"element vertex {count}".encode()))
     one_line(path)
 
 
@@ -227,7 +227,7 @@ def test_counts_beyond_the_file_allocate_nothing(tmp_path, count, format):
         ((b"1.0", b"2.0"), "invalid line"),
         ((b"property float opacity", b"property quaternion opacity"), "invalid line"),
         ((b"property float opacity", b"property float x"), "twice"),
-        ((b"property float opacity", b"property float alpha"), "no opacity"),
+        ((b"property float opacity", b"property float alpha"), "missing properties: opacity"),
         ((b"property float f_rest_8", b"property float f_rest_9"), "SH degree"),
         ((b"property float f_rest_8", b"property float other"), "SH degree"),
         ((b"property float f_rest_8", b"property list uchar float f_rest_8"), "list property"),
@@ -238,11 +238,11 @@ def test_counts_beyond_the_file_allocate_nothing(tmp_path, count, format):
         ((b"comment made by a test", b"comment " + b"x" * 5000), "no end"),
     ],
 )
-def test_headers_that_make_no_sense(tmp_path, change, expected):
-    whole = dialect(random_gaussians(3, 1))
-    assert change[0] in whole
+def test_invalid_headers_are_reported(tmp_path, change, expected):
+    data = dialect(random_gaussians(3, 1))
+    assert change[0] in data
     path = tmp_path / "scene.ply"
-    path.write_bytes(whole.replace(*change))
+    path.write_bytes(data.replace(*change))
     assert expected in one_line(path)
 
 
@@ -256,13 +256,13 @@ def test_ascii_rows_that_are_not_numbers(tmp_path, row):
 
 
 def test_random_damage_never_escapes(tmp_path):
-    """Bytes changed anywhere: a scene, or one line; never another exception."""
+    """Random bytes changed: a scene or a one-line error, never another exception."""
     random = np.random.default_rng(0)
     path = tmp_path / "scene.ply"
     for format in ("binary_little_endian", "ascii"):
-        whole = dialect(random_gaussians(3, 0), format=format)
+        data = dialect(random_gaussians(3, 0), format=format)
         for _ in range(300):
-            damaged = bytearray(whole)
+            damaged = bytearray(data)
             for _ in range(random.integers(1, 4)):
                 damaged[random.integers(len(damaged))] = random.integers(256)
             path.write_bytes(damaged)
@@ -270,8 +270,8 @@ def test_random_damage_never_escapes(tmp_path):
                 read_gaussians(path)
 
 
-def test_not_there_and_not_a_file(tmp_path):
-    assert "cannot be read" in one_line(tmp_path / "absent.ply")
+def test_a_missing_file_and_a_folder(tmp_path):
+    assert "cannot be read" in one_line(tmp_path / "missing.ply")
     (tmp_path / "folder.ply").mkdir()
     assert "cannot be read" in one_line(tmp_path / "folder.ply")
     (tmp_path / "scene.obj").write_bytes(b"v 0 0 0")
@@ -283,7 +283,7 @@ def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "scene.ply"
     write_gaussians(path, random_gaussians(5, 1))
     old = path.read_bytes()
-    monkeypatch.setattr(ply, "_WRITE_ROWS", 0)  # makes the writer raise after its header
+    monkeypatch.setattr(ply, "_WRITE_ROWS", 0)  # makes the writer raise after the header
     with pytest.raises(ValueError, match="range"):
         write_gaussians(path, random_gaussians(9, 1))
     assert path.read_bytes() == old

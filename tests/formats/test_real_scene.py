@@ -1,4 +1,4 @@
-"""A scene trained by the reference implementation, through each format and back: its picture."""
+"""A scene trained by the 3DGS reference implementation, rendered after a round trip per format."""
 
 import pytest
 import torch
@@ -9,14 +9,14 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
 
-#: What the picture must keep, in dB; .splat has no colour that depends on the direction.
+#: Least PSNR in dB by format; .splat has no view-dependent colour.
 LEAST = {"splat": 25.0}
 
 
 @pytest.mark.parametrize(
     "format", [f for f in FORMATS if f.read and f.write], ids=lambda format: format.name
 )
-def test_the_picture_stays(tmp_path, shared, format):
+def test_the_rendered_image_is_nearly_the_same(tmp_path, shared, format):
     scene = read_gaussians(shared / "reference_layout_sh3.ply")
     center = scene.means.median(0).values
     distance = 2 * (scene.means - center).norm(dim=1).quantile(0.8)
@@ -27,5 +27,5 @@ def test_the_picture_stays(tmp_path, shared, format):
     path = tmp_path / f"a{format.suffixes[0]}"
     write_gaussians(path, scene)
     before, after = (render(g, camera).image for g in (scene, read_gaussians(path)))
-    assert before.std() > 0.1  # there is something to see
+    assert before.std() > 0.1  # the image is not empty
     assert psnr(after.clamp(0, 1), before.clamp(0, 1)) > LEAST.get(format.name, 38.0)

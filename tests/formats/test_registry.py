@@ -1,4 +1,4 @@
-"""The table of formats: content before name, one line for what it does not know."""
+"""The table of formats: the content has priority over the suffix; unknown files are refused."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def one() -> Gaussians:
     )
 
 
-def test_no_name_belongs_to_two_formats():
+def test_no_suffix_belongs_to_two_formats():
     suffixes = [suffix for format in FORMATS for suffix in format.suffixes]
     assert len(suffixes) == len(set(suffixes))
     assert all(s.startswith(".") and s == s.lower() for s in suffixes)
@@ -37,7 +37,7 @@ def test_no_name_belongs_to_two_formats():
 @pytest.mark.parametrize(
     "format", [f for f in FORMATS if f.write and f.read], ids=lambda format: format.name
 )
-def test_what_is_written_under_a_name_is_read_as_that_format(tmp_path, format):
+def test_the_suffix_selects_the_format_and_the_file_is_read_as_such(tmp_path, format):
     for suffix in format.suffixes:
         path = tmp_path / f"A scene{suffix.upper()}"
         assert format_for_writing(path) is format
@@ -49,7 +49,7 @@ def test_what_is_written_under_a_name_is_read_as_that_format(tmp_path, format):
 @pytest.mark.parametrize(
     "format", [f for f in FORMATS if f.write and f.recognises], ids=lambda format: format.name
 )
-def test_the_content_counts_not_the_name(tmp_path, format):
+def test_the_content_has_priority_over_the_suffix(tmp_path, format):
     path = tmp_path / f"scene{format.suffixes[0]}"
     write_gaussians(path, one())
     for other in ("scene", "scene.splat", "scene.ply", "scene.glb.spz"):
@@ -59,7 +59,7 @@ def test_the_content_counts_not_the_name(tmp_path, format):
         assert format_for_reading(renamed) is format
 
 
-def test_what_is_not_known_is_told_in_one_line(tmp_path):
+def test_unknown_formats_are_one_line_errors(tmp_path):
     path = tmp_path / "scene.obj"
     with pytest.raises(UserError, match=r"cannot be read \(No such file"):
         read_gaussians(path)
@@ -73,7 +73,7 @@ def test_what_is_not_known_is_told_in_one_line(tmp_path):
         read_gaussians(tmp_path)
 
 
-def test_names_alone_never_raise_on_folders_with_dots(tmp_path):
+def test_a_suffix_of_the_folder_is_ignored(tmp_path):
     folder = tmp_path / "v1.ply"
     folder.mkdir()
     with pytest.raises(UserError, match="selects no scene format"):

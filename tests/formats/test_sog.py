@@ -1,4 +1,4 @@
-"""SOG: what bytes can hold comes back; version 1; hostile bundles give one line."""
+"""SOG: precision of round trips; version 1; malicious files are one-line errors."""
 
 import io
 import json
@@ -31,23 +31,23 @@ def test_round_trip(tmp_path, make_scene, rotation_error, degree, n):
     write_gaussians(path, scene)
     read = read_gaussians(path)
     assert (len(read), read.sh_degree) == (n, degree)
-    # 16 bits between the ends, in logarithms.
+    # 16 bits between the bounds, of logarithms.
     span = torch.log1p(scene.means.abs()).max() * 2
     error = (read.means - scene.means).abs() / (1 + scene.means.abs())
     assert float(error.max()) <= float(span) / 65535 * 0.51 + 1e-6
-    # 256 levels, dense where the values are: the error is that of the cell.
+    # 256 levels, as dense as the values: the error is that of a cell.
     assert float((read.log_scales - scene.log_scales).square().mean().sqrt()) < 0.02
     assert float((read.sh_dc - scene.sh_dc).square().mean().sqrt()) < 0.02
     assert float((read.opacities - scene.opacities).abs().max()) <= 0.51 / 255
-    # Half a step is 2^½ / 510; the largest entry, at least ½, takes up the others' errors.
+    # Half a step is 2^½ / 510; the largest entry, at least ½, is computed from the others.
     assert rotation_error(scene, read) < 0.0091
     if degree:
         rough = (read.sh_rest - scene.sh_rest).square().mean() / scene.sh_rest.square().mean()
         assert float(rough) < (1e-3 if n < 100 else 0.6)  # noise does not cluster
 
 
-def test_a_palette_has_no_more_rows_than_labels_tell():
-    """Each of many small clusters takes a row; the large one does not get the rest on top."""
+def test_a_palette_has_no_more_rows_than_requested():
+    """Each of many small clusters has one row, and the large one must not exceed the total."""
     random = np.random.default_rng(0)
     rows = np.zeros((40_000, 3), np.float32)
     rows[:300] = random.normal(0, 1000, (300, 3))
@@ -68,14 +68,14 @@ def test_a_real_scene(tmp_path, shared, psnr):
     assert float(explained) > 0.99
 
 
-def test_the_same_scene_gives_the_same_file(tmp_path, make_scene):
+def test_equal_scenes_are_equal_files(tmp_path, make_scene):
     scene = make_scene(3000)
     for name in ("a.sog", "b.sog"):
         write_gaussians(tmp_path / name, scene)
     assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
 
 
-def test_colours_under_no_opacity_survive(tmp_path, make_scene):
+def test_colours_of_transparent_gaussians_are_preserved(tmp_path, make_scene):
     scene = in_order(make_scene(200, 0))
     scene.opacity_logits[:] = -20.0
     write_gaussians(tmp_path / "a.sog", scene)
@@ -170,8 +170,8 @@ def test_version_1(tmp_path, files):
     assert -0.5 <= float(read.sh_rest.min()) < float(read.sh_rest.max()) <= 0.25
 
 
-def test_a_lost_first_level_is_mended(tmp_path, files):
-    """Files are about whose codebooks begin with null, which stood for the lowest level."""
+def test_a_missing_first_level_is_restored(tmp_path, files):
+    """Some files have codebooks that begin with null in place of the lowest level."""
 
     def lose(meta):
         meta["scales"]["codebook"][0] = None
@@ -189,11 +189,11 @@ BROKEN = {
     "version 9": lambda meta: meta.update(version=9),
     "one file of two": lambda meta: meta["means"].update(files=["means_l.webp"]),
     "file a number": lambda meta: meta["quats"].update(files=[7]),
-    "absent file": lambda meta: meta["quats"].update(files=["other.webp"]),
+    "missing file": lambda meta: meta["quats"].update(files=["other.webp"]),
     "no file": lambda meta: meta["quats"].update(files=[]),
     "path out": lambda meta: meta["quats"].update(files=["../../etc/passwd"]),
-    "wrong picture": lambda meta: meta["quats"].update(files=["shN_centroids.webp", ""]),
-    "meta as a picture": lambda meta: meta["sh0"].update(files=["meta.json"]),
+    "wrong image": lambda meta: meta["quats"].update(files=["shN_centroids.webp", ""]),
+    "meta as an image": lambda meta: meta["sh0"].update(files=["meta.json"]),
     "codebook too long": lambda meta: meta["sh0"].update(codebook=[0.0] * 300),
     "codebook of words": lambda meta: meta["sh0"].update(codebook=["a"] * 256),
     "codebook of lists": lambda meta: meta["sh0"].update(codebook=[[]]),
@@ -203,13 +203,13 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_meta_json_that_makes_no_sense(tmp_path, files, one_line, name):
-    if name == "wrong picture":  # as large as the others, but no picture of quaternions
+def test_an_invalid_meta_json_is_reported(tmp_path, files, one_line, name):
+    if name == "wrong image":  # as large as the others, but not of quaternions
         files = files | {"shN_centroids.webp": b"RIFF0000WEBPVP8L"}
     one_line(bundle(tmp_path / "a.sog", with_meta(files, BROKEN[name])))
 
 
-def test_a_folder_is_not_left(tmp_path, files, one_line):
+def test_files_outside_of_the_folder_are_refused(tmp_path, files, one_line):
     inner = tmp_path / "inner"
     inner.mkdir()
     for name, data in files.items():
@@ -222,7 +222,7 @@ def test_a_folder_is_not_left(tmp_path, files, one_line):
         one_line(inner / "meta.json")
 
 
-def test_bombs(tmp_path, files, one_line):
+def test_decompression_bombs(tmp_path, files, one_line):
     zeros = bytes(200 << 20)
     path = bundle(tmp_path / "a.sog", files | {"quats.webp": zeros}, zipfile.ZIP_DEFLATED)
     assert "would unpack to" in one_line(path)
@@ -236,7 +236,7 @@ def test_bombs(tmp_path, files, one_line):
     assert "compression method" in one_line(path)
 
 
-def test_a_member_that_lies_about_its_size(tmp_path, files, one_line):
+def test_a_member_with_a_false_size(tmp_path, files, one_line):
     path = bundle(tmp_path / "a.sog", files, zipfile.ZIP_DEFLATED)
     data = bytearray(path.read_bytes())
     with zipfile.ZipFile(path) as archive:
@@ -256,7 +256,7 @@ def test_not_a_scene(tmp_path, one_line):
     assert "meta.json" in one_line(bundle(tmp_path / "c.sog", {"meta.json": b"[]"}))
 
 
-def test_too_many_for_a_picture(tmp_path, make_scene, monkeypatch):
+def test_too_many_gaussians_for_an_image(tmp_path, make_scene, monkeypatch):
     monkeypatch.setattr(sog, "_SIDE_LIMIT", 7)
     with pytest.raises(Exception, match="too many for SOG"):
         write_gaussians(tmp_path / "a.sog", make_scene(20, 0))
@@ -270,11 +270,11 @@ def test_too_many_for_a_picture(tmp_path, make_scene, monkeypatch):
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(changes=json_damage.changes, pixels=st.binary(min_size=4, max_size=256))
-def test_json_and_pixels_of_random_damage(tmp_path, files, survives, changes, pixels):
+def test_randomly_damaged_json_and_pixels(tmp_path, files, survives, changes, pixels):
     meta = json_damage.damaged(json.loads(files["meta.json"]), changes)
     noise = np.resize(np.frombuffer(pixels, np.uint8), (8, 8, 4))
-    picture = io.BytesIO()
-    Image.fromarray(noise).save(picture, format="WEBP", lossless=True, exact=True)
+    image_file = io.BytesIO()
+    Image.fromarray(noise).save(image_file, format="WEBP", lossless=True, exact=True)
     name = ("quats.webp", "sh0.webp", "shN_labels.webp", "means_u.webp")[pixels[0] % 4]
-    changed = {"meta.json": json.dumps(meta).encode(), name: picture.getvalue()}
+    changed = {"meta.json": json.dumps(meta).encode(), name: image_file.getvalue()}
     survives(bundle(tmp_path / "a.sog", files | changed))

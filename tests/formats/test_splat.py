@@ -1,4 +1,4 @@
-"""`.splat`: the bytes of a Gaussian, the customary order, the exactness of each part."""
+"""`.splat`: the bytes of a Gaussian, the order of the rows, the precision of each field."""
 
 import struct
 
@@ -30,13 +30,13 @@ def test_the_32_bytes_of_a_gaussian(tmp_path):
     assert list(data[24:]) == [255, 0, 255, 128, round(128 - half), 128, round(128 + half), 128]
 
 
-def test_a_file_by_hand_reads_as_what_it_says(tmp_path):
+def test_reading_a_row_packed_by_hand(tmp_path):
     row = struct.pack("<6f8B", 1, 2, 3, 1, 0.5, 0, 255, 128, 0, 255, 128, 128, 128, 0)
     (tmp_path / "a.splat").write_bytes(row + row[:28] + bytes([128] * 4))
     read = read_gaussians(tmp_path / "a.splat")
     assert read.means.tolist() == [[1, 2, 3]] * 2
     torch.testing.assert_close(read.scales[0], torch.tensor([1.0, 0.5, 0.0]))
-    assert read.log_scales.isfinite().all()  # a disc, whose third axis has no logarithm
+    assert read.log_scales.isfinite().all()  # a disc: its third scale is 0, which has no logarithm
     assert read.rotations.tolist() == [[0, 0, 0, -1], [1, 0, 0, 0]]
     torch.testing.assert_close(read.base_colors[0], torch.tensor([1.0, 128 / 255, 0.0]))
     assert read.sh_degree == 0
@@ -45,7 +45,9 @@ def test_a_file_by_hand_reads_as_what_it_says(tmp_path):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 257])
-def test_round_trip_is_as_exact_as_the_bytes_allow(tmp_path, make_scene, rotation_error, n, degree):
+def test_round_trip_is_as_precise_as_the_bytes_allow(
+    tmp_path, make_scene, rotation_error, n, degree
+):
     scene = make_scene(n, degree)
     write_gaussians(tmp_path / "a.splat", scene)
     assert (tmp_path / "a.splat").stat().st_size == 32 * n
@@ -58,10 +60,10 @@ def test_round_trip_is_as_exact_as_the_bytes_allow(tmp_path, make_scene, rotatio
     torch.testing.assert_close(read.opacities, scene.opacities, rtol=0, atol=half_a_step)
     colors = scene.base_colors.clamp(0, 1)
     torch.testing.assert_close(read.base_colors, colors, rtol=0, atol=half_a_step)
-    assert read.sh_degree == 0  # the format has no more
+    assert read.sh_degree == 0  # the highest degree of the format
 
 
-def test_the_picture_stays(tmp_path, make_scene, psnr):
+def test_the_rendered_image_is_nearly_the_same(tmp_path, make_scene, psnr):
     scene = make_scene(500, 0)
     write_gaussians(tmp_path / "a.splat", scene)
     assert psnr(scene, read_gaussians(tmp_path / "a.splat")) > 40
@@ -80,6 +82,6 @@ def test_fixtures(shared):
     assert len(read_gaussians(shared / "airplane.splat")) == 26_108
 
 
-def test_what_is_no_splat_file_is_told(tmp_path, one_line):
+def test_an_invalid_size_is_reported(tmp_path, one_line):
     (tmp_path / "a.splat").write_bytes(bytes(33))
     assert "33 bytes are not a multiple of 32" in one_line(tmp_path / "a.splat")

@@ -1,4 +1,4 @@
-"""Our files read by PlayCanvas' converter, and its files by us: the same scene each time."""
+"""Exchange of files with the converter of PlayCanvas, in both directions."""
 
 import pytest
 import torch
@@ -21,12 +21,12 @@ def assert_same(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
     torch.testing.assert_close(a.sh_dc, b.sh_dc, rtol=0, atol=tolerance)
     torch.testing.assert_close(a.sh_rest, b.sh_rest, rtol=0, atol=tolerance)
     cosine = (a.rotations * b.rotations).sum(1).abs()
-    # It takes a .splat's bytes for 127.5 + 127.5 q.
+    # It reads the bytes of a .splat as 127.5 + 127.5 q.
     assert (1 - cosine).max() < 1e-4
 
 
 def as_it_reads_spz(scene: Gaussians) -> Gaussians:
-    """It takes the numbers of an .spz file for those of a PLY, without turning the frame."""
+    """It reads the numbers of an .spz file like those of a PLY, without converting the frame."""
     turned = flip_axes(scene.means.numpy(), scene.quats.numpy(), scene.sh_rest.numpy(), UP_BACK)
     means, quats, sh_rest = (torch.from_numpy(array) for array in turned)
     return Gaussians(means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
@@ -61,7 +61,7 @@ def test_we_read_what_it_writes(tmp_path, make_scene, splat_transform, degree):
         assert_same(ours, read_gaussians(tmp_path / "back.ply"))
 
 
-def test_we_read_fixtures_as_it_does(tmp_path, shared, splat_transform):
+def test_both_read_the_same_from_fixtures(tmp_path, shared, splat_transform):
     for name in ("minimal.splat", "minimal.ksplat", "guitar.compressed.ply"):
         splat_transform(shared / name, tmp_path / "back.ply")
         assert_same(read_gaussians(shared / name), read_gaussians(tmp_path / "back.ply"))
@@ -93,14 +93,14 @@ def test_we_read_its_sog(tmp_path, make_scene, splat_transform, degree):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_we_read_its_glb(tmp_path, make_scene, splat_transform, degree):
-    """It takes y up from a PLY by half a turn about z, we by one about x: the difference is half a
-    turn about the vertical."""
+    """It converts a PLY to y up by 180° about z, snowsplat by 180° about x; the difference is 180°
+    about the vertical."""
     scene = make_scene(300, degree)
     write_gaussians(tmp_path / "a.ply", scene)
     splat_transform(tmp_path / "a.ply", tmp_path / "a.glb")
     half = Similarity(1.0, torch.diag(torch.tensor([-1.0, 1.0, -1.0])), torch.zeros(3))
     read = transform(read_gaussians(tmp_path / "a.glb"), half)
-    # The axes of an ellipsoid point either way.
+    # The axes of an ellipsoid have no sign.
     axes = rotation_from_quat(read.quats).mT @ rotation_from_quat(scene.quats)
     torch.testing.assert_close(axes.abs(), torch.eye(3).expand(300, 3, 3), rtol=0, atol=1e-5)
     read.quats = scene.quats

@@ -1,4 +1,4 @@
-"""`.spz`: its bytes by hand in every version, its frame, its exactness, its lies."""
+"""`.spz`: bytes packed by hand in every version, frames, precision, false declarations."""
 
 import gzip
 import logging
@@ -39,16 +39,16 @@ COLUMNS = [
 
 
 def check_the_one(read: Gaussians) -> None:
-    """What `COLUMNS` say, in the house frame: y and z change their signs."""
+    """Compare with the content of `COLUMNS` in the frame of a PLY: y and z change their signs."""
     torch.testing.assert_close(read.means, torch.tensor([[1.0, 2.0, -0.5]]))
     torch.testing.assert_close(read.opacities, torch.tensor([0.2]))
     dc = torch.tensor([[[0.5, 38.5, -127.5]]]) / 38.25
     torch.testing.assert_close(read.sh_dc, dc)
     torch.testing.assert_close(read.log_scales, torch.tensor([[0.0, -1.0, -2.0]]))
-    # x and −y are equal; the turn of the frame changes the sign of y and z.
+    # x and −y are equal; the conversion of the frame changes the signs of y and z.
     q = torch.tensor([[0.0, 0.5**0.5, 0.5**0.5, 0.0]])
     torch.testing.assert_close(read.rotations, q, rtol=0, atol=1e-6)
-    # The coefficients of degree 1 go with y, z, x.
+    # The coefficients of degree 1 belong to y, z, x.
     sh = torch.tensor([[0, 0.5, -0.5], [-1, 0.125, 0], [0.0625, -0.0625, 0]])
     torch.testing.assert_close(read.sh_rest[0], sh * torch.tensor([[-1.0], [-1.0], [1.0]]))
 
@@ -61,19 +61,19 @@ def test_one_gaussian_by_hand_in_versions_3_and_4(tmp_path):
     check_the_one(read_gaussians(path))
 
 
-def test_version_2_has_three_bytes_of_rotation_and_may_come_unpacked(tmp_path):
+def test_version_2_has_three_bytes_of_rotation_and_may_be_uncompressed(tmp_path):
     q = bytes([128 + 90, 127 - 90, 128])  # 90.5 / 127.5 is nearly 1/√2
     body = head(2, 1, 1) + b"".join([*COLUMNS[:4], q, COLUMNS[5]])
     for data in (gzip.compress(body), body):
         (tmp_path / "a.spz").write_bytes(data)
         read = read_gaussians(tmp_path / "a.spz")
-        read.quats[0, 0] = read.quats[0, 3] = 0  # as near as bytes come to them
+        read.quats[0, 0] = read.quats[0, 3] = 0  # up to the precision of a byte
         assert (read.rotations[0, 1:3] - 0.5**0.5).abs().max() < 0.01
         read.quats = torch.tensor([[0.0, 1.0, 1.0, 0.0]])
         check_the_one(read)
 
 
-def test_version_1_has_halves_of_positions(tmp_path):
+def test_version_1_has_positions_as_halves(tmp_path):
     q = bytes([128 + 90, 127 - 90, 128])
     halves = struct.pack("<3e", 1, -2, 0.5)
     (tmp_path / "a.spz").write_bytes(
@@ -85,7 +85,7 @@ def test_version_1_has_halves_of_positions(tmp_path):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_what_is_written_is_those_bytes(tmp_path, version):
+def test_written_bytes(tmp_path, version):
     path = tmp_path / "a.spz"
     path.write_bytes(version_4(COLUMNS, 1, 1))
     write_spz(path, GaussianArrays.from_gaussians(read_gaussians(path)), version)
@@ -107,10 +107,10 @@ def test_what_is_written_is_those_bytes(tmp_path, version):
             assert len(columns[-1]) == unpacked
             start += size
         assert start == len(data)
-    # 14 bits after the point, not 12: the scene is small.
+    # 14 fractional bits, not 12: the scene is small.
     position = b"".join(struct.pack("<i", 4 * v)[:3] for v in (4096, -8192, 2048))
     assert columns[:4] == [position, *COLUMNS[1:4]]
-    # Which of two equal entries counts as the larger is rounding; the rotation is the same.
+    # Which of two equal entries is the larger one depends on rounding; the rotation is the same.
     assert columns[5] == COLUMNS[5]
     check_the_one(read_gaussians(path))
 
@@ -118,7 +118,7 @@ def test_what_is_written_is_those_bytes(tmp_path, version):
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 257])
-def test_round_trip_is_as_exact_as_the_bytes_allow(
+def test_round_trip_is_as_precise_as_the_bytes_allow(
     tmp_path, make_scene, rotation_error, n, degree, version
 ):
     scene = make_scene(n, degree)
@@ -139,7 +139,7 @@ def test_round_trip_is_as_exact_as_the_bytes_allow(
     torch.testing.assert_close(read.sh_rest[:, 3:], sh[:, 3:], rtol=0, atol=2.6 / 128)
 
 
-def test_the_picture_stays(tmp_path, make_scene, psnr):
+def test_the_rendered_image_is_nearly_the_same(tmp_path, make_scene, psnr):
     scene = make_scene(500, 3)
     write_gaussians(tmp_path / "a.spz", scene)
     assert psnr(scene, read_gaussians(tmp_path / "a.spz")) > 40
@@ -151,7 +151,7 @@ def test_a_second_round_trip_changes_nothing(tmp_path, make_scene):
     write_gaussians(tmp_path / "b.spz", once)
     twice = read_gaussians(tmp_path / "b.spz")
     for name, tensor in once.parameters().items():
-        if name != "quats":  # of which two may be equally large
+        if name != "quats":  # two of its entries may be equally large
             assert torch.equal(twice.parameters()[name], tensor), name
 
 
@@ -176,7 +176,7 @@ def test_one_stray_gaussian_does_not_cost_the_others_their_precision(tmp_path, m
     assert (read.means - scene.means).abs().max() < 1e-3
 
 
-def test_degree_4_is_read_as_3_with_a_note(tmp_path, caplog):
+def test_degree_4_is_read_as_3_with_a_warning(tmp_path, caplog):
     columns = [*COLUMNS[:5], bytes(range(72))]
     (tmp_path / "a.spz").write_bytes(version_4(columns, 1, 4))
     with caplog.at_level(logging.WARNING):
@@ -185,14 +185,14 @@ def test_degree_4_is_read_as_3_with_a_note(tmp_path, caplog):
     assert "SH degree 4 is reduced to 3" in caplog.text
 
 
-def test_antialiased_scenes_come_with_a_note(tmp_path, caplog):
+def test_antialiased_scenes_are_a_warning(tmp_path, caplog):
     (tmp_path / "a.spz").write_bytes(version_4(COLUMNS, 1, 1, flags=1))
     with caplog.at_level(logging.WARNING):
         check_the_one(read_gaussians(tmp_path / "a.spz"))
     assert "anti-aliasing" in caplog.text
 
 
-def test_extensions_are_passed_over_but_for_another_frame(tmp_path, one_line):
+def test_extensions_are_ignored_except_for_another_frame(tmp_path, one_line):
     path = tmp_path / "a.spz"
     other = struct.pack("<II5s", 0xADBE0002, 5, b"hello")
     path.write_bytes(version_4(COLUMNS, 1, 1, flags=2, extensions=other))
@@ -216,13 +216,13 @@ def test_fixtures(shared):
         torch.testing.assert_close(read.opacities, torch.full((4,), 230 / 255))
 
 
-def test_lies_about_counts_cost_one_line_and_no_memory(tmp_path, one_line):
+def test_false_counts_are_one_line_errors_without_memory(tmp_path, one_line):
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(head(3, 2**32 - 1, 3) + b"".join(COLUMNS)))
     assert "declares 4294967295 Gaussians" in one_line(path)
     path.write_bytes(gzip.compress(head(3, 1000, 3) + b"".join(COLUMNS)))
     assert "damaged" in one_line(path)
-    # A bomb: a small file that unpacks to more than it says, and one that says so.
+    # Decompression bombs: a file that unpacks to more than it declares, and one that declares it.
     path.write_bytes(gzip.compress(head(3, 1, 1) + b"".join(COLUMNS) + bytes(50 << 20)))
     assert "damaged" in one_line(path)
     path.write_bytes(gzip.compress(head(3, 5_000_000, 0) + bytes(100 << 20)))
@@ -230,12 +230,14 @@ def test_lies_about_counts_cost_one_line_and_no_memory(tmp_path, one_line):
     path.write_bytes(version_4([bytes(9 << 20), *COLUMNS[1:]], 1, 1))
     assert "damaged" in one_line(path)
     bomb = bytearray(version_4([bytes(9 << 20), *COLUMNS[1:]], 1, 1))
-    struct.pack_into("<Q", bomb, 32 + 8, 9)  # the table says 9 bytes, the stream nine million
+    struct.pack_into(
+        "<Q", bomb, 32 + 8, 9
+    )  # the table declares 9 bytes, the stream has nine million
     path.write_bytes(bomb)
     assert "damaged" in one_line(path)
 
 
-def test_damage_is_told(tmp_path, make_scene, one_line):
+def test_damage_is_reported(tmp_path, make_scene, one_line):
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(b"no splats at all, but gzip"))
     assert "not an .spz file" in one_line(path)

@@ -1,4 +1,4 @@
-"""`.spz` against its reference implementation: both read each other's files alike, frame too."""
+"""Exchange of `.spz` files with Niantic's implementation, in both directions."""
 
 import json
 import shutil
@@ -19,9 +19,11 @@ NODE = Path(__file__).parents[1] / "node"
 
 @pytest.fixture(scope="module")
 def reference() -> Callable[..., str]:
-    """``reference("read", file)`` gives JSON; ``reference("write", version, file, input=json)``."""
+    """``reference("read", file)`` returns JSON;
+    ``reference("write", version, file, input=json)``.
+    """
     if not (NODE / "node_modules/@adobe/spz").is_dir() or shutil.which("node") is None:
-        pytest.skip(f"{NODE}/node_modules or node is absent; `npm ci --ignore-scripts` in {NODE}")
+        pytest.skip(f"{NODE}/node_modules or node is missing; `npm ci --ignore-scripts` in {NODE}")
 
     def run(*arguments: object, input: str = "") -> str:
         command = ["node", str(NODE / "spz.mjs"), *map(str, arguments)]

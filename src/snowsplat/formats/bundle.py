@@ -85,7 +85,7 @@ class Bundle:
         raise Damaged(f"its image {name} has {width}×{height} pixels; expected {least}")
 
     def bytes_with(self, names: Iterable[str]) -> int:
-        """Bytes of a folder's scene with these members; of a zip file, its whole size."""
+        """Bytes of a folder's scene with these members; of a zip file, its size."""
         if self._zip is not None:
             return self.size
         found = [path for path in {self._beside(name) for name in names} if is_file(path)]
