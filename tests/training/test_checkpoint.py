@@ -1,4 +1,4 @@
-"""Checkpoints: back to the bit, and never a part of one, whatever happens."""
+"""Checkpoints: a bitwise round trip, and no incomplete file after any failure."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ def some_tensors() -> dict[str, torch.Tensor]:
     table = torch.randn(50, 16, generator=generator)
     return {
         "means": torch.randn(100, 3, generator=generator),
-        "view": table[:, 2:5],  # neither contiguous nor alone in its storage
+        "view": table[:, 2:5],  # not contiguous, and shares its storage
         "row": table[7],
         "exact": torch.tensor([3.4e38, -1.2e-38, -0.0, 1e-45]),
         "random_state": generator.get_state(),
@@ -34,7 +34,7 @@ def some_tensors() -> dict[str, torch.Tensor]:
     }
 
 
-def test_back_to_the_bit(tmp_path):
+def test_bitwise_round_trip(tmp_path):
     tensors = some_tensors()
     meta = {"config": {"iterations": 30_000, "background": "black", "lr": 1.6e-4}, "note": "ä\n"}
     path = checkpoint.save(tmp_path / "checkpoints", 500, tensors, meta)
@@ -48,7 +48,7 @@ def test_back_to_the_bit(tmp_path):
         assert again.tensors[name].numpy().tobytes() == tensor.contiguous().numpy().tobytes()
 
 
-def test_a_random_state_goes_on_where_it_was(tmp_path):
+def test_a_random_state_continues(tmp_path):
     generator = torch.Generator().manual_seed(1)
     torch.rand(17, generator=generator)
     path = checkpoint.save(tmp_path, 1, {"random": generator.get_state()}, {})
@@ -57,7 +57,7 @@ def test_a_random_state_goes_on_where_it_was(tmp_path):
     assert torch.equal(torch.rand(5, generator=generator), expected)
 
 
-def test_keeps_the_newest_and_sorts_by_number(tmp_path):
+def test_the_newest_by_number_are_kept(tmp_path):
     for step in (500, 999_500, 1_000_000, 1_000_500):
         checkpoint.save(tmp_path, step, {"a": torch.tensor(step)}, {})
     assert sorted(p.name for p in tmp_path.iterdir()) == [
@@ -69,7 +69,7 @@ def test_keeps_the_newest_and_sorts_by_number(tmp_path):
     assert newest.step == newest.tensors["a"] == 1_000_500
 
 
-def test_none_there(tmp_path):
+def test_no_checkpoint(tmp_path):
     assert checkpoint.latest(tmp_path / "absent") is None
     (tmp_path / "step_000500.safetensors.bak").write_bytes(b"")
     assert checkpoint.latest(tmp_path) is None
@@ -83,18 +83,18 @@ def test_truncated_at_any_length_falls_back_with_a_warning(tmp_path):
     whole = newest.read_bytes()
     for length in {0, 1, 7, 8, 9, 100, len(whole) - 1, *range(0, len(whole), 211)}:
         newest.write_bytes(whole[:length])
-        with pytest.warns(UserWarning, match=r"step_001000.*using the one before"):
+        with pytest.warns(UserWarning, match=r"step_001000.*using the previous one"):
             used = checkpoint.latest(tmp_path)
         assert used is not None
         assert used.step == 500
 
 
-def test_one_that_cannot_be_read_is_not_taken_for_damaged(tmp_path):
-    """Going on from an older one, or anew, would be for nothing."""
+def test_an_unreadable_file_is_not_treated_as_damaged(tmp_path):
+    """Resuming from an older one would repeat steps without need."""
     checkpoint.save(tmp_path, 500, some_tensors(), {})
     checkpoint.save(tmp_path, 1000, some_tensors(), {})
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    for spare in (0, 1):  # torch opens it once more
+    for spare in (0, 1):  # torch opens the file a second time
         taken = []
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(512, limits[0]), limits[1]))
         try:
@@ -103,7 +103,7 @@ def test_one_that_cannot_be_read_is_not_taken_for_damaged(tmp_path):
                     taken.append(os.open(tmp_path, os.O_RDONLY))
             for _ in range(spare):
                 os.close(taken.pop())
-            os.close(taken.pop())  # for the list of the folder
+            os.close(taken.pop())  # for listing the folder
             found = checkpoint.files(tmp_path)
             assert len(found) == 2
             taken.append(os.open(tmp_path, os.O_RDONLY))
@@ -118,7 +118,7 @@ def test_one_that_cannot_be_read_is_not_taken_for_damaged(tmp_path):
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
-def test_any_damaged_byte_is_noticed(tmp_path):
+def test_any_damaged_byte_is_detected(tmp_path):
     path = checkpoint.save(tmp_path, 500, some_tensors(), {"seed": 1})
     whole = path.read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
@@ -129,12 +129,12 @@ def test_any_damaged_byte_is_noticed(tmp_path):
         if position >= header:
             with pytest.raises(UserError):
                 checkpoint.load(path)
-        else:  # in the header a change may fall on what means nothing, such as padding
+        else:  # a change in the header may have no effect, e.g. in padding
             with contextlib.suppress(UserError):
                 checkpoint.load(path)
 
 
-def test_not_ours_and_another_version(tmp_path, monkeypatch):
+def test_foreign_files_and_other_versions(tmp_path, monkeypatch):
     from safetensors.torch import save_file
 
     save_file({"a": torch.zeros(3)}, tmp_path / "step_000001.safetensors")
@@ -147,7 +147,7 @@ def test_not_ours_and_another_version(tmp_path, monkeypatch):
         checkpoint.load(path)
 
 
-def test_failed_save_leaves_the_older_ones(tmp_path, monkeypatch):
+def test_a_failed_save_leaves_older_checkpoints(tmp_path, monkeypatch):
     checkpoint.save(tmp_path, 1, {"a": torch.zeros(3)}, {})
     checkpoint.save(tmp_path, 2, {"a": torch.zeros(3)}, {})
 
@@ -175,8 +175,8 @@ while True:
 """
 
 
-def test_kill_9_in_the_middle_of_a_save(tmp_path):
-    """Killed at moments spread over a save of 16 MB: all that has its name is whole."""
+def test_kill_9_during_a_save(tmp_path):
+    """Killed at different moments of a save of 16 MB: a file under its final name is complete."""
     cut = 0
     for attempt in range(2):
         folder = tmp_path / str(attempt)
@@ -188,7 +188,7 @@ def test_kill_9_in_the_middle_of_a_save(tmp_path):
         assert process.stdout is not None
         process.stdout.readline()
         deadline = time.monotonic() + 20
-        while not checkpoint.exists(folder):  # one is complete
+        while not checkpoint.exists(folder):  # the first one is complete
             assert time.monotonic() < deadline
             time.sleep(0.001)
         time.sleep(0.05)
@@ -201,11 +201,11 @@ def test_kill_9_in_the_middle_of_a_save(tmp_path):
         process.stdout.close()
         cut += any(folder.glob(".*tmp*"))
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # the newest must be whole
+            warnings.simplefilter("error")  # the newest must be valid
             newest = checkpoint.latest(folder)
         assert newest is not None
         assert newest.step == newest.meta["step"] > 0
         assert newest.tensors["table"][1] == 1 + newest.step
         checkpoint.save(folder, newest.step + 1, {"a": torch.zeros(1)}, {})
-        assert not list(folder.glob(".*"))  # the next save sweeps up
-    assert cut, "no kill fell into a save"
+        assert not list(folder.glob(".*"))  # the next save removes them
+    assert cut, "no kill happened during a save"

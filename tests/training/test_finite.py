@@ -252,7 +252,7 @@ def test_checkpoints_are_finite(dataset: Dataset, key: str, tmp_path, monkeypatc
         newer = checkpoint.save(tmp_path, 5, bad, {})
     with pytest.raises(UserError, match=rf"{key} \(1 row\)"):
         checkpoint.load(newer)
-    with pytest.warns(UserWarning, match="using the one before it"):
+    with pytest.warns(UserWarning, match="using the previous one"):
         newest = checkpoint.latest(tmp_path)
     assert newest is not None
     assert newest.path == good

@@ -1,4 +1,4 @@
-"""The curves of a training: few points, true sums, and they go on after a stop."""
+"""The curves of a training: few points, exact sums, and continuation after resuming."""
 
 import json
 
@@ -20,7 +20,7 @@ def test_few_points_for_any_number_of_steps(steps):
     history = filled(steps)
     points = history.stretches
     assert min(steps, MOST_POINTS // 2) <= len(points) <= MOST_POINTS
-    # None is lost and none counted twice.
+    # Every step is counted exactly once.
     assert sum(point.steps for point in points) == points[-1].step == steps
     assert {point.steps for point in points[:-1]} <= {history.stride}
     mean = sum(point.steps * point.loss for point in points) / steps
@@ -33,20 +33,20 @@ def test_only_the_time_of_steps_counts(monkeypatch):
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     history = History()
     for step in range(1, 4):
-        now[0] += 100.0  # what is done between two steps
+        now[0] += 100.0  # between two steps
         history.step_begins()
         now[0] += 2.0
         history.step_ends(step, 0.1, 5)
     assert history.seconds == 6.0
     assert [stretch.seconds for stretch in history.stretches] == [2.0, 2.0, 2.0]
     history.step_begins()
-    now[0] += 50.0  # something was measured within the step
+    now[0] += 50.0  # an evaluation within the step
     history.step_ends(4, 0.1, 5, timed=False)
     assert history.seconds == 8.0
 
 
-def test_goes_on_from_a_checkpoint(tmp_path):
-    """The file may be of a later step than the checkpoint: what came after it is run again."""
+def test_it_continues_from_a_checkpoint(tmp_path):
+    """The file may be of a later step than the checkpoint: the steps between are repeated."""
     history = filled(1000)
     for step in (400, 800):
         history.measure(step, 20.0 + step / 100, 0.5)
@@ -62,14 +62,14 @@ def test_goes_on_from_a_checkpoint(tmp_path):
     assert len(again.stretches) <= MOST_POINTS
 
 
-def test_measuring_a_step_again_replaces_its_figures():
+def test_measuring_a_step_again_replaces_its_metrics():
     history = History()
     history.measure(5, 20.0, 0.5)
     history.measure(5, 21.0, 0.6)
     assert [figures.psnr for figures in history.measured] == [21.0]
 
 
-def test_a_file_that_is_absent_or_damaged_is_no_obstacle(tmp_path):
+def test_a_missing_or_damaged_file_is_an_empty_history(tmp_path):
     path = tmp_path / "history.json"
     assert History.read(path, 10) == History()
     whole = json.dumps({"stretches": [{"step": 1}], "measured": [], "stride": 1})
@@ -78,6 +78,6 @@ def test_a_file_that_is_absent_or_damaged_is_no_obstacle(tmp_path):
         assert History.read(path, 10) == History()
 
 
-def test_two_stretches_are_one():
+def test_two_stretches_are_merged():
     both = Stretch(10, 10, 1.0, 2.0, 50).then(Stretch(15, 5, 4.0, 1.0, 60))
     assert both == Stretch(15, 15, 2.0, 3.0, 60)

@@ -78,7 +78,8 @@ class TimeBudget:
 
     def pace(self, trainer: Trainer, slowness: float) -> Pace:
         """What keeps the trainer to the time that is left."""
-        from snowsplat.training.time_budget.pace import Pace, Work
+        from snowsplat.training.time_budget.pace import Pace
+        from snowsplat.training.time_budget.step_cost import Work
 
         sizes = [view.camera.width * view.camera.height for view in trainer.dataset.train]
         work = Work(trainer.config, sum(sizes) / len(sizes), len(trainer.dataset.test))

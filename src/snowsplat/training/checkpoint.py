@@ -1,10 +1,10 @@
-"""Checkpoints: everything that a training needs to go on as if it had never stopped.
+"""Checkpoints: the complete state of a training, from which it resumes with a bit-identical result.
 
 A checkpoint is a set of named tensors (parameters, optimiser moments, random states, statistics,
-the order of the views) and a JSON value, in ONE safetensors file: a format that holds numbers only
-and cannot execute code. It appears under its name when it is whole and on disk, so a kill at any
-moment leaves the one before. Each tensor's CRC-32 is in the header, which has one of its own, and
-all are checked on load, as a file can also rot or be cut in a copy.
+the order of the views) and a JSON value in one safetensors file, a format that contains only
+numbers and cannot execute code. The file appears under its name only when it is complete and on
+disk, so a kill at any moment leaves the previous one. The header contains the CRC-32 of each tensor
+and of itself. All are checked when a file is loaded, to detect damaged or truncated files.
 """
 
 import json
@@ -27,7 +27,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.safe_json import check_header, parse_json
 
-#: One more whenever the meaning of the tensors changes, so that an old file is refused.
+#: Incremented when the meaning of the tensors changes: files of another version are rejected.
 VERSION = 1
 _HEADER = "snowsplat"
 _NAME = re.compile(r"step_(\d+)\.safetensors")
@@ -35,11 +35,11 @@ _NAME = re.compile(r"step_(\d+)\.safetensors")
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What `save` was given, back from disk and checked."""
+    """The content of a file, checked: ``tensors`` on the CPU, ``meta`` as passed to `save`."""
 
     path: Path
     step: int
-    tensors: dict[str, Tensor]  # on the CPU
+    tensors: dict[str, Tensor]
     meta: dict[str, Any]
 
 
@@ -58,27 +58,28 @@ def save(
         meta: JSON values.
 
     Raises:
-        UserError: a state that is not finite. Older checkpoints are as they were.
-        OSError: the folder is not writable, or the disk is full. Older checkpoints are as they
-        were.
+        UserError: the state is not finite.
+        OSError: the folder is not writable, or the disk is full.
+
+    Older checkpoints are unchanged after an error.
     """
     check_finite(f"the state of step {step}", tensors, "older checkpoints are unchanged")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"step_{step:06d}.safetensors"
-    whole = {name: _owned(tensor) for name, tensor in tensors.items()}
+    stored = {name: _owned(tensor) for name, tensor in tensors.items()}
     header = {
         "version": VERSION,
         "step": step,
         "meta": dict(meta),
-        "crc32": {name: _crc32(tensor) for name, tensor in whole.items()},
-        "layout": _layout(whole),
+        "crc32": {name: _crc32(tensor) for name, tensor in stored.items()},
+        "layout": _layout(stored),
     }
     text = json.dumps(header)
     metadata = {_HEADER: text, "crc32": str(zlib.crc32(text.encode()))}
     with atomic_path(path) as temporary:
         try:
-            safetensors.torch.save_file(whole, temporary, metadata=metadata)
+            safetensors.torch.save_file(stored, temporary, metadata=metadata)
         except safetensors.SafetensorError as error:
             number = re.search(r"os error (\d+)", str(error))
             if number is None:
@@ -89,9 +90,9 @@ def save(
 
 
 def remove_old(folder: Path | str, step: int, *, keep: int = 2) -> None:
-    """Remove the checkpoints before the ``keep`` newest up to ``step``, and what killed saves left.
+    """Remove all but the ``keep`` newest checkpoints up to ``step``, and files of killed saves.
 
-    Newer ones stay: a training goes on from ``step`` where it found those damaged.
+    Newer ones are kept: they are damaged if a training resumes from ``step``.
     """
     folder = Path(folder)
     for leftover in folder.glob(".*tmp*"):
@@ -101,10 +102,11 @@ def remove_old(folder: Path | str, step: int, *, keep: int = 2) -> None:
 
 
 def load(path: Path | str) -> Checkpoint:
-    """Read one checkpoint and check every byte of it.
+    """Read a checkpoint and verify its checksums.
 
     Raises:
-        UserError: absent, cut, damaged, not finite, not a checkpoint, or one of another version.
+        UserError: the file is missing, truncated, damaged, not finite, not a checkpoint, or has
+            another version.
     """
     path = Path(path)
     try:
@@ -114,23 +116,23 @@ def load(path: Path | str) -> Checkpoint:
 
 
 def latest(folder: Path | str) -> Checkpoint | None:
-    """The newest whole checkpoint of ``folder``, or None; a warning for each newer, damaged one.
+    """The newest valid checkpoint of ``folder``, or None; warns of each newer, damaged one.
 
     Raises:
-        UserError: one that cannot be read, which may be whole.
+        UserError: a file cannot be read (permissions, open files); it may be valid.
     """
     for _, path in files(folder):
         try:
             return _read(path)
         except UserError as error:
-            warnings.warn(f"{error}; using the one before it", stacklevel=2)
+            warnings.warn(f"{error}; using the previous one", stacklevel=2)
         except OSError as error:
             raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
     return None
 
 
 def exists(folder: Path | str) -> bool:
-    """Whether ``folder`` holds a checkpoint, whole or not."""
+    """Whether ``folder`` contains a checkpoint, valid or damaged."""
     return bool(files(folder))
 
 
@@ -146,7 +148,7 @@ def files(folder: Path | str) -> list[tuple[int, Path]]:
 
 
 def _read(path: Path) -> Checkpoint:
-    """Raises: OSError: it cannot be read. UserError: what can be read is no whole checkpoint."""
+    """Raises OSError if the file cannot be read, UserError if its content is not valid."""
     try:
         check_header(path)
         with safetensors.safe_open(path, framework="pt", device="cpu") as file:
@@ -155,35 +157,35 @@ def _read(path: Path) -> Checkpoint:
             header = parse_json(text)
             if header["version"] != VERSION:
                 raise UserError(
-                    f"{path}: a checkpoint of version {header['version']}, this program reads "
-                    f"{VERSION}; go on with the snowsplat that wrote it"
+                    f"{path}: checkpoint of version {header['version']}, this program reads "
+                    f"version {VERSION}; resume with the snowsplat that wrote it"
                 )
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        whole = header["crc32"] == {name: _crc32(tensor) for name, tensor in tensors.items()}
-        # Not in older files, where a damaged header may go unseen.
-        whole = whole and header.get("layout", _layout(tensors)) == _layout(tensors)
-        whole = whole and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
+        intact = header["crc32"] == {name: _crc32(tensor) for name, tensor in tensors.items()}
+        # Older files lack the next two, and may have an undetected error in the header.
+        intact = intact and header.get("layout", _layout(tensors)) == _layout(tensors)
+        intact = intact and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
         if not isinstance(header["meta"], dict):
-            raise ValueError("no names")
-        # Floats of a byte, which nothing here writes and torch hardly reckons with.
+            raise ValueError("meta is not an object")
+        # Floats of one byte are never written here, and torch supports few operations on them.
         if any(t.is_floating_point() and t.itemsize < 2 for t in tensors.values()):
-            raise ValueError("tensors of another program")
+            raise ValueError("unsupported dtype")
         checkpoint = Checkpoint(path, int(header["step"]), tensors, header["meta"])
-    except RuntimeError as error:  # as torch says what the system said
+    except RuntimeError as error:  # torch wraps an error of the operating system
         number = re.search(r"\((\d+)\)$", str(error))
         if number is None:
             raise
         raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from None
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: damaged, or not a checkpoint") from None
-    if not whole:
-        raise UserError(f"{path}: damaged (its checksums do not match)")
-    check_finite(str(path), checkpoint.tensors, "remove it, and go on from an earlier one")
+        raise UserError(f"{path}: not a checkpoint, or damaged; use another one") from None
+    if not intact:
+        raise UserError(f"{path}: damaged, checksums do not match; use another one")
+    check_finite(str(path), checkpoint.tensors, "remove it and resume from an earlier one")
     return checkpoint
 
 
 def _owned(tensor: Tensor) -> Tensor:
-    """On the CPU, contiguous, alone in its storage: safetensors refuses views that share one."""
+    """On the CPU, contiguous, in its own storage: safetensors rejects views that share one."""
     tensor = tensor.detach().cpu().contiguous()
     alone = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
     return tensor if alone else tensor.clone()

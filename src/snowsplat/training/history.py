@@ -1,4 +1,4 @@
-"""`History`: the curves of a training, as some hundred points however long it is."""
+"""`History`: the curves of a training, as a few hundred points for any number of steps."""
 
 from __future__ import annotations
 
@@ -9,23 +9,32 @@ from pathlib import Path
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, read_json
 
-#: Most points of a curve; when there are more, neighbours become one.
+#: Maximum number of points of a curve; beyond it, neighbours are merged.
 MOST_POINTS = 400
-_ABSURD = 1e30
+#: Larger values in a file are rejected, because sums of them may not be finite.
+_LARGEST_VALUE = 1e30
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Some steps one after the other, and what they were like."""
+    """Consecutive steps.
 
-    step: int  # the last of them
-    steps: int  # how many
-    loss: float  # their mean
-    seconds: float  # of them all; what happens between two steps does not count
-    gaussians: int  # after the last
+    Attributes:
+        step: the last of them.
+        steps: their number.
+        loss: the mean of their losses.
+        seconds: their total time, without the time between steps.
+        gaussians: the number of Gaussians after the last step.
+    """
+
+    step: int
+    steps: int
+    loss: float
+    seconds: float
+    gaussians: int
 
     def then(self, other: Stretch) -> Stretch:
-        """This one and the next as one."""
+        """This stretch and the next one, merged."""
         steps = self.steps + other.steps
         loss = (self.steps * self.loss + other.steps * other.loss) / steps
         return Stretch(other.step, steps, loss, self.seconds + other.seconds, other.gaussians)
@@ -33,18 +42,19 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Measured:
-    """Mean figures of the held-out views after a step."""
+    """Mean metrics of the held-out views after a step; PSNR in dB."""
 
     step: int
-    psnr: float  # dB
+    psnr: float
     ssim: float
 
 
 @dataclass
 class History:
-    """What is noted after each step: some microseconds' work, and memory that does not grow.
+    """Loss, time and number of Gaussians of all steps, as at most `MOST_POINTS` stretches.
 
-    A stretch has ``stride`` steps, the last one may have fewer.
+    Recording a step takes a few microseconds. A stretch has ``stride`` steps; the last one may have
+    fewer.
     """
 
     stretches: list[Stretch] = field(default_factory=list)
@@ -56,22 +66,22 @@ class History:
 
     @property
     def seconds(self) -> float:
-        """Of all steps."""
+        """Total time of all steps."""
         return sum(stretch.seconds for stretch in self.stretches)
 
     def step_begins(self) -> None:
-        """Its time is counted from now on."""
+        """Start measuring the time of a step."""
         self._since = time.perf_counter()
 
     def step_ends(self, step: int, loss: float, gaussians: int, timed: bool = True) -> None:
-        """Its time is counted until now; if it is not ``timed``, it counts as the ones before."""
+        """Record a step; if not ``timed``, with the mean time of the previous stretch."""
         seconds = time.perf_counter() - self._since
         if not timed and self.stretches:
             seconds = self.stretches[-1].seconds / self.stretches[-1].steps
         self._append(Stretch(step, 1, loss, seconds, gaussians))
 
     def measure(self, step: int, psnr: float, ssim: float) -> None:
-        """Figures of a step, instead of those that it had."""
+        """Record metrics after a step, replacing earlier ones of the same step."""
         self.measured = [m for m in self.measured if m.step != step]
         self.measured.append(Measured(step, psnr, ssim))
 
@@ -94,21 +104,21 @@ class History:
 
     @classmethod
     def read(cls, path: Path, last_step: int) -> History:
-        """What `write` wrote, up to a step: a training may go on from before its end.
+        """Read the file up to ``last_step``: training may resume from a checkpoint before its end.
 
-        Empty where the file is absent or damaged: these are curves to look at, and no reason not
-        to go on with a training.
+        Returns an empty history if the file is missing or damaged: curves are no reason not to
+        resume a training.
         """
         try:
             values = read_json(path)
             stretches = [from_json(Stretch, stretch) for stretch in values["stretches"]]
             measured = [from_json(Measured, measure) for measure in values["measured"]]
             if any(stretch.steps < 1 for stretch in stretches):
-                raise ValueError("of no steps")
-            figures = [f for s in stretches for f in (s.loss, s.seconds)]
-            figures += [f for m in measured for f in (m.psnr, m.ssim)]
-            if any(abs(figure) > _ABSURD for figure in figures):
-                raise ValueError("sums of them are not finite")
+                raise ValueError("a stretch without steps")
+            values_read = [v for s in stretches for v in (s.loss, s.seconds)]
+            values_read += [v for m in measured for v in (m.psnr, m.ssim)]
+            if any(abs(value) > _LARGEST_VALUE for value in values_read):
+                raise ValueError("values too large")
             return cls(
                 [stretch for stretch in stretches if stretch.step <= last_step],
                 [measure for measure in measured if measure.step <= last_step],

@@ -1,4 +1,4 @@
-"""Trainings that keep to a time, on machines that are made up."""
+"""Trainings within a time budget, on simulated machines."""
 
 from collections.abc import Callable
 
@@ -7,13 +7,14 @@ import pytest
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.recipes import recipe
 from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.time_budget.pace import Pace, StepCost, Work
+from snowsplat.training.time_budget.pace import Pace
+from snowsplat.training.time_budget.step_cost import StepCost, Work
 
 PIXELS, FINAL, VIEWS = 500_000.0, 120_000, 6
 
 
 class Machine:
-    """A clock that goes on with each step, and a scene that grows as a real one does."""
+    """A clock that advances with each step, and a number of Gaussians that grows."""
 
     def __init__(self, config: TrainConfig, cost: Callable[[int, int, float], float]) -> None:
         self.config, self.cost, self.now = config, cost, 100.0
@@ -22,7 +23,7 @@ class Machine:
         self.lengths: list[int] = []
 
     def train(self, seconds: float, iterations: int, slowness: float = 1.0) -> float:
-        """Gives when the last step was over, in parts of the time given."""
+        """Returns the time of the last step, as a fraction of the budget."""
         start = self.now
         schedule = Schedule(iterations)
         pace = Pace(Work(self.config, PIXELS, VIEWS), seconds, slowness, lambda: self.now)
@@ -69,22 +70,26 @@ def busy_now_and_then(downscale: int, gaussians: int, when: float) -> float:
 
 
 MACHINES = [
-    *(usual, flat, steep),
-    *(twice_as_slow_from_half, three_times_as_fast_from_half, busy_now_and_then),
+    usual,
+    flat,
+    steep,
+    twice_as_slow_from_half,
+    three_times_as_fast_from_half,
+    busy_now_and_then,
 ]
 
 
 @pytest.mark.parametrize("cost", MACHINES, ids=lambda cost: cost.__name__)
 @pytest.mark.parametrize("seconds", [20.0, 120.0])
 @pytest.mark.parametrize("guess", [300, 3000, 30_000])
-def test_the_last_step_is_over_in_time(cost, seconds, guess):
-    """Whatever the first guess; what comes after the last step has its time as well."""
+def test_the_training_ends_in_time(cost, seconds, guess):
+    """For any initial guess, and including the evaluation after the last step."""
     machine = Machine(recipe("default"), cost)
     end = machine.train(seconds, guess)
     after = VIEWS * (0.5 * cost(1, machine.gaussians, 1.0) + 0.05 * PIXELS / 1e6)
     after += 4.0 * machine.gaussians / 1e6
     assert end + after / seconds == pytest.approx(1.0, abs=0.01)
-    # The schedule went on without a step back, through every stage, to its end.
+    # The schedule was monotonic, included every stage, and was completed.
     assert machine.shares == sorted(machine.shares)
     assert machine.shares[-1] == 1.0
     assert machine.downscales == sorted(machine.downscales, reverse=True)
@@ -97,7 +102,7 @@ def test_other_recipes(name):
     assert machine.train(60.0, 3000) == pytest.approx(0.98, abs=0.04)
 
 
-def test_the_length_settles():
+def test_the_number_of_steps_converges():
     machine = Machine(recipe("default"), usual)
     machine.train(120.0, 10_000, slowness=1.5)
     later = machine.lengths[len(machine.lengths) // 2 :]
@@ -106,8 +111,8 @@ def test_the_length_settles():
     assert machine.downscales.count(2) / machine.iterations == pytest.approx(0.25, abs=0.03)
 
 
-def test_a_pause_is_no_slow_machine():
-    """Ten seconds in which the computer slept: lost, but what comes after is as quick as before."""
+def test_one_slow_step_is_an_outlier():
+    """The computer sleeps for ten seconds: they are lost, but later predictions do not change."""
 
     def sleepy(downscale: int, gaussians: int, when: float) -> float:
         asleep = 0.5 < when < 0.5001 or (when > 0.5 and not slept)
@@ -121,16 +126,16 @@ def test_a_pause_is_no_slow_machine():
     assert len(slept) == 1
 
 
-def test_time_that_was_put_off_is_not_lost():
-    """A minute for which somebody held the training: it ends a minute later, as if never held."""
+def test_a_pause_moves_the_deadline():
+    """A training that is paused for a minute ends a minute later, with the same number of steps."""
     now = 100.0
     config = recipe("default")
-    pace, held = (Pace(Work(config, PIXELS, VIEWS), 60.0, 1.0, lambda: now) for _ in range(2))
+    pace, paused = (Pace(Work(config, PIXELS, VIEWS), 60.0, 1.0, lambda: now) for _ in range(2))
     plain, other = Schedule(2000), Schedule(2000)
     clocks = [100.0, 100.0]
     for step in range(1, 400):
         lengths = []
-        for i, (each, schedule) in enumerate(((pace, plain), (held, other))):
+        for i, (each, schedule) in enumerate(((pace, plain), (paused, other))):
             clocks[i] += 0.023
             if i and step == 200:
                 clocks[i] += 60.0
@@ -138,18 +143,18 @@ def test_time_that_was_put_off_is_not_lost():
             now = clocks[i]
             lengths.append(each.iterations_after(schedule, step, 1, 10_000))
         assert lengths[1] == (lengths[0] and pytest.approx(lengths[0], abs=1)), step
-    assert held.deadline == pace.deadline + 60.0
+    assert paused.deadline == pace.deadline + 60.0
 
 
-def test_no_time_at_all():
-    """The schedule is run through all the same, in few steps."""
+def test_no_time():
+    """The schedule is completed in few steps."""
     machine = Machine(recipe("default"), usual)
     machine.train(0.01, 3000)
     assert machine.shares[-1] == 1.0
     assert machine.iterations < 100
 
 
-def test_a_stage_to_come_is_as_slow_as_the_one_that_is():
+def test_a_future_stage_is_predicted_with_the_present_slowness():
     work = Work(recipe("default"), PIXELS, VIEWS)
     cost = StepCost(work, 1.0, 5.0)
     for _ in range(3000):

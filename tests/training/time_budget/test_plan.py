@@ -1,4 +1,4 @@
-"""What is planned for a time, on machines that are made up."""
+"""Plans for a given time, on simulated machines."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ POSE = torch.eye(4, dtype=torch.float64)[:3]
 
 
 def dataset(width: int, height: int, photos: int = 50) -> Dataset:
-    """Cameras alone: a plan looks at no photo."""
+    """Cameras without image files: a plan reads none."""
     camera = Camera(width, height, 500.0, 500.0, width / 2, height / 2, POSE)
     views = [
         View(f"{i}.jpg", camera, ImageSource(Path(f"{i}.jpg"), width, height))
@@ -38,13 +38,13 @@ def planned(seconds: float, width: int, height: int, slowness: float = 1.0, **ho
 
 
 @pytest.mark.parametrize(("width", "height"), [(552, 986), (4032, 3024), (3024, 4032)])
-def test_more_time_never_gives_less(width, height):
+def test_more_time_never_reduces_size_or_gaussians(width, height):
     plans = [planned(seconds, width, height) for seconds in (5, 20, 60, 180, 600, 3600)]
     pixels = [plan.width * plan.height for plan in plans]
     assert pixels == sorted(pixels)
     caps = [plan.config.density.max_gaussians for plan in plans]
     assert caps == sorted(caps)
-    # Where one size or cap gives way to the next, the number of steps may fall, but not far.
+    # Where the size or the limit increases, the number of steps may decrease a little.
     assert all(plan.config.iterations >= 1000 for plan in plans[2:])
     assert plans[-1].config.iterations > 10_000
 
@@ -63,7 +63,7 @@ def test_the_size_of_photos():
 
 
 def test_the_time_is_used():
-    """Steps times what one takes is the time, but for what comes before and after."""
+    """Steps times seconds per step is the budget, except for the time before and after them."""
     for seconds in (20.0, 300.0):
         plan = planned(seconds, 552, 986, slowness=2.0)
         assert 0.85 * seconds < plan.config.iterations * plan.seconds < seconds
@@ -86,7 +86,7 @@ def test_a_short_training_densifies_more_often():
     assert (density.densify_interval, density.densify_from) == (100, 100)
 
 
-def test_many_photos_are_all_looked_at():
+def test_many_photos_are_all_used():
     config = recipe("default")
     few, many = (make_plan(dataset(1000, 750, n), config, 120, 2.0) for n in (40, 400))
     assert many.width < few.width
@@ -100,13 +100,13 @@ def test_other_recipes():
     assert "no limit" in str(make_plan(dataset(552, 986), recipe("paper"), 600, 1.0))
 
 
-def test_in_words():
+def test_plans_as_text():
     plan = replace(planned(60, 552, 986), config=recipe("default", iterations=8964))
     assert str(plan) == "552x986, at most 120,000 Gaussians, about 9,000 steps"
 
 
 def test_the_speed_of_this_machine(tmp_path):
-    """Positive, and it leaves the dataset as it was."""
+    """It is positive, and measuring it does not change the dataset."""
     for format, points in (("colmap-bin", 300), ("blender", None)):
         folder = tmp_path / format
         write_toy_dataset(folder, format, 9, 48, 36, n_points=300)
@@ -116,8 +116,8 @@ def test_the_speed_of_this_machine(tmp_path):
         assert (small.points is None) if points is None else (len(small.points) == points)
 
 
-def test_the_speed_is_measured_on_photos_no_larger_than_are_chosen(tmp_path, monkeypatch):
-    """Steps on the photos as they are may take many times the memory of the training."""
+def test_the_speed_is_measured_on_photos_of_at_most_the_largest_size(tmp_path, monkeypatch):
+    """Steps on the original photos may take many times the memory of the training."""
     random = np.random.default_rng(0)
     views = []
     for name in ("0.png", "1.png"):

@@ -1,1 +1,1 @@
-"""Train within a given time: choose the settings, then keep the pace."""
+"""Training within a given time: a plan before it starts, and its pace while it runs."""

@@ -1,7 +1,7 @@
-"""What to train in a given time on this machine: how large photos, how many Gaussians and steps.
+"""Plans a training for a given time on this machine: photo size, number of Gaussians, steps.
 
-More steps first, then larger photos, then more Gaussians: see "Training in a given time" in
-docs/performance.md.
+First the number of steps increases with the time, then the size of the photos, then the number of
+Gaussians: see "Training in a given time" in docs/performance.md.
 """
 
 from __future__ import annotations
@@ -16,24 +16,43 @@ import torch
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.training.config import TrainConfig, changed
 from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.time_budget.pace import Work
+from snowsplat.training.time_budget.step_cost import Work
 from snowsplat.training.trainer import Trainer
 
-# As many steps as the largest photos are worth: so many, and so many looks at each photo.
-_STEPS, _LOOKS = 1000, 10
-# Where there are few steps, Gaussians are added more often: so many times in each half, but with so
-# many steps between.
-_DENSIFICATIONS, _FEWEST_BETWEEN = 15, 25
-# The longer side of photos, in pixels.
-_SMALLEST, _LARGEST = 400, 1600
-# Where there is time for so many steps with the recipe's cap, it may rise, so far.
-_STEPS_TO_SPARE, _RISE = 4500, 2.0
-# How the speed is measured: seconds and steps at most, photos, points.
-_SECONDS, _SAMPLE_STEPS, _PHOTOS, _POINTS = 0.7, 100, 2, 20_000
-# By how much a trained scene is slower: more splats lie behind each other (fox, fern: 1.5 to 1.9).
-_TRAINED = 1.5
-# Time to load the photos of the first steps and to set up, in seconds.
+#: Larger photos are not worth having fewer steps than this,
+_ENOUGH_STEPS = 1000
+#: or fewer steps per photo than this.
+_ENOUGH_STEPS_PER_PHOTO = 10
+#: The longer side of the photos, in pixels.
+_SMALLEST_SIDE = 400
+_LARGEST_SIDE = 1600
+#: If there is time for more steps than this, the limit of Gaussians may increase,
+_STEPS_TO_SPARE = 4500
+#: by this factor at most.
+_LARGEST_RISE = 2.0
+#: A short training densifies at least this often in its first half,
+_DENSIFICATIONS = 15
+#: but with at least this many steps between.
+_FEWEST_BETWEEN = 25
+#: Seconds before the first step: setting up, and decoding the first photos.
 _SETTING_UP = 0.5
+
+# The speed of the machine is measured by a small training:
+#: It ends after this many seconds,
+_SAMPLE_SECONDS = 0.7
+#: or this many steps.
+_SAMPLE_STEPS = 100
+#: The first steps are run in any case.
+_FEWEST_SAMPLE_STEPS = 3
+#: It uses this many photos, so that decoding them takes little time.
+_SAMPLE_PHOTOS = 2
+#: It uses this many points at most, which limits its memory.
+_SAMPLE_POINTS = 20_000
+#: Photos of more pixels than this are halved for it.
+_SAMPLE_PIXELS = 500_000
+#: A trained scene is slower than one of initial points by this factor, because more splats overlap
+#: (fox, fern: 1.5 to 1.9).
+_TRAINED = 1.5
 
 
 @dataclass(frozen=True)
@@ -41,11 +60,11 @@ class Plan:
     """What `make_plan` chose.
 
     Attributes:
-        resolution: width of the photos, as -r takes it; None: as they are.
+        resolution: width of the photos, as for `load_dataset`; None: original size.
         width, height: of a photo at that resolution, in pixels.
-        config: the configuration with the number of steps and the cap.
-        slowness: how many times as long as reckoned a step takes here, see `pace.Work`.
-        seconds: of a step, the mean.
+        config: the configuration with the number of steps and the limit of Gaussians.
+        slowness: ratio of the seconds of a step on this machine to `Work.seconds`.
+        seconds: mean of a step.
     """
 
     resolution: int | None
@@ -74,42 +93,43 @@ def make_plan(
     more_gaussians: bool = True,
     more_often: bool = True,
 ) -> Plan:
-    """The best training of ``capture`` (at full resolution) that fits into ``seconds``.
+    """The best training of ``dataset`` (at full resolution) that fits into ``seconds``.
 
     Args:
         config: of the recipe; its ``iterations`` are replaced.
         slowness: from `measure_slowness`.
-        resize: choose the size of the photos, or leave it.
-        more_gaussians: whether the cap may rise.
+        resize: whether the photos may be reduced.
+        more_gaussians: whether the limit of Gaussians may increase.
         more_often: whether a short training may densify more often.
     """
     camera = max((view.camera for view in dataset.train), key=lambda c: c.width * c.height)
     longer = max(camera.width, camera.height)
-    wanted = max(_STEPS, _LOOKS * len(dataset.train))
+    enough = max(_ENOUGH_STEPS, _ENOUGH_STEPS_PER_PHOTO * len(dataset.train))
 
     def plan(side: int, rise: float = 1.0) -> Plan:
         width = camera.width if side >= longer else max(1, round(camera.width * side / longer))
         height = round(camera.height * width / camera.width)
         sized = _capped(config, width * height, rise)
         work = Work(sized, width * height, len(dataset.test))
-        start = config.initial_points if dataset.points is None else len(dataset.points)
-        start = min(start, sized.density.max_gaussians or start)
-        steps, mean = _steps(work, seconds - _SETTING_UP, slowness, start)
+        initial = config.initial_points if dataset.points is None else len(dataset.points)
+        initial = min(initial, sized.density.max_gaussians or initial)
+        steps, mean = _steps(work, seconds - _SETTING_UP, slowness, initial)
         if more_often:
             sized = _densified_in(sized, steps)
             work = replace(work, config=sized)
-            steps, mean = _steps(work, seconds - _SETTING_UP, slowness, start)
+            steps, mean = _steps(work, seconds - _SETTING_UP, slowness, initial)
         resolution = None if width == camera.width else width
         return Plan(resolution, width, height, replace(sized, iterations=steps), slowness, mean)
 
     side = longer
     if resize:
-        side, smallest = min(longer, _LARGEST), min(longer, _SMALLEST)
-        while side > smallest and plan(side).config.iterations < wanted:
+        side = min(longer, _LARGEST_SIDE)
+        smallest = min(longer, _SMALLEST_SIDE)
+        while side > smallest and plan(side).config.iterations < enough:
             side = max(smallest, min(side - 8, round(0.97 * side)))
     best = plan(side)
     if more_gaussians and best.config.iterations > _STEPS_TO_SPARE:
-        rise = min(_RISE, best.config.iterations / _STEPS_TO_SPARE)
+        rise = min(_LARGEST_RISE, best.config.iterations / _STEPS_TO_SPARE)
         best = plan(side, rise)
     return best
 
@@ -121,27 +141,27 @@ def measure_slowness(
     *,
     resize: bool = True,
 ) -> float:
-    """How many times as long as reckoned a step takes on this machine, by a few real ones.
+    """Ratio of the seconds of a training step on this machine to `Work.seconds`.
 
     Args:
         device: to train on; default: the CPU.
-        resize: as of `make_plan`, which then takes photos no larger than some size. Steps on larger
-            ones would take time and memory that the training does not.
+        resize: see `make_plan`, which limits the size of the photos then. Steps on larger ones
+            would take time and memory that the training does not.
     """
-    views = dataset.train[:_PHOTOS]
+    views = dataset.train[:_SAMPLE_PHOTOS]
     if resize:
         views = [_no_larger(view) for view in views]
     camera = views[0].camera
-    downscale = 1 if camera.width * camera.height < 500_000 else 2
+    downscale = 1 if camera.width * camera.height < _SAMPLE_PIXELS else 2
     points = dataset.points
-    if points is not None and len(points) > _POINTS:
-        every = math.ceil(len(points) / _POINTS)
+    if points is not None and len(points) > _SAMPLE_POINTS:
+        every = math.ceil(len(points) / _SAMPLE_POINTS)
         points = Points(points.xyz[::every], points.rgb[::every])
     trainer = Trainer(
         replace(dataset, train=views, test=[], points=points),
         replace(
             config,
-            initial_points=min(config.initial_points, _POINTS),
+            initial_points=min(config.initial_points, _SAMPLE_POINTS),
             iterations=_SAMPLE_STEPS,
             coarse_to_fine=(0, 0) if downscale == 1 else (0, 1.0),
             sh_interval=0,
@@ -150,20 +170,22 @@ def measure_slowness(
         device=device,
     )
     work = Work(trainer.config, camera.width * camera.height, 0)
-    end = time.monotonic() + _SECONDS
+    end = time.monotonic() + _SAMPLE_SECONDS
     ratios: list[float] = []
-    while trainer.step < _SAMPLE_STEPS and (len(ratios) < 3 or time.monotonic() < end):
-        start = time.monotonic()
+    while trainer.step < _SAMPLE_STEPS and (
+        len(ratios) < _FEWEST_SAMPLE_STEPS or time.monotonic() < end
+    ):
+        before = time.monotonic()
         trainer.step_once()
-        reckoned = work.seconds(downscale, len(trainer.gaussians))
-        ratios.append((time.monotonic() - start) / reckoned)
-    return _TRAINED * statistics.median(ratios[1:])  # the first one waits for its photo
+        modelled = work.seconds(downscale, len(trainer.gaussians))
+        ratios.append((time.monotonic() - before) / modelled)
+    return _TRAINED * statistics.median(ratios[1:])  # the first step waits for its photo
 
 
 def _no_larger(view: View) -> View:
-    """The view at the largest size that is chosen, or as it is."""
+    """The view, reduced to the largest size that a plan may have."""
     camera, mask = view.camera, view.mask
-    scale = _LARGEST / max(camera.width, camera.height)
+    scale = _LARGEST_SIDE / max(camera.width, camera.height)
     if scale >= 1.0:
         return view
     width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
@@ -176,6 +198,7 @@ def _no_larger(view: View) -> View:
 
 
 def _capped(config: TrainConfig, pixels: int, rise: float) -> TrainConfig:
+    """With a limit of Gaussians that is ``rise`` times higher, for photos of ``pixels``."""
     cap = config.density.max_gaussians
     if rise > 1.0 and cap:
         config = replace(config, density=changed(config, max_gaussians=round(rise * cap)).density)
@@ -183,6 +206,7 @@ def _capped(config: TrainConfig, pixels: int, rise: float) -> TrainConfig:
 
 
 def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:
+    """With more frequent densification if there are few ``steps``."""
     interval = max(_FEWEST_BETWEEN, steps // (2 * _DENSIFICATIONS))
     density = config.density
     begin = density.densify_from
@@ -194,10 +218,10 @@ def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:
 
 
 def _steps(work: Work, seconds: float, slowness: float, gaussians: int) -> tuple[int, float]:
-    """How many steps fit, and the seconds of one."""
+    """The number of steps that fit, and the mean seconds of one."""
     steps = work.config.iterations
     mean = 0.0
-    for _ in range(5):  # what a step takes depends on how many there are
+    for _ in range(5):  # a fixed point: the mean depends on the number of steps
         parts = work.parts_ahead(Schedule(steps), 0, gaussians)
         mean = slowness * sum(work.seconds(*part) for part in parts) / len(parts)
         left = seconds - work.seconds_after(slowness * work.seconds(1, parts[-1][1]), parts[-1][1])
@@ -206,6 +230,6 @@ def _steps(work: Work, seconds: float, slowness: float, gaussians: int) -> tuple
 
 
 def _rounded(count: int) -> int:
-    """To two digits."""
+    """To two significant digits."""
     digits = max(0, len(str(count)) - 2)
     return round(count / 10**digits) * 10**digits

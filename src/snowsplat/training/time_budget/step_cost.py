@@ -1,0 +1,125 @@
+"""The time that training steps take: a model of the work, and its calibration while training."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from snowsplat.training.config import TrainConfig
+from snowsplat.training.step_schedule import Schedule
+
+# Seconds of a step on the machine of docs/performance.md. The ratio to this machine and this scene,
+# the "slowness", is measured, so only their proportions matter.
+_SECONDS_PER_STEP = 0.001
+_SECONDS_PER_MEGAPIXEL = 0.035
+_SECONDS_PER_MILLION_GAUSSIANS = 0.07
+
+# Seconds after the last step, on the same machine.
+#: Rendering a test view, in training steps at full resolution: a forward pass, no backward pass.
+_STEPS_PER_VIEW = 0.5
+#: Decoding its photo and computing the metrics.
+_SECONDS_PER_VIEW_MEGAPIXEL = 0.05
+#: Writing the scene.
+_SECONDS_PER_MILLION_WRITTEN = 4.0
+
+#: Factor by which a densification increases the number of Gaussians, below their limit.
+_GROWTH = 1.25
+#: The remaining steps are estimated in this many equal parts.
+_PARTS = 40
+
+#: Weight of the initial guess of the slowness, relative to the full weight of measurements.
+_GUESS_WEIGHT = 0.3
+#: A step that takes this many times longer than predicted was delayed by something else.
+_OUTLIER = 5.0
+
+
+@dataclass(frozen=True)
+class Work:
+    """What the time of a training depends on.
+
+    Attributes:
+        config: for its coarse-to-fine stages and its densification.
+        pixels: of a photo at full resolution, the mean.
+        held_out: number of test photos, which are evaluated at the end.
+    """
+
+    config: TrainConfig
+    pixels: float
+    held_out: int
+
+    def seconds(self, downscale: int, gaussians: float) -> float:
+        """Of one step, on the machine of docs/performance.md."""
+        megapixels = self.pixels / downscale**2 / 1e6
+        return (
+            _SECONDS_PER_STEP
+            + _SECONDS_PER_MEGAPIXEL * megapixels
+            + _SECONDS_PER_MILLION_GAUSSIANS * gaussians / 1e6
+        )
+
+    def seconds_after(self, step: float, gaussians: float) -> float:
+        """From the last step to the end: test views are evaluated, the scene is written.
+
+        Args:
+            step: seconds of a step at full resolution.
+            gaussians: their number at the end.
+        """
+        view = _STEPS_PER_VIEW * step + _SECONDS_PER_VIEW_MEGAPIXEL * self.pixels / 1e6
+        return self.held_out * view + _SECONDS_PER_MILLION_WRITTEN * gaussians / 1e6
+
+    def parts_ahead(self, schedule: Schedule, step: int, gaussians: int) -> list[tuple[int, float]]:
+        """Downscale and number of Gaussians in equal parts of the steps after ``step``.
+
+        The number is assumed to increase linearly until densification ends, up to its limit, or to
+        twice its present value without one.
+        """
+        density = self.config.density
+        last = min(schedule.step_of(density.densify_until), schedule.iterations)
+        times = max(0, last - step) // density.densify_interval
+        most = min(density.max_gaussians or 2 * gaussians, gaussians * _GROWTH ** min(times, 99))
+        parts = []
+        for i in range(_PARTS):
+            ahead = (i + 0.5) / _PARTS * (schedule.iterations - step)
+            grown = min(1.0, ahead / (last - step)) if last > step else 0.0
+            downscale = self.config.downscale_at(math.ceil(step + ahead), schedule)
+            parts.append((downscale, gaussians + grown * max(0, most - gaussians)))
+        return parts
+
+
+class StepCost:
+    """Predicts the seconds of a training step from those of previous steps."""
+
+    def __init__(self, work: Work, slowness: float, memory: float) -> None:
+        """
+        Args:
+            slowness: measured seconds per second of `Work.seconds`, as an initial guess.
+            memory: seconds after which the weight of a measurement has decreased to 1/e.
+        """
+        self._work = work
+        self._memory = memory
+        # By downscale: sums of measured and of modelled seconds, with exponentially decreasing
+        # weights. A stage starts with a guess from the previous one, whose weight prevails over its
+        # first steps, which wait for photos to be decoded.
+        self._measured: dict[int, float] = {}
+        self._modelled: dict[int, float] = {}
+        self._slowness = slowness
+        self._guess = _GUESS_WEIGHT * memory / slowness
+
+    def observe(self, seconds: float, downscale: int, gaussians: int) -> None:
+        """Add the measurement of a step."""
+        expected = self.predict(downscale, gaussians)
+        seconds = min(seconds, _OUTLIER * expected)
+        if downscale not in self._measured:
+            self._measured[downscale] = self._guess * self._slowness
+            self._modelled[downscale] = self._guess
+        keep = math.exp(-seconds / self._memory)
+        modelled = self._work.seconds(downscale, gaussians)
+        self._measured[downscale] = keep * self._measured[downscale] + seconds
+        self._modelled[downscale] = keep * self._modelled[downscale] + modelled
+        self._slowness = self._measured[downscale] / self._modelled[downscale]
+
+    def predict(self, downscale: int, gaussians: float) -> float:
+        """Seconds of a step; a future stage is predicted with the slowness of the present one."""
+        slowness = self._slowness
+        if downscale in self._measured:
+            slowness = self._measured[downscale] / self._modelled[downscale]
+        return slowness * self._work.seconds(downscale, gaussians)
