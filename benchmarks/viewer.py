@@ -32,8 +32,8 @@ from snowsplat.data import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.process import single_threaded
+from snowsplat.viewer.live.display import DisplaySettings
 from snowsplat.viewer.live.gauge import Gauge
-from snowsplat.viewer.live.look import Look
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer
@@ -99,7 +99,7 @@ def pictures(name: str, repeats: int) -> None:
         times = []
         for _ in range(repeats):
             started = time.perf_counter()
-            draw(scene.gaussians, scene.camera, Look(mode))
+            draw(scene.gaussians, scene.camera, DisplaySettings(mode))
             times.append(time.perf_counter() - started)
         print(f"{mode:15} {milliseconds(times)}")
 

@@ -138,4 +138,4 @@ def test_refused(refused, out, tmp_path):
     assert "holds no Gaussians" in refused("view", tmp_path / "empty.ply")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert f"port {port} is taken" in refused("view", out, "--port", port)
+        assert f"--port: {port} is in use" in refused("view", out, "--port", port)

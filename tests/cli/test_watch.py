@@ -103,7 +103,7 @@ def test_watch_refuses(refused, trained, tmp_path):
     assert "not the output folder" in refused("watch", tmp_path / "empty")
     assert "no scene of iteration 7" in refused("watch", trained, "--iteration", 7)
     assert "no such folder" in refused("watch", trained, "-s", tmp_path / "absent")
-    assert "--host 192.0.2.1" in refused("watch", trained, "--host", "192.0.2.1")
+    assert "--host: cannot listen at 192.0.2.1" in refused("watch", trained, "--host", "192.0.2.1")
 
 
 def test_a_port_that_is_taken(refused, trained, dataset, tmp_path):
@@ -111,12 +111,12 @@ def test_a_port_that_is_taken(refused, trained, dataset, tmp_path):
         listener.bind(("127.0.0.1", 0))
         listener.listen()
         port = listener.getsockname()[1]
-        assert f"port {port} is taken" in refused("watch", trained, "--port", port)
+        assert f"--port: {port} is in use" in refused("watch", trained, "--port", port)
         out = tmp_path / "out"
         line = refused("train", dataset, "-o", out, "--view", "--port", port)
-        assert f"port {port} is taken" in line
+        assert f"--port: {port} is in use" in line
         line = refused("make", dataset / "images", "-o", out, "--view", "--port", port)
-        assert f"port {port} is taken" in line
+        assert f"--port: {port} is in use" in line
         assert not out.exists()
 
 

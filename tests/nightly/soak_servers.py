@@ -203,9 +203,9 @@ class Crowd:
         pictures = 0
         for _ in range(rng.randrange(1, 12)):
             position = [rng.uniform(-2, 2) for _ in range(3)]
-            visitor.look(position=position, image_width=size[0], image_height=size[1])
+            visitor.send_camera(position=position, image_width=size[0], image_height=size[1])
             pictures += visitor.pictures(rng.uniform(0.1, 2.0))
-            label = rng.choice(["Show", "SH degree", "Gaussian size", "Go to", "Keep this view"])
+            label = rng.choice(["Show", "SH degree", "Gaussian size", "Go to", "Store this view"])
             value = {
                 "Show": rng.choice(["Depth", "Colour", "Points", "Normals"]),
                 "SH degree": rng.randrange(4),

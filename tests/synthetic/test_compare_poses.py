@@ -1,4 +1,4 @@
-"""Found poses against true ones: nothing but what a similarity cannot explain is an error."""
+"""Errors of estimated poses are those that a similarity transform cannot explain."""
 
 import math
 
@@ -26,7 +26,7 @@ def in_another_frame(poses):
     return {name: similarity.apply_to_poses(pose) for name, pose in poses.items()}, similarity
 
 
-def test_a_similarity_is_no_error(true):
+def test_a_similarity_transform_is_not_an_error(true):
     found, similarity = in_another_frame(true)
     errors = compare_poses(found, true)
     assert errors.names == sorted(true)
@@ -36,9 +36,9 @@ def test_a_similarity_is_no_error(true):
     assert errors.true_from_found.scale == pytest.approx(1 / similarity.scale)
 
 
-def test_known_errors_are_seen(true):
+def test_known_errors_are_measured(true):
     found, _ = in_another_frame(true)
-    # One camera turned by a quarter of a degree about its own centre.
+    # One camera is rotated by a quarter of a degree about its own centre.
     half = math.radians(0.25) / 2
     turn = rotation_from_quat(torch.tensor([math.cos(half), 0.0, math.sin(half), 0.0]).double())
     still = torch.zeros(3, 1, dtype=torch.float64)
@@ -50,7 +50,7 @@ def test_known_errors_are_seen(true):
 
 
 def test_a_moved_centre_is_a_fraction_of_the_extent():
-    """Many cameras along x, so that one that moves hardly moves the alignment."""
+    """There are many cameras along x, so one moved camera hardly changes the alignment."""
     true = {}
     for i in range(400):
         centre = torch.tensor([i / 399 * 10, math.sin(i), math.cos(i)], dtype=torch.float64)
@@ -64,14 +64,14 @@ def test_a_moved_centre_is_a_fraction_of_the_extent():
     assert errors.centres.median() < 1e-3 * errors.centres[200] + 1e-4
 
 
-def test_half_a_turn_is_half_a_turn(true):
+def test_a_rotation_by_180_degrees(true):
     found = {name: pose.clone() for name, pose in true.items()}
     upside_down = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
     found["IMG_00.jpg"] = upside_down @ found["IMG_00.jpg"]
     assert compare_poses(found, true).rotations[0] == pytest.approx(180)
 
 
-def test_what_was_not_found_is_named(true):
+def test_missing_poses_are_named(true):
     found, _ = in_another_frame(true)
     del found["IMG_07.jpg"]
     found["elsewhere.jpg"] = found["IMG_01.jpg"]
@@ -80,7 +80,7 @@ def test_what_was_not_found_is_named(true):
     assert len(errors.names) == len(errors.rotations) == len(errors.centres) == 11
 
 
-def test_two_poses_tell_nothing(true):
+def test_two_poses_are_not_enough(true):
     two = {name: true[name] for name in list(true)[:2]}
     with pytest.raises(ValueError, match="2 poses in common"):
         compare_poses(two, true)

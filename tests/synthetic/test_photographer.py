@@ -1,4 +1,4 @@
-"""The photographed still life: photos and poses agree with each other, to a part of a pixel."""
+"""Photos of the still life agree with their poses to a fraction of a pixel."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.photographer import photograph, walk
-from snowsplat.synthetic.scene import Scene, Thing
+from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
 DISTORTIONS = [
@@ -27,7 +27,7 @@ def photos(tmp_path_factory):
     return folder, write_synthetic_photos(folder, n_views=3, width=96, height=64, seed=1)
 
 
-def test_photos_are_a_users(photos):
+def test_photos_are_like_those_of_a_phone(photos):
     folder, truth = photos
     names = ["IMG_0001.jpg", "IMG_0002.jpg", "IMG_0003.jpg"]
     assert sorted(path.name for path in folder.iterdir()) == names == list(truth.poses)
@@ -36,15 +36,15 @@ def test_photos_are_a_users(photos):
             assert (image.format, image.size) == ("JPEG", (96, 64))
             assert image.getexif().get_ifd(0x8769)[0xA405] == 28  # FocalLengthIn35mmFilm
             pixels = np.asarray(image, np.float64)
-        assert pixels.std() > 30  # something is seen
-        assert 60 < pixels.mean() < 180  # neither too dark nor too bright
-    # What EXIF says is near the truth, and not the truth itself.
-    told = 28 * np.hypot(96, 64) / np.hypot(36, 24)
-    assert truth.lens.focal == pytest.approx(told, rel=0.03)
-    assert truth.lens.focal != pytest.approx(told, rel=0.005)
+        assert pixels.std() > 30  # the photo has content
+        assert 60 < pixels.mean() < 180  # and a normal exposure
+    # The focal length in EXIF is close to the true one, but not equal.
+    focal = 28 * np.hypot(96, 64) / np.hypot(36, 24)
+    assert truth.lens.focal == pytest.approx(focal, rel=0.03)
+    assert truth.lens.focal != pytest.approx(focal, rel=0.005)
 
 
-def test_the_same_arguments_give_the_same_photos(photos, tmp_path):
+def test_the_same_arguments_produce_the_same_photos(photos, tmp_path):
     folder, truth = photos
     again = write_synthetic_photos(tmp_path, n_views=3, width=96, height=64, seed=1)
     for name, pose in truth.poses.items():
@@ -52,17 +52,17 @@ def test_the_same_arguments_give_the_same_photos(photos, tmp_path):
         assert torch.equal(again.poses[name], pose)
 
 
-def test_photos_that_are_there_are_kept(photos, tmp_path):
+def test_existing_photos_are_kept(photos, tmp_path):
     folder, _ = photos
     (tmp_path / "IMG_0001.jpg").write_bytes(b"mine")
-    said = []
-    write_synthetic_photos(tmp_path, 3, 96, 64, 1, report=lambda *what: said.append(what))
+    calls = []
+    write_synthetic_photos(tmp_path, 3, 96, 64, 1, report=lambda *call: calls.append(call))
     assert (tmp_path / "IMG_0001.jpg").read_bytes() == b"mine"
     assert (tmp_path / "IMG_0003.jpg").read_bytes() == (folder / "IMG_0003.jpg").read_bytes()
-    assert said[-1] == (2, 2, "photos")
+    assert calls[-1] == (2, 2, "photos")
 
 
-def test_truth_is_written_as_a_model(photos, tmp_path):
+def test_the_truth_is_written_as_a_colmap_model(photos, tmp_path):
     _, truth = photos
     truth.write(tmp_path)
     model = read_model(tmp_path)
@@ -75,7 +75,7 @@ def test_truth_is_written_as_a_model(photos, tmp_path):
 
 
 @pytest.mark.parametrize("distortion", DISTORTIONS)
-def test_lens_there_and_back(distortion):
+def test_lens_directions_are_the_inverse_of_project(distortion):
     lens = Lens(640, 480, 525.0, distortion)
     pixels = np.random.default_rng(0).uniform([[0], [0]], [[640], [480]], (2, 500))
     directions = lens.directions(pixels)
@@ -83,7 +83,7 @@ def test_lens_there_and_back(distortion):
     assert np.abs(lens.project(5 * directions) - pixels).max() < 1e-9
 
 
-def test_lens_is_colmaps_opencv():
+def test_lens_is_colmaps_opencv_model():
     pycolmap = pytest.importorskip("pycolmap")
     lens = Lens(640, 480, 525.0, DISTORTIONS[2])
     camera = pycolmap.Camera(model="OPENCV", width=640, height=480, params=lens.params)
@@ -92,12 +92,12 @@ def test_lens_is_colmaps_opencv():
 
 
 @pytest.mark.parametrize("distortion", DISTORTIONS)
-def test_marks_are_where_the_poses_say(distortion):
-    """Small balls that shine in the dark: the middles of their spots, against their projection."""
+def test_marks_are_where_the_poses_project_them(distortion):
+    """Small emissive balls in the dark: the centres of their images against their projections."""
     lens = Lens(320, 240, 262.0, distortion)
     marks = [(0, 0, 0), (0.5, 0.2, 0.1), (-0.4, 0.3, 0.3), (0.1, -0.5, -0.2), (-0.45, -0.35, 0.2)]
     white = np.ones((16, 16, 3), np.float32)
-    balls = [Thing(Ellipsoid(mark, (0.02,) * 3), [white], shines=True) for mark in marks]
+    balls = [SceneObject(Ellipsoid(mark, (0.02,) * 3), [white], emissive=True) for mark in marks]
     scene = Scene(balls, Lamp((0, 0, 9), (1, 1), 0.0, 0.0))
     errors = []
     for pose in walk(12, seed=5):
@@ -114,7 +114,7 @@ def test_marks_are_where_the_poses_say(distortion):
             seen_x = (bright.sum(0) * (np.arange(columns.start, columns.stop) + 0.5)).sum()
             seen_y = (bright.sum(1) * (np.arange(rows.start, rows.stop) + 0.5)).sum()
             errors.append((seen_x / bright.sum() - x, seen_y / bright.sum() - y))
-    # Four rays a pixel tell the middle of one spot to about a tenth of a pixel, and without a bias.
+    # With four rays per pixel, the centre of a spot is exact to a tenth of a pixel, without bias.
     assert len(errors) > 24
     assert np.abs(errors).max() < 0.15
     assert np.abs(np.mean(errors, axis=0)).max() < 0.02
@@ -131,8 +131,8 @@ SHAPES = [
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
-def test_skin_of_a_shape(shape):
-    """`points`, `surface` and `hit` are about the same skin."""
+def test_surface_of_a_shape(shape):
+    """`points`, `surface` and `hit` are consistent."""
     random = np.random.default_rng(2)
     for face in range(len(shape.sizes)):
         uv = random.uniform(0.05, 0.95, (2, 200)).astype(np.float32)
@@ -144,22 +144,22 @@ def test_skin_of_a_shape(shape):
         assert (faces == face).all()
         assert np.allclose(uv_back, uv, atol=1e-4)
         assert np.allclose(normals_back, normals, atol=1e-3)
-        # From a little above each point straight down: that point is what is hit.
+        # A ray from slightly above each point along its normal hits that point.
         distance = shape.hit(positions + np.float32(0.05) * normals, -normals)
         assert np.allclose(distance, 0.05, atol=1e-3)
 
 
-def test_what_is_missed_is_missed():
+def test_rays_that_miss_a_shape():
     away = np.array([[0.0], [0.0], [1.0]], np.float32)
     for shape in SHAPES:
         distance = shape.hit(np.array([[0.05], [0.0], [2.0]], np.float32), away)
         assert np.isinf(distance).all() != getattr(shape, "inside", False)
 
 
-def test_nearer_things_hide_others_and_shade_them():
+def test_nearer_objects_occlude_and_shade_others():
     grey = np.full((16, 16, 3), 0.5, np.float32)
-    floor = Thing(Box((0, 0, -0.05), (4.0, 4.0, 0.1)), [grey])
-    ball = Thing(Ellipsoid((0, 0, 0.5), (0.3, 0.3, 0.3)), [grey])
+    floor = SceneObject(Box((0, 0, -0.05), (4.0, 4.0, 0.1)), [grey])
+    ball = SceneObject(Ellipsoid((0, 0, 0.5), (0.3, 0.3, 0.3)), [grey])
     lamp = Lamp((0, 0, 3), (0.2, 0.2), 5.0, 0.2)
     down = np.array([[0.0, 1.2], [0.0, 0.0], [-1.0, -1.0]], np.float32)
     below = np.array([[0.0, 1.2], [0.0, 0.0], [0.1, 0.1]], np.float32)

@@ -1,4 +1,4 @@
-"""The procedural dataset: images, poses and points agree with each other."""
+"""The toy dataset: images, poses and points are consistent."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from snowsplat.data import ImageLoader, load_dataset
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 
-def test_the_same_arguments_give_the_same_files(tmp_path):
+def test_the_same_arguments_write_the_same_files(tmp_path):
     a = write_toy_dataset(tmp_path / "a", n_views=2, width=16, height=12, seed=3)
     b = write_toy_dataset(tmp_path / "b", n_views=2, width=16, height=12, seed=3)
     c = write_toy_dataset(tmp_path / "c", n_views=2, width=16, height=12, seed=4)
@@ -17,7 +17,7 @@ def test_the_same_arguments_give_the_same_files(tmp_path):
     assert (a / "images/view_00.png").read_bytes() != (c / "images/view_00.png").read_bytes()
 
 
-def test_binary_and_text_hold_the_same(pristine):
+def test_binary_and_text_have_the_same_content(pristine):
     binary, text = load_dataset(pristine["colmap-bin"]), load_dataset(pristine["colmap-txt"])
     assert torch.equal(binary.points.xyz, text.points.xyz)
     assert torch.equal(binary.points.rgb, text.points.rgb)
@@ -26,12 +26,12 @@ def test_binary_and_text_hold_the_same(pristine):
         assert torch.equal(a.camera.cam_from_world, b.camera.cam_from_world)
 
 
-def test_points_have_the_colour_of_the_pixels_they_fall_on(tmp_path):
+def test_points_have_the_colours_of_their_pixels(tmp_path):
     dataset = load_dataset(write_toy_dataset(tmp_path, n_views=3), hold_out=None)
     assert len(dataset.points) == 1500
     with ImageLoader(dataset.train) as loader:
         for i, view in enumerate(dataset.train):
-            own = slice(500 * i, 500 * (i + 1))  # those this camera saw, so nothing hides them
+            own = slice(500 * i, 500 * (i + 1))  # sampled from this camera, so not occluded
             pixels, depth = view.camera.project(dataset.points.xyz[own].double())
             assert (depth > 0).all()
             column, row = pixels.long().T
@@ -42,15 +42,15 @@ def test_points_have_the_colour_of_the_pixels_they_fall_on(tmp_path):
 
 
 @pytest.mark.parametrize("format", ["colmap-bin", "blender"])
-def test_images_show_something(pristine, format):
+def test_images_have_content(pristine, format):
     dataset = load_dataset(pristine[format])
     with ImageLoader(dataset.train, background=(1, 1, 1)) as loader:
         for view in dataset.train:
             assert loader.get(view).rgb.double().std() > 15
 
 
-def test_transforms_and_model_agree(pristine):
-    """The same cameras through both readers: axes and intrinsics are converted rightly."""
+def test_transforms_json_and_colmap_model_agree(pristine):
+    """The readers convert the axes and intrinsics of both formats to the same cameras."""
     colmap = load_dataset(pristine["colmap-bin"], hold_out=None)
     blender = load_dataset(pristine["blender"], hold_out=None)
     by_number = {view.name.split("_")[1].rjust(6, "0"): view.camera for view in blender.train}

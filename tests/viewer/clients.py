@@ -1,7 +1,7 @@
 """Clients of both servers, on real sockets: those that behave like a browser, and others.
 
     with Visitor(url) as visitor:
-        visitor.look()
+        visitor.send_camera()
         visitor.pictures(1.0)
 
     HOSTILE["pings"](url)
@@ -75,7 +75,7 @@ class Visitor:
         with contextlib.suppress(OSError, ConnectionClosed):
             self.socket.close()
 
-    def look(self, **changes: object) -> None:
+    def send_camera(self, **changes: object) -> None:
         """Say where it looks from."""
         self.socket.send(camera(**changes))
 

@@ -1,7 +1,7 @@
-"""Photos of a scene of our own, with known poses: for the demo, and for tests of the whole way.
+"""Photos of a procedural scene with known poses, for the demo and for end-to-end tests.
 
-A still life (`still_life`) of procedurally painted (`textures`) shapes (`shapes`), ray traced
-(`scene`) and photographed on a walk around it, with lens distortion and sensor noise
+The scene is a still life (`still_life`) of shapes (`shapes`) with procedural textures (`textures`).
+It is ray traced (`scene`) along a path around it, with lens distortion and sensor noise
 (`photographer`).
 """
 

@@ -1,4 +1,4 @@
-"""How far found poses are from true ones: both are known only up to a similarity."""
+"""Errors of estimated poses; estimated and true poses are aligned by a similarity transform."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from snowsplat.scene.geometry import Similarity, invert_rigid, similarity_from_p
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors of found poses after they were aligned with the true ones by their centres."""
+    """Errors of estimated poses after their camera centres were aligned with the true ones."""
 
-    names: list[str]  # in both; the errors are in this order
-    missing: list[str]  # true ones that were not found
-    rotations: Tensor  # (N,) degrees, the angle between the found and the true orientation
+    names: list[str]  # photos with both poses; the errors are in this order
+    missing: list[str]  # photos without an estimated pose
+    rotations: Tensor  # (N,) degrees, angle between the estimated and the true rotation
     centres: Tensor  # (N,) distance between the camera centres, as a fraction of ``extent``
-    extent: float  # largest distance between two of the true centres, in their unit
+    extent: float  # largest distance between two true centres, in their unit
     true_from_found: Similarity
 
 
 def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> PoseErrors:
-    """Compare poses by name; each is a ``cam_from_world`` (3, 4), in a world frame of its own.
+    """Compare poses by name; each is a ``cam_from_world`` (3, 4), in two different world frames.
 
     Raises:
-        ValueError: fewer than three names in common, or camera centres that all lie on one line.
+        ValueError: fewer than three common names, or all camera centres on one line.
     """
     names = sorted(found.keys() & true.keys())
     if len(names) < 3:
-        raise ValueError(f"{len(names)} poses in common: a similarity takes three")
+        raise ValueError(f"{len(names)} poses in common; a similarity transform needs three")
     found_poses = torch.stack([found[name].double() for name in names])
     true_poses = torch.stack([true[name].double() for name in names])
     true_centres = invert_rigid(true_poses)[..., 3]
@@ -50,7 +50,7 @@ def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> Po
 
 
 def _angles(a: Tensor, b: Tensor) -> Tensor:
-    """Degrees (N,) between rotations (N, 3, 3), exact for small angles too."""
-    # |A − B| (Frobenius) is 2√2 sin(θ/2); the cosine from the trace would lose half the digits.
+    """Angles in degrees (N,) between rotations (N, 3, 3), accurate for small angles, too."""
+    # |A − B| (Frobenius) is 2√2 sin(θ/2). The arccosine of the trace would lose half the digits.
     sine = (a - b).flatten(1).norm(dim=1) / 8**0.5
     return 2 * torch.rad2deg(torch.asin(sine.clamp(max=1.0)))

@@ -1,4 +1,4 @@
-"""A camera with lens distortion: COLMAP's model OPENCV, with one focal length."""
+"""A camera with lens distortion: COLMAP's OPENCV model with a single focal length."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _NEWTON_STEPS = 8
 
 @dataclass(frozen=True)
 class Lens:
-    """Pixels as in `snowsplat.scene.camera.Camera`; the principal point is the image centre.
+    """Pixel coordinates as in `snowsplat.scene.camera.Camera`; principal point at the centre.
 
-    A point (x, y, 1) in the camera's frame falls on focal · d(x, y) from the middle, where
+    A point (x, y, 1) in the camera's frame is at focal · d(x, y) from the image centre, where
     d(x, y) = (x, y) (1 + k1 r² + k2 r⁴) + (2 p1 xy + p2 (r² + 2x²), p1 (r² + 2y²) + 2 p2 xy).
     """
 
@@ -27,10 +27,10 @@ class Lens:
         return self.focal * self._distorted(points[:2] / points[2]) + self._middle
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
-        """Directions (3, P) of length 1, in the camera's frame, of pixel positions (2, P).
+        """Unit directions (3, P) in the camera's frame, of pixel positions (2, P).
 
-        The inverse of `project`, by Newton's method: exact to rounding for a lens that bends
-        straight lines a little, as that of a phone.
+        The inverse of `project`, by Newton's method. It converges to rounding error for weak
+        distortion, such as that of a phone.
         """
         goal = (pixels - self._middle) / self.focal
         k1, k2, p1, p2 = self.distortion
@@ -50,7 +50,7 @@ class Lens:
 
     @property
     def params(self) -> tuple[float, ...]:
-        """As COLMAP's OPENCV has them: fx, fy, cx, cy, k1, k2, p1, p2."""
+        """Parameters of COLMAP's OPENCV: fx, fy, cx, cy, k1, k2, p1, p2."""
         return (self.focal, self.focal, self.width / 2, self.height / 2, *self.distortion)
 
     @property

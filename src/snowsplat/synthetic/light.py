@@ -1,6 +1,6 @@
-"""How light falls on a face: the lamp with its soft shadows, and light from all around.
+"""Illumination of surfaces: a lamp with soft shadows, and ambient light with occlusion.
 
-Computed on a coarse grid, since shadows without hard edges vary slowly.
+Computed on a coarse grid, since soft shadows vary slowly.
 """
 
 from __future__ import annotations
@@ -14,28 +14,29 @@ from PIL import Image
 
 from snowsplat.synthetic.shapes import Shape
 
-_LIGHT_GRID = 0.015, 64  # light is computed every so many metres, but at this many points a side
+_SPACING = 0.015  # metres between the points at which light is computed
+_MOST_POINTS = 64  # along each side of a face, approximately
 _LIGHT_SAMPLES = 6  # along each side of the lamp
-_AROUND = 48  # directions in which light from all around is looked for
-_REACH = 1.2  # metres; what is farther does not shade from that light
-_RAYS = 1 << 14  # at a time, so that their numbers stay in the processor's cache
+_AMBIENT_DIRECTIONS = 48  # sampled per point
+_REACH = 1.2  # metres; objects farther away do not occlude the ambient light
+_RAYS = 1 << 14  # per batch, which fits the processor's cache
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A rectangle of light that shines down, and the light from all around."""
+    """A rectangular lamp that emissive downwards, and ambient light."""
 
     middle: tuple[float, float, float]
     size: tuple[float, float]  # metres, along x and y
-    power: float  # irradiance right below it at 1 m, were it small
-    around: float  # irradiance of a face that sees nothing near
+    power: float  # irradiance 1 m below the lamp, if it were small
+    ambient: float  # irradiance of a face without occlusion
 
 
 def irradiance(
     shape: Shape, face: int, size: tuple[int, int], lamp: Lamp, blockers: Sequence[Shape]
 ) -> np.ndarray:
-    """Irradiance (H, W, 3) of a face, ``size`` (H, W); matt white paint is as bright as this."""
-    spacing = max(_LIGHT_GRID[0], max(shape.sizes[face]) / _LIGHT_GRID[1])
+    """Irradiance (H, W, 3) of a face, ``size`` (H, W); the radiance of white matt paint there."""
+    spacing = max(_SPACING, max(shape.sizes[face]) / _MOST_POINTS)
     rows, columns = (
         int(min(pixels, max(6, round(metres / spacing))))
         for pixels, metres in zip(size, shape.sizes[face][::-1], strict=True)
@@ -46,7 +47,7 @@ def irradiance(
     light = _direct(lamp, blockers, positions, normals)
     light += _indirect(lamp, blockers, positions, normals)
     planes = light.reshape(3, rows, columns)
-    if shape.wraps[face]:  # so that the seam is not seen
+    if shape.wraps[face]:  # avoids a visible seam
         planes = np.concatenate([planes[..., -2:], planes, planes[..., :2]], axis=2)
         box = (2, 0, 2 + columns, rows)
     else:
@@ -81,12 +82,12 @@ def _direct(
 def _indirect(
     lamp: Lamp, blockers: Sequence[Shape], positions: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Irradiance (3, P) from all around: the ceiling brighter, and warm light off what is near.
+    """Ambient irradiance (3, P): cold white light, warm light reflected from near objects.
 
-    The directions are distributed like the cosine, so that each counts the same.
+    The directions are cosine-distributed, so all samples have the same weight.
     """
-    i = np.arange(_AROUND) + 0.5
-    radius, angle = np.sqrt(i / _AROUND), i * (math.pi * (3 - math.sqrt(5)))
+    i = np.arange(_AMBIENT_DIRECTIONS) + 0.5
+    radius, angle = np.sqrt(i / _AMBIENT_DIRECTIONS), i * (math.pi * (3 - math.sqrt(5)))
     own = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)])
     x, y, z = own.astype(np.float32)[:, :, None]
     tangent = np.cross(normals, [[1], [0], [0]], axis=0)
@@ -96,7 +97,7 @@ def _indirect(
     bitangent = np.cross(normals, tangent, axis=0)
     around = x * tangent[:, None] + y * bitangent[:, None] + z * normals[:, None]
     blocked = _blocked(blockers, positions, around, np.full_like(around[0], _REACH))
-    strength = np.float32(lamp.around) * (0.75 + 0.25 * around[2])
+    strength = np.float32(lamp.ambient) * (0.75 + 0.25 * around[2])
     white = np.array([0.95, 0.98, 1.05], np.float32)
     warm = np.array([0.42, 0.36, 0.30], np.float32)
     colours = np.where(blocked, warm[:, None, None], white[:, None, None])
@@ -106,7 +107,7 @@ def _indirect(
 def _blocked(
     blockers: Sequence[Shape], positions: np.ndarray, directions: np.ndarray, within: np.ndarray
 ) -> np.ndarray:
-    """Whether (D, P) something is in the direction (3, D, P), nearer than ``within`` (D, P)."""
+    """Whether (D, P) a shape is in direction (3, D, P), nearer than ``within`` (D, P)."""
     middle = positions.mean(axis=1, keepdims=True)
     reach = float(np.linalg.norm(positions - middle, axis=0).max() + within.max())
     shapes = [s for s in blockers if np.linalg.norm(s.centre - middle) < reach + s.radius]

@@ -1,4 +1,4 @@
-"""Walks around the scene and takes photos: JPEGs as from a phone, and where each was taken."""
+"""Renders photos along a path around the scene: JPEG files like those of a phone, known poses."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ from snowsplat.synthetic.still_life import still_life
 from snowsplat.util.files import atomic_path
 
 _RAYS = 2  # along each side of a pixel
-_TILE = 64  # pixels along each side; rays of a tile pass through few shapes
-_FOCAL_35MM = 28  # what EXIF says, as of the wide camera of a phone
-_FOCAL_TRUE = 1.013  # the true focal length is a little longer, as that of any phone
+_TILE = 64  # pixels along each side; the rays of a tile hit few shapes
+_FOCAL_35MM = 28  # in EXIF, mm; typical of a phone
+_FOCAL_TRUE = 1.013  # the true focal length over that in EXIF: EXIF is inexact
 _DISTORTION = (-0.062, 0.021, 0.00015, -0.0001)  # of COLMAP's model OPENCV: k1, k2, p1, p2
-_WALK_RADIUS, _WALK_HEIGHTS = 1.42, (0.46, 0.92)  # metres, around and above the table's middle
-_FULL_WELL = 15000.0  # electrons of a white pixel: the noise of light is their square root
+_WALK_RADIUS = 1.42  # metres, around the centre of the table
+_WALK_HEIGHTS = (0.46, 0.92)  # metres above the table, first and second round
+_FULL_WELL = 15000.0  # electrons of a white pixel; the shot noise is their square root
 _READ_NOISE = 6.0  # electrons
 _JPEG_QUALITY = 92
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What the photos do not tell."""
+    """The true lens and poses of the photos."""
 
     lens: Lens
-    poses: dict[str, Tensor]  # by name of the photo: cam_from_world (3, 4) float64, metres, z up
+    poses: dict[str, Tensor]  # photo name -> cam_from_world (3, 4) float64, metres, z up
 
     def write(self, folder: Path) -> None:
-        """As a COLMAP model (text) without points."""
+        """Write a COLMAP text model without points."""
         images = [
             ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
             for name, pose in self.poses.items()
@@ -59,12 +60,14 @@ def write_synthetic_photos(
     distortion: tuple[float, float, float, float] = _DISTORTION,
     report: Report = silent,
 ) -> Truth:
-    """Write photos ``IMG_0001.jpg`` … of a still life into ``folder``, on two walks around it.
+    """Render photos ``IMG_0001.jpg`` … of a still life into ``folder``, in two rounds around it.
 
-    Equal arguments give equal photos; those that are there already are not taken again.
+    Equal arguments produce equal photos. Existing photos are kept.
 
     Args:
+        seed: of the scene and of the path.
         distortion: k1, k2, p1, p2 of COLMAP's model OPENCV.
+        report: progress callback.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -83,7 +86,7 @@ def write_synthetic_photos(
         with atomic_path(folder / names[i]) as temporary:
             _save(temporary, pixels)
 
-    # numpy lets go of the interpreter, so threads do.
+    # numpy releases the GIL, so threads run in parallel.
     with ThreadPoolExecutor(2) as pool:
         for done, _ in enumerate(pool.map(take, missing), 1):
             report(done, len(missing), "photos")
@@ -91,12 +94,12 @@ def write_synthetic_photos(
 
 
 def walk(count: int, seed: int) -> list[Tensor]:
-    """``cam_from_world`` of a hand-held camera: once around low, once around higher."""
+    """``cam_from_world`` of a hand-held camera: a low round, then a higher one."""
     random = np.random.default_rng([seed, count])
     poses = []
     for i in range(count):
         second = 2 * i >= count
-        # The second walk's photos are between those of the first.
+        # The angles of the second round are between those of the first.
         angle = 2 * math.pi * (2 * i + second) / count
         angle += random.normal(0, 0.02)
         radius = _WALK_RADIUS * (1 + random.normal(0, 0.03))
@@ -113,7 +116,7 @@ def walk(count: int, seed: int) -> list[Tensor]:
 
 
 def _rolled(cam_from_world: Tensor, angle: float) -> Tensor:
-    """The camera turned about its line of sight."""
+    """The camera rotated about its optical axis by ``angle`` in radians."""
     cos, sin = math.cos(angle), math.sin(angle)
     roll = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64)
     return roll @ cam_from_world
@@ -122,14 +125,14 @@ def _rolled(cam_from_world: Tensor, angle: float) -> Tensor:
 def photograph(
     scene: Scene, lens: Lens, cam_from_world: Tensor, random: np.random.Generator
 ) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB, with the noise of a small sensor."""
+    """(H, W, 3) uint8 sRGB, with the noise of a small image sensor."""
     world_from_cam = invert_rigid(cam_from_world).numpy()
     rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
     spread = 1 / (lens.focal * _RAYS)
     light = np.empty((lens.height, lens.width, 3), np.float32)
     for rows, columns, rays in _tiles(lens):
         seen = scene.radiance(origin, rotation @ rays, spread)
-        # A photo saturates: what is brighter than white spreads no farther than its pixel.
+        # A sensor saturates: values above white are clipped before a pixel is averaged.
         height, width = rows.stop - rows.start, columns.stop - columns.start
         seen = seen.clip(0, 1).reshape(3, height, _RAYS, width, _RAYS).mean(axis=(2, 4))
         light[rows, columns] = seen.transpose(1, 2, 0)
@@ -142,7 +145,7 @@ def photograph(
 
 @functools.lru_cache(1)
 def _tiles(lens: Lens) -> list[tuple[slice, slice, np.ndarray]]:
-    """The picture in tiles: rows, columns, and the directions (3, R) of their rays."""
+    """Tiles of the image: rows, columns, and the directions (3, R) of their rays."""
     tiles = []
     for top in range(0, lens.height, _TILE):
         for left in range(0, lens.width, _TILE):

@@ -1,9 +1,9 @@
-"""Shapes with paint on them, lit once and for all, and what a ray sees of them.
+"""Textured shapes with precomputed illumination, and the radiance along rays.
 
-Light does not move and most surfaces are matt, so how bright each point is does not depend on who
-looks: direct light with its soft shadows, and light from all around with its occlusion, are
-computed when the scene is made (`light`) and multiplied into the paint. A ray then costs an
-intersection and a look into a picture. Gloss is what depends on the eye: one more ray, mirrored.
+The lamp does not move and most surfaces are matt, so the radiance of a point does not depend on the
+viewing direction. Direct light with soft shadows and ambient light with occlusion are computed once
+(`light`) and multiplied into the textures. A ray then costs an intersection and a texture look-up.
+Only gloss depends on the viewing direction: it needs one reflected ray.
 """
 
 from __future__ import annotations
@@ -18,49 +18,47 @@ from PIL import Image
 from snowsplat.synthetic.light import Lamp, irradiance
 from snowsplat.synthetic.shapes import Shape
 
-_LEVELS = 5  # each texture is kept at 1, 1/2 … 1/16 of its size
-_BLOCK = 1 << 14  # rays at a time, so that their numbers stay in the processor's cache
+_LEVELS = 5  # each texture is stored at 1, 1/2 … 1/16 of its size
+_BLOCK = 1 << 14  # rays per batch, which fits the processor's cache
 
 
 @dataclass(frozen=True)
-class Thing:
-    """A shape and its paint."""
+class SceneObject:
+    """A shape and its textures."""
 
     shape: Shape
     paint: Sequence[np.ndarray]  # one for each face, or one for all: sRGB (H, W, 3), 0 to 1
-    gloss: float = 0.0  # share of light mirrored head-on; more at grazing angles (Schlick)
-    shines: bool = False  # as bright as its paint, whatever light falls on it; casts no shadow
+    gloss: float = 0.0  # reflectance at normal incidence (Schlick's approximation)
+    emissive: bool = False  # radiates its texture's colour, unlit; casts no shadow
 
 
 class Scene:
-    """What `radiance` looks at: linear light, 1 is white in a photo."""
+    """A lit scene. `radiance` returns linear light, in which 1 is white in a photo."""
 
-    def __init__(self, things: Sequence[Thing], lamp: Lamp) -> None:
-        self._shapes = [thing.shape for thing in things]
-        self._gloss = np.array([thing.gloss for thing in things], np.float32)
+    def __init__(self, objects: Sequence[SceneObject], lamp: Lamp) -> None:
+        self._shapes = [item.shape for item in objects]
+        self._gloss = np.array([item.gloss for item in objects], np.float32)
         blockers = [
-            thing.shape
-            for thing in things
-            if math.isfinite(thing.shape.radius) and not thing.shines
-        ]  # whoever is within a room is not shaded by its walls
+            item.shape for item in objects if math.isfinite(item.shape.radius) and not item.emissive
+        ]  # infinite shapes are rooms: their walls do not shade what is inside
         textures: list[np.ndarray] = []
         texels, wraps, firsts = [], [], []
-        for thing in things:
+        for item in objects:
             firsts.append(len(textures))
-            for face, size in enumerate(thing.shape.sizes):
-                paint = _linear(thing.paint[face % len(thing.paint)])
-                if not thing.shines:
-                    paint = paint * irradiance(thing.shape, face, paint.shape[:2], lamp, blockers)
+            for face, size in enumerate(item.shape.sizes):
+                paint = _linear(item.paint[face % len(item.paint)])
+                if not item.emissive:
+                    paint = paint * irradiance(item.shape, face, paint.shape[:2], lamp, blockers)
                 textures.append(paint)
                 height, width = paint.shape[:2]
                 texels.append(math.sqrt(size[0] / width * size[1] / height))
-                wraps.append(thing.shape.wraps[face])
+                wraps.append(item.shape.wraps[face])
         self._first_texture = np.array(firsts)
         self._texels, self._wraps = np.array(texels, np.float32), np.array(wraps)
         self._store(textures)
 
     def _store(self, textures: Sequence[np.ndarray]) -> None:
-        """All textures at all levels in one array, so that one look-up serves all rays."""
+        """Store all textures at all levels in one array, so one look-up serves all rays."""
         texels: list[np.ndarray] = []
         starts, widths, heights = (np.zeros((len(textures), _LEVELS), np.int32) for _ in range(3))
         total = 0
@@ -78,13 +76,13 @@ class Scene:
     def radiance(
         self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool = True
     ) -> np.ndarray:
-        """Linear colours (3, R) that rays see; black where there is nothing.
+        """Linear colours (3, R) along rays; black where they hit nothing.
 
         Args:
             origins: (3, 1) or (3, R) float32, metres.
             directions: (3, R) float32, of length 1.
-            spread: width of a ray at a distance of 1, for the level of a texture that it reads.
-            mirrored: follow rays on from glossy things, once.
+            spread: width of a ray at distance 1, which selects the texture level.
+            mirrored: follow one reflection at glossy objects.
         """
         result = np.zeros_like(directions)
         for start in range(0, directions.shape[1], _BLOCK):
@@ -113,7 +111,7 @@ class Scene:
             face, uv[:, own], normals[:, own] = self._shapes[i].surface(positions[:, own])
             texture[own] = self._first_texture[i] + face
         cosine = np.maximum(-(directions * normals).sum(axis=0), np.float32(0.02))
-        # A slanted surface is seen smaller one way only: the root is between the two ways.
+        # A slanted surface is shortened in one of two directions: use the geometric mean.
         footprint = nearest * np.float32(spread) / np.sqrt(cosine)
         colours = self._look_up(texture, uv, footprint)
         colours[:, owner < 0] = 0
@@ -130,7 +128,7 @@ class Scene:
         return colours
 
     def _candidates(self, origins: np.ndarray, directions: np.ndarray) -> list[int]:
-        """The shapes that rays from one point may hit: those whose ball touches their cone."""
+        """Indices of shapes that rays may hit: their ball touches the cone of the rays."""
         if origins.shape[1] > 1:
             return list(range(len(self._shapes)))
         axis = directions.mean(axis=1, keepdims=True)
@@ -171,13 +169,13 @@ class Scene:
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Light of sRGB values; above 1, light that is brighter than white, as it is."""
+    """Linear light of sRGB values; values above 1 (brighter than white) are unchanged."""
     low, high = srgb / 12.92, ((srgb.clip(0, 1) + 0.055) / 1.055) ** 2.4
     return np.where(srgb > 1, srgb, np.where(srgb <= 0.04045, low, high)).astype(np.float32)
 
 
 def _halved(texture: np.ndarray) -> np.ndarray:
-    """Each 2 x 2 averaged; an odd last row or column is stretched over."""
+    """Half the size by a mean of 2 x 2 texels; odd sizes are resampled."""
     height, width = (max(1, side // 2) for side in texture.shape[:2])
     if texture.shape[0] != 2 * height or texture.shape[1] != 2 * width:
         planes = [

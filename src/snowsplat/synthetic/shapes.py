@@ -1,8 +1,8 @@
-"""What a scene is built of: shapes that know where a ray hits them, and each point of their skin.
+"""Shapes that rays can hit, with texture coordinates on their surfaces.
 
-Rays are (3, R) arrays, one ray a column, so that every step of the arithmetic runs over contiguous
-numbers; directions have length 1. The skin of a shape is one or more faces, each with coordinates
-(u, v) from 0 to 1, v downwards as in a picture, and `points` is the inverse of `surface`.
+Rays are (3, R) arrays with one ray per column, so every operation runs over contiguous numbers.
+Directions have length 1. A surface has one or more faces, each with coordinates (u, v) from 0 to 1;
+v points downwards as in an image. `points` is the inverse of `surface`.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ Sizes = tuple[tuple[float, float], ...]
 
 
 class Shape(Protocol):
-    centre: np.ndarray  # (3, 1) float32, of a ball that holds the shape
-    radius: float  # of that ball; infinite: never skip it
-    sizes: Sizes  # of each face, along u and v, metres (about)
-    wraps: tuple[bool, ...]  # of each face: whether u = 1 is u = 0 again
+    centre: np.ndarray  # (3, 1) float32, of a ball that contains the shape
+    radius: float  # of that ball; infinite: always test the shape
+    sizes: Sizes  # of each face, along u and v, metres (approximate)
+    wraps: tuple[bool, ...]  # for each face: whether u = 1 is the same as u = 0
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distances (R,) at which rays first hit; infinite where they do not."""
+        """Distances (R,) to the first hits; infinite without a hit."""
         ...
 
     def surface(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Faces (R,), coordinates (2, R) and outward normals (3, R) of points on the skin."""
+        """Faces (R,), coordinates (2, R) and outward normals (3, R) of surface points."""
         ...
 
     def points(self, face: int, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -40,7 +40,7 @@ def _column(*values: float) -> np.ndarray:
     return np.array(values, np.float32)[:, None]
 
 
-# The faces of a box, ±x, ±y, ±z: which way is out, and to whoever looks at it, right and down.
+# The faces of a box, ±x, ±y, ±z: the outward, right and down directions, seen from outside.
 _OUT = np.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], np.float32).T
 _RIGHT = np.array(
     [[0, -1, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [-1, 0, 0], [1, 0, 0]], np.float32
@@ -50,7 +50,7 @@ _DOWN *= -1
 
 
 class Box:
-    """A box turned by ``angle`` about the vertical. From within, where ``inside``: a room."""
+    """A box rotated by ``angle`` about the vertical axis; ``inside``: a room seen from inside."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class Box:
         self.wraps: tuple[bool, ...] = (False,) * 6
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        # The ray is within each of three pairs of planes between two distances (slabs).
+        # Slab method: the ray is between each of three pairs of planes from enter to leave.
         direction = self._own_from_world @ directions
         direction[direction == 0] = 1e-12
         inverse = 1 / direction
@@ -98,14 +98,14 @@ class Box:
 
     @property
     def _right(self) -> np.ndarray:
-        return -_RIGHT if self.inside else _RIGHT  # so that pictures are not seen as in a mirror
+        return -_RIGHT if self.inside else _RIGHT  # so that textures are not mirrored
 
     def _normals(self, faces: np.ndarray) -> np.ndarray:
         return self._own_from_world.T @ (-_OUT if self.inside else _OUT)[:, faces]
 
 
 class Ellipsoid:
-    """A ball with a radius along each axis; one face, as a map of the earth: north is up."""
+    """A ball with a radius for each axis; one face, as a world map: north is up."""
 
     def __init__(
         self, centre: tuple[float, float, float], radii: tuple[float, float, float]
@@ -117,8 +117,8 @@ class Ellipsoid:
         self.wraps: tuple[bool, ...] = (True,)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        # In units of the radii it is the unit ball. The distance of the line from the middle
-        # comes from the foot of the perpendicular: nothing cancels, however far the camera is.
+        # In units of the radii it is the unit ball. The distance of the line from the centre is
+        # that of the foot of the perpendicular: this avoids cancellation for distant cameras.
         direction = directions / self.radii
         length = np.sqrt((direction * direction).sum(axis=0))
         direction /= length
@@ -152,7 +152,7 @@ class Ellipsoid:
 
 
 class Frustum:
-    """An upright cylinder or cut cone on ``base``; its faces are the side, the top, the bottom."""
+    """A vertical cylinder or truncated cone on ``base``; faces: side, top, bottom."""
 
     def __init__(
         self, base: tuple[float, float, float], height: float, bottom: float, top: float
@@ -228,13 +228,13 @@ class Frustum:
 
 
 class Ring:
-    """A torus whose axis is vertical, or (``upright``) horizontal in the direction ``angle``.
+    """A torus whose axis is vertical, or horizontal in the direction ``angle`` if ``upright``.
 
-    It is found by sphere tracing: the distance to it is known everywhere, and a ray may always
-    go on by that much.
+    Intersected by sphere tracing: a ray may always advance by the distance to the surface.
     """
 
-    _STEPS, _NEAR = 60, 1e-4
+    _STEPS = 60
+    _NEAR = 1e-4  # metres: distance that counts as a hit
 
     def __init__(
         self,
@@ -261,16 +261,16 @@ class Ring:
         live = np.flatnonzero((along > -self.radius) & (near2 < self.radius**2))
         start = self._own_from_world @ -to_centre[:, live]
         step = self._own_from_world @ directions[:, live]
-        # From where the ball around it begins, or from within.
+        # Start at the bounding ball, or at the origin if that is inside.
         distance = np.maximum(along[live] - np.float32(self.radius), 0)
         for _ in range(self._STEPS):
             away = self._distance(start + distance * step)
             found = away < self._NEAR
             result[live[found]] = distance[found]
             distance = distance + away
-            go_on = ~found & (distance < along[live] + self.radius)
-            live, start, step = live[go_on], start[:, go_on], step[:, go_on]
-            distance = distance[go_on]
+            advances = ~found & (distance < along[live] + self.radius)
+            live, start, step = live[advances], start[:, advances], step[:, advances]
+            distance = distance[advances]
             if not len(live):
                 break
         return result

@@ -1,6 +1,6 @@
-"""The scene: a round table with things on it, in a room with things along its walls.
+"""The scene: a round table with objects on it, in a room with furniture along its walls.
 
-Metres, z up; the middle of the table top is the origin. All paint comes from the seed.
+Metres, z up; the centre of the table top is the origin. All textures depend on the seed.
 """
 
 from __future__ import annotations
@@ -11,33 +11,33 @@ import numpy as np
 
 from snowsplat.synthetic import textures as paint
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.scene import Scene, Thing
+from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
-_FLOOR, _CEILING = -0.72, 2.0
+_FLOOR = -0.72
+_CEILING = 2.0
 _ROOM = (5.2, 4.8)
-_LAMP = Lamp(middle=(0.5, -0.4, 1.95), size=(1.1, 0.8), power=2.5, around=0.60)
-_OAK, _PINE, _DARK = (0.62, 0.45, 0.29), (0.78, 0.62, 0.42), (0.42, 0.28, 0.19)
+_LAMP = Lamp(middle=(0.5, -0.4, 1.95), size=(1.1, 0.8), power=2.5, ambient=0.60)
+# sRGB colours of wood.
+_OAK = (0.62, 0.45, 0.29)
+_PINE = (0.78, 0.62, 0.42)
+_DARK = (0.42, 0.28, 0.19)
 
 
 def _size(metres: tuple[float, float], texel: float) -> tuple[int, int]:
-    """Pixels of a texture of this size; multiples of 16, which halve exactly."""
+    """Texture size in pixels for a surface; multiples of 16, which can be halved exactly."""
     width, height = (max(16, 16 * round(side / texel / 16)) for side in metres)
     return width, height
 
 
-def _turned(sheet: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(sheet.transpose(1, 0, 2))
-
-
 def still_life(seed: int = 0) -> Scene:
-    """The scene, its light computed; equal seeds give equal scenes."""
+    """The scene with its illumination; equal seeds produce equal scenes."""
     random = np.random.default_rng(seed)
-    things = [*_room(random), *_furniture(random), *_on_the_table(random)]
-    return Scene(things, _LAMP)
+    objects = [*_room(random), *_furniture(random), *_objects_on_the_table(random)]
+    return Scene(objects, _LAMP)
 
 
-def _room(random: np.random.Generator) -> list[Thing]:
+def _room(random: np.random.Generator) -> list[SceneObject]:
     x, y = _ROOM
     height = _CEILING - _FLOOR
     texel = 0.005
@@ -62,36 +62,38 @@ def _room(random: np.random.Generator) -> list[Thing]:
     room = Box((0, 0, (_CEILING + _FLOOR) / 2), (x, y, height), inside=True)
     lamp = np.full((8, 8, 3), 9.0, np.float32)
     return [
-        Thing(room, [brick, boards, plaster, papered, floor, ceiling]),
-        Thing(Box(_LAMP.middle, (*_LAMP.size, 0.04)), [lamp], shines=True),
+        SceneObject(room, [brick, boards, plaster, papered, floor, ceiling]),
+        SceneObject(Box(_LAMP.middle, (*_LAMP.size, 0.04)), [lamp], emissive=True),
     ]
 
 
-def _furniture(random: np.random.Generator) -> list[Thing]:
-    things = []
+def _furniture(random: np.random.Generator) -> list[SceneObject]:
+    objects = []
     rug_colours = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
     rug = Frustum((0, 0, _FLOOR), 0.012, 1.35, 1.35)
     edge = paint.plain((256, 16), (0.5, 0.3, 0.2), random)
-    things.append(Thing(rug, [edge, paint.woven((640, 640), 34, rug_colours, random), edge]))
+    objects.append(SceneObject(rug, [edge, paint.woven((640, 640), 34, rug_colours, random), edge]))
     shelf = paint.spines(_size((1.7, 1.5), 0.004), 4, random)
     side = paint.wood(_size((0.3, 1.5), 0.005), 2, _DARK, random)
     top = paint.wood(_size((1.7, 0.3), 0.005), 2, _DARK, random)
-    things.append(
-        Thing(
+    objects.append(
+        SceneObject(
             Box((-0.7, 2.24, _FLOOR + 0.75), (1.7, 0.3, 1.5)), [side, side, shelf, shelf, top, top]
         )
     )
     front = paint.wood(_size((1.3, 0.75), 0.004), 3, _PINE, random)
     side = paint.wood(_size((0.4, 0.75), 0.004), 3, _PINE, random)
     top = paint.wood(_size((1.3, 0.4), 0.004), 2, _PINE, random)
-    things.append(
-        Thing(
+    objects.append(
+        SceneObject(
             Box((0.9, -2.15, _FLOOR + 0.375), (1.3, 0.4, 0.75)),
             [side, side, front, front, top, top],
         )
     )
     vase = paint.marble((256, 160), (0.25, 0.42, 0.45), (0.85, 0.85, 0.75), random)
-    things.append(Thing(Ellipsoid((1.2, -2.15, 0.22), (0.15, 0.15, 0.2)), [vase], gloss=0.04))
+    objects.append(
+        SceneObject(Ellipsoid((1.2, -2.15, 0.22), (0.15, 0.15, 0.2)), [vase], gloss=0.04)
+    )
     for x, y, z, side_length, angle in (
         (2.05, 1.75, _FLOOR, 0.62, 0.2),
         (2.10, 1.80, _FLOOR + 0.62, 0.45, 0.6),
@@ -105,18 +107,18 @@ def _furniture(random: np.random.Generator) -> list[Thing]:
             label = paint.printed((160, 120), random, lines=7)
             faces.append(paint.paste(wall, label, tuple(random.uniform(0.4, 0.6, 2)), 0.55, 4))
         middle = (x, y, z + side_length / 2)
-        things.append(Thing(Box(middle, (side_length,) * 3, angle), faces))
+        objects.append(SceneObject(Box(middle, (side_length,) * 3, angle), faces))
     for angle in (0.5, 2.7, 4.4):
         x, y = 1.0 * math.cos(angle), 1.0 * math.sin(angle)
         seat = paint.wood((192, 192), 3, _OAK, random)
         rim = paint.wood((512, 16), 1, _OAK, random)
         leg = paint.wood((64, 128), 1, _DARK, random)
-        things.append(Thing(Frustum((x, y, -0.32), 0.04, 0.18, 0.18), [rim, seat, seat]))
-        things.append(Thing(Frustum((x, y, _FLOOR), 0.4, 0.12, 0.05), [leg]))
-    return things
+        objects.append(SceneObject(Frustum((x, y, -0.32), 0.04, 0.18, 0.18), [rim, seat, seat]))
+        objects.append(SceneObject(Frustum((x, y, _FLOOR), 0.4, 0.12, 0.05), [leg]))
+    return objects
 
 
-def _on_the_table(random: np.random.Generator) -> list[Thing]:
+def _objects_on_the_table(random: np.random.Generator) -> list[SceneObject]:
     top = paint.wood((960, 960), 7, _OAK, random)
     sheets = [paint.printed((210, 290), random, lines=18) for _ in range(3)]
     for sheet, middle, angle in zip(
@@ -125,18 +127,18 @@ def _on_the_table(random: np.random.Generator) -> list[Thing]:
         top = paint.paste(top, sheet, middle, 0.16, angle)
     rim = paint.wood((1536, 16), 1, _DARK, random)
     leg = paint.wood((128, 256), 1, _DARK, random)
-    things = [
-        Thing(Frustum((0, 0, -0.04), 0.04, 0.72, 0.72), [rim, top, top]),
-        Thing(Frustum((0, 0, _FLOOR), 0.68, 0.22, 0.08), [leg]),
+    objects = [
+        SceneObject(Frustum((0, 0, -0.04), 0.04, 0.72, 0.72), [rim, top, top]),
+        SceneObject(Frustum((0, 0, _FLOOR), 0.68, 0.22, 0.08), [leg]),
     ]
 
     world = paint.globe((768, 384), random)
-    things += [
-        Thing(Ellipsoid((0.06, 0.10, 0.235), (0.175, 0.175, 0.175)), [world], gloss=0.03),
-        Thing(
+    objects += [
+        SceneObject(Ellipsoid((0.06, 0.10, 0.235), (0.175, 0.175, 0.175)), [world], gloss=0.03),
+        SceneObject(
             Frustum((0.06, 0.10, 0), 0.07, 0.10, 0.045), [paint.wood((256, 64), 1, _DARK, random)]
         ),
-        Thing(
+        SceneObject(
             Ring((0.06, 0.10, 0.235), 0.20, 0.010, upright=True, angle=0.9),
             [paint.plain((512, 32), (0.75, 0.6, 0.3), random)],
             gloss=0.08,
@@ -153,26 +155,30 @@ def _on_the_table(random: np.random.Generator) -> list[Thing]:
         spine = paint.printed(_size((width, thick), 0.0015), random, lines=3)
         pages = paint.wood(_size((depth, thick), 0.0015), 9, (0.85, 0.8, 0.68), random)
         box = Box((-0.37, 0.20, z + thick / 2), (width, depth, thick), angle)
-        things.append(Thing(box, [pages, pages, spine, spine, cover, cover]))
+        objects.append(SceneObject(box, [pages, pages, spine, spine, cover, cover]))
         z += thick
     for x, y, height, radius in ((-0.10, -0.42, 0.17, 0.055), (0.03, -0.50, 0.11, 0.06)):
         label = paint.printed(_size((2 * math.pi * radius, height), 0.0012), random, lines=9)
         lid = paint.plain((64, 64), (0.6, 0.6, 0.62), random)
-        things.append(Thing(Frustum((x, y, 0), height, radius, radius), [label, lid, lid], 0.03))
+        objects.append(
+            SceneObject(Frustum((x, y, 0), height, radius, radius), [label, lid, lid], 0.03)
+        )
     for x, y, z, side, angle in (
         (-0.40, -0.18, 0.0, 0.11, 0.5),
         (-0.29, -0.28, 0.0, 0.11, -0.2),
         (-0.35, -0.225, 0.11, 0.10, 0.9),
     ):
         faces = [paint.printed((80, 80), random, lines=3) for _ in range(6)]
-        things.append(Thing(Box((x, y, z + side / 2), (side,) * 3, angle), faces))
+        objects.append(SceneObject(Box((x, y, z + side / 2), (side,) * 3, angle), faces))
 
     glaze = paint.plain((384, 192), (0.50, 0.07, 0.06), random, stains=0.4)
-    things.append(Thing(Ellipsoid((0.40, -0.16, 0.10), (0.10, 0.10, 0.10)), [glaze], gloss=0.10))
+    objects.append(
+        SceneObject(Ellipsoid((0.40, -0.16, 0.10), (0.10, 0.10, 0.10)), [glaze], gloss=0.10)
+    )
     stone = paint.marble((512, 256), (0.80, 0.78, 0.70), (0.28, 0.34, 0.42), random)
-    things += [
-        Thing(Ellipsoid((-0.02, 0.48, 0.12), (0.11, 0.11, 0.12)), [stone], gloss=0.05),
-        Thing(
+    objects += [
+        SceneObject(Ellipsoid((-0.02, 0.48, 0.12), (0.11, 0.11, 0.12)), [stone], gloss=0.05),
+        SceneObject(
             Frustum((-0.02, 0.48, 0.22), 0.11, 0.045, 0.065),
             [paint.marble((256, 96), (0.80, 0.78, 0.70), (0.28, 0.34, 0.42), random)],
             gloss=0.05,
@@ -181,13 +187,17 @@ def _on_the_table(random: np.random.Generator) -> list[Thing]:
     mug = paint.printed(_size((0.33, 0.11), 0.0012), random, lines=6)
     coffee = paint.plain((64, 64), (0.25, 0.15, 0.09), random)
     handle = paint.plain((128, 32), (0.25, 0.35, 0.55), random)
-    things += [
-        Thing(Frustum((0.42, 0.24, 0), 0.115, 0.05, 0.056), [mug, coffee, coffee], gloss=0.04),
-        Thing(Ring((0.485, 0.275, 0.06), 0.032, 0.008, upright=True, angle=2.07), [handle], 0.04),
+    objects += [
+        SceneObject(
+            Frustum((0.42, 0.24, 0), 0.115, 0.05, 0.056), [mug, coffee, coffee], gloss=0.04
+        ),
+        SceneObject(
+            Ring((0.485, 0.275, 0.06), 0.032, 0.008, upright=True, angle=2.07), [handle], 0.04
+        ),
     ]
     for x, y, radius in ((0.17, -0.30, 0.055), (0.27, -0.36, 0.052), (0.24, -0.25, 0.050)):
         peel = paint.plain((256, 128), (0.86, 0.48, 0.12), random, stains=0.35)
-        things.append(Thing(Ellipsoid((x, y, radius), (radius,) * 3), [peel], gloss=0.02))
+        objects.append(SceneObject(Ellipsoid((x, y, radius), (radius,) * 3), [peel], gloss=0.02))
     bread = paint.plain((384, 128), (0.70, 0.46, 0.22), random, stains=0.5)
-    things.append(Thing(Ring((0.16, 0.42, 0.035), 0.065, 0.035), [bread], gloss=0.03))
-    return things
+    objects.append(SceneObject(Ring((0.16, 0.42, 0.035), 0.065, 0.035), [bread], gloss=0.03))
+    return objects

@@ -1,8 +1,8 @@
-"""Procedural pictures to paint a scene with: wood, brick, prints, cloth, in values of a photo.
+"""Procedural textures: wood, bricks, prints, cloth, stone.
 
 Every function takes a size (width, height) in pixels and a random generator, and returns sRGB
-values (H, W, 3) float32 from 0 to 1. Their detail is a few pixels wide on purpose: what is finer
-would only flicker, and what is coarser gives feature detectors nothing to hold on to.
+values (H, W, 3) float32 from 0 to 1. Details are a few pixels wide: finer ones would cause
+aliasing, and coarser ones would not yield enough features.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ _BRIGHT: Sequence[Ink] = (
 def noise(
     size: Size, cells: tuple[float, float], octaves: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Value noise (H, W) in about -1 to 1, standard deviation about 1/3; u = 0 and u = 1 agree.
+    """Value noise (H, W) in about -1 to 1, standard deviation about 1/3; periodic in u.
 
-    The first octave has ``cells`` random values across and down; each further one twice as many,
-    at 0.6 of the strength.
+    The first octave has ``cells`` random values across and down. Each further octave has twice as
+    many, at 0.6 of the amplitude.
     """
     total, strength, sum2 = np.zeros(size[::-1], np.float32), 1.0, 0.0
     for octave in range(octaves):
@@ -64,12 +64,12 @@ def _grid(size: Size) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shade(colour: Colour, value: np.ndarray) -> np.ndarray:
-    """A colour made lighter and darker by ``value`` (H, W), 0: as it is."""
+    """``colour`` made lighter or darker by ``value`` (H, W); 0 leaves it unchanged."""
     return (np.asarray(colour, np.float32) * (1 + value[..., None])).clip(0, 1)
 
 
 def _mix(a: np.ndarray, b: Colour | np.ndarray, share: np.ndarray) -> np.ndarray:
-    """``a``, and where ``share`` (H, W) is 1, ``b``."""
+    """Linear mix: ``a`` where ``share`` (H, W) is 0, ``b`` where it is 1."""
     share = share.clip(0, 1)[..., None]
     return a * (1 - share) + np.asarray(b, np.float32) * share
 
@@ -84,11 +84,11 @@ def plain(
 
 
 def wood(size: Size, planks: int, colour: Colour, random: np.random.Generator) -> np.ndarray:
-    """Planks along u, each with its own tone, grain and rings, with dark joints between them."""
+    """Planks along u, each with its own tone, grain and rings, and dark joints."""
     u, v = _grid(size)
     row = np.minimum((v * planks).astype(int), planks - 1)
     across = v * planks - row  # 0 to 1 within a plank
-    # Each row is cut at its own two places.
+    # Each row of planks is cut at two random positions.
     cuts = random.uniform(0, 0.5, planks)[row]
     piece = np.floor((u - cuts) * 2).astype(int)
     tone = random.normal(0, 0.14, (planks, 4))[row, piece % 4]
@@ -105,7 +105,7 @@ def wood(size: Size, planks: int, colour: Colour, random: np.random.Generator) -
 
 
 def bricks(size: Size, rows: int, columns: int, random: np.random.Generator) -> np.ndarray:
-    """A wall of bricks, each of its own tone, weathered, with rough mortar."""
+    """A wall of weathered bricks of different tones, with rough mortar."""
     u, v = _grid(size)
     warp = 0.05 * noise(size, (3 * columns, 2 * rows), 3, random)
     row = np.floor(v * rows + 0 * u).astype(int)
@@ -126,7 +126,7 @@ def bricks(size: Size, rows: int, columns: int, random: np.random.Generator) -> 
 def woven(
     size: Size, stripes: int, colours: Sequence[Colour], random: np.random.Generator
 ) -> np.ndarray:
-    """Cloth: stripes across of random widths and colours, with small woven figures in them."""
+    """Cloth with horizontal stripes of random widths and colours, and small woven patterns."""
     width, height = size
     edges = np.sort(random.uniform(0, 1, stripes - 1))
     _, v = _grid(size)
@@ -149,22 +149,22 @@ def _glyph(
     ink: Ink,
     random: np.random.Generator,
 ) -> None:
-    """A letter of no alphabet: a few strokes between the points of a 3 x 3 grid."""
+    """A symbol that looks like a letter: a few strokes between the points of a 3 x 3 grid."""
     corners = random.integers(0, 3, (random.integers(3, 6), 2)) * (size * np.array([0.32, 0.45]))
     points = [(float(x + a), float(y + b)) for a, b in corners]
     draw.line(points, fill=ink, width=max(1, round(size * 0.17)), joint="curve")
 
 
 def _ink(random: np.random.Generator, inks: Sequence[Ink]) -> Ink:
-    """One of the inks, a little lighter or darker, as prints of different age are."""
+    """A random ink, slightly lighter or darker, so that prints differ."""
     red, green, blue = inks[int(random.integers(len(inks)))]
     change = random.uniform(0.8, 1.15)
     return min(255, int(red * change)), min(255, int(green * change)), min(255, int(blue * change))
 
 
 def printed(size: Size, random: np.random.Generator, lines: int = 12) -> np.ndarray:
-    """A poster, cover or label: shapes of many colours, a title and lines of small marks."""
-    scale = 2  # drawn twice as large, then reduced: smooth edges
+    """A poster, cover or label: coloured shapes, a title and lines of small symbols."""
+    scale = 2  # drawn at twice the size, then reduced for smooth edges
     width, height = size[0] * scale, size[1] * scale
     light_paper = random.random() < 0.6
     paper = _ink(random, _LIGHT if light_paper else _DARK)
@@ -232,7 +232,7 @@ def spines(size: Size, shelves: int, random: np.random.Generator) -> np.ndarray:
 def paste(
     base: np.ndarray, sheet: np.ndarray, middle: tuple[float, float], width: float, angle: float
 ) -> np.ndarray:
-    """``sheet`` laid on ``base``: its middle (u, v), its width as a share of base's, degrees."""
+    """``sheet`` pasted on ``base``: centre (u, v), width as a share of base's, angle in degrees."""
     target = Image.fromarray(np.rint(255 * base).astype(np.uint8))
     columns = max(2, round(width * target.width))
     size = (columns, max(2, round(columns * sheet.shape[0] / sheet.shape[1])))
@@ -248,7 +248,7 @@ def paste(
 
 
 def globe(size: Size, random: np.random.Generator) -> np.ndarray:
-    """A map of a world of its own, with meridians, parallels and place names."""
+    """A map of an invented world, with meridians, parallels and place names."""
     u, v = _grid(size)
     height = noise(size, (5, 3), 6, random)
     land = (height > 0.05).astype(np.float32)

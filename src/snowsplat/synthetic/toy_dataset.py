@@ -1,8 +1,8 @@
-"""A small procedural dataset: tests need no data, and a first run needs no photos.
+"""A small procedural dataset for tests.
 
-The scene is analytic: coloured balls in the middle and, for the COLMAP formats, a large sphere
-around everything. Rays are cast in closed form, so poses, images and points are exact. Colours
-vary slowly over the surfaces, which is what a few hundred Gaussians can show.
+The scene is analytic: coloured balls at the centre and, in the COLMAP formats, a large sphere
+around everything. Rays are intersected in closed form, so poses, images and points are exact.
+Colours vary slowly over the surfaces, so that a few hundred Gaussians can represent them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Format = Literal["colmap-bin", "colmap-txt", "blender"]
 
 
 class _Scene:
-    """Balls (centre, radius), each with a colour that is a sum of a few slow waves."""
+    """Balls (centre, radius); the colour of each is a sum of a few slow waves."""
 
     def __init__(self, seed: int, surroundings: bool) -> None:
         random = np.random.default_rng(seed)
@@ -42,23 +42,23 @@ class _Scene:
         self.centres, self.radii = centres, radii
         count = len(self.radii)
         self._base = random.uniform(0.3, 0.7, (count, 3))
-        # Three waves a ball, over its unit normal: 2 to 3 radians from pole to centre.
+        # Three waves per ball, over its unit normal: 2 to 3 radians from pole to centre.
         self._directions = random.normal(size=(count, 3, 3))
         self._directions *= 2.5 / np.linalg.norm(self._directions, axis=1, keepdims=True)
         self._phases = random.uniform(0, 2 * np.pi, (count, 3, 3))
 
     def hit(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (R,) to what unit rays hit first (infinite: nothing), and its colour (R, 3)."""
+        """Distance (R,) of unit rays to the first hit (infinite: none), and its colour (R, 3)."""
         nearest = np.full(len(directions), np.inf)
         ball = np.zeros(len(directions), np.int64)
         for i, (centre, radius) in enumerate(zip(self.centres, self.radii, strict=True)):
-            # |o + s d − c|² = r²: the nearer root, or the farther one from within.
+            # |o + s d − c|² = r²: the nearer root, or the farther one if the origin is inside.
             b = directions @ (centre - origin)
             c = ((centre - origin) ** 2).sum() - radius**2
             with np.errstate(invalid="ignore"):
                 root = np.sqrt(b * b - c)
             distance = b - root if c > 0 else b + root
-            hit = (distance > 0) & (distance < nearest)  # false where the root is not a number
+            hit = (distance > 0) & (distance < nearest)  # False where the root is NaN
             nearest[hit], ball[hit] = distance[hit], i
         positions = origin + np.where(np.isfinite(nearest), nearest, 0.0)[:, None] * directions
         return nearest, self._colour(ball, positions)
@@ -70,7 +70,7 @@ class _Scene:
 
 
 def _cameras(n: int, width: int, height: int) -> list[Camera]:
-    """Cameras around the middle at three heights, golden angles apart, world z up."""
+    """Cameras around the centre at three elevations, golden angles apart, world z up."""
     cameras = []
     focal = 0.9 * width
     for i in range(n):
@@ -115,7 +115,7 @@ def _render(scene: _Scene, camera: Camera) -> np.ndarray:
 def _sample_points(
     scene: _Scene, cameras: list[Camera], count: int, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, list[list[tuple[int, int]]]]:
-    """Points on what the cameras see: xyz (P, 3), rgb (P, 3) uint8, and their tracks."""
+    """Points on visible surfaces: xyz (P, 3), rgb (P, 3) uint8, and their tracks."""
     xyz, rgb, tracks = [], [], []
     for number, camera in enumerate(cameras, 1):
         share = count // len(cameras) + (number <= count % len(cameras))
@@ -125,7 +125,7 @@ def _sample_points(
         seen = np.isfinite(distance)
         xyz.append(origin + distance[seen, None] * directions[seen])
         rgb.append(np.rint(255 * colours[seen]).astype(np.uint8))
-        # As long as the chance wills, so that readers meet records of many lengths.
+        # Random lengths, so that readers are tested with records of different lengths.
         lengths = random.integers(1, 6, seen.sum())
         tracks += [[(number, i) for i in range(length)] for length in lengths]
     return np.concatenate(xyz), np.concatenate(rgb), tracks
@@ -140,10 +140,10 @@ def write_toy_dataset(
     seed: int = 0,
     n_points: int = 1500,
 ) -> Path:
-    """Write a dataset of a procedural scene into ``folder``; equal arguments give equal files.
+    """Write a dataset of a procedural scene into ``folder``; equal arguments write equal files.
 
     "colmap-bin" and "colmap-txt": ``sparse/0`` with ``n_points`` points, and ``images``. "blender":
-    ``transforms_train.json`` and ``transforms_test.json`` (every 8th), RGBA images with a
+    ``transforms_train.json`` and ``transforms_test.json`` (every 8th view), RGBA images with a
     transparent background, no points.
 
     Returns:
@@ -193,7 +193,7 @@ def _write_blender(folder: Path, scene: _Scene, cameras: list[Camera]) -> None:
             Image.fromarray(_render(scene, camera)).save(folder / split / f"r_{i}.png")
             matrix = torch.eye(4, dtype=torch.float64)
             matrix[:3] = camera.world_from_cam
-            matrix[:3, 1:3] *= -1  # OpenCV's camera axes to OpenGL's
+            matrix[:3, 1:3] *= -1  # from OpenCV's camera axes to OpenGL's
             frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix.tolist()})
         content = json.dumps({"camera_angle_x": angle, "frames": frames}, indent=1)
         folder.joinpath(f"transforms_{split}.json").write_text(content, encoding="utf-8")

@@ -1,1 +1,1 @@
-"""Looking at scenes in a browser: `network` while they are trained, the static one afterwards."""
+"""View scenes in a browser: `live` during training, `web` for finished scenes."""

@@ -1,8 +1,8 @@
-"""By what names a server may be called, and which pages may call it: for both servers.
+"""Checks of the Host and Origin headers of requests, for both servers.
 
-A name that somebody else owns can be made to point here (DNS rebinding), and any page on the web
-can ask its browser to connect to this machine. Neither tells the truth about where it comes from,
-but for these two headers: Host and Origin, which browsers write themselves.
+A web page elsewhere can make a domain name resolve to this machine (DNS rebinding), and any page
+can make a browser connect to this machine. Browsers write the Host and Origin headers themselves,
+so these reveal both attacks.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import ipaddress
 import re
 import socket
 
-#: Hosts that mean all addresses of this machine.
+#: Hosts that stand for all addresses of this machine.
 ANY_HOST = ("", "0.0.0.0", "::")
 
 
 def is_own_host(header: str, listening: str) -> bool:
-    """Whether the Host of a request is a name of this machine, as seen by one who may ask.
+    """Whether the Host header is a valid name of this machine for a server at ``listening``.
 
-    The port is not looked at: with SSH forwarding it is another one. A server that listens on this
-    machine alone is called by its loopback names; one that listens to others also by any address,
-    since only names can be made to point here.
+    The port is not compared, since it differs with SSH forwarding. A server on the loopback
+    interface accepts loopback names only. Other servers also accept any IP address, since DNS
+    rebinding needs a domain name.
     """
     match = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^:\[\]]+)(?::\d*)?", header.strip())
     if match is None:
@@ -36,12 +36,12 @@ def is_own_host(header: str, listening: str) -> bool:
 
 
 def is_own_page(origin: str, host: str) -> bool:
-    """Whether the page that asks came from where it asks, by the headers Origin and Host."""
+    """Whether the requesting page was loaded from this server, by the Origin and Host headers."""
     return origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether what listens there can be reached from this machine alone."""
+    """Whether a server at ``host`` is reachable from this machine only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

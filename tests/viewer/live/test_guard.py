@@ -1,4 +1,4 @@
-"""The door of the network viewer: who comes in, and what those can do who should not."""
+"""The running of the network viewer: who comes in, and what those can do who should not."""
 
 import contextlib
 import gc
@@ -18,8 +18,15 @@ import pytest
 import viser
 from websockets.exceptions import InvalidMessage, InvalidStatus
 
-from snowsplat.viewer.live.guard import _BROWSERS, _PAGES, _WAITING, Governor, Guard, is_sane
-from snowsplat.viewer.live.server import Door, start_server, stop_server
+from snowsplat.viewer.live.guard import (
+    _BROWSERS,
+    _PAGES,
+    _WAITING,
+    Governor,
+    Guard,
+    is_valid_message,
+)
+from snowsplat.viewer.live.server import RunningServer, start_server, stop_server
 
 from ..clients import (
     HOSTILE,
@@ -40,25 +47,25 @@ from ..clients import (
 
 
 @pytest.fixture
-def local() -> Iterator[Door]:
-    door = start_server("127.0.0.1", None, "a scene")
-    Governor(door.server, lambda: True)
-    door.open()
-    yield door
-    stop_server(door.server)
+def local() -> Iterator[RunningServer]:
+    running = start_server("127.0.0.1", None, "a scene")
+    Governor(running.server, lambda: True)
+    running.open()
+    yield running
+    stop_server(running.server)
 
 
 @pytest.fixture
-def shared() -> Iterator[Door]:
+def shared() -> Iterator[RunningServer]:
     """For others too; its address is that for this machine."""
-    door = start_server("0.0.0.0", None, "a scene")
-    door.open()
-    yield door
-    stop_server(door.server)
+    running = start_server("0.0.0.0", None, "a scene")
+    running.open()
+    yield running
+    stop_server(running.server)
 
 
-def port(door: Door) -> int:
-    return door.server.get_port()
+def port(running: RunningServer) -> int:
+    return running.server.get_port()
 
 
 def wait(true: Callable[[], bool], seconds: float = 20.0) -> None:
@@ -113,11 +120,11 @@ def test_foreign_pages_are_refused(local, origin):
 
 
 def test_the_page_itself_is_let_in(local, shared):
-    for door in (local, shared):
-        parts = urlsplit(door.url)
-        with Visitor(door.url, origin=f"http://{parts.netloc}") as visitor:
-            visitor.look()
-            wait(lambda door=door: len(door.server.get_clients()) == 1)
+    for running in (local, shared):
+        parts = urlsplit(running.url)
+        with Visitor(running.url, origin=f"http://{parts.netloc}") as visitor:
+            visitor.send_camera()
+            wait(lambda running=running: len(running.server.get_clients()) == 1)
     assert local.others is None
     assert local.url == f"http://127.0.0.1:{port(local)}"
 
@@ -150,8 +157,8 @@ def test_others_need_the_address(shared):
 
 
 def test_nothing_but_the_page(local, shared):
-    for door in (local, shared):
-        root = urlsplit(door.url).path.rstrip("/")
+    for running in (local, shared):
+        root = urlsplit(running.url).path.rstrip("/")
         for path in (
             *("//", "/.", "/..", "/./", "/index.html/", "/index", "/build", "/favicon.ico", "/%00"),
             *(
@@ -162,11 +169,11 @@ def test_nothing_but_the_page(local, shared):
             *("/%252e%252e" * 9 + "/etc/passwd", "/..\\" * 9 + "etc/passwd", "//etc/passwd"),
             *("/..%5c" * 9 + "etc/passwd", "/../package.json", "/\udcff", "/" + "a" * 7000),
         ):
-            answer = get(door.url, root + path)
+            answer = get(running.url, root + path)
             assert status(answer) == 404, path
             assert b"root:" not in answer
-        for target in ("*", door.url, "http://evil.example/", "evil.example:80"):
-            assert status(get(door.url, target)) == 404, target
+        for target in ("*", running.url, "http://evil.example/", "evil.example:80"):
+            assert status(get(running.url, target)) == 404, target
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE", "CONNECT", "get"])
@@ -214,30 +221,30 @@ def test_pages_may_not_be_framed_nor_read_by_others(local):
 
 
 def test_messages():
-    assert is_sane(camera())
-    assert is_sane(update("a", 5))
-    assert is_sane(update("a", [0.5, 1]))
+    assert is_valid_message(camera())
+    assert is_valid_message(update("a", 5))
+    assert is_valid_message(update("a", [0.5, 1]))
     click = {"type": "SceneNodeClickMessage", "name": "/photos/3", "instance_index": None}
     click |= {"ray_origin": [0, 0, 0], "ray_direction": [0, 0, 1.5], "screen_pos": [0.5, 0.5]}
-    assert is_sane(msgspec.msgpack.encode({**click, "modifier": None, "owner": ""}))
+    assert is_valid_message(msgspec.msgpack.encode({**click, "modifier": None, "owner": ""}))
     for name in POSE:
         for bad in (float("nan"), "x", None, [], [1.0, 2.0], b"x", {}):
             sane = name in ("near", "far") and isinstance(bad, float)  # not looked at
-            assert is_sane(camera(**{name: bad})) is sane, (name, bad)
+            assert is_valid_message(camera(**{name: bad})) is sane, (name, bad)
     for name in ("image_width", "image_height"):
         for size in (0, -1, 1 << 20, 1e300):
-            assert not is_sane(camera(**{name: size}))
+            assert not is_valid_message(camera(**{name: size}))
     # viser sets whatever attribute is named.
     for name in ("removed", "sync_cb", "update_cb", "label", "order"):
-        assert not is_sane(update("a", 5, name))
-    assert not is_sane(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a"}))
+        assert not is_valid_message(update("a", 5, name))
+    assert not is_valid_message(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a"}))
     for value in ({}, {"a": 1}, "x" * 300, [1] * 20, [float("nan")], [[1]], float("inf")):
-        assert not is_sane(update("a", value))
+        assert not is_valid_message(update("a", value))
     for kind in (*("GuiFormDirtyMessage", "FileTransferStartUpload", "ShareUrlDisconnect"), "x"):
-        assert not is_sane(msgspec.msgpack.encode({"type": kind, "uuid": "a"}))
+        assert not is_valid_message(msgspec.msgpack.encode({"type": kind, "uuid": "a"}))
     for data in (b"", b"\xc1", b"\x91" * 60_000, os.urandom(500), b"\xdf\xff\xff\xff\xff"):
-        assert not is_sane(data)
-    assert not is_sane(camera().decode("latin-1"))
+        assert not is_valid_message(data)
+    assert not is_valid_message(camera().decode("latin-1"))
 
 
 def test_a_program_of_another_version_is_refused(local, capfd):
@@ -257,7 +264,7 @@ def test_who_says_what_no_page_says_is_not_heard(local, capfd, caplog):
     slider = local.server.gui.add_slider("x", 0, 10, 1, 5)
     slider.on_update(lambda _: names.append("x"))
     with Visitor(local.url) as visitor:
-        visitor.look()
+        visitor.send_camera()
         wait(lambda: len(local.server.get_clients()) == 1)
         for value in ("nonsense", None, [], float("nan"), [1, 2, 3], True, 2**64 - 1):
             visitor.socket.send(update(slider._impl.uuid, value))
@@ -274,7 +281,7 @@ def test_who_says_what_no_page_says_is_not_heard(local, capfd, caplog):
         thread.join(60)
     wait(lambda: not local.server.get_clients())
     with Visitor(local.url) as visitor:
-        visitor.look()
+        visitor.send_camera()
         wait(lambda: len(local.server.get_clients()) == 1)
     assert capfd.readouterr() == ("", "")
     gc.collect()  # asyncio tells of errors that nobody asked for
@@ -378,7 +385,7 @@ def test_no_more_than_so_many(local):
         assert own <= _WAITING + _PAGES + _BROWSERS + 100  # it takes up to 100 at a time
         assert threading.active_count() == threads
         with Visitor(local.url) as visitor:
-            visitor.look()
+            visitor.send_camera()
             wait(lambda: len(local.server.get_clients()) == 1)
     finally:
         for client in clients:

@@ -20,7 +20,7 @@ from snowsplat.training.config import TrainConfig
 from snowsplat.training.trainer import Trainer
 from snowsplat.viewer.live import guard
 from snowsplat.viewer.live.gauge import Gauge
-from snowsplat.viewer.live.guard import tell
+from snowsplat.viewer.live.guard import call_in_server_thread
 from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer
 
@@ -127,13 +127,13 @@ def test_viser_is_changed_in_its_own_thread_alone(watched, monkeypatch):
 
     monkeypatch.setattr(AsyncMessageBuffer, "push", noting)
     with Visitor(watched.viewer.url) as visitor:
-        visitor.look()
+        visitor.send_camera()
         while len(visitor.controls) < 20 or not visitor.shown:
             watched.step()
             visitor.pictures(0.05)
         for label, value in (("Show", "Depth"), ("Cameras", True), ("Go to", "Next")):
             visitor.press(label, value)
-        visitor.press("Keep this view")
+        visitor.press("Store this view")
         end = time.monotonic() + 2.5
         while time.monotonic() < end:
             watched.step()
@@ -143,29 +143,29 @@ def test_viser_is_changed_in_its_own_thread_alone(watched, monkeypatch):
 def test_controls_take_what_is_there(watched):
     """Sliders have ends, lists have entries; a browser may say otherwise."""
     with Visitor(watched.viewer.url) as visitor:
-        visitor.look()
+        visitor.send_camera()
         while len(visitor.controls) < 20:
             watched.step()
             visitor.pictures(0.05)
         (seen,) = watched.viewer.session._visitors.values()
         for label, value in (
-            *(("Most pixels", 10**9), ("Most pixels", -5), ("SH degree", 99), ("SH degree", -3)),
+            *(("Image size", 10**9), ("Image size", -5), ("SH degree", 99), ("SH degree", -3)),
             *(("Gaussian size", -1e300), ("Gaussian size", 1e300), ("Show", "Nonsense")),
             *(("Photo (%)", 1e300), ("Viewing time (%)", 1e9), ("Viewing time (%)", -1e9)),
             *(("Crop", True), ("x (right)", []), ("x (right)", [1e300, -1e300]), ("Go to", "x")),
-            *(("x (right)", [1.0] * 16), ("Show only", "x"), ("Keep this view", None)),
+            *(("x (right)", [1.0] * 16), ("Show only", "x"), ("Store this view", None)),
         ):
             visitor.press(label, value)
             end = time.monotonic() + 0.1
             while time.monotonic() < end:
                 watched.step()
-            look = seen.look
-            assert 0 <= look.sh_degree <= 3, label
-            assert 0.02 <= look.scale <= 1.0, label
-            assert 0.0 <= look.wipe <= 1.0, label
+            display = seen.display
+            assert 0 <= display.sh_degree <= 3, label
+            assert 0.02 <= display.scale <= 1.0, label
+            assert 0.0 <= display.wipe <= 1.0, label
             assert 320 <= seen.longest <= 2560, label
             assert 0.05 <= watched.viewer.session.share <= 0.95, label
-            assert look.mode == "color"
+            assert display.mode == "color"
         for pose in (
             {"wxyz": [0.0] * 4},
             {"wxyz": [1e300] * 4},
@@ -178,7 +178,7 @@ def test_controls_take_what_is_there(watched):
             for _ in range(5):
                 watched.step()
         visitor.press("Crop", False)
-        visitor.look(position=[0.0, 0.5, -3.0])
+        visitor.send_camera(position=[0.0, 0.5, -3.0])
         shown = visitor.shown
         end = time.monotonic() + 20
         while visitor.shown == shown:
@@ -189,17 +189,17 @@ def test_controls_take_what_is_there(watched):
 
 def test_a_picture_that_cannot_be_made_costs_no_training(watched):
     with Visitor(watched.viewer.url) as visitor:
-        visitor.look()
+        visitor.send_camera()
         session = watched.viewer.session
         while not session._visitors:
             watched.step()
         (seen,) = session._visitors.values()
-        session.change(seen, look=dataclasses.replace(seen.look, crop=((0.0,), (1.0, 2.0))))
+        session.change(seen, display=dataclasses.replace(seen.display, crop=((0.0,), (1.0, 2.0))))
         time.sleep(0.3)  # it is still
         for _ in range(20):
             watched.step()
         assert seen.shown_version == seen.version  # it is not tried again and again
-        session.change(seen, look=dataclasses.replace(seen.look, crop=None))
+        session.change(seen, display=dataclasses.replace(seen.display, crop=None))
         shown = visitor.shown
         end = time.monotonic() + 20
         while visitor.shown == shown:
@@ -210,14 +210,14 @@ def test_a_picture_that_cannot_be_made_costs_no_training(watched):
 
 def test_views_kept_and_downloads_are_bounded(watched):
     with Visitor(watched.viewer.url) as visitor:
-        visitor.look()
-        while "Keep this view" not in visitor.controls:
+        visitor.send_camera()
+        while "Store this view" not in visitor.controls:
             watched.step()
             visitor.pictures(0.05)
         for _ in range(600):
-            visitor.press("Keep this view")
+            visitor.press("Store this view")
         for _ in range(200):
-            visitor.press("Download them")
+            visitor.press("Download the views")
         end = time.monotonic() + 3
         taken = 0
         while time.monotonic() < end:
@@ -236,11 +236,11 @@ def test_pictures_wait_for_one_another(watched, monkeypatch):
     draw = watched.viewer._draw
     monkeypatch.setattr(watched.viewer, "_draw", lambda *what: drawn.append(1) or draw(*what))
     with Visitor(watched.viewer.url) as visitor:
-        visitor.look()
+        visitor.send_camera()
         while not drawn:
             watched.step()
         (seen,) = watched.viewer.session._visitors.values()
-        tell(watched.viewer.server, lambda: time.sleep(1.0))
+        call_in_server_thread(watched.viewer.server, lambda: time.sleep(1.0))
         first, end = len(drawn), time.monotonic() + 0.8
         while time.monotonic() < end:
             watched.viewer.session.move(seen, seen.pose)

@@ -152,7 +152,7 @@ def test_pause_step_and_go_on(page):
     # Where it is paused the camera can be moved all the same, and what is seen changes.
     page.drag(200, 600, 320, 640)
     assert differ(settled(page), still) > 2
-    press(page, "Go on")
+    press(page, "Resume")
     wait(lambda: step_of(page) > paused + 10)
 
 
@@ -167,7 +167,7 @@ def test_what_is_shown_can_be_chosen(page):
         before = name
     choose(page, before, "Colour")
     wait(lambda: differ(scene(page), seen[0]) < 1)
-    press(page, "Go on")
+    press(page, "Resume")
 
 
 def test_standing_at_a_photo(training, page):
@@ -184,8 +184,8 @@ def test_standing_at_a_photo(training, page):
     page.wait_for("document.body.innerText.includes('At view_02.png')")
     wait(lambda: differ(scene(page), photo) > 1)
     page.drag(200, 600, 320, 640)
-    page.wait_for("document.body.innerText.includes('stand where its photo was taken')")
-    press(page, "Go on")
+    page.wait_for("document.body.innerText.includes('photo_view where its photo was taken')")
+    press(page, "Resume")
 
 
 def test_views_are_kept_for_a_film(page, tmp_path):
@@ -194,21 +194,21 @@ def test_views_are_kept_for_a_film(page, tmp_path):
         "blob => { if (blob.type.includes('json')) window.kept = blob; "
         "return make.call(URL, blob); }; })()"
     )
-    press(page, "Keep this view")
-    page.wait_for("document.body.textContent.includes('1 kept')")
+    press(page, "Store this view")
+    page.wait_for("document.body.textContent.includes('1 stored')")
     page.drag(200, 600, 320, 640)
     settled_after = time.monotonic() + 1.0
     wait(lambda: time.monotonic() > settled_after)  # the browser has told where it is now
-    press(page, "Keep this view")
-    page.wait_for("document.body.textContent.includes('2 kept')")
-    press(page, "Download them")
+    press(page, "Store this view")
+    page.wait_for("document.body.textContent.includes('2 stored')")
+    press(page, "Download the views")
     page.wait_for("!!window.kept")
     (tmp_path / "cameras.json").write_text(page.evaluate("window.kept.text()"))
     names, cameras = read_cameras(tmp_path / "cameras.json")
     assert names == ["key_000", "key_001"]
     assert float((cameras[0].position - cameras[1].position).norm()) > 0.01
-    press(page, "Forget the last")
-    page.wait_for("document.body.textContent.includes('1 kept')")
+    press(page, "Remove the last view")
+    page.wait_for("document.body.textContent.includes('1 stored')")
 
 
 def test_two_pages_have_a_camera_each(training, browser, page):
@@ -223,7 +223,7 @@ def test_two_pages_have_a_camera_each(training, browser, page):
     assert differ(settled(page), here) < 1
     choose(other, "Colour", "Depth")
     assert differ(settled(page), here) < 1
-    press(other, "Go on")  # the training is one
+    press(other, "Resume")  # the training is one
     paused = step_of(page)
     wait(lambda: step_of(page) > paused)
     other.close()

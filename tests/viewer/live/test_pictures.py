@@ -10,7 +10,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.render import render
 from snowsplat.viewer.live import palette
-from snowsplat.viewer.live.look import Look, Placed
+from snowsplat.viewer.live.display import DisplaySettings, Placed
 from snowsplat.viewer.live.pictures import Photo, draw
 
 WIDTH, HEIGHT = 90, 60
@@ -40,7 +40,7 @@ def at(picture: np.ndarray, column: int, row: int = 30) -> list[int]:
 
 
 def test_colours_are_those_of_a_render():
-    picture = draw(TWO, CAMERA, Look(), torch.tensor([0.0, 0.0, 1.0]))
+    picture = draw(TWO, CAMERA, DisplaySettings(), torch.tensor([0.0, 0.0, 1.0]))
     assert picture.shape == (HEIGHT, WIDTH, 3)
     assert picture.dtype == np.uint8
     image = render(TWO, CAMERA, torch.tensor([0.0, 0.0, 1.0])).image
@@ -54,7 +54,7 @@ def test_depth_grows_from_yellow_to_violet():
     far = [float(x) for x in np.linspace(2.0, 8.0, 5)]
     row = balls(*[((i - 2) * 0.15 * z, 0.0, z) for i, z in enumerate(far)], colors=[RED] * 5)
     row.log_scales = torch.log(0.04 * torch.tensor(far))[:, None].repeat(1, 3)
-    picture = draw(row, CAMERA, Look("depth"))
+    picture = draw(row, CAMERA, DisplaySettings("depth"))
     # The place of each colour in the palette.
     table = palette.DEPTH.numpy().astype(int)
     places = [
@@ -65,11 +65,11 @@ def test_depth_grows_from_yellow_to_violet():
     assert places[0] > 240
     assert places[4] < 30
     assert at(picture, 45, 2) == [0, 0, 0]  # nothing there
-    assert not draw(balls((0.0, 0.0, -1.0)), CAMERA, Look("depth")).any()
+    assert not draw(balls((0.0, 0.0, -1.0)), CAMERA, DisplaySettings("depth")).any()
 
 
 def test_opacity():
-    picture = draw(TWO, CAMERA, Look("alpha"), torch.ones(3))
+    picture = draw(TWO, CAMERA, DisplaySettings("alpha"), torch.ones(3))
     assert at(picture, 25)[0] > 230
     assert len(set(at(picture, 25))) == 1
     assert at(picture, 5) == [0, 0, 0]
@@ -80,12 +80,12 @@ def test_normals_are_the_shortest_axes_towards_the_camera(sign):
     flat = balls((0.0, 0.0, 2.0))
     flat.log_scales[0, 2] = math.log(0.001)
     flat.quats = sign * flat.quats
-    red, green, blue = at(draw(flat, CAMERA, Look("normals")), 45)
+    red, green, blue = at(draw(flat, CAMERA, DisplaySettings("normals")), 45)
     assert (red, green) == pytest.approx((128, 128), abs=4)
     assert blue > 250
     # Turned about the vertical by 45° it faces right, or left.
     flat.quats = torch.tensor([[math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0]])
-    red, green, blue = at(draw(flat, CAMERA, Look("normals")), 45)
+    red, green, blue = at(draw(flat, CAMERA, DisplaySettings("normals")), 45)
     assert red == pytest.approx(255 * (0.5 - 0.5 / math.sqrt(2)), abs=6)
     assert green == pytest.approx(128, abs=4)
     assert blue == pytest.approx(255 * (0.5 + 0.5 / math.sqrt(2)), abs=6)
@@ -96,21 +96,23 @@ def shown(picture: np.ndarray) -> int:
 
 
 def test_points_are_small_and_have_their_colours():
-    picture = draw(TWO, CAMERA, Look("points"))
+    picture = draw(TWO, CAMERA, DisplaySettings("points"))
     assert 2 <= shown(picture) < 40
     assert at(picture, 65)[1] > at(picture, 65)[0]
-    assert np.array_equal(picture, draw(TWO, CAMERA, Look("points", scale=0.1)))
+    assert np.array_equal(picture, draw(TWO, CAMERA, DisplaySettings("points", scale=0.1)))
 
 
 def test_ellipsoids_are_opaque_discs_with_an_edge():
-    picture = draw(balls((0.0, 0.0, 2.0), opacity=0.5), CAMERA, Look("ellipsoids"))
+    picture = draw(balls((0.0, 0.0, 2.0), opacity=0.5), CAMERA, DisplaySettings("ellipsoids"))
     radius = 1.5 * math.hypot(80 * 0.12 / 2, math.sqrt(0.3))  # of the splat, blurred as all are
     assert shown(picture) == pytest.approx(math.pi * radius**2, rel=0.15)
     values = picture[30, :, 0]
     assert values.max() == pytest.approx(0.9 * 255, abs=6)
     between = (values > 20) & (values < 200)
     assert between.sum() <= 4
-    assert not draw(balls((0.0, 0.0, 2.0), opacity=0.05), CAMERA, Look("ellipsoids")).any()
+    assert not draw(
+        balls((0.0, 0.0, 2.0), opacity=0.05), CAMERA, DisplaySettings("ellipsoids")
+    ).any()
 
 
 def test_cost_counts_gaussians():
@@ -118,7 +120,9 @@ def test_cost_counts_gaussians():
     heat = palette.HEAT.numpy().astype(int)
     places = []
     for n in (1, 2, 8):
-        picture = draw(balls(*[place] * n, colors=[RED] * n, opacity=0.1), CAMERA, Look("cost"))
+        picture = draw(
+            balls(*[place] * n, colors=[RED] * n, opacity=0.1), CAMERA, DisplaySettings("cost")
+        )
         places.append(int(np.abs(heat - picture[30, 45].astype(int)).sum(1).argmin()))
         assert at(picture, 2) == [0, 0, 0]
     expected = [255 * math.log1p(n) / math.log1p(256) for n in (1, 2, 8)]
@@ -127,23 +131,26 @@ def test_cost_counts_gaussians():
 
 def test_a_crop_removes_what_is_outside():
     crop = ((-1.0, -1.0, 1.0), (0.0, 1.0, 3.0))
-    picture = draw(TWO, CAMERA, Look(crop=crop))
+    picture = draw(TWO, CAMERA, DisplaySettings(crop=crop))
     assert at(picture, 25)[0] > 200
     assert at(picture, 65) == [0, 0, 0]
-    assert not draw(TWO, CAMERA, Look(crop=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))).any()
+    assert not draw(TWO, CAMERA, DisplaySettings(crop=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))).any()
 
 
 def test_scale_shrinks():
-    sizes = [shown(draw(TWO, CAMERA, Look(scale=scale))) for scale in (1.0, 0.5, 0.2)]
+    sizes = [shown(draw(TWO, CAMERA, DisplaySettings(scale=scale))) for scale in (1.0, 0.5, 0.2)]
     assert sizes[0] > 2 * sizes[1] > 4 * sizes[2] > 0
 
 
 def test_sh_degree():
     views = TWO.clone()
     views.sh_rest[:, 1] = 1.0  # along z
-    full, plain = draw(views, CAMERA, Look(sh_degree=3)), draw(views, CAMERA, Look(sh_degree=0))
+    full, plain = (
+        draw(views, CAMERA, DisplaySettings(sh_degree=3)),
+        draw(views, CAMERA, DisplaySettings(sh_degree=0)),
+    )
     assert not np.array_equal(full, plain)
-    assert np.array_equal(plain, draw(TWO, CAMERA, Look()))
+    assert np.array_equal(plain, draw(TWO, CAMERA, DisplaySettings()))
 
 
 def photo_of(picture: np.ndarray) -> Photo:
@@ -152,27 +159,27 @@ def photo_of(picture: np.ndarray) -> Photo:
 
 
 def test_no_error_where_photo_and_render_are_the_same():
-    colors = draw(TWO, CAMERA, Look())
-    same = draw(TWO, CAMERA, Look("error"), photo=photo_of(colors))
+    colors = draw(TWO, CAMERA, DisplaySettings())
+    same = draw(TWO, CAMERA, DisplaySettings("error"), photo=photo_of(colors))
     assert not same[:, 10:80].any()
     other = photo_of(colors)
     other.pixels[20:40, 40:50] = 255  # column 50 to 60 of the picture
-    error = draw(TWO, CAMERA, Look("error"), photo=other)
+    error = draw(TWO, CAMERA, DisplaySettings("error"), photo=other)
     assert error[30, 52].min() > 100
     assert not error[:20, 10:80].any()
-    without = draw(TWO, CAMERA, Look("error"))
+    without = draw(TWO, CAMERA, DisplaySettings("error"))
     assert np.array_equal(without, colors)
 
 
 def test_a_photo_is_wiped_over_the_render():
-    colors = draw(TWO, CAMERA, Look())
+    colors = draw(TWO, CAMERA, DisplaySettings())
     white = Photo(torch.full((60, 70, 3), 255, dtype=torch.uint8), Placed(10, 0, 70, 60))
-    render_only = draw(TWO, CAMERA, Look(), photo=white)
+    render_only = draw(TWO, CAMERA, DisplaySettings(), photo=white)
     assert np.array_equal(render_only[:, 10:80], colors[:, 10:80])
-    half = draw(TWO, CAMERA, Look(wipe=0.5), photo=white)
+    half = draw(TWO, CAMERA, DisplaySettings(wipe=0.5), photo=white)
     assert (half[:, 10:45] == 255).all()
     assert np.array_equal(half[:, 46:80], colors[:, 46:80])
-    whole = draw(TWO, CAMERA, Look(wipe=1.0), photo=white)
+    whole = draw(TWO, CAMERA, DisplaySettings(wipe=1.0), photo=white)
     assert (whole[:, 10:80] == 255).all()
     assert whole[:, :10].max() <= 0.36 * 255  # darker around it
 
@@ -180,4 +187,4 @@ def test_a_photo_is_wiped_over_the_render():
 def test_nothing_at_all():
     nothing = TWO.select(torch.zeros(0, dtype=torch.int64))
     for mode in ("color", "depth", "alpha", "normals", "points", "ellipsoids", "cost", "error"):
-        assert not draw(nothing, CAMERA, Look(mode)).any(), mode
+        assert not draw(nothing, CAMERA, DisplaySettings(mode)).any(), mode

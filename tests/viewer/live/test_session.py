@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from snowsplat.scene.camera import Camera
-from snowsplat.viewer.live.look import Look, Pose
-from snowsplat.viewer.live.session import IDLE_SHARE, STILL, Session, Stand
+from snowsplat.viewer.live.display import DisplaySettings, Pose
+from snowsplat.viewer.live.session import IDLE_SHARE, STILL, PhotoView, Session
 
 
 class Clock:
@@ -79,7 +79,7 @@ def test_every_change_makes_a_picture_due(session, clock):
     session.move(visitor, pose())
     clock.now += 1
     assert serve(session, clock, 0, 0.01) == "still"
-    for change in ({"look": Look("depth")}, {"longest": 320}):
+    for change in ({"look": DisplaySettings("depth")}, {"longest": 320}):
         session.change(visitor, **change)
         clock.now += 1
         assert serve(session, clock, 0, 0.01, training=False) == "still", change
@@ -204,21 +204,21 @@ def test_moving_away_leaves_the_photo(session, clock):
     visitor = session.enter(1)
     session.move(visitor, pose())
     camera = Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(3, 4).double())
-    stand = Stand(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5))
-    session.send(visitor, stand)
+    photo_view = PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5))
+    session.send(visitor, photo_view)
     clock.now += 0.1
     session.move(visitor, pose(1))  # was under way already
-    assert visitor.stand is stand
+    assert visitor.photo_view is photo_view
     session.move(visitor, pose(5))
-    assert visitor.stand is stand
+    assert visitor.photo_view is photo_view
     session.move(visitor, pose(5.1))
-    assert visitor.stand is None
+    assert visitor.photo_view is None
 
 
 def test_a_browser_that_never_arrives_does_not_stand_there(session, clock):
     visitor = session.enter(1)
     camera = Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(3, 4).double())
-    session.send(visitor, Stand(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5)))
+    session.send(visitor, PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5)))
     clock.now += 10
     session.move(visitor, pose(1))
-    assert visitor.stand is None
+    assert visitor.photo_view is None

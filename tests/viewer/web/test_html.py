@@ -1,4 +1,4 @@
-"""One page with everything in it: opened from the disk by a real browser, without a network."""
+"""The self-contained page, opened from disk in a real browser without a network."""
 
 import base64
 import json
@@ -18,7 +18,7 @@ from ...browser import Browser
 
 
 def three_balls() -> Gaussians:
-    """Red on the left, green above it, blue on the right, as seen from −z with y down."""
+    """Three balls: red left, green above it, blue right, seen from −z with y down."""
     means = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
     colors = torch.eye(3)
     return Gaussians(
@@ -34,7 +34,7 @@ def three_balls() -> Gaussians:
 FRONT = InitialView((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), 60.0)
 
 
-def test_the_scene_is_in_it(tmp_path):
+def test_the_scene_is_embedded(tmp_path):
     path = tmp_path / "a <b>.html"
     write_gaussians(path, three_balls())
     page = path.read_text(encoding="utf-8")
@@ -51,14 +51,14 @@ def test_the_scene_is_in_it(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [path.name, "scene.ply"]
 
 
-def test_it_is_not_read_back(tmp_path):
+def test_html_files_cannot_be_read(tmp_path):
     write_gaussians(tmp_path / "scene.html", three_balls())
     with pytest.raises(UserError, match="HTML files can be written, not read"):
         read_gaussians(tmp_path / "scene.html")
 
 
-def test_what_makes_no_page(tmp_path, monkeypatch):
-    with pytest.raises(UserError, match="without Gaussians"):
+def test_scenes_without_a_page(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="has no Gaussians"):
         write_gaussians(tmp_path / "scene.html", three_balls().select(torch.zeros(0).long()))
     monkeypatch.setattr(html, "_LARGEST", 100)
     with pytest.raises(UserError, match="too many for one page; decimate"):
@@ -67,7 +67,7 @@ def test_what_makes_no_page(tmp_path, monkeypatch):
 
 
 @pytest.mark.browser
-def test_a_real_browser_opens_it_from_the_disk(tmp_path):
+def test_a_real_browser_opens_it_from_disk(tmp_path):
     path = tmp_path / "scene.html"
     html.write_html(path, three_balls(), FRONT)
     with Browser(400, 300) as browser:
@@ -76,7 +76,7 @@ def test_a_real_browser_opens_it_from_the_disk(tmp_path):
         shown = page.screenshot(tmp_path / "scene.png").astype(float)
         assert not page.errors
         assert all(url.startswith(("file://", "blob:null/")) for url in page.requests)
-        # A scene of other people's making cannot make it ask the network either.
+        # Even injected scripts cannot make network requests.
         refused = "fetch('http://127.0.0.1:9/').then(() => 'sent', () => 'refused')"
         assert page.evaluate(refused) == "refused"
         assert any("Content Security Policy" in line for line in page.errors)

@@ -1,4 +1,4 @@
-"""The viewer's page: what is put into it, and what it is allowed to do."""
+"""The viewer's page: inserted values and the content security policy."""
 
 import base64
 import hashlib
@@ -22,7 +22,7 @@ def bootstrap_of(text: str) -> dict:
 
 
 def test_settings_are_in_the_viewers_frame():
-    """It turns scenes half round about z."""
+    """The viewer rotates scenes by 180° about z."""
     made = settings(InitialView((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 50.0), (0.1, 0.2, 0.3))
     (camera,) = made["cameras"]
     expected = {"position": [-1.0, -2.0, 3.0], "target": [-4.0, -5.0, 6.0], "fov": 50.0}
@@ -30,7 +30,7 @@ def test_settings_are_in_the_viewers_frame():
     assert made["background"] == {"color": [0.1, 0.2, 0.3]}
 
 
-def test_nothing_put_into_the_page_becomes_markup():
+def test_inserted_values_do_not_become_markup():
     for text in (page(HOSTILE, {"x": HOSTILE}), whole_page(HOSTILE, {"x": HOSTILE}, "")):
         assert bootstrap_of(text) == {"x": HOSTILE}
         assert "alert(1)</script>" not in text
@@ -38,12 +38,12 @@ def test_nothing_put_into_the_page_becomes_markup():
         assert html.unescape(title) == HOSTILE
 
 
-def test_the_page_is_theirs_but_for_what_is_put_into_it():
+def test_the_page_is_unchanged_except_for_inserted_values():
     theirs, ours = asset("index.html").splitlines(), page("scene", {}).splitlines()
     assert sum(line not in ours for line in theirs) <= 6
 
 
-def test_the_policy_names_each_script():
+def test_the_policy_has_a_hash_of_each_script():
     text = page("scene", {"contentUrl": "./x"})
     policy = content_policy(text, "'self'")
     scripts = re.findall(r'<script type="module">(.*?)</script>', text, re.DOTALL)
@@ -53,7 +53,7 @@ def test_the_policy_names_each_script():
         assert f"'sha256-{digest}'" in policy
 
 
-def test_the_whole_page_carries_everything_and_the_licence():
+def test_the_self_contained_page_has_the_licence():
     text = whole_page("scene", {}, "<p>body</p>")
     assert "<p>body</p>\n    </body>" in text
     assert asset("LICENSE") in text
@@ -61,11 +61,11 @@ def test_the_whole_page_carries_everything_and_the_licence():
     (policy,) = re.findall(r'Content-Security-Policy" content="(.*?)"', text)
     assert "self" not in policy
     assert "http" not in policy
-    # Before all that it is about.
+    # The policy comes before everything that it restricts.
     assert text.index("Content-Security-Policy") < text.index("<script")
 
 
-def test_a_checkout_that_is_not_built(tmp_path, monkeypatch):
+def test_a_checkout_without_the_viewer(tmp_path, monkeypatch):
     monkeypatch.setattr(viewer_page, "_FOLDER", tmp_path)
     with pytest.raises(UserError, match="run make native"):
         page("scene", {})

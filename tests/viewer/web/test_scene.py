@@ -1,4 +1,4 @@
-"""The finished viewer: what it is given, and what a real browser makes of it."""
+"""The web viewer: its input, and its image in a real browser."""
 
 import dataclasses
 import json
@@ -23,11 +23,11 @@ from snowsplat.viewer.web.server import StaticServer
 from ...browser import Browser, Page
 
 WIDTH, HEIGHT = 480, 360
-LOADED = "!!window.app"  # the viewer sets it after its first whole picture
+LOADED = "!!window.app"  # the viewer sets it after its first complete frame
 
 
 def camera_of(start: InitialView) -> Camera:
-    """The viewer's camera in a window wider than high: level, with −y up."""
+    """The viewer's camera in a landscape window: level, with −y up."""
     position, target = (
         torch.tensor(p, dtype=torch.float64) for p in (start.position, start.target)
     )
@@ -37,7 +37,7 @@ def camera_of(start: InitialView) -> Camera:
 
 
 def wide(camera: Camera, start: InitialView) -> Camera:
-    """A camera's pose, with the window and the angle of the start."""
+    """A camera's pose, with the window size and field of view of the initial view."""
     like = camera_of(start)
     return dataclasses.replace(like, cam_from_world=camera.cam_from_world)
 
@@ -51,27 +51,27 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((a.astype(float) - b) ** 2) / 255**2))
 
 
-def test_it_starts_at_the_first_camera_upright(trained):
+def test_the_initial_view_is_the_first_camera(trained):
     gaussians, start = ready(trained.gaussians, trained.cameras)
     camera = trained.cameras[0]
-    # World z was up; the distances, near the usual ones, are as they were.
+    # World z was up. The scale is unchanged, as the distances are usual ones.
     turned = transform(trained.gaussians, _similarity(1.0, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
     torch.testing.assert_close(gaussians.means, turned.means, rtol=0, atol=1e-2)
     torch.testing.assert_close(gaussians.sh_rest, turned.sh_rest, rtol=0, atol=1e-2)
     x, y, z = camera.position.tolist()
     assert start.position == pytest.approx((x, -z, y), abs=1e-3)
-    # What lies ahead is the ball of radius 0.6 around the origin, 3 away.
+    # In front is the ball of radius 0.6 around the origin, at a distance of 3.
     distance = math.dist(start.position, start.target)
     assert distance == pytest.approx(2.4, abs=0.3)
     assert math.dist(start.target, (0, 0, 0)) == pytest.approx(3 - distance, abs=0.05)
     assert start.fov == pytest.approx(math.degrees(2 * math.atan(1.2 * 0.5 / 0.9)), abs=1e-6)
-    # Its picture is that of the photo, and a little on both sides.
+    # The view shows the photo and a little more on both sides.
     ours = picture(trained.gaussians, wide(camera, start))
     assert psnr(picture(gaussians, camera_of(start)), ours) > 45
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])
-def test_scenes_of_odd_size_are_brought_to_one_that_can_be_walked_in(trained, scale):
+def test_scenes_of_unusual_scale_are_rescaled(trained, scale):
     change = _similarity(scale, rotation_from_quat(torch.tensor([0.9, 0.2, -0.3, 0.1])).tolist())
     odd = transform(trained.gaussians, change)
     cameras = [
@@ -84,7 +84,7 @@ def test_scenes_of_odd_size_are_brought_to_one_that_can_be_walked_in(trained, sc
     assert psnr(picture(gaussians, camera_of(start)), ours) > 40
 
 
-def test_an_upright_scene_is_left_as_it_is(trained):
+def test_an_upright_scene_is_unchanged(trained):
     upright, _ = ready(trained.gaussians, trained.cameras)
     change = _similarity(1.0, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     cameras = [
@@ -95,7 +95,7 @@ def test_an_upright_scene_is_left_as_it_is(trained):
     assert ready(trained.gaussians, [])[0] is trained.gaussians
 
 
-def test_nothing_ahead_of_the_camera(trained):
+def test_empty_space_in_front_of_the_camera(trained):
     away = torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64)
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     camera = Camera(96, 72, 90.0, 90.0, 48.0, 36.0, look_at(away, 2 * away, up))
@@ -122,7 +122,7 @@ def test_the_page_and_its_policy(trained):
 
 
 @pytest.mark.browser
-def test_a_real_browser_shows_what_we_render(trained, tmp_path):
+def test_a_real_browser_shows_our_render(trained, tmp_path):
     gaussians, start = ready(trained.gaussians, trained.cameras)
     ours = picture(gaussians, camera_of(start))
     files, headers = site("scene", trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
@@ -130,7 +130,7 @@ def test_a_real_browser_shows_what_we_render(trained, tmp_path):
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
         shown = soon(page, lambda shown: psnr(shown, ours) > 30)
-        page.screenshot(tmp_path / "viewer.png")  # to be looked at
+        page.screenshot(tmp_path / "viewer.png")  # for inspection
         assert shown.std() > 10
         assert np.corrcoef(shown.ravel(), ours.ravel())[0, 1] > 0.98
         assert not page.errors
@@ -139,21 +139,21 @@ def test_a_real_browser_shows_what_we_render(trained, tmp_path):
 
 
 def with_controls(browser: Browser, server: StaticServer, before: np.ndarray) -> None:
-    """A second viewer at the same time, with its controls; dragging turns the scene."""
+    """A second viewer at the same time, with its controls; dragging rotates the scene."""
     page: Page = browser.open(f"{server.url}?webgl")
     page.wait_for(LOADED, 60)
     still = page.screenshot().astype(float)
-    assert psnr(still, before) > 12  # but for the controls
+    assert psnr(still, before) > 12  # except for the controls
     page.drag(WIDTH / 2, HEIGHT / 2, WIDTH / 2 + 120, HEIGHT / 2 + 20)
     soon(page, lambda shown: psnr(shown, still) < 22)
     assert not page.errors
 
 
 def soon(page: Page, fits: Callable[[np.ndarray], bool]) -> np.ndarray:
-    """The first screenshot that fits: frames come when the machine has time for them."""
+    """The first screenshot that matches: frames may be late on a slow machine."""
     end = time.monotonic() + 30
     while not fits(shown := page.screenshot().astype(float)):
-        assert time.monotonic() < end, "the picture that was waited for did not come"
+        assert time.monotonic() < end, "the expected image was not shown in time"
         time.sleep(0.2)
     return shown
 

@@ -1,4 +1,4 @@
-"""The small web server: what it gives, what it refuses, and that nobody's leaving stops it."""
+"""The web server: served files, rejected requests, and clients that disconnect."""
 
 import contextlib
 import http.client
@@ -72,7 +72,7 @@ def test_whole_files(server):
     assert response.headers["Content-Length"] == str(len(SCENE))
 
 
-def test_unchanged_files_are_not_sent_again(server):
+def test_unchanged_files_are_not_sent_twice(server):
     etag = ask(server, "scene.ply")[0].headers["ETag"]
     response, body = ask(server, "scene.ply", If_None_Match=etag)
     assert (response.status, body) == (304, b"")
@@ -105,26 +105,26 @@ def test_ranges_past_the_end(server, asked):
 
 
 @pytest.mark.parametrize("asked", ["bytes=9-3", "bytes=-", "lines=1-2", "bytes=0-1,4-5", "x" * 999])
-def test_what_is_no_range_gives_the_whole_file(server, asked):
+def test_a_malformed_range_returns_the_whole_file(server, asked):
     response, body = ask(server, "scene.ply", Range=asked)
     assert (response.status, len(body)) == (200, 1 << 20)
 
 
-def test_a_range_of_what_has_changed_gives_the_whole_file(server):
+def test_a_range_of_a_changed_file_returns_the_whole_file(server):
     response, body = ask(server, "scene.ply", Range="bytes=0-9", If_Range='"older"')
     assert (response.status, len(body)) == (200, 1 << 20)
     etag = response.headers["ETag"]
     assert ask(server, "scene.ply", Range="bytes=0-9", If_Range=etag)[0].status == 206
 
 
-def test_nothing_but_what_it_was_given(server):
+def test_only_the_given_files_are_served(server):
     prefix = "/" + server.url.split("/", 3)[3]
     for path in (
         *("/", "/scene.ply", "/favicon.ico", prefix[:-1], prefix[:-2] + "/", "//", "*"),
         *(prefix + name for name in ("absent", "scene.ply/", ".", "..", "/", "SCENE.PLY", "%00")),
         *(prefix + up + "etc/passwd" for up in ("../" * 9, "..%2f" * 9, "%2e%2e/" * 9, "..\\" * 9)),
         *(prefix + name for name in ("%2Fetc%2Fpasswd", "//etc/passwd", "....//etc/passwd")),
-        server.url,  # as a proxy would be asked
+        server.url,  # the form of a request to a proxy
     ):
         response, body = ask(server, path=path)
         assert (response.status, body) == (404, b""), path
@@ -133,7 +133,7 @@ def test_nothing_but_what_it_was_given(server):
 @pytest.mark.parametrize(
     "method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT"]
 )
-def test_only_reading(server, method):
+def test_only_get_and_head(server, method):
     response, _ = ask(server, method=method)
     assert response.status == 405
     assert response.headers["Allow"] == "GET, HEAD"
@@ -142,18 +142,18 @@ def test_only_reading(server, method):
 @pytest.mark.parametrize(
     "host", ["evil.example", "127.0.0.1.evil.example", "10.0.0.1:80", "", "a b"]
 )
-def test_foreign_hosts_are_refused(server, host):
+def test_foreign_hosts_are_rejected(server, host):
     response, body = ask(server, Host=host)
     assert (response.status, body) == (421, b"")
 
 
 @pytest.mark.parametrize("host", ["localhost", "LOCALHOST:1234", "127.0.0.1:5", "[::1]:99"])
-def test_its_own_names_at_any_port(server, host):
-    """With SSH forwarding the port at the other end is another one."""
+def test_own_names_with_any_port(server, host):
+    """With SSH forwarding the browser uses another port."""
     assert ask(server, Host=host)[0].status == 200
 
 
-def test_hosts_when_others_are_let_in():
+def test_hosts_if_other_machines_can_connect():
     assert is_own_host("192.168.1.7:8080", "0.0.0.0")
     assert is_own_host(f"{socket.gethostname()}:8080", "0.0.0.0")
     assert is_own_host("[fe80::1]", "::")
@@ -166,7 +166,7 @@ def test_hosts_when_others_are_let_in():
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "", "http://localhost:1", "http://127.0.0.1:{port}.x"]
 )
-def test_foreign_pages_are_refused(server, origin):
+def test_foreign_pages_are_rejected(server, origin):
     response, body = ask(server, Origin=origin.format(port=server.port))
     assert (response.status, body) == (403, b"")
     assert ask(server, Origin=f"http://127.0.0.1:{server.port}")[0].status == 200
@@ -190,8 +190,8 @@ def test_foreign_pages_are_refused(server, origin):
         [f"X-{i}: y" for i in range(300)],
     ],
 )
-def test_requests_that_could_be_two(server, headers):
-    """One answer, that refuses, and the end of the connection."""
+def test_ambiguous_requests_are_rejected(server, headers):
+    """There is one response with an error, then the connection is closed."""
     path = "/" + server.url.split("/", 3)[3]
     body = f"GET {path}scene.ply HTTP/1.1\r\nHost: localhost\r\n\r\n"
     answer = clients.ask(
@@ -203,15 +203,15 @@ def test_requests_that_could_be_two(server, headers):
     assert ask(server)[0].status == 200
 
 
-def test_two_requests_at_once_get_two_answers(server):
+def test_two_requests_at_once_have_two_responses(server):
     path = "/" + server.url.split("/", 3)[3]
     request = f"GET {path} HTTP/1.1\r\nHost: localhost\r\n"
     both = f"{request}\r\n{request}Connection: close\r\n\r\n".encode()
     assert clients.ask(server.url, both).count(b"<!doctype html>") == 2
 
 
-def test_a_request_has_its_time(monkeypatch):
-    """However often another byte of it comes."""
+def test_an_incomplete_request_times_out(monkeypatch):
+    """Also if it arrives byte by byte."""
     monkeypatch.setattr(static_server, "_REQUEST_SECONDS", 0.5)
     with StaticServer(FILES, POLICY) as server, clients.open_socket(server.url) as client:
         began = time.monotonic()
@@ -222,7 +222,7 @@ def test_a_request_has_its_time(monkeypatch):
         assert time.monotonic() - began < 3.0
 
 
-def test_a_client_that_takes_nothing_is_left(monkeypatch):
+def test_a_client_that_does_not_read_is_disconnected(monkeypatch):
     monkeypatch.setattr(static_server._Handler, "timeout", 0.5)
     threads = threading.active_count()
     big = {"big": ServedFile(bytes(64 << 20), "application/octet-stream")}
@@ -240,7 +240,7 @@ def test_a_client_that_takes_nothing_is_left(monkeypatch):
 
 
 def test_a_thousand_connections(server):
-    """Half a request each: those who ask are served, threads and descriptors are bounded."""
+    """Each sends half a request: others are served, threads and descriptors are limited."""
     threads, descriptors = threading.active_count(), len(os.listdir("/proc/self/fd"))
     known = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
     path = "/" + server.url.split("/", 3)[3]
@@ -259,7 +259,7 @@ def test_a_thousand_connections(server):
         assert threading.active_count() - threads <= most + 20
         own = len(os.listdir("/proc/self/fd")) - descriptors - len(strangers)
         assert own <= most + 20
-        known.request("GET", path)  # who has the address keeps its connection
+        known.request("GET", path)  # a connection with a valid request is kept
         assert known.getresponse().read() == b"<!doctype html>"
     finally:
         known.close()
@@ -271,7 +271,7 @@ def test_a_thousand_connections(server):
         time.sleep(0.05)
 
 
-def test_two_clients_and_one_connection_for_many(server):
+def test_two_clients_and_many_requests_per_connection(server):
     connections = [http.client.HTTPConnection("127.0.0.1", server.port) for _ in range(2)]
     path = "/" + server.url.split("/", 3)[3] + "scene.ply"
     for connection in connections * 3:
@@ -284,7 +284,7 @@ def test_two_clients_and_one_connection_for_many(server):
     assert all(body == SCENE for body in bodies)
 
 
-def test_a_browser_that_leaves_in_the_middle(capfd, caplog):
+def test_a_browser_that_disconnects_during_a_download(capfd, caplog):
     big = {"big": ServedFile(bytes(64 << 20), "application/octet-stream")}
     with StaticServer(big, {}) as server:
         path = "/" + server.url.split("/", 3)[3] + "big"
@@ -306,7 +306,7 @@ def test_a_browser_that_leaves_in_the_middle(capfd, caplog):
     assert not caplog.records
 
 
-def test_closing_ends_it():
+def test_close_stops_the_server():
     threads = threading.active_count()
     server = StaticServer(FILES, POLICY)
     server.close()
@@ -316,12 +316,12 @@ def test_closing_ends_it():
         socket.create_connection(("127.0.0.1", server.port)).close()
 
 
-def test_places_where_it_cannot_listen(server):
-    with pytest.raises(UserError, match=f"port {server.port} is taken; name another"):
+def test_unavailable_ports_and_hosts(server):
+    with pytest.raises(UserError, match=f"port: {server.port} is in use; choose another"):
         StaticServer(FILES, POLICY, port=server.port)
     with pytest.raises(UserError, match="0 to 65535"):
         StaticServer(FILES, POLICY, port=70_000)
-    with pytest.raises(UserError, match="not a name or address of this machine|listened on"):
+    with pytest.raises(UserError, match="not a name or address of this machine|cannot listen at"):
         StaticServer(FILES, POLICY, host="no-such-host.invalid")
     with pytest.raises(UserError, match=r"192\.0\.2\.1"):
         StaticServer(FILES, POLICY, host="192.0.2.1")

@@ -1,15 +1,18 @@
-"""The network viewer: a page of viser, whose pictures are made by our own rasterizer.
+"""The live viewer: a page of viser whose images are rendered by our own rasterizer.
 
-What is shown is what is trained: between two steps of a training the pictures that browsers wait
-for are rendered from the very Gaussians that the next step changes. `viewer.NetworkViewer` is what
-the command line uses.
+It shows the Gaussians that are being trained. Between two training steps, the images that browsers
+wait for are rendered from the same tensors that the next step changes. The command line uses
+`viewer.NetworkViewer`.
 
-    look.py      what a browser wants to see
-    pictures.py  Gaussians + camera + look → picture; pure
-    session.py   who looks from where, what runs, what is due; pure, any thread
+    display.py   display settings and pose of a browser
+    pictures.py  Gaussians + camera + display settings → image; no side effects
+    session.py   state of the browsers and of the training, next image to render; thread-safe
     gauge.py     curves of loss and PSNR
     server.py    viser on a free port of this machine
-    page.py      the controls of the page ↔ session
-    photos.py    the cameras of the photos, in the scene and to stand at
-    viewer.py    all of it, between the steps of a training and after it
+    guard.py     limits what connections may do
+    page.py      the controls of the page
+    photos.py    the cameras of the photos: frustums, and views at their positions
+    keys.py      camera positions stored by a browser, for a video
+    viewer.py    combines all of these
+    training.py  the viewer between the steps of a training
 """

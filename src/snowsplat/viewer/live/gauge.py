@@ -1,4 +1,4 @@
-"""Curves of a training, as the viewer shows them: loss of every step, PSNR of a few views."""
+"""The curves of a training in the viewer: loss of all steps, PSNR of a few views."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded
-from snowsplat.viewer.live.look import fit
+from snowsplat.viewer.live.display import fit
 
-# A curve has at most so many points: more are halved.
-_POINTS = 512
-# PSNR is the mean of so many views, their longer side at most this many pixels.
-_VIEWS, _LONGEST = 4, 480
+_POINTS = 512  # of a curve, at most; then neighbouring points are merged
+_VIEWS = 4  # whose PSNR is averaged
+_LONGEST = 480  # pixels: longer side of these views
 
 
 class Curve:
-    """Means of a number over equal stretches of steps, however long the training."""
+    """Means of a value over equal numbers of steps, with a limited number of points."""
 
     def __init__(self) -> None:
         self._points: list[tuple[float, float]] = []
-        self._every = 1  # numbers that make a point
+        self._every = 1  # values per point
         self._steps = self._sum = 0.0
         self._count = 0
 
     def add(self, step: int, value: float) -> None:
-        """One more number."""
+        """Add a value."""
         self._steps += step
         self._sum += value
         self._count += 1
@@ -60,10 +59,10 @@ class Curve:
 
 
 class Gauge:
-    """PSNR of a few fixed views, one at a time, since it costs the training time."""
+    """PSNR of a few fixed views, one at a time, since rendering interrupts the training."""
 
     def __init__(self, views: Sequence[View], background: Tensor) -> None:
-        """``views``: to choose from."""
+        """``views``: from which a few are chosen."""
         self._background = background
         chosen = [views[i * len(views) // _VIEWS] for i in range(_VIEWS)] if views else []
         unique = list(dict.fromkeys(chosen))
@@ -73,9 +72,9 @@ class Gauge:
         self.can_measure = bool(unique)
 
     def measure(self, gaussians: Gaussians) -> float:
-        """Measure the next view (at first: each); gives the mean of the newest figures, dB.
+        """Measure the next view (at first all views); returns the mean of the latest PSNRs, dB.
 
-        NaN where a photo cannot be read.
+        NaN if a photo cannot be read.
         """
         for _ in range(1 if self._newest else self._newest.maxlen or 0):
             self._measure_next(gaussians)
@@ -89,7 +88,7 @@ class Gauge:
             try:
                 photo, mask = self._photo(view, size)
             except UserError:
-                self.can_measure = False  # whoever needs the photo will say so
+                self.can_measure = False  # the training itself reports the error
                 return
             image = render(gaussians, view.camera.scaled(*size), self._background).image
             self._newest.append(psnr(image.clamp(0.0, 1.0).cpu(), photo, mask))

@@ -1,17 +1,18 @@
-"""The door of the network viewer: who comes in, what visitors may say, and how much work they make.
+"""Limits access to the live viewer, the messages of browsers, and the work they may cause.
 
-viser serves whoever reaches its port, believes what it is told, and does as much as it is asked,
-in the process that trains. So what it starts its server with is `Guard.serve`:
+viser accepts every connection, trusts all messages and processes any number of them, in the process
+that trains. So its server is started by `Guard.serve`, which adds these checks:
 
-- A request is answered where its Host is ours, its Origin is our page, and, where others than this
-  machine can ask, its path begins with a word that cannot be guessed.
-- So many connections are open, pages under way, browsers connected, and no more.
-- A message is passed on if it is one of the three that our page sends and every number in it is
-  one. Who says more than a page can is sent away; who does not read is not listened to.
-- All of it may take a fifth of a core while this process trains.
+- A request needs an own Host and Origin. If other machines can connect, its path must begin with a
+  secret token.
+- The numbers of connections, page downloads and browsers are limited.
+- Messages must be of the three types that the page sends, with finite numbers. A connection that
+  sends more than a page can is closed. One that does not read is not read from.
+- While this process trains, the server may use a fifth of a core.
 
-And it all happens in viser's thread, what comes from the training too (`tell`): its buffers may
-break when another thread adds to them while a browser comes or goes.
+All of this runs in the thread of viser's server, also what the training sends
+(`call_in_server_thread`): viser's buffers are not safe against other threads while browsers connect
+or disconnect.
 """
 
 from __future__ import annotations
@@ -39,28 +40,28 @@ from websockets.typing import Data
 
 from snowsplat.viewer.hosts import is_loopback, is_own_host, is_own_page
 
-# Connections that have not been let in yet, of pages under way, and of browsers: at most. A new
-# one of the first kind takes the place of the oldest.
-_WAITING, _PAGES, _BROWSERS = 96, 16, 16
-# Bytes of a request, of a message, and of what is looked at before it is asked whether to go on.
-_REQUEST, _MESSAGE, _PIECE = 16 << 10, 64 << 10, 4 << 10
-# Messages a second, and how many at once. A page sends 50 while a camera moves; what it sent while
-# the training held this process up comes at once.
-_RATE, _BURST = 100.0, 1000.0
-# Frames that a message may come in: a browser sends what is so short in one.
-_FRAMES = 16
-# The part of a core that the server may take, seconds between two looks, and of rest at most.
-_SHARE, _TICK, _LONGEST_REST = 0.2, 0.05, 1.0
+_WAITING = 96  # connections without a valid request, at most; a new one replaces the oldest
+_PAGES = 16  # connections that download the page, at most
+_BROWSERS = 16  # connected browsers, at most
+_REQUEST = 16 << 10  # bytes of a request, at most
+_MESSAGE = 64 << 10  # bytes of a message, at most
+_PIECE = 4 << 10  # bytes that are processed before the limits are checked again
+_RATE = 100.0  # messages per second; a page sends 50 while its camera moves
+_BURST = 1000.0  # messages at once, which were waiting while the training blocked the process
+_FRAMES = 16  # of a message, at most; browsers send short messages in one frame
+_SHARE = 0.2  # of a core that the server may use
+_TICK = 0.05  # seconds between two measurements of its use
+_LONGEST_REST = 1.0  # seconds that the server is paused at once, at most
 
 _PROTOCOL = f"viser-v{viser.__version__}"
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",  # the address may be a secret
+    "Referrer-Policy": "no-referrer",  # the address may contain the token
     "Cross-Origin-Resource-Policy": "same-origin",
     "Content-Security-Policy": "frame-ancestors 'self'",
 }
 _log = logging.getLogger(__name__)
-# What strangers send is no news: websockets writes a traceback for each.
+# websockets logs a traceback for every malformed request; these are not useful.
 _unheard = logging.getLogger(f"{__name__}.connections")
 _unheard.setLevel(logging.CRITICAL + 1)
 
@@ -69,20 +70,20 @@ _listen = websockets.asyncio.server.serve
 
 
 class Guard:
-    """What stands before one server."""
+    """The checks of one server."""
 
     def __init__(self, host: str, token: str | None) -> None:
         """
         Args:
-            host: where the server listens.
-            token: what paths must begin with; None: nothing.
+            host: the address at which the server listens.
+            token: the first part of all paths; None: no token.
         """
         if token is None and not is_loopback(host):
-            raise ValueError(f"{host}: a server that others reach needs a token")
-        self.serves = False  # viser has started its server with this
-        self.is_open = False  # what browsers are to find is in its place
+            raise ValueError(f"{host}: a server that other machines can reach needs a token")
+        self.serves = False  # viser has started its server through `serve`
+        self.is_open = False  # the scene is complete, browsers may connect
         self._host, self._token = host, token
-        self._waiting: dict[_Connection, None] = {}  # in the order in which they came
+        self._waiting: dict[_Connection, None] = {}  # in order of their start
         self._pages: set[_Connection] = set()
         self._browsers: set[_Connection] = set()
         root = Path(viser.__file__).parent / "client" / "build"
@@ -90,7 +91,7 @@ class Guard:
         self._paths = {"/", *(f"/{path.relative_to(root).as_posix()}" for path in files)}
 
     def serve(self, handler: Any, host: str, port: int, **options: Any) -> Any:
-        """In place of `websockets.asyncio.server.serve`."""
+        """Used instead of `websockets.asyncio.server.serve`."""
         self.serves = True
         answer = options["process_request"]
         options |= {
@@ -105,7 +106,7 @@ class Guard:
     def _answer(
         self, answer: _Answer, connection: ServerConnection, request: Request
     ) -> Response | None:
-        """What viser says to a request; None: a browser is let in."""
+        """Viser's response to a request; None: accepts the WebSocket of a browser."""
         assert isinstance(connection, _Connection)
         response = self._refusal(connection, request) or answer(connection, request)
         if response is None:
@@ -120,7 +121,7 @@ class Guard:
         return response
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Why a request is not passed on; None: it is, its path without the token."""
+        """A response that rejects the request; None accepts it and removes the token."""
 
         def refuse(status: http.HTTPStatus, *more: tuple[str, str]) -> Response:
             headers = Headers([*more, ("Content-Length", "0"), ("Connection", "close")])
@@ -152,7 +153,7 @@ class Guard:
         return None
 
     def _path(self, path: str) -> str | None:
-        """The path without the token, taken as it stands; None: without the right one."""
+        """The path without the token; None without the correct token. No decoding is applied."""
         path = path.partition("?")[0]
         if self._token is None:
             return path
@@ -160,46 +161,47 @@ class Guard:
         ours = self._token.encode()
         return f"/{rest}" if hmac.compare_digest(_bytes(given), ours) else None
 
-    def came(self, connection: _Connection) -> None:
-        """A connection was made."""
+    def connected(self, connection: _Connection) -> None:
+        """Called when a connection was made."""
         self._waiting[connection] = None
         if len(self._waiting) > _WAITING:
             oldest = next(iter(self._waiting))
             del self._waiting[oldest]
             oldest.transport.abort()
 
-    def went(self, connection: _Connection) -> None:
-        """It is over."""
+    def disconnected(self, connection: _Connection) -> None:
+        """Called when a connection was closed."""
         self._waiting.pop(connection, None)
         self._pages.discard(connection)
         self._browsers.discard(connection)
 
 
 def _bytes(path: str) -> bytes:
-    return path.encode("ascii", "surrogateescape")  # as websockets decoded it
+    return path.encode("ascii", "surrogateescape")  # inverse of the decoding in websockets
 
 
 class _Connection(ServerConnection):
-    """A connection that is let go on as long as it behaves like a browser."""
+    """A connection that is closed if it exceeds the limits."""
 
     def __init__(self, guard: Guard, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._guard = guard
         self._refused = False
-        self._head = 0  # bytes of the request so far
-        self._budget, self._counted = _BURST, self.loop.time()  # of frames, and when
-        self._frames = 0  # of the message that is coming
+        self._head = 0  # bytes of the request received so far
+        self._budget = _BURST  # frames that may still be received
+        self._counted = self.loop.time()  # when the budget was updated
+        self._frames = 0  # of the current message
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        self._guard.came(self)
+        self._guard.connected(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        self._guard.went(self)
+        self._guard.disconnected(self)
 
     def data_received(self, data: bytes) -> None:
-        for start in range(0, len(data), _PIECE):  # so that little is done for one to be refused
+        for start in range(0, len(data), _PIECE):  # limits the work for data that is rejected
             if self._refused:
                 return
             piece = data[start : start + _PIECE]
@@ -217,7 +219,7 @@ class _Connection(ServerConnection):
             super().process_event(event)
 
     def _may(self, frame: Frame) -> bool:
-        """Whether it has said no more than a page does."""
+        """Whether the frame is within the limits of a page."""
         now = self.loop.time()
         self._budget = min(_BURST, self._budget + _RATE * (now - self._counted)) - 1.0
         self._counted = now
@@ -231,13 +233,13 @@ class _Connection(ServerConnection):
 
     async def recv(self, decode: bool | None = None) -> Data:  # type: ignore[override]
         while True:
-            await self.drain()  # one that does not read what it asked for may not ask for more
+            await self.drain()  # a client that does not read its data may not request more
             data = await super().recv(decode)
-            if is_sane(data):
+            if is_valid_message(data):
                 return data
 
 
-# What a page says
+# Messages of the page
 
 
 _Number = float
@@ -265,7 +267,7 @@ class _Camera(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields=T
 
 class _Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):
     uuid: _Name
-    # viser would set whatever attribute of a control is named here.
+    # viser would set any attribute of a control that is named here.
     updates: Annotated[dict[_Name, _Value], msgspec.Meta(max_length=1)]
 
     def numbers(self) -> list[object]:
@@ -288,8 +290,8 @@ class _Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=
 _decoder = msgspec.msgpack.Decoder(_Camera | _Update | _Click)
 
 
-def is_sane(data: Data) -> bool:
-    """Whether it is a message that our page sends, of numbers that are finite."""
+def is_valid_message(data: Data) -> bool:
+    """Whether ``data`` is a message that the page sends, and all its numbers are finite."""
     if not isinstance(data, bytes):
         return False
     try:
@@ -305,42 +307,42 @@ def is_sane(data: Data) -> bool:
 
 
 class Governor:
-    """Holds the thread of a server to its share of a core while there is a training to share with.
+    """Limits the server's thread to its share of a core while a training runs.
 
-    Its errors go to our own log.
+    Errors in the thread are logged.
     """
 
     def __init__(self, server: viser.ViserServer, training: Callable[[], bool]) -> None:
         self._loop = server.get_event_loop()
         self._training = training
-        self._used = self._seen = 0.0  # seconds of this thread and of the clock, when it looked
-        self._granted = 0.0
-        tell(server, self._begin)
+        self._used = self._seen = 0.0  # thread time and clock at the last measurement, seconds
+        self._uncounted = 0.0  # thread time that is not counted, seconds
+        call_in_server_thread(server, self._begin)
 
     def _begin(self) -> None:
         self._loop.set_exception_handler(_note)
-        self._look()
+        self._measure()
 
-    def _look(self) -> None:
-        used = time.thread_time() - self._used - self._granted
+    def _measure(self) -> None:
+        used = time.thread_time() - self._used - self._uncounted
         rest = used / _SHARE - (time.monotonic() - self._seen)
         if self._seen and rest > 0.0 and self._training():
             time.sleep(min(rest, _LONGEST_REST))
-        self._used, self._seen, self._granted = time.thread_time(), time.monotonic(), 0.0
-        self._loop.call_later(_TICK, self._look)
+        self._used, self._seen, self._uncounted = time.thread_time(), time.monotonic(), 0.0
+        self._loop.call_later(_TICK, self._measure)
 
     @contextlib.contextmanager
-    def granted(self) -> Iterator[None]:
-        """What happens within, the training itself has asked for: it does not count."""
+    def uncounted(self) -> Iterator[None]:
+        """Work inside the with block was requested by the training, so it is not counted."""
         before = time.thread_time()
         try:
             yield
         finally:
-            self._granted += time.thread_time() - before
+            self._uncounted += time.thread_time() - before
 
 
-def tell(server: viser.ViserServer, run: Callable[[], None]) -> None:
-    """Run it in the thread of the server, soon; after its end, not at all."""
+def call_in_server_thread(server: viser.ViserServer, run: Callable[[], None]) -> None:
+    """Call ``run`` in the thread of the server, soon; does nothing if it has stopped."""
     with contextlib.suppress(RuntimeError):
         server.get_event_loop().call_soon_threadsafe(run)
 

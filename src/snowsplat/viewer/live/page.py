@@ -1,4 +1,4 @@
-"""The controls of the page: those of the training, for all browsers, and each browser's own."""
+"""The controls of the page: those of the training are shared, all others are per browser."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import viser
 from torch import Tensor
 
 from snowsplat.util.errors import UserError
+from snowsplat.viewer.live.display import Mode
 from snowsplat.viewer.live.gauge import Curve
-from snowsplat.viewer.live.guard import tell
-from snowsplat.viewer.live.look import Mode
+from snowsplat.viewer.live.guard import call_in_server_thread
 from snowsplat.viewer.live.photos import FRUSTUMS, Photos
 from snowsplat.viewer.live.session import Session, Visitor
 
@@ -30,29 +30,29 @@ _MODES: dict[str, Mode] = {
     "Error against the photo": "error",
 }
 _LEGENDS: dict[Mode, str] = {
-    "color": "Drag to turn, right button to shift, wheel to come nearer.",
+    "color": "Drag to rotate, right button to move, wheel to zoom.",
     "depth": "Yellow is near, violet is far.",
     "alpha": "White is opaque, black is empty.",
-    "normals": "Red to the right, green up, blue to you: the shortest axis of each Gaussian.",
+    "normals": "Red: right, green: up, blue: towards you; the shortest axis of each Gaussian.",
     "points": "The centre of each Gaussian.",
-    "ellipsoids": "Each Gaussian as a solid body, as far as 1.5 standard deviations.",
-    "cost": "How many a pixel blends. Black: none, red: about 30, pale yellow: 256 or more.",
+    "ellipsoids": "Each Gaussian as a solid body of 1.5 standard deviations.",
+    "cost": "Gaussians blended per pixel. Black: none, red: about 30, pale yellow: 256 or more.",
     "error": "Black: none, pale yellow: a quarter of the range or more.",
 }
-_NOWHERE = "Show the cameras and click one, to stand where its photo was taken."
-_NEEDS_PHOTO = "Shown where you stand at a photo: click a camera, or Next below."
+_NOWHERE = "Show the cameras and click one to view the scene from its position."
+_NEEDS_PHOTO = "Only shown at the position of a photo: click a camera, or Next below."
 
 
 def note(text: str) -> str:
-    """Lines of small text."""
+    """A block of small text; ``text`` is HTML."""
     style = "font-size:0.85em;padding:0 1em 0.5em 1em;line-height:1.5"
     return f'<div style="{style}">{text}</div>'
 
 
-def at_once(run: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
-    """A callback of a control that runs in the thread of the server, not in one of many.
+def in_server_thread(run: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
+    """A callback of a control that runs in the server's thread instead of a thread pool.
 
-    So what is asked is done in order, and nothing is read from a browser before it is.
+    So events are processed in order, and the next message is read only when one is processed.
     """
 
     async def called(_: Any) -> None:
@@ -62,16 +62,16 @@ def at_once(run: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None
 
 
 def within(value: Any, low: float, high: float) -> float:
-    """The value of a slider, which browsers may set to whatever they like."""
+    """A slider's value, limited to its range: browsers can send any number."""
     return min(max(float(value), low), high)
 
 
 class TrainingPanel:
-    """How the training goes, and its controls: the same for all browsers."""
+    """State and controls of the training, the same for all browsers."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
-        tell(server, self._add)
+        call_in_server_thread(server, self._add)
 
     def _add(self) -> None:
         server, session = self._server, self._session
@@ -86,13 +86,13 @@ class TrainingPanel:
                 95,
                 5,
                 round(100 * session.share),
-                hint="While a camera moves: how much of the time pictures may take from training",
+                hint="While a camera moves: share of the time for rendering instead of training",
             )
             self._loss = _plot(server, "Loss", "#4a7fe0")
             self._psnr = _plot(server, "PSNR (dB)", "#e08a2a")
-        self._pause.on_click(at_once(self._pause_clicked))
-        self._step.on_click(at_once(self._step_clicked))
-        self._share.on_update(at_once(self._share_changed))
+        self._pause.on_click(in_server_thread(self._pause_clicked))
+        self._step.on_click(in_server_thread(self._step_clicked))
+        self._share.on_update(in_server_thread(self._share_changed))
 
     def _pause_clicked(self) -> None:
         if self._session.paused:
@@ -109,13 +109,14 @@ class TrainingPanel:
         self._session.share = within(self._share.value, 5, 95) / 100.0
 
     def _name_pause(self) -> None:
-        self._pause.label = "Go on" if self._session.paused else "Pause"
+        self._pause.label = "Resume" if self._session.paused else "Pause"
 
     def show(self, status: list[str], share: float, loss: Curve, psnr: Curve) -> None:
-        """
+        """Show the state of the training.
+
         Args:
-            status: lines about the training.
-            share: of its steps that are made, 0..1.
+            status: lines of text.
+            share: finished fraction of the steps, 0..1.
         """
         curves = loss.arrays(), psnr.arrays()
 
@@ -127,16 +128,16 @@ class TrainingPanel:
                     plot.data = curve
                     plot.visible = True
 
-        tell(self._server, put)
+        call_in_server_thread(self._server, put)
 
     def end(self) -> None:
-        """Nothing is left to be paused."""
+        """Hide the controls: the training has finished."""
 
         def hide() -> None:
             for control in (self._pause, self._step, self._share):
                 control.visible = False
 
-        tell(self._server, hide)
+        call_in_server_thread(self._server, hide)
 
 
 def _plot(server: viser.ViserServer, name: str, color: str) -> viser.GuiUplotHandle:
@@ -146,7 +147,7 @@ def _plot(server: viser.ViserServer, name: str, color: str) -> viser.GuiUplotHan
     )
     return server.gui.add_uplot(
         (np.zeros(2), np.zeros(2)),
-        series,  # type: ignore[arg-type]  # plain dictionaries are meant
+        series,  # type: ignore[arg-type]  # viser accepts plain dictionaries
         title=name,
         scales={"x": {"time": False}},
         legend={"show": False},
@@ -156,27 +157,27 @@ def _plot(server: viser.ViserServer, name: str, color: str) -> viser.GuiUplotHan
 
 
 class ScenePanel:
-    """What is shown, where nothing is trained."""
+    """State of the scene, if there is no training."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        tell(server, self._add)
+        call_in_server_thread(server, self._add)
 
     def _add(self) -> None:
         with self._server.gui.add_folder("Scene", order=0):
-            self._status = self._server.gui.add_html(note("nothing yet"))
+            self._status = self._server.gui.add_html(note("no scene yet"))
 
     def show(self, status: list[str]) -> None:
-        """Lines about the scene."""
+        """Show lines of text."""
 
         def put() -> None:
             self._status.content = note("<br>".join(map(html.escape, status)))
 
-        tell(self._server, put)
+        call_in_server_thread(self._server, put)
 
 
 class Controls:
-    """One browser's own: what its pictures show."""
+    """The controls of one browser: display settings, photos, crop box."""
 
     def __init__(
         self,
@@ -186,57 +187,69 @@ class Controls:
         photos: Photos,
         bounds: Tensor,
     ) -> None:
-        """``bounds``: (2, 3) of the scene, for the crop box."""
+        """``bounds``: (2, 3) corners of the scene, for the crop box."""
         self._client, self._session, self._visitor = client, session, visitor
         self._photos = photos
-        self._stand: int | None = None
-        self._next: int | None = None  # where it is to stand when that photo is read
+        self._photo_index: int | None = None
+        self._next: int | None = None  # the photo to go to when it has been read
         self._going: asyncio.Task[None] | None = None
-        self._hidden: viser.FrameHandle | None = None  # of this browser, in place of all frustums
+        self._hidden: viser.FrameHandle | None = None  # hides all frustums in this browser
         self._add_picture()
         self._add_photos()
         self._add_crop(bounds)
 
-    def _look(self, **changes: Any) -> None:
-        look = dataclasses.replace(self._visitor.look, **changes)
-        self._session.change(self._visitor, look=look)
+    def _set_display(self, **changes: Any) -> None:
+        display = dataclasses.replace(self._visitor.display, **changes)
+        self._session.change(self._visitor, display=display)
 
     # Picture
 
     def _add_picture(self) -> None:
-        gui, look = self._client.gui, self._visitor.look
+        gui, display = self._client.gui, self._visitor.display
         with gui.add_folder("Picture", order=1):
             self._mode = gui.add_dropdown("Show", list(_MODES))
             self._legend = gui.add_html(note(_LEGENDS["color"]))
             degree = gui.add_slider(
-                "SH degree", 0, 3, 1, look.sh_degree, hint="How far colours change with direction"
+                "SH degree", 0, 3, 1, display.sh_degree, hint="Degree of view-dependent colour"
             )
             scale = gui.add_slider(
-                *("Gaussian size", 2, 100, 2, 100),
-                hint="Percent: shrinks every Gaussian, to see each by itself",
+                "Gaussian size",
+                2,
+                100,
+                2,
+                100,
+                hint="Percent: shrinks every Gaussian, so that each is visible",
             )
             finest = gui.add_slider(
-                *("Most pixels", 320, 2560, 80, self._visitor.longest),
-                hint="The longer side of a picture when the camera stands still",
+                "Image size",
+                320,
+                2560,
+                80,
+                self._visitor.longest,
+                hint="Longer side in pixels while the camera does not move",
             )
 
         def size_chosen() -> None:
             longest = int(within(finest.value, 320, 2560))
             self._session.change(self._visitor, longest=longest)
 
-        self._mode.on_update(at_once(self._mode_chosen))
-        degree.on_update(at_once(lambda: self._look(sh_degree=int(within(degree.value, 0, 3)))))
-        scale.on_update(at_once(lambda: self._look(scale=within(scale.value, 2, 100) / 100.0)))
-        finest.on_update(at_once(size_chosen))
+        self._mode.on_update(in_server_thread(self._mode_chosen))
+        degree.on_update(
+            in_server_thread(lambda: self._set_display(sh_degree=int(within(degree.value, 0, 3))))
+        )
+        scale.on_update(
+            in_server_thread(lambda: self._set_display(scale=within(scale.value, 2, 100) / 100.0))
+        )
+        finest.on_update(in_server_thread(size_chosen))
 
     def _mode_chosen(self) -> None:
         if self._mode.value in _MODES:
-            self._look(mode=_MODES[self._mode.value])
-            self._say_legend()
+            self._set_display(mode=_MODES[self._mode.value])
+            self._show_legend()
 
-    def _say_legend(self) -> None:
-        mode = self._visitor.look.mode
-        missing = mode == "error" and self._stand is None
+    def _show_legend(self) -> None:
+        mode = self._visitor.display.mode
+        missing = mode == "error" and self._photo_index is None
         self._legend.content = note(_NEEDS_PHOTO if missing else _LEGENDS[mode])
 
     # Photos
@@ -247,31 +260,41 @@ class Controls:
             self._shown = gui.add_checkbox("Cameras", False)
             self._where = gui.add_html(note(_NOWHERE))
             self._wipe = gui.add_slider(
-                *("Photo (%)", 0, 100, 1, 0), visible=False, hint="From the left, over the render"
+                "Photo (%)",
+                0,
+                100,
+                1,
+                0,
+                visible=False,
+                hint="Width of the photo over the render, from the left",
             )
             self._flip = gui.add_button_group("Show only", ("Render", "Photo"), visible=False)
             self._move = gui.add_button_group("Go to", ("Previous", "Next"))
         self._show_frustums()
-        self._shown.on_update(at_once(self._show_frustums))
+        self._shown.on_update(in_server_thread(self._show_frustums))
         self._wipe.on_update(
-            at_once(lambda: self._look(wipe=within(self._wipe.value, 0, 100) / 100.0))
+            in_server_thread(
+                lambda: self._set_display(wipe=within(self._wipe.value, 0, 100) / 100.0)
+            )
         )
         self._flip.on_click(
-            at_once(lambda: self._wipe_to(100 if self._flip.value == "Photo" else 0))
+            in_server_thread(lambda: self._wipe_to(100 if self._flip.value == "Photo" else 0))
         )
-        self._move.on_click(at_once(lambda: self._go(1 if self._move.value == "Next" else -1)))
+        self._move.on_click(
+            in_server_thread(lambda: self._go(1 if self._move.value == "Next" else -1))
+        )
 
     def _wipe_to(self, percent: int) -> None:
         self._wipe.value = percent  # type: ignore[misc]
-        self._look(wipe=percent / 100.0)
+        self._set_display(wipe=percent / 100.0)
 
     def _go(self, by: int) -> None:
         count = len(self._photos.views)
-        now = self._stand if self._next is None else self._next
-        self.stand_at(0 if now is None else (now + by) % count)
+        now = self._photo_index if self._next is None else self._next
+        self.go_to_photo(0 if now is None else (now + by) % count)
 
-    def stand_at(self, index: int) -> None:
-        """Go to where a photo was taken, once it has been read; the last that was asked for."""
+    def go_to_photo(self, index: int) -> None:
+        """Go to the position of a photo when it has been read; a later call replaces this one."""
         self._next = index
         if self._going is None or self._going.done():
             self._going = asyncio.get_running_loop().create_task(self._go_on())
@@ -280,33 +303,33 @@ class Controls:
         while self._next is not None:
             index = self._next
             try:
-                stand = await self._photos.read(self._visitor, index)
+                photo_view = await self._photos.read(self._visitor, index)
             except UserError as error:
                 self._where.content = note(html.escape(str(error)))
-                stand = None
+                photo_view = None
             if self._next != index:
-                continue  # another one was asked for meanwhile
+                continue  # another photo was requested meanwhile
             self._next = None
-            if stand is not None:
-                self._photos.send(self._client, self._visitor, stand)
+            if photo_view is not None:
+                self._photos.send(self._client, self._visitor, photo_view)
                 self.follow()
 
     def follow(self) -> None:
-        """Show whether the browser stands at a photo, if that has changed."""
-        stand = self._visitor.stand
-        index = None if stand is None else stand.index
-        if index == self._stand:
+        """Update the controls if the browser has arrived at a photo or left it."""
+        photo_view = self._visitor.photo_view
+        index = None if photo_view is None else photo_view.index
+        if index == self._photo_index:
             return
-        self._stand = index
+        self._photo_index = index
         name = _NOWHERE if index is None else f"At {html.escape(self._photos.views[index].name)}"
         self._where.content = note(name)
         self._wipe.visible = self._flip.visible = index is not None
         self._show_frustums()
-        self._say_legend()
+        self._show_legend()
 
     def _show_frustums(self) -> None:
-        """Not where one stands: the camera's own would be before the eye."""
-        shown = self._shown.value and self._stand is None
+        """Show or hide frustums; at a photo its own frustum would cover the view."""
+        shown = self._shown.value and self._photo_index is None
         if shown and self._hidden is not None:
             self._hidden.remove()
             self._hidden = None
@@ -320,7 +343,7 @@ class Controls:
         middle, half = bounds.mean(0), (bounds[1] - bounds[0]) / 2
         low, high = (middle - 2 * half).tolist(), (middle + 2 * half).tolist()
         with gui.add_folder("Crop box", order=3, expand_by_default=False):
-            self._crop = gui.add_checkbox("Crop", False, hint="Show only what is within")
+            self._crop = gui.add_checkbox("Crop", False, hint="Show only Gaussians in the box")
             self._ranges = [
                 gui.add_multi_slider(
                     name,
@@ -332,7 +355,7 @@ class Controls:
                 for i, name in enumerate(("x (right)", "y (down)", "z (forward)"))
             ]
         for control in (self._crop, *self._ranges):
-            control.on_update(at_once(self._crop_changed))  # type: ignore[attr-defined]
+            control.on_update(in_server_thread(self._crop_changed))  # type: ignore[attr-defined]
 
     def _crop_changed(self) -> None:
         crop = None
@@ -340,4 +363,4 @@ class Controls:
             ranges = [sorted(map(float, control.value)) for control in self._ranges]
             low, high = zip(*((values[0], values[-1]) for values in ranges), strict=True)
             crop = (low, high)
-        self._look(crop=crop)
+        self._set_display(crop=crop)

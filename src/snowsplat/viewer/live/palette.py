@@ -1,4 +1,4 @@
-"""Colours for numbers: (256, 3) uint8 tables."""
+"""Colour maps: (256, 3) uint8 tables."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ def _table(*anchors: tuple[int, int, int]) -> Tensor:
     return torch.from_numpy(np.rint(np.stack(columns, 1)).astype(np.uint8))
 
 
-# The lightness of both only grows.
-#: From far (violet) by blue and green to near (yellow).
+# The lightness of both increases monotonically.
+#: From far (violet) through blue and green to near (yellow).
 DEPTH = _table(
     (68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132), (122, 209, 81), (253, 231, 37)
 )
-#: From nothing (black) by violet and orange to much (pale yellow).
+#: From small (black) through violet and orange to large (pale yellow).
 HEAT = _table(
     (0, 0, 0), (51, 10, 95), (136, 34, 106), (211, 67, 67), (251, 140, 20), (252, 255, 164)
 )

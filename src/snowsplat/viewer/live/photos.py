@@ -1,4 +1,4 @@
-"""The cameras of the photos: as frustums in the scene, and as places to stand at."""
+"""The cameras of the photos: as frustums in the scene, and as views to go to."""
 
 from __future__ import annotations
 
@@ -22,26 +22,27 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.trajectory.focus import up_of
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.live.guard import tell
-from snowsplat.viewer.live.look import Placed, Pose, fit
+from snowsplat.viewer.live.display import Placed, Pose, fit
+from snowsplat.viewer.live.guard import call_in_server_thread
 from snowsplat.viewer.live.pictures import Photo
-from snowsplat.viewer.live.session import Session, Stand, Visitor
+from snowsplat.viewer.live.session import PhotoView, Session, Visitor
 
 #: The parent of all frustums.
 FRUSTUMS = "/photos"
-_TRAIN_COLOR, _TEST_COLOR = (70, 130, 230), (240, 150, 40)
-# Length of a frustum, in the distance to the next camera, and in extents of the scene at most; how
-# many there are at most; the longer side of the small photos in them, pixels.
-_LENGTH, _LONGEST, _MOST, _SMALL = 0.6, 0.06, 400, 96
-# While a training runs, the small photos are read in this part of the time.
-_READING = 0.2
+_TRAIN_COLOR = (70, 130, 230)
+_TEST_COLOR = (240, 150, 40)
+_LENGTH = 0.6  # of a frustum, relative to the distance of neighbouring cameras
+_LONGEST = 0.06  # of a frustum, relative to the extent of the scene, at most
+_MOST = 400  # frustums
+_SMALL = 96  # pixels: longer side of the thumbnails in frustums
+_READING = 0.2  # share of the time for reading thumbnails while a training runs
 
 
 class Photos:
     """The photos of a dataset in the scene of a server.
 
     Attributes:
-        views: those to train on, then those held out.
+        views: the training views, then the test views.
     """
 
     def __init__(
@@ -57,8 +58,8 @@ class Photos:
         """
         Args:
             extent: of the scene, world units.
-            centre: (3,) of the scene, about which a browser turns.
-            background: (3,) behind transparent photos.
+            centre: (3,) of the scene, around which a browser rotates.
+            background: (3,) behind transparent photos, 0..1.
         """
         self.views = [*train, *test]
         self._server, self._session = server, session
@@ -71,7 +72,7 @@ class Photos:
         self._centre = centre.to(torch.float64)
         self._background = background
         self._reading = asyncio.Semaphore(1)
-        self._began = threading.Event()  # reading the small photos
+        self._began = threading.Event()  # reading thumbnails has begun
         self._closed = threading.Event()
         self._frustums: dict[int, viser.CameraFrustumHandle] = {}
         server.scene.add_frame(FRUSTUMS, show_axes=False)
@@ -107,61 +108,61 @@ class Photos:
             receive_shadow=False,
         )
 
-    def on_click(self, stand_at: Callable[[viser.ClientHandle, int], None]) -> None:
-        """Call this with the browser that clicks a frustum, and the photo's number."""
+    def on_click(self, go_to_photo: Callable[[viser.ClientHandle, int], None]) -> None:
+        """Call ``go_to_photo`` with the browser that clicked a frustum, and the photo's index."""
 
         def register(index: int, frustum: viser.CameraFrustumHandle) -> None:
             @frustum.on_click
             async def _(event: viser.SceneNodePointerEvent) -> None:
-                stand_at(event.client, index)
+                go_to_photo(event.client, index)
 
         for index, frustum in self._frustums.items():
             register(index, frustum)
 
-    async def read(self, visitor: Visitor, index: int) -> Stand:
-        """Where a photo was taken, and the photo; one is read at a time, whoever asks.
+    async def read(self, visitor: Visitor, index: int) -> PhotoView:
+        """Read a photo; one at a time, for all browsers.
 
         Raises:
-            UserError: the photo is absent or damaged.
+            UserError: the photo is missing or damaged.
         """
         view = self.views[index]
         async with self._reading:
             started = time.monotonic()
             photo = await asyncio.to_thread(load_image, view.image, self._background.tolist())
-            if self._session.training:  # which has its share of the time
+            if self._session.training:  # use at most half of the time
                 await asyncio.sleep(time.monotonic() - started)
         now = visitor.pose
         width, height = (now.width, now.height) if now else (view.camera.width, view.camera.height)
-        return Stand(index, view.camera, photo, self._pose(view.camera, width, height))
+        return PhotoView(index, view.camera, photo, self._pose(view.camera, width, height))
 
-    def send(self, client: viser.ClientHandle, visitor: Visitor, stand: Stand) -> None:
-        """Send a browser there."""
-        self._session.send(visitor, stand)
-        up = -stand.camera.cam_from_world[1, :3].detach()
+    def send(self, client: viser.ClientHandle, visitor: Visitor, photo_view: PhotoView) -> None:
+        """Move the browser to the pose of the photo."""
+        self._session.send(visitor, photo_view)
+        up = -photo_view.camera.cam_from_world[1, :3].detach()
         with client.atomic():
-            client.camera.fov = stand.pose.fov
-            client.camera.position = stand.pose.position.numpy()
+            client.camera.fov = photo_view.pose.fov
+            client.camera.position = photo_view.pose.position.numpy()
             client.camera.up_direction = up.numpy()
-            client.camera.look_at = self._look_at(stand.camera).numpy()
+            client.camera.look_at = self._look_at(photo_view.camera).numpy()
 
     def _pose(self, camera: Camera, width: int, height: int) -> Pose:
-        """Of a browser that sees the whole photo in a window of this size."""
+        """The pose of a browser that shows the whole photo in a window of this size."""
         placed = Placed.within(camera, width, height).camera(camera, width, height)
         pose = camera.world_from_cam.detach().to(torch.float64)
         fov = 2.0 * math.atan(0.5 * height / placed.fy)
         return Pose(quat_from_rotation(pose[:, :3]), pose[:, 3], fov, width, height)
 
     def _look_at(self, camera: Camera) -> Tensor:
-        """The point on its axis that is nearest to the centre of the scene, in front of it."""
+        """The point on the optical axis nearest to the centre of the scene, in front."""
         pose = camera.world_from_cam.detach().to(torch.float64)
         axis, position = pose[:, 2], pose[:, 3]
         distance = max(float(axis @ (self._centre - position)), 0.1 * self._extent)
         return position + distance * axis
 
-    # Small photos, in the background
+    # Thumbnails, in the background
 
     def begin(self) -> None:
-        """Read the small photos, if that has not begun."""
+        """Start reading thumbnails, if not started yet."""
         if not self._began.is_set():
             self._began.set()
             threading.Thread(target=self._read, name="snowsplat-photos", daemon=True).start()
@@ -175,24 +176,26 @@ class Photos:
             try:
                 planes = load_image(small, self._background.tolist())
             except UserError:
-                continue  # the training, or standing there, will say so
+                continue  # reported by the training, or when a user goes to the photo
             if self._closed.is_set():
                 return
             pixels = planes.permute(1, 2, 0).contiguous().numpy()
-            tell(self._server, functools.partial(setattr, frustum, "image", pixels))
+            call_in_server_thread(
+                self._server, functools.partial(setattr, frustum, "image", pixels)
+            )
             rest = (1.0 / _READING - 1.0) if self._session.training else 0.0
             if self._closed.wait(rest * (time.monotonic() - started)):
                 return
 
     def close(self) -> None:
-        """Stop reading."""
+        """Stop reading thumbnails."""
         self._closed.set()
 
 
-def placed_photo(stand: Stand, width: int, height: int) -> Photo:
-    """The photo as it lies in a picture of this size."""
-    placed = Placed.within(stand.camera, width, height)
-    image = Image.fromarray(stand.photo.permute(1, 2, 0).contiguous().numpy())
+def placed_photo(photo_view: PhotoView, width: int, height: int) -> Photo:
+    """The photo, resized to its rectangle in an image of this size."""
+    placed = Placed.within(photo_view.camera, width, height)
+    image = Image.fromarray(photo_view.photo.permute(1, 2, 0).contiguous().numpy())
     resized = image.resize((placed.width, placed.height), Image.Resampling.BILINEAR)
     pixels = torch.frombuffer(bytearray(resized.tobytes()), dtype=torch.uint8)
     return Photo(pixels.view(placed.height, placed.width, 3), placed)

@@ -1,4 +1,4 @@
-"""A picture of Gaussians for a screen: `draw`."""
+"""Renders Gaussians for display: `draw`."""
 
 from __future__ import annotations
 
@@ -17,21 +17,18 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.util.process import single_threaded
 from snowsplat.viewer.live import palette
-from snowsplat.viewer.live.look import Look, Placed
+from snowsplat.viewer.live.display import DisplaySettings, Placed
 
-# Standard deviation of the dot of a point, pixels.
-_DOT = 0.8
-# Ellipsoids end at so many standard deviations; what is fainter than this has none.
-_ELLIPSOID_END, _ELLIPSOID_OPACITY = 1.5, 0.1
-# exp(this) is the opacity that makes a Gaussian a disc: α stays at its highest as far as
-# ½ d² = this, and is gone at ½ d² = this + 5.5, that is within 3% of the radius.
+_DOT = 0.8  # pixels: standard deviation of the dot of a point
+_ELLIPSOID_END = 1.5  # standard deviations at which ellipsoids end
+_ELLIPSOID_OPACITY = 0.1  # Gaussians below this opacity are not shown as ellipsoids
+# exp(this) is the opacity that makes a Gaussian a disc: α is at its maximum up to ½ d² = this, and
+# vanishes at ½ d² = this + 5.5, which is within 3% of the radius.
 _DISC = 80.0
-# This mean absolute difference of the colours, and this many Gaussians, have the palette's end.
-_WORST, _MANY = 0.25, 256.0
-# What shows mostly background has neither depth nor normal.
-_OPAQUE_ENOUGH = 0.5
-# Around a photo the render is darker.
-_AROUND = 0.35
+_WORST = 0.25  # mean absolute colour difference at the end of the palette
+_MANY = 256.0  # number of Gaussians at the end of the palette
+_OPAQUE_ENOUGH = 0.5  # pixels of lower opacity have neither depth nor normal
+_AROUND = 0.35  # brightness of the render around a photo
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +36,8 @@ class Photo:
     """A photo to compare with.
 
     Attributes:
-        pixels: (h, w, 3) uint8 of the size of ``placed``.
-        placed: where it lies in the picture.
+        pixels: (h, w, 3) uint8, of the size of ``placed``.
+        placed: its rectangle in the image.
     """
 
     pixels: Tensor
@@ -51,53 +48,57 @@ class Photo:
 def draw(
     gaussians: Gaussians,
     camera: Camera,
-    look: Look,
+    display: DisplaySettings,
     background: Tensor | None = None,
     photo: Photo | None = None,
 ) -> np.ndarray:
-    """(H, W, 3) uint8: the Gaussians as ``look`` wants to see them, from ``camera``.
+    """(H, W, 3) uint8: the Gaussians with these display settings, from ``camera``.
 
-    ``background`` (3,) in 0..1 is black where there is none. The mode "error" needs a photo;
-    without one it shows colours.
+    ``background`` (3,) is in 0..1, black by default. The mode "error" needs a photo; without one
+    it shows colours.
     """
     with single_threaded():
-        picture = _modes(gaussians, camera, look, background, photo)
+        picture = _modes(gaussians, camera, display, background, photo)
         if photo is not None:
-            picture = _beside(picture, photo, look)
-        return picture.contiguous().numpy()  # on the CPU, whatever the Gaussians are on
+            picture = _beside(picture, photo, display)
+        return picture.contiguous().numpy()  # on the CPU, for Gaussians on any device
 
 
 def _modes(
-    gaussians: Gaussians, camera: Camera, look: Look, background: Tensor | None, photo: Photo | None
+    gaussians: Gaussians,
+    camera: Camera,
+    display: DisplaySettings,
+    background: Tensor | None,
+    photo: Photo | None,
 ) -> Tensor:
     """(H, W, 3) uint8, on the CPU."""
     if background is not None:
         background = background.to(gaussians.means.device)
-    if look.scale != 1.0 and look.mode != "points":
-        log_scales = gaussians.log_scales + math.log(look.scale)
+    if display.scale != 1.0 and display.mode != "points":
+        log_scales = gaussians.log_scales + math.log(display.scale)
         gaussians = dataclasses.replace(gaussians, log_scales=log_scales)
-    splats = project(gaussians, camera, look.sh_degree).without_empty_rows()
-    if look.crop is not None:
-        splats = _cropped(splats, gaussians, look.crop)
+    splats = project(gaussians, camera, display.sh_degree).without_empty_rows()
+    if display.crop is not None:
+        splats = _cropped(splats, gaussians, display.crop)
     size = camera.width, camera.height
-    if look.mode == "depth":
+    if display.mode == "depth":
         _, alpha, depth = ops.rasterize(splats, *size, background, with_depth=True)
         assert depth is not None
         return _depth(depth, alpha)
-    if look.mode == "alpha":
+    if display.mode == "alpha":
         _, alpha, _ = ops.rasterize(splats, *size)
         return _bytes(alpha)[:, :, None].expand(-1, -1, 3)
-    if look.mode == "normals":
+    if display.mode == "normals":
         return _normals(splats, gaussians, camera)
-    if look.mode == "points":
+    if display.mode == "points":
         splats = _as_points(splats)
-    elif look.mode == "ellipsoids":
+    elif display.mode == "ellipsoids":
         splats = _as_ellipsoids(splats, gaussians, camera)
-    elif look.mode == "cost":
+    elif display.mode == "cost":
         counts = ops.count_blended(splats, *size)
         return palette.HEAT[_steps(torch.log1p(counts) / math.log1p(_MANY))]
     image, _, _ = ops.rasterize(splats, *size, background)
-    if look.mode == "error" and photo is not None:
+    if display.mode == "error" and photo is not None:
         return _error(image.cpu(), photo)
     return _bytes(image)
 
@@ -108,7 +109,7 @@ def _bytes(values: Tensor) -> Tensor:
 
 
 def _steps(values: Tensor) -> Tensor:
-    """0..1 to places in a palette."""
+    """0..1 to indices into a palette."""
     return _bytes(values.nan_to_num()).long()
 
 
@@ -117,7 +118,7 @@ def _cropped(
     gaussians: Gaussians,
     crop: tuple[tuple[float, float, float], tuple[float, float, float]],
 ) -> Splats2D:
-    """Those whose centres lie in the box."""
+    """The splats whose Gaussians have their centres in the box."""
     low, high = (gaussians.means.new_tensor(corner) for corner in crop)
     assert splats.ids is not None
     means = gaussians.means[splats.ids.long()]
@@ -126,7 +127,7 @@ def _cropped(
 
 
 def _depth(depth: Tensor, alpha: Tensor) -> Tensor:
-    """Even steps of disparity, 1/z, between the nearest and the farthest, but for 1% each."""
+    """Colours by disparity, 1/z, linear between its 1% and 99% quantiles."""
     shown = alpha >= _OPAQUE_ENOUGH
     disparity = alpha / depth.clamp_min(1e-9)
     some = disparity[::4, ::4][shown[::4, ::4]]
@@ -138,8 +139,8 @@ def _depth(depth: Tensor, alpha: Tensor) -> Tensor:
 
 
 def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The shortest axis (M, 3) of each splat's Gaussian, camera frame, towards the camera, and how
-    straight it points there, (M,) in 0..1."""
+    """The shortest axis (M, 3) of each splat's Gaussian, camera frame, towards the camera; and the
+    cosine (M,), 0..1, of its angle with the direction to the camera."""
     assert splats.ids is not None
     ids = splats.ids.long()
     unit = torch.eye(3, dtype=gaussians.quats.dtype, device=gaussians.quats.device)
@@ -153,7 +154,7 @@ def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tenso
 
 
 def _rotated(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors (M, 3) turned by unit quaternions wxyz (M, 4): v + 2 q × (q × v + w v)."""
+    """Vectors (M, 3) rotated by unit quaternions wxyz (M, 4): v + 2 q × (q × v + w v)."""
     w, q = quats[:, :1], quats[:, 1:]
     return vectors + 2.0 * torch.linalg.cross(q, torch.linalg.cross(q, vectors) + w * vectors)
 
@@ -165,9 +166,9 @@ def _recolored(splats: Splats2D, colors: Tensor) -> Splats2D:
 
 
 def _normals(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Red: to the right, green: up, blue: to the camera."""
+    """Red: right, green: up, blue: towards the camera."""
     axes, _ = _axes(splats, gaussians, camera)
-    # Blended as they are, then of unit length: the direction of the mean.
+    # Blend the axes, then normalise: the direction of the mean.
     image, alpha, _ = ops.rasterize(_recolored(splats, axes), camera.width, camera.height)
     length = image.permute(2, 0, 1).square().sum(0).sqrt_().clamp_min_(1e-9)  # plane by plane
     normals = image / length[:, :, None] * image.new_tensor([0.5, -0.5, -0.5])
@@ -175,7 +176,7 @@ def _normals(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def _as_points(splats: Splats2D) -> Splats2D:
-    """A dot for each, of its colour."""
+    """Each Gaussian as a dot of its colour."""
     packed = splats.packed.clone()
     packed[:, CONICS] = packed.new_tensor([1.0, 0.0, 1.0]) / _DOT**2
     packed[:, OPACITIES] = 1.0
@@ -183,11 +184,11 @@ def _as_points(splats: Splats2D) -> Splats2D:
 
 
 def _as_ellipsoids(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Splats2D:
-    """Opaque discs with a sharp edge, the darker the more they are seen from the side."""
+    """Opaque discs with a sharp edge, darker if their surface is seen at an angle."""
     assert splats.ids is not None
     _, straight = _axes(splats, gaussians, camera)
     shortest, middle = gaussians.log_scales[splats.ids.long()].sort(1).values[:, :2].unbind(1)
-    roundness = torch.exp(shortest - middle)  # what is round has no side
+    roundness = torch.exp(shortest - middle)  # a round Gaussian has no shortest axis
     light = 0.4 + 0.6 * (straight + (1.0 - straight) * roundness)
     packed = splats.packed.clone()
     packed[:, COLORS : COLORS + 3] *= light[:, None]
@@ -199,7 +200,7 @@ def _as_ellipsoids(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Sp
 
 
 def _error(image: Tensor, photo: Photo) -> Tensor:
-    """How far the colours are from the photo's; around it the render."""
+    """The colour difference inside the photo; around it the render."""
     picture = _bytes(image)
     at = photo.placed
     rows, columns = slice(at.top, at.top + at.height), slice(at.left, at.left + at.width)
@@ -209,12 +210,12 @@ def _error(image: Tensor, photo: Photo) -> Tensor:
     return picture
 
 
-def _beside(picture: Tensor, photo: Photo, look: Look) -> Tensor:
-    """The photo from its left edge as far as the wipe, a line there, and darkness around."""
+def _beside(picture: Tensor, photo: Photo, display: DisplaySettings) -> Tensor:
+    """The photo up to the wipe position, a line there, and a darker render around the photo."""
     at = photo.placed
     rows, columns = slice(at.top, at.top + at.height), slice(at.left, at.left + at.width)
     inside = picture[rows, columns].clone()
-    edge = round(look.wipe * at.width)
+    edge = round(display.wipe * at.width)
     inside[:, :edge] = photo.pixels[:, :edge]
     if 0 < edge < at.width:
         inside[:, max(0, edge - 1) : edge + 1] = 255

@@ -1,4 +1,4 @@
-"""A viser server on this machine: quiet, on one port that is free, not to be shared by accident."""
+"""Starts a viser server: silent, on one free port, with access control."""
 
 from __future__ import annotations
 
@@ -14,28 +14,27 @@ from dataclasses import dataclass
 import viser
 import websockets.asyncio.server
 
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError
 from snowsplat.viewer.hosts import ANY_HOST, is_loopback
 from snowsplat.viewer.live.guard import Guard
 
 DEFAULT_PORT = 8080
-# How many ports are tried where none was asked for.
-_TRIED = 20
+_TRIED = 20  # ports that are tried if none is given
 
 
 class _Server(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Nothing: a page may not publish what it shows through somebody's tunnel."""
+        """Disabled: the page must not be published through viser's share service."""
         return None
 
 
 @dataclass(frozen=True)
-class Door:
-    """A server, and the address that lets in.
+class RunningServer:
+    """A server and its address.
 
     Attributes:
-        url: for a browser on this machine, or on another where the host is this machine's name.
-        others: for one on another computer, where that is let in and is another address.
+        url: for browsers on this machine; if a host name was given, also on other machines.
+        others: for other machines, if they can connect at another address.
     """
 
     server: viser.ViserServer
@@ -44,39 +43,39 @@ class Door:
     guard: Guard
 
     def open(self) -> None:
-        """Let browsers in; from now on the server is changed in its own thread, see `tell`."""
+        """Accept browsers. From now on, use `call_in_server_thread` for changes."""
         self.guard.is_open = True
 
 
-def start_server(host: str, port: int | None, label: str) -> Door:
-    """Listen at ``host`` and ``port``; without one, at 8080 or the next that is free.
+def start_server(host: str, port: int | None, label: str) -> RunningServer:
+    """Listen at ``host`` and ``port``; without a port, at 8080 or the next free one.
 
-    Nobody is let in before `Door.open`. Where other machines reach it, only who has the address
-    is.
+    Browsers are rejected before `RunningServer.open`. If other machines can connect, the address
+    has a secret token.
 
     Raises:
-        UserError: the port is taken, or the host is not one of this machine.
+        UserError: the port is in use, or the host is not an address of this machine.
     """
     free = free_port(host, port)
     token = None if is_loopback(host) else secrets.token_urlsafe(16)
     guard = Guard(host, token)
-    # Viser welcomes in the terminal by itself, and complains of browsers that left.
+    # viser prints a welcome, and warns about browsers that have disconnected.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     with contextlib.redirect_stdout(io.StringIO()), _guarded(guard):
         server = _Server(host=host, port=free, label=label, verbose=False)
     if not guard.serves:
         stop_server(server)
-        raise RuntimeError(f"viser {viser.__version__} starts its server in another way")
-    if server.get_port() != free:  # taken since, and viser takes the next by itself
+        raise RuntimeError(f"viser {viser.__version__} is not supported: it starts differently")
+    if server.get_port() != free:  # in use by now; viser takes the next port silently
         stop_server(server)
-        raise UserError(f"port {free} is taken; name another: --port {free + 1}")
+        raise SettingError("port", f"{free} is in use; choose another, e.g. {free + 1}")
     others = address(socket.gethostname(), free, token) if host in ANY_HOST else None
-    return Door(server, address(host, free, token), others, guard)
+    return RunningServer(server, address(host, free, token), others, guard)
 
 
 @contextlib.contextmanager
 def _guarded(guard: Guard) -> Iterator[None]:
-    """Viser takes no word on how to listen, so what it listens with is ours meanwhile."""
+    """viser has no setting for its listening function, so it is replaced temporarily."""
     serve = websockets.asyncio.server.serve
     websockets.asyncio.server.serve = guard.serve  # type: ignore[assignment,misc]
     try:
@@ -92,35 +91,37 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 def address(host: str, port: int, token: str | None = None) -> str:
-    """For a browser on this machine, or on another where ``host`` is this machine's name there."""
+    """The URL for browsers; ``host`` is the name or address of this machine."""
     shown = "localhost" if host in ANY_HOST else host
     root = f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
     return root if token is None else f"{root}/{token}/"
 
 
 def free_port(host: str, port: int | None) -> int:
-    """``port`` if it is free; without one, 8080 or the next that is.
+    """``port`` if it is free; without one, 8080 or the next free one.
 
     Raises:
-        UserError: the port is taken, or the host is not one of this machine.
+        UserError: the port is in use, or the host is not an address of this machine.
     """
     if port is not None and not 0 < port < 65536:
-        raise UserError(f"--port is {port}; it must be between 1 and 65535")
+        raise SettingError("port", f"{port} is out of range; use 1 to 65535")
     first = DEFAULT_PORT if port is None else port
     for candidate in range(first, first + (_TRIED if port is None else 1)):
         if _is_free(host, candidate):
             return candidate
     if port is not None:
-        raise UserError(f"port {port} is taken; name another, or leave out --port")
-    raise UserError(f"ports {first} to {first + _TRIED - 1} are taken; name one with --port")
+        raise SettingError("port", f"{port} is in use; choose another, or do not set it")
+    raise SettingError("port", f"{first} to {first + _TRIED - 1} are in use; choose another")
 
 
 def _is_free(host: str, port: int) -> bool:
-    """Raises: UserError: this machine cannot listen at ``host``, or not at this port."""
+    """Raises UserError if this machine cannot listen at ``host``, or not at this port."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError):
-        raise UserError(f"--host {host}: no such host; 0.0.0.0 means all of this machine") from None
+        raise SettingError(
+            "host", f"{host} does not exist; 0.0.0.0 stands for all addresses of this machine"
+        ) from None
     for family, kind, protocol, _, where in found:
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -128,14 +129,15 @@ def _is_free(host: str, port: int) -> bool:
                 probe.bind(where)
                 probe.listen(1)
             except PermissionError:
-                raise UserError(
-                    f"port {port} may not be used (permissions); name one above 1023"
+                raise SettingError(
+                    "port", f"no permission to use {port}; choose one above 1023"
                 ) from None
             except OSError as error:
                 if error.errno == errno.EADDRINUSE:
                     return False
-                raise UserError(
-                    f"--host {host}: this machine cannot listen there ({error.strerror}); "
-                    "0.0.0.0 means all of this machine"
+                raise SettingError(
+                    "host",
+                    f"cannot listen at {host} ({error.strerror}); 0.0.0.0 stands for all "
+                    "addresses of this machine",
                 ) from None
     return True

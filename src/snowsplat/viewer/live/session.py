@@ -1,7 +1,7 @@
-"""Who looks from where, whether the training runs, and which picture is due next.
+"""State of the browsers and of the training, and the choice of the next image.
 
-Browsers change this from threads of their own; the thread that trains asks it between two steps.
-Nothing here draws, sends or knows viser.
+Browsers change it from the server's thread; the training thread reads it between two steps. This
+module neither renders nor sends, and does not depend on viser.
 """
 
 from __future__ import annotations
@@ -15,29 +15,27 @@ from typing import Literal
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
-from snowsplat.viewer.live.look import Look, Pose, fit
+from snowsplat.viewer.live.display import DisplaySettings, Pose, fit
 
-# A camera that has not moved for so long is still, seconds.
-STILL = 0.2
-# What a browser takes to arrive where it is sent, seconds.
-_JOURNEY = 2.0
-# A picture of a camera that moves is to take no longer than this, seconds; it is made smaller
-# until it does, but not smaller than this many pixels at its longer side.
-_MOVING_SECONDS, _SMALLEST = 0.05, 160
-# What the pictures that nobody asked for (the scene has changed, the camera has not) may take of a
-# training's time, and the seconds between two of them at least.
-IDLE_SHARE, _IDLE_SECONDS = 0.05, 1.0
+STILL = 0.2  # seconds without motion after which a camera counts as still
+_JOURNEY = 2.0  # seconds that a browser may need to arrive at a photo
+_MOVING_SECONDS = 0.05  # to render an image of a moving camera, at most: its size is reduced
+_SMALLEST = 160  # pixels: longer side of such an image, at least
+# Images are "requested" if a user moved the camera or changed a setting, and "idle" if only the
+# scene has changed.
+IDLE_SHARE = 0.05  # of the training's time for idle images
+_IDLE_SECONDS = 1.0  # between two idle images, at least
 
 
 @dataclass(frozen=True, eq=False)
-class Stand:
-    """Standing where a photo was taken.
+class PhotoView:
+    """The view at the position of a photo.
 
     Attributes:
         index: of the photo among those of the viewer.
-        camera: its camera.
+        camera: of the photo.
         photo: (3, H, W) uint8.
-        pose: that the browser was sent to.
+        pose: to which the browser was moved.
     """
 
     index: int
@@ -48,12 +46,12 @@ class Stand:
 
 @dataclass(frozen=True)
 class Due:
-    """A picture that a browser is to get.
+    """An image to render for a browser.
 
     Attributes:
-        kind: "moving" small and at once; "still" full size; "idle" the same, of a scene that has
-            gone on.
-        version: what `Visitor.version` was.
+        kind: "moving": small and fast; "still": full size; "idle": full size, and only the scene
+            has changed.
+        version: of the visitor's state when this was requested.
     """
 
     visitor: Visitor
@@ -62,31 +60,31 @@ class Due:
     height: int
     version: int
     pose: Pose
-    look: Look
-    stand: Stand | None
+    display: DisplaySettings
+    photo_view: PhotoView | None
 
 
 @dataclass(eq=False)
 class Visitor:
-    """One browser. Change it through `Session.change`."""
+    """One browser. Change its attributes through `Session.change`."""
 
     pose: Pose | None = None
-    look: Look = field(default_factory=Look)
-    stand: Stand | None = None
-    arrived: bool = False  # at the stand: from there, moving is leaving
-    sent: float = 0.0  # when it was sent there
-    longest: int = 1280  # pixels of the longer side of a full picture
-    sending: bool = False  # its last picture is under way
-    version: int = 0  # of all above
-    changed: float = 0.0  # when that was
-    # What it was shown last.
+    display: DisplaySettings = field(default_factory=DisplaySettings)
+    photo_view: PhotoView | None = None
+    arrived: bool = False  # at the photo's pose; moving away from there leaves the photo
+    sent: float = 0.0  # time when it was moved to the photo
+    longest: int = 1280  # pixels of the longer side of a full-size image
+    sending: bool = False  # its last image is being sent
+    version: int = 0  # incremented with each change of the above
+    changed: float = 0.0  # time of the last change
+    # The last image that it got.
     shown_version: int = -1
     shown_full: bool = False
     shown_scene: int = -1
     seconds_per_pixel: float = 0.0
 
     def due(self, scene: int, now: float) -> Due | None:
-        """The picture that would be right now, if it has not been shown."""
+        """The image that is needed at the time ``now``, if any."""
         if self.pose is None or self.sending:
             return None
         full = fit(self.pose.width, self.pose.height, self.longest)
@@ -100,10 +98,10 @@ class Visitor:
             kind, size = "idle", full
         else:
             return None
-        return Due(self, kind, *size, self.version, self.pose, self.look, self.stand)
+        return Due(self, kind, *size, self.version, self.pose, self.display, self.photo_view)
 
     def _moving_size(self, full: tuple[int, int]) -> tuple[int, int]:
-        """Small enough to be quick, by what pictures have taken so far."""
+        """A size that renders fast enough, from the times of previous images."""
         if not self.seconds_per_pixel:
             return fit(*full, max(full) // 2)
         pixels = _MOVING_SECONDS / self.seconds_per_pixel
@@ -111,7 +109,7 @@ class Visitor:
         return fit(*full, max(round(max(full) * scale), _SMALLEST))
 
     def shown(self, due: Due, scene: int, seconds: float) -> None:
-        """The picture was made, and took so long."""
+        """Record that the image was rendered in ``seconds``."""
         self.shown_version, self.shown_scene = due.version, scene
         self.shown_full = due.kind != "moving"
         cost = seconds / (due.width * due.height)
@@ -120,36 +118,36 @@ class Visitor:
 
 
 class Session:
-    """All browsers and the training."""
+    """All browsers and the training; thread-safe."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._changed = threading.Condition()
         self._visitors: dict[int, Visitor] = {}
         self._paused = False
-        self._steps = 0  # that may be made while it is paused
-        self.training = False  # steps are made, or wait
-        self.share = 0.5  # of the time, for pictures of cameras that move, while it trains
-        self._free_at = {"asked": 0.0, "idle": 0.0}  # when the training has had its share
-        self.busy = False  # somebody looks, or it is paused: the one thing a training has to ask
+        self._steps = 0  # single steps that are allowed while paused
+        self.training = False  # a training runs, or is paused
+        self.share = 0.5  # of the time, for requested images during training
+        self._free_at = {"requested": 0.0, "idle": 0.0}  # when the training has had its share
+        self.busy = False  # there are browsers, or it is paused: the check after each step
 
     # From the browsers
 
     def enter(self, number: int) -> Visitor:
-        """A browser has come."""
+        """Add a browser."""
         with self._changed:
             visitor = self._visitors[number] = Visitor()
             self._notify()
             return visitor
 
     def leave(self, number: int) -> None:
-        """A browser has gone."""
+        """Remove a browser."""
         with self._changed:
             self._visitors.pop(number, None)
             self._notify()
 
     def change(self, visitor: Visitor, **changes: object) -> None:
-        """Set attributes of a visitor: a new picture is due."""
+        """Set attributes of a visitor, so that a new image is due."""
         with self._changed:
             for name, value in changes.items():
                 setattr(visitor, name, value)
@@ -158,34 +156,34 @@ class Session:
             self._notify()
 
     def move(self, visitor: Visitor, pose: Pose) -> None:
-        """It looks from somewhere else; whoever stands at a photo and moves, leaves it."""
-        stand, arrived = visitor.stand, visitor.arrived
-        if stand is not None:
-            if pose.is_near(stand.pose):
+        """Set the pose of a browser; leaves the photo if it moves away from it."""
+        photo_view, arrived = visitor.photo_view, visitor.arrived
+        if photo_view is not None:
+            if pose.is_near(photo_view.pose):
                 arrived = True
-            # What is still on its way from the browser when it is sent to a photo is no leaving.
+            # Poses that were under way when the browser was moved to a photo do not leave it.
             elif arrived or self._clock() - visitor.sent > _JOURNEY:
-                stand = None
-        self.change(visitor, pose=pose, stand=stand, arrived=arrived)
+                photo_view = None
+        self.change(visitor, pose=pose, photo_view=photo_view, arrived=arrived)
 
-    def send(self, visitor: Visitor, stand: Stand) -> None:
-        """It is being sent to a photo."""
-        self.change(visitor, stand=stand, arrived=False, sent=self._clock())
+    def send(self, visitor: Visitor, photo_view: PhotoView) -> None:
+        """Record that the browser is being moved to a photo."""
+        self.change(visitor, photo_view=photo_view, arrived=False, sent=self._clock())
 
     def pause(self) -> None:
-        """Hold the training after the step that it is at."""
+        """Pause the training after the current step."""
         with self._changed:
             self._paused, self._steps = True, 0
             self._notify()
 
     def resume(self) -> None:
-        """Let it go on."""
+        """Resume the training."""
         with self._changed:
             self._paused, self._steps = False, 0
             self._notify()
 
     def step(self) -> None:
-        """Let it make one more step, and hold it there."""
+        """Allow one step, then pause."""
         with self._changed:
             self._steps = self._steps + 1 if self._paused else 0
             self._paused = True
@@ -203,11 +201,11 @@ class Session:
 
     @property
     def visitors(self) -> int:
-        """How many look."""
+        """Number of browsers."""
         return len(self._visitors)
 
     def may_step(self) -> bool:
-        """Whether the training may make a step; one of those allowed is used up."""
+        """Whether the training may make a step; uses up one single step if paused."""
         with self._changed:
             if self._paused and self._steps:
                 self._steps -= 1
@@ -215,67 +213,67 @@ class Session:
             return not self._paused
 
     def is_here(self, visitor: Visitor) -> bool:
-        """Whether it has not gone."""
+        """Whether the browser is still connected."""
         with self._changed:
             return visitor in self._visitors.values()
 
     def next_due(self, scene: int, training: bool) -> Due | None:
-        """The most urgent picture; None where there is none, or the training has the time now.
+        """The most urgent image; None if there is none, or if it is the training's turn.
 
         Args:
             scene: a number that changes when the scene does.
-            training: steps are waiting.
+            training: whether the training waits to continue.
         """
         now = self._clock()
         with self._changed:
             found = [due for v in self._visitors.values() if (due := v.due(scene, now))]
         if training:
-            found = [due for due in found if now >= self._free_at[_purse(due)]]
-        # Those that move first; of equals the one that has waited longest.
+            found = [due for due in found if now >= self._free_at[_budget_of(due)]]
+        # Moving cameras first, then the visitor that has waited longest.
         order = ("moving", "still", "idle")
         return min(
             found, key=lambda due: (order.index(due.kind), due.visitor.changed), default=None
         )
 
     def spent(self, due: Due, scene: int, seconds: float) -> None:
-        """The picture was made in so many seconds."""
+        """Record that an image was rendered in ``seconds``."""
         with self._changed:
             due.visitor.shown(due, scene, seconds)
-        self.pay(_purse(due), seconds)
+        self.charge(_budget_of(due), seconds)
 
     def send_to(self, visitor: Visitor) -> None:
-        """A picture is on its way to it: until it is `sent`, no other is due."""
+        """Record that an image is being sent: no other is due until `sent`."""
         with self._changed:
             visitor.sending = True
 
     def sent(self, due: Due, seconds: float) -> None:
-        """It has taken so long in all, from its drawing on."""
-        self.pay(_purse(due), seconds)
+        """Record that an image was sent, ``seconds`` after rendering began."""
+        self.charge(_budget_of(due), seconds)
         with self._changed:
             due.visitor.sending = False
             self._notify()
 
-    def may_pay(self, purse: Literal["asked", "idle"]) -> bool:
-        """Whether the training has had its share since the last time."""
-        return self._clock() >= self._free_at[purse]
+    def may_spend(self, budget: Literal["requested", "idle"]) -> bool:
+        """Whether the training has had its share of the time since the last image."""
+        return self._clock() >= self._free_at[budget]
 
-    def pay(self, purse: Literal["asked", "idle"], seconds: float) -> None:
-        """The training is left alone until its share is what was promised.
+    def charge(self, budget: Literal["requested", "idle"], seconds: float) -> None:
+        """Reserve time for the training, so that images get no more than their share.
 
-        Also by what nobody asked for, when time went into what somebody did.
+        Requested images also delay the next idle image.
         """
         now = self._clock()
         share = min(max(self.share, 0.01), 1.0)
-        if purse == "asked":
-            self._free_at["asked"] = now + seconds * (1.0 / share - 1.0)
+        if budget == "requested":
+            self._free_at["requested"] = now + seconds * (1.0 / share - 1.0)
         pause = max(_IDLE_SECONDS, seconds * (1.0 / min(share, IDLE_SHARE) - 1.0))
         self._free_at["idle"] = max(self._free_at["idle"], now + pause)
 
     def wait(self, seconds: float) -> None:
-        """Until something changes, no longer than this."""
+        """Wait until the state changes, at most ``seconds``."""
         with self._changed:
             self._changed.wait(seconds)
 
 
-def _purse(due: Due) -> Literal["asked", "idle"]:
-    return "idle" if due.kind == "idle" else "asked"
+def _budget_of(due: Due) -> Literal["requested", "idle"]:
+    return "idle" if due.kind == "idle" else "requested"

@@ -1,4 +1,4 @@
-"""`TrainingViewer`: what happens on the page between two steps of a training."""
+"""`TrainingViewer`: updates the page between two steps of a training."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from snowsplat.viewer.live.gauge import Curve, Gauge
 from snowsplat.viewer.live.page import TrainingPanel
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
-# Seconds between two looks at the figures. PSNR may take this part of the time.
-_SECONDS, _PSNR_SHARE = 1.0, 0.03
-# The loss shown is the mean of about so many steps, the rate of about so many seconds.
-_LOSS_STEPS, _RATE_SECONDS = 50, 3.0
+_SECONDS = 1.0  # between two updates of the figures
+_PSNR_SHARE = 0.03  # of the time for measuring PSNR
+_LOSS_STEPS = 50  # over which the displayed loss is averaged, approximately
+_RATE_SECONDS = 3.0  # over which the displayed rate is averaged, approximately
 
 
 class TrainingViewer:
-    """Shows a training on a page, pauses it from there; call `after_step` after each step."""
+    """Shows and pauses a training; call `after_step` after each step."""
 
     def __init__(self, viewer: NetworkViewer, gauge: Gauge) -> None:
         self.viewer = viewer
@@ -29,15 +29,17 @@ class TrainingViewer:
         self._losses, self._psnrs = Curve(), Curve()
         self._loss = math.nan
         self._rate = 0.0
-        self._rated = (0, time.monotonic())  # step and time when the rate was reckoned
-        self._next = self._next_psnr = 0.0  # when figures are due
-        self._measured = 0  # the step of the last PSNR
+        self._rated = (0, time.monotonic())  # step and time of the last rate
+        self._next = self._next_psnr = 0.0  # times of the next updates
+        self._measured = 0  # step of the last PSNR
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
-        """Make the pictures that are due, and wait while the training is paused.
+        """Render the images that are due, and wait while the training is paused.
 
         Args:
-            steps: in all.
+            step: number of finished steps.
+            steps: total number of steps.
+            loss: of this step.
 
         Returns:
             Seconds for which it was paused.
@@ -51,21 +53,21 @@ class TrainingViewer:
         if not self._session.busy:
             return 0.0
         self.viewer.serve(gaussians, step, training=True)
-        self._tell(step, steps, gaussians)
+        self._update_panel(step, steps, gaussians)
         if self._session.may_step():
             return 0.0
         started = time.monotonic()
         self._next = 0.0
         while True:
-            self._tell(step, steps, gaussians)
+            self._update_panel(step, steps, gaussians)
             if not self.viewer.serve(gaussians, step, training=False):
                 self.viewer.wait()
             let_interrupt()
             if self._session.may_step():
                 return time.monotonic() - started
 
-    def _tell(self, step: int, steps: int, gaussians: Gaussians) -> None:
-        """Figures and curves, now and then."""
+    def _update_panel(self, step: int, steps: int, gaussians: Gaussians) -> None:
+        """Update figures and curves, at most once per `_SECONDS`."""
         now = time.monotonic()
         if now < self._next:
             return
@@ -77,7 +79,7 @@ class TrainingViewer:
                 self._psnrs.add(step, psnr)
             took = time.monotonic() - now
             self._next_psnr = now + took / _PSNR_SHARE
-        pace = "paused" if self._session.paused else f"{self._steps_a_second(step):.1f} a second"
+        pace = "paused" if self._session.paused else f"{self._steps_a_second(step):.1f} steps/s"
         figures = [f"{len(gaussians):,} Gaussians", f"loss {self._loss:.4f}"]
         if len(self._psnrs):
             figures.append(f"PSNR {self._psnrs.arrays()[1][-1]:.2f} dB")
@@ -95,7 +97,7 @@ class TrainingViewer:
         return self._rate
 
     def end(self, step: int, gaussians: Gaussians) -> None:
-        """The training is over; show what has come of it until Ctrl-C, which it raises."""
+        """Show the result of the finished training until Ctrl-C, which is raised."""
         self._session.training = False
         self._session.resume()
         self._panel.end()

@@ -1,4 +1,4 @@
-"""`NetworkViewer`: a page for any number of browsers, and the pictures that they wait for."""
+"""`NetworkViewer`: a page for any number of browsers, and the images that they wait for."""
 
 from __future__ import annotations
 
@@ -13,35 +13,32 @@ import viser
 
 from snowsplat.data import Dataset
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.viewer.live.guard import Governor, tell
+from snowsplat.viewer.live.display import Pose
+from snowsplat.viewer.live.guard import Governor, call_in_server_thread
 from snowsplat.viewer.live.keys import KeyCameras
-from snowsplat.viewer.live.look import Pose
 from snowsplat.viewer.live.page import Controls, ScenePanel
 from snowsplat.viewer.live.photos import Photos, placed_photo
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.server import start_server, stop_server
 from snowsplat.viewer.live.session import Due, Session, Visitor
 
-# Quality of the JPEG pictures, of a camera that moves and of one that is still.
-_QUALITY = {"moving": 60, "still": 90, "idle": 90}
-# Seconds between two looks at what is due: with browsers, and without.
-_TICK, _LONG_TICK = 0.02, 0.5
-# Seconds between two looks at whether there is a newer scene.
-_POLL = 2.0
-# Lengths of quaternions and distances are within this and one by this.
-_SMALL = 1e-9
+_QUALITY = {"moving": 60, "still": 90, "idle": 90}  # of JPEG images
+_TICK = 0.02  # seconds between two checks for images that are due
+_LONG_TICK = 0.5  # the same without browsers
+_POLL = 2.0  # seconds between two checks for a newer scene
+_SMALL = 1e-9  # norms of quaternions must be above this; these and distances below its inverse
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is shown.
+    """The scene to show.
 
     Attributes:
-        gaussians: None where there is nothing yet.
-        number: that changes when the Gaussians do.
-        about: lines for people.
+        gaussians: None if there are none yet.
+        number: changes when the Gaussians do.
+        about: lines of text for the user.
     """
 
     gaussians: Gaussians | None
@@ -53,10 +50,10 @@ class NetworkViewer:
     """A page at `url` that shows Gaussians.
 
     Attributes:
-        others: its address for other computers, where they are let in and it is another.
+        others: its address for other machines, if they can connect at another address.
 
-    Pictures are made by `serve` and `hold`, in the thread that calls them and in no other: nothing
-    reads the Gaussians while they change, and nothing has to copy them.
+    Images are rendered by `serve` and `hold` in the calling thread only: nothing reads the
+    Gaussians while they change, and no copy is needed.
     """
 
     def __init__(
@@ -70,36 +67,43 @@ class NetworkViewer:
     ) -> None:
         """
         Args:
-            dataset: its cameras and photos are in the scene.
+            dataset: its cameras and photos are shown in the scene.
             background: behind the Gaussians, 0..1.
-            port: None takes 8080, or the next that is free.
+            host: address at which to listen.
+            port: None takes 8080, or the next free port.
+            label: title of the page.
 
         Raises:
-            UserError: the port is taken, or the host is not this machine.
+            UserError: the port is in use, or the host is not an address of this machine.
         """
         self.session = Session()
         self.background = torch.tensor(background, dtype=torch.float32)
         self._bounds = dataset.bounds
-        door = start_server(host, port, label)
-        self.server, self.url, self.others = door.server, door.url, door.others
+        running = start_server(host, port, label)
+        self.server, self.url, self.others = running.server, running.url, running.others
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._photos = Photos(
-            *(self.server, self.session, dataset.train, dataset.test, dataset.extent),
-            *(self._bounds.mean(0), self.background),
+            self.server,
+            self.session,
+            dataset.train,
+            dataset.test,
+            dataset.extent,
+            self._bounds.mean(0),
+            self.background,
         )
         self._browsers: dict[int, tuple[viser.ClientHandle, Visitor, Controls]] = {}
         self._photos.on_click(self._clicked)
         self.server.on_client_connect(self._entered)
         self.server.on_client_disconnect(self._left)
         self._governor = Governor(self.server, lambda: self.session.training)
-        door.open()
+        running.open()
 
     def close(self) -> None:
         """Close the page."""
         self._photos.close()
         stop_server(self.server)
 
-    # The thread of the server: one thing after the other, no faster than messages are read
+    # In the server's thread: events are processed in order, no faster than messages are read
 
     async def _entered(self, client: viser.ClientHandle) -> None:
         visitor = self.session.enter(client.client_id)
@@ -124,28 +128,28 @@ class NetworkViewer:
     def _clicked(self, client: viser.ClientHandle, index: int) -> None:
         browser = self._browsers.get(client.client_id)
         if browser is not None:
-            browser[2].stand_at(index)
+            browser[2].go_to_photo(index)
 
     def _send(self, due: Due, picture: np.ndarray, drawing: float) -> None:
         started = time.monotonic()
         client = next((c for c, v, _ in self._browsers.values() if v is due.visitor), None)
         try:
-            if client is not None:  # else it has left while this was drawn
+            if client is not None:  # else it has disconnected meanwhile
                 quality = _QUALITY[due.kind]
-                with self._governor.granted():
+                with self._governor.uncounted():
                     client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
                 client.flush()
         finally:
             self.session.sent(due, drawing + time.monotonic() - started)
 
-    # The caller's thread
+    # In the caller's thread
 
     def serve(self, gaussians: Gaussians, scene: int, *, training: bool) -> bool:
-        """Make the most urgent picture and send it; whether there was one.
+        """Render the most urgent image and send it; returns whether there was one.
 
         Args:
             scene: a number that changes when the Gaussians do.
-            training: steps are waiting, and get their share of the time.
+            training: the training waits to continue and gets its share of the time.
         """
         due = self.session.next_due(scene, training)
         if due is None:
@@ -155,26 +159,26 @@ class NetworkViewer:
             picture = self._draw(due, gaussians)
             self.session.send_to(due.visitor)
             seconds = time.monotonic() - started
-            tell(self.server, lambda: self._send(due, picture, seconds))
-        except Exception:  # whatever somebody wanted to see: the training does not end of it
-            _log.debug("a picture was not made", exc_info=True)
+            call_in_server_thread(self.server, lambda: self._send(due, picture, seconds))
+        except Exception:  # an unusual request of a browser must not end the training
+            _log.debug("an image was not rendered", exc_info=True)
         self.session.spent(due, scene, time.monotonic() - started)
         return True
 
     def _draw(self, due: Due, gaussians: Gaussians) -> np.ndarray:
-        if due.stand is None:
+        if due.photo_view is None:
             camera = due.pose.camera(due.width, due.height)
-            return draw(gaussians, camera, due.look, self.background)
-        photo = placed_photo(due.stand, due.width, due.height)
-        camera = photo.placed.camera(due.stand.camera, due.width, due.height)
-        return draw(gaussians, camera, due.look, self.background, photo)
+            return draw(gaussians, camera, due.display, self.background)
+        photo = placed_photo(due.photo_view, due.width, due.height)
+        camera = photo.placed.camera(due.photo_view.camera, due.width, due.height)
+        return draw(gaussians, camera, due.display, self.background, photo)
 
     def wait(self) -> None:
-        """For something to happen, or some hundredths of a second."""
+        """Wait for a change, or a fraction of a second."""
         self.session.wait(_TICK if self.session.visitors else _LONG_TICK)
 
     def hold(self, newest: Callable[[], Scene]) -> None:
-        """Show the newest scene until Ctrl-C, which it raises."""
+        """Show the newest scene until Ctrl-C, which is raised."""
         panel = ScenePanel(self.server)
         scene, looked = None, 0.0
         while True:
@@ -191,7 +195,7 @@ class NetworkViewer:
 
 
 def _pose(camera: viser.CameraHandle) -> Pose | None:
-    """Where a browser looks from; None where that makes no sense."""
+    """The pose of a browser; None if it is not valid."""
     quat, position = torch.from_numpy(camera.wxyz.copy()), torch.from_numpy(camera.position.copy())
     turned = _SMALL < float(quat.norm()) < 1.0 / _SMALL
     near = float(position.norm()) < 1.0 / _SMALL

@@ -1,1 +1,1 @@
-"""View a finished scene in the browser: the page, its server, and the page as a single file."""
+"""View finished scenes in a browser: the page, a server for it, and the page as a single file."""

@@ -1,7 +1,7 @@
-"""One self-contained page: the viewer and the scene in a single file, to send by mail.
+"""A self-contained page: the viewer and the scene in a single HTML file.
 
-It opens from the disk in any browser with WebGL 2 and asks the network for nothing. The scene is in
-it as a compressed PLY file in base64; a page is written, never read.
+It can be opened from disk in any browser with WebGL 2, and makes no network requests. The scene is
+embedded as a compressed PLY file in base64. Pages are written, but cannot be read.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_text
 from snowsplat.viewer.web.page import settings, whole_page
 
-#: Browsers hold a text of some 500 million characters; base64 makes 4 of 3 bytes.
+#: Browsers support strings of about 500 million characters; base64 makes 4 characters of 3 bytes.
 _LARGEST = 360_000_000
 
-# Given to the viewer as the address of a blob: browsers limit the length of data addresses.
+# Passed to the viewer as a blob URL, since browsers limit the length of data URLs.
 _SCENE = """        <script type="text/plain" id="scene">{scene}</script>
         <script>
             const scene = document.getElementById('scene');
@@ -42,15 +42,15 @@ _SCENE = """        <script type="text/plain" id="scene">{scene}</script>
 
 
 def write_html(path: Path | str, gaussians: Gaussians, start: InitialView | None = None) -> None:
-    """Write the page atomically; it starts at ``start``, else where most of the scene is in view.
+    """Write the page atomically; its first view is ``start``, else an overview of the scene.
 
     Raises:
-        UserError: no Gaussians, or more than browsers take in one page.
-        OSError: the folder is absent or not writable, or the disk is full.
+        UserError: no Gaussians, or too many for one page.
+        OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
     if not len(gaussians):
-        raise UserError(f"{path}: a scene without Gaussians shows nothing; no page is made of it")
+        raise UserError(f"{path}: the scene has no Gaussians; a page needs at least one")
     scene = encode_compressed_ply(path, GaussianArrays.from_gaussians(gaussians))
     if len(scene) > _LARGEST:
         raise UserError(

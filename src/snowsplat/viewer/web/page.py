@@ -1,8 +1,8 @@
-"""The page that shows finished scenes: PlayCanvas' SuperSplat viewer, which the wheel carries.
+"""The page for finished scenes: the SuperSplat viewer of PlayCanvas, bundled with the package.
 
-The page is theirs (third_party/README.md says which version); what it shows and where it starts is
-put into the places that it has for this. It turns a scene half round about the z axis, since its
-own y axis points up; `settings` does the same to the start.
+The page is third-party (third_party/README.md names the version). Settings, the title and the
+initial view are inserted at the places that it provides. The viewer's y axis points up, so it
+rotates a scene by 180° about the z axis; `settings` rotates the initial view in the same way.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from typing import Any
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 
-_FOLDER = Path(__file__).parents[2] / "_viewer"
+_FOLDER = Path(__file__).parents[2] / "_viewer"  # of the package
 _STYLESHEET = '<link rel="stylesheet" href="./index.css" />'
 _IMPORT = "import { createViewer } from './index.js';"
-# In the HTML that their script makes: event.stopPropagation() of two buttons.
+# Event handlers in the HTML that the script creates: event.stopPropagation() of two buttons.
 _HANDLER = re.compile(r' on[a-z]+=\\"([^"\\]*)\\"')
 _INLINE_SCRIPT = re.compile(r'<script(?: type="module")?>(.*?)</script>', re.DOTALL)
 
 
 def asset(name: str) -> str:
-    """One of the viewer's files: index.html, index.css, index.js or LICENSE.
+    """The content of a file of the viewer: index.html, index.css, index.js or LICENSE.
 
     Raises:
-        UserError: a checkout in which it was not unpacked yet.
+        UserError: the viewer has not been unpacked in this checkout.
     """
     try:
         return (_FOLDER / name).read_text(encoding="utf-8")
     except OSError:
         raise UserError(
-            f"{_FOLDER / name}: the viewer's page is absent; in a checkout, run make native"
+            f"{_FOLDER / name}: the viewer's page is missing; in a checkout, run make native"
         ) from None
 
 
 def settings(start: InitialView, background: Sequence[float]) -> dict[str, Any]:
-    """What the viewer takes as settings: where it starts, and a background colour in 0..1."""
+    """The viewer's settings: its initial view, and a background colour in 0..1."""
     off = {"enabled": False}
     return {
         "version": 2,
-        "tonemapping": "none",  # colours are shown as they were trained
+        "tonemapping": "none",  # colours are displayed as they were trained
         "highPrecisionRendering": False,
         "background": {"color": list(background)},
         "postEffectSettings": {
@@ -77,32 +77,32 @@ def _turned(point: tuple[float, float, float]) -> list[float]:
 
 
 def page(title: str, bootstrap: Mapping[str, Any]) -> str:
-    """The page, whose stylesheet and script lie beside it as index.css and index.js.
+    """The page; its stylesheet and script are the separate files index.css and index.js.
 
-    ``bootstrap`` is the viewer's: settings, contentUrl, contentFilename.
+    ``bootstrap`` has the viewer's keys: settings, contentUrl, contentFilename.
     """
     text = asset("index.html")
     text = _replaced(
         text, "<title>SuperSplat Viewer</title>", f"<title>{html.escape(title)}</title>"
     )
-    # An empty icon: else browsers ask for one.
+    # An empty icon, since browsers would request one.
     text = _replaced(text, '<base href="" />', '<link rel="icon" href="data:," />')
-    # It stands still until someone moves it or presses Play.
+    # No animation until the user moves the camera or presses Play.
     text = _replaced(text, "noanim: url.searchParams.has('noanim')", "noanim: true")
-    seam = re.compile(r'(<script type="application/json" id="sse-bootstrap">)\s*null\s*(</script>)')
-    parts = seam.split(text)
+    slot = re.compile(r'(<script type="application/json" id="sse-bootstrap">)\s*null\s*(</script>)')
+    parts = slot.split(text)
     assert len(parts) == 4, "the viewer's page has no bootstrap"
     return parts[0] + parts[1] + _json_in_script(bootstrap) + parts[2] + parts[3]
 
 
 def whole_page(title: str, bootstrap: Mapping[str, Any], body: str) -> str:
-    """The page with its stylesheet and script in it, and ``body`` (HTML) at its end.
+    """The page with its stylesheet and script embedded, and ``body`` (HTML) at its end.
 
-    It asks the network for nothing: its content policy forbids it.
+    Its content security policy forbids all network requests.
     """
     css, script = asset("index.css"), asset("index.js")
     script = re.sub(r"\n//# sourceMappingURL=\S+\s*$", "\n", script)
-    # What the HTML parser would take for markup: their bundle has none of it.
+    # The HTML parser would treat these as markup; the viewer's bundle does not contain them.
     assert "</style" not in css.lower()
     assert not re.search(r"</script|<!--|<script", script, re.IGNORECASE)
     text = page(title, bootstrap)
@@ -112,15 +112,15 @@ def whole_page(title: str, bootstrap: Mapping[str, Any], body: str) -> str:
     policy = html.escape(content_policy(text, "blob: data:"))
     head = f"""<meta charset="UTF-8" />
         <meta http-equiv="Content-Security-Policy" content="{policy}" />
-        <!-- The viewer, whose licence asks to be in every copy:
+        <!-- The licence of the viewer, which must be part of every copy:
 {asset("LICENSE")}-->"""
     return _replaced(text, '<meta charset="UTF-8" />', head)
 
 
 def content_policy(page: str, sources: str) -> str:
-    """A Content-Security-Policy under which the page works, and does nothing else.
+    """The strictest Content-Security-Policy under which the page works.
 
-    Its own scripts are named by their hashes. ``sources`` is where it may fetch from.
+    Inline scripts are allowed by their hashes. ``sources``: from where the page may load.
     """
     scripts = [*_INLINE_SCRIPT.findall(page), *sorted(set(_HANDLER.findall(asset("index.js"))))]
     digests = [hashlib.sha256(script.encode()).digest() for script in scripts]
@@ -129,7 +129,7 @@ def content_policy(page: str, sources: str) -> str:
         [
             "default-src 'none'",
             f"script-src {sources} {hashes} 'unsafe-hashes' 'wasm-unsafe-eval'",
-            "worker-src blob:",  # the sorter of the Gaussians
+            "worker-src blob:",  # sorts the Gaussians
             f"style-src {sources} 'unsafe-inline'",
             f"img-src {sources} blob: data:",
             f"connect-src {sources} blob: data:",
@@ -140,11 +140,11 @@ def content_policy(page: str, sources: str) -> str:
 
 
 def _replaced(text: str, old: str, new: str) -> str:
-    assert text.count(old) == 1, f"the viewer's page has not one {old}"
+    assert text.count(old) == 1, f"the viewer's page does not contain {old} exactly once"
     before, after = text.split(old)
     return before + new + after
 
 
 def _json_in_script(value: Any) -> str:
-    # "<" could end the script's element, or begin a comment in it.
+    # "<" could end the script element or begin a comment in it.
     return json.dumps(value).replace("<", "\\u003c")

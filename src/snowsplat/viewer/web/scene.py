@@ -1,4 +1,4 @@
-"""A finished scene made ready for the browser: upright, at a size one can walk in, compressed."""
+"""A finished scene prepared for the browser: upright, at a usual scale, compressed."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from snowsplat.viewer.web.page import asset, content_policy, page, settings
 from snowsplat.viewer.web.server import ServedFile
 
 _SCENE = "scene.compressed.ply"
-_LEVEL_ENOUGH = math.radians(3)  # a horizon that is off by less is not seen
-_TOO_LARGE = 3.0  # times the usual distances, or too small
+_LEVEL_ENOUGH = math.radians(3)  # a smaller tilt of the horizon is not visible
+_TOO_LARGE = 3.0  # factor between the scene's and the usual distances that is still accepted
 
 
 def site(
     title: str, gaussians: Gaussians, cameras: Sequence[Camera], background: Sequence[float]
 ) -> tuple[dict[str, ServedFile], dict[str, str]]:
-    """The files of a page that shows a scene, by name, and the headers that belong to them.
+    """The files of a page that shows a scene, by name, and the HTTP headers for them.
 
-    It starts at the first of ``cameras``; without any, at a place that fits the scene.
+    The initial view is the first of ``cameras``; without cameras, an overview of the scene.
     """
     gaussians, start = ready(gaussians, cameras)
     bootstrap = {"settings": settings(start, background), "contentUrl": f"./{_SCENE}"}
@@ -51,11 +51,11 @@ def site(
 
 
 def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[Gaussians, InitialView]:
-    """The scene in a frame that suits the viewer, and where one starts in that frame.
+    """The scene in a frame that suits the viewer, and the initial view in that frame.
 
-    The viewer takes −y for up, and walks some units a second. So where the cameras tell that
-    another direction is up, or that they stood much nearer or farther than `VIEWING_DISTANCE`, the
-    scene is turned and scaled; else it is left as it is.
+    In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
+    direction, or distances very different from `VIEWING_DISTANCE`, the scene is rotated and scaled.
+    Otherwise it is unchanged.
     """
     if not cameras:
         return gaussians, overview(gaussians)
@@ -70,7 +70,7 @@ def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[Gaussians, I
 
 
 def _viewing_frame(cameras: Sequence[Camera], depth: float) -> Similarity | None:
-    """From the scene's frame to one with −y up and distances near the usual; None: it is one."""
+    """Transform to a frame with −y up and usual distances; None if the scene has both."""
     rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
     up = torch.from_numpy(up_direction(rotations.numpy()))
     rotation = _shortest_rotation(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
@@ -84,10 +84,10 @@ def _viewing_frame(cameras: Sequence[Camera], depth: float) -> Similarity | None
 
 
 def _shortest_rotation(source: Tensor, target: Tensor) -> Tensor:
-    """(3, 3) that takes one unit vector to another, about the axis across both."""
+    """(3, 3): rotates one unit vector to another, about their cross product."""
     axis = torch.linalg.cross(source, target)
     cosine = float(source @ target)
-    if cosine < -1 + 1e-9:  # half round, about the x axis, which is across ±y
+    if cosine < -1 + 1e-9:  # by 180° about the x axis, which is perpendicular to ±y
         return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     x, y, z = axis.tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
@@ -95,7 +95,7 @@ def _shortest_rotation(source: Tensor, target: Tensor) -> Tensor:
 
 
 def _depth_ahead(gaussians: Gaussians, camera: Camera) -> float:
-    """World units from a camera to what its picture shows in the middle."""
+    """Median depth, in world units, at the centre of a camera's image."""
     factor = max(1, max(camera.width, camera.height) // 160)
     small = camera.downscaled(factor)
     with torch.no_grad():
@@ -107,7 +107,7 @@ def _depth_ahead(gaussians: Gaussians, camera: Camera) -> float:
     solid = alpha > 0.5
     if bool(solid.any()):
         return float((depth[solid] / alpha[solid]).median())
-    # Nothing there: as far as most of the scene is.
+    # The centre is empty: use the median distance to the Gaussians.
     distances = (gaussians.means.double() - camera.position).norm(dim=1)
     distances = distances[distances.isfinite()]
     found = float(distances.median()) if len(distances) else 0.0

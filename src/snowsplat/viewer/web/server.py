@@ -1,8 +1,8 @@
-"""A small web server for one page: some files in memory, for the browsers of one person.
+"""A small web server for one page: a few files in memory, for one user.
 
-It serves what it was given and nothing else: names are looked up, never opened. Its address has a
-part that cannot be guessed, and requests that name a foreign host are refused: a web page elsewhere
-cannot reach it through a name that it makes point here (DNS rebinding).
+It only serves the files that it was given: names are looked up in a table, never opened. Its
+address contains a secret token. Requests with an unknown Host header are rejected, so a web page
+elsewhere cannot reach the server through its own domain name (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from typing import Any, cast
 
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError
 from snowsplat.viewer.hosts import ANY_HOST, is_own_host, is_own_page
 
 _BLOCK = 1 << 18  # bytes sent at once
-# Seconds after which a connection is closed that asks nothing, whose request is not all there, that
-# does not take a block.
-_IDLE_SECONDS, _REQUEST_SECONDS, _SEND_SECONDS = 60.0, 10.0, 60.0
-_REQUEST = 16 << 10  # bytes of a request at most
-# Connections open at once. A new one takes the place of the oldest of those that have not been
-# answered anything but refusals; where there is none, it is closed.
+# Seconds after which a connection is closed:
+_IDLE_SECONDS = 60.0  # without a request
+_REQUEST_SECONDS = 10.0  # with an incomplete request
+_SEND_SECONDS = 60.0  # if it does not receive a block
+_REQUEST = 16 << 10  # bytes of a request, at most
+# Open connections, at most. A new connection replaces the oldest one that has not made a valid
+# request; if there is none, the new connection is closed.
 _CONNECTIONS = 256
-# A line that asks and lines of headers, as the protocol has them and in no other way: what one
-# reader takes for the end of a request, another might not.
+# The request line and headers, exactly as in the protocol: other parsers might disagree about where
+# a request with unusual line ends or characters ends.
 _HEAD = re.compile(
     rb"[!-~]+ [!-~]+ HTTP/1\.[01](\r\n[!#$%&'*+.^_`|~0-9A-Za-z-]+:[\t -~\x80-\xff]*)*\r\n\r\n"
 )
@@ -61,12 +62,13 @@ class ServedFile:
 
 
 class StaticServer:
-    """Serves ``files`` by name ("" is the page itself) from the time it is made, until `close`.
+    """Serves ``files`` by name ("" is the page itself) until `close`; starts at once.
 
-    Every response carries the headers ``headers`` too.
+    Every response has the additional ``headers``.
 
     Raises:
-        UserError: the port is taken or not allowed, the host is no address of this machine.
+        UserError: the port is in use or not permitted, or the host is not an address of this
+            machine.
     """
 
     def __init__(
@@ -92,15 +94,15 @@ class StaticServer:
 
     @property
     def url(self) -> str:
-        """The page's address, for a browser on this machine."""
+        """The URL of the page, for a browser on this machine."""
         return self.url_at("127.0.0.1" if self.host in ANY_HOST else self.host)
 
     def url_at(self, host: str) -> str:
-        """The page's address for those who call this machine ``host``."""
+        """The URL of the page if this machine is called ``host``."""
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}/"
 
     def close(self) -> None:
-        """Stop; downloads under way are cut off."""
+        """Stop the server; running downloads are aborted."""
         self._server.shutdown()
         self._server.server_close()
         self._server.hang_up()
@@ -115,7 +117,7 @@ class StaticServer:
 class _Server(socketserver.ThreadingTCPServer):
     daemon_threads = True
     block_on_close = False
-    allow_reuse_address = sys.platform != "win32"  # there it would share a port that is taken
+    allow_reuse_address = sys.platform != "win32"  # on Windows it allows to share a used port
     request_queue_size = 64
 
     prefix: str
@@ -125,24 +127,24 @@ class _Server(socketserver.ThreadingTCPServer):
 
     def __init__(self, *args: Any) -> None:
         self._lock = threading.Lock()
-        self._strangers: dict[socket.socket, None] = {}  # in the order in which they came
-        self._known: set[socket.socket] = set()  # have been given something
+        self._strangers: dict[socket.socket, None] = {}  # no valid request yet; oldest first
+        self._known: set[socket.socket] = set()  # have made a valid request
         super().__init__(*args)
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Whether there is room for a connection."""
+        """Whether a new connection is accepted."""
         with self._lock:
             if len(self._strangers) + len(self._known) >= _CONNECTIONS:
                 if not self._strangers:
                     return False
                 oldest = next(iter(self._strangers))
                 del self._strangers[oldest]
-                _hang_up(oldest)  # its thread sees that, and ends
+                _hang_up(oldest)  # its thread ends when it notices
             self._strangers[request] = None
             return True
 
     def know(self, request: socket.socket) -> None:
-        """This one has the address."""
+        """Record that a connection has made a valid request."""
         with self._lock:
             if request in self._strangers:
                 del self._strangers[request]
@@ -155,16 +157,16 @@ class _Server(socketserver.ThreadingTCPServer):
         super().shutdown_request(request)
 
     def hang_up(self) -> None:
-        """Cut all connections off."""
+        """Close all connections."""
         with self._lock:
             for request in (*self._strangers, *self._known):
                 _hang_up(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        # A browser that leaves in the middle of a download is not an error.
+        # A browser that disconnects during a download is not an error.
         error = sys.exc_info()[1]
         if not isinstance(error, ConnectionError | TimeoutError):
-            _log.error("the viewer's server: %s: %s", type(error).__name__, error)
+            _log.error("web server of the viewer: %s: %s", type(error).__name__, error)
 
 
 def _hang_up(connection: socket.socket) -> None:
@@ -180,17 +182,21 @@ def _listen(host: str, port: int) -> _Server:
     try:
         return (_Server6 if ":" in host else _Server)((host, port), _Handler)
     except OverflowError:
-        raise UserError(f"--port is {port}; it must be 0 to 65535") from None
+        raise SettingError("port", f"{port} is out of range; use 0 to 65535") from None
     except PermissionError:
-        raise UserError(f"port {port} is not allowed to you; name one above 1023") from None
+        raise SettingError("port", f"no permission to use {port}; choose one above 1023") from None
     except socket.gaierror:
-        raise UserError(f"{host}: not a name or address of this machine") from None
+        raise SettingError(
+            "host", f"{host} is not a name or address of this machine; use e.g. 127.0.0.1"
+        ) from None
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise UserError(
-                f"port {port} is taken; name another, or leave --port out for a free one"
+            raise SettingError(
+                "port", f"{port} is in use; choose another, or do not set it to use a free one"
             ) from None
-        raise UserError(f"{host}: cannot be listened on ({error.strerror})") from None
+        raise SettingError(
+            "host", f"cannot listen at {host} ({error.strerror}); use e.g. 127.0.0.1"
+        ) from None
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -204,7 +210,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._received = b""
 
     def handle_one_request(self) -> None:
-        """As the library's, but for a request that is all there, in its time and of its size."""
+        """Like the base class, but requires a complete request in time, of limited size."""
         head = self._receive()
         self.close_connection = True
         if not head:
@@ -223,7 +229,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send_empty(status, {"Connection": "close"})
 
     def _receive(self) -> bytes | None:
-        """The next request as far as its empty line, or too much of one; None: it does not come."""
+        """The next request up to its empty line, or a too long part; None if none arrives."""
         started: float | None = time.monotonic() if self._received else None
         while (end := self._received.find(b"\r\n\r\n")) < 0:
             if len(self._received) > _REQUEST:
@@ -254,7 +260,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=False)
 
     def _refuse_method(self) -> None:
-        self.close_connection = True  # its body was not read
+        self.close_connection = True  # the body of the request was not read
         self._send_empty(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": "GET, HEAD"})
 
     @property
@@ -294,9 +300,9 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(content[at : min(at + _BLOCK, end)])
 
     def _refusal(self) -> HTTPStatus | None:
-        """Why a request is not looked at."""
+        """The status with which a request is rejected; None accepts it."""
         hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
-        # What has a body, or might have one to somebody else, would be two requests to us.
+        # A body, or what another parser takes for one, could be read as a second request.
         bodies = (
             self.headers.get_all("Content-Length", []),
             self.headers.get_all("Transfer-Encoding", []),
@@ -312,7 +318,7 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def _file(self) -> ServedFile | None:
-        """What the path names, taken as it stands: no name of ours needs decoding."""
+        """The file at the requested path, without decoding: all names are plain ASCII."""
         path = self.path.partition("?")[0]
         prefix = self._ours.prefix
         start, name = path[: len(prefix)], path[len(prefix) :]
@@ -321,10 +327,10 @@ class _Handler(BaseHTTPRequestHandler):
         return self._ours.files.get(name)
 
     def _range(self, file: ServedFile) -> tuple[int, int] | None:
-        """First byte asked for and the one after the last; None: the whole file.
+        """First requested byte and the one after the last; None: the whole file.
 
-        A range that the file does not have is empty. Several ranges at once, and what is no range,
-        are answered by the whole file, as the protocol allows.
+        A range outside of the file is empty. Multiple and malformed ranges are answered with the
+        whole file, as the protocol allows.
         """
         match = _RANGE.fullmatch(self.headers.get("Range", "").replace(" ", ""))
         if match is None or match[0] == "bytes=-":
@@ -332,7 +338,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.headers.get("If-Range", file.etag) != file.etag:
             return None
         size = len(file.content)
-        # A number with thousands of digits is refused by int(); any of these is past the end.
+        # int() rejects numbers with thousands of digits; 19 digits are past the end anyway.
         first, last = (int(digits[:19]) if digits else None for digits in match.groups())
         if first is None:
             return max(0, size - (last or 0)), size
@@ -350,7 +356,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         always = {
             "X-Content-Type-Options": "nosniff",
-            "Referrer-Policy": "no-referrer",  # the address is a secret
+            "Referrer-Policy": "no-referrer",  # the address contains the token
             "Cross-Origin-Resource-Policy": "same-origin",
         }
         for name, value in {**always, **self._ours.headers, **headers}.items():

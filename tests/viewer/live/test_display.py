@@ -7,7 +7,7 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation
-from snowsplat.viewer.live.look import Placed, Pose, fit
+from snowsplat.viewer.live.display import Placed, Pose, fit
 
 
 def pose(fov: float = 1.0, width: int = 640, height: int = 480) -> Pose:
