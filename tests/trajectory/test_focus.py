@@ -5,9 +5,17 @@ import math
 import pytest
 import torch
 
-from snowsplat.trajectory.focus import focus_of, resized, viewing_distance
+from snowsplat.scene.camera import Camera
+from snowsplat.trajectory.focus import (
+    DEFAULT_UP,
+    focus_of,
+    resized,
+    typical,
+    up_of,
+    viewing_distance,
+)
 
-from .rigs import FOCUS, camera_at, ring, wall
+from .rigs import FOCUS, UP, camera_at, ring, wall
 
 
 def test_viewing_distance_counts_visible_points():
@@ -44,3 +52,69 @@ def test_resized_cameras_have_square_pixels_and_the_same_area_of_view():
     field, before = 160 * 90 / wide.fx**2, 64 * 48 / 60.0**2
     assert field == pytest.approx(before)
     torch.testing.assert_close(wide.cam_from_world, camera.cam_from_world)
+
+
+def ahead() -> Camera:
+    """At the origin, along z; it sees x / z from −32/60 to 32/60, y / z from −24/60 to 24/60."""
+    return Camera(64, 48, 60.0, 60.0, 32.0, 24.0, torch.eye(3, 4, dtype=torch.float64))
+
+
+def test_only_points_within_the_image_are_seen():
+    inside = torch.tensor([[0.0, 0.0, 2.0]])
+    left, above = torch.tensor([[-6.0, 0.0, 10.0]]), torch.tensor([[0.0, -4.5, 10.0]])
+    behind = torch.tensor([[0.0, 0.0, -10.0]])
+    for outside in (left, -left * torch.tensor([1, 1, -1]), above, behind):
+        points = torch.cat([inside, outside.repeat(5, 1)])
+        assert viewing_distance([ahead()], points) == 2.0
+
+
+def test_viewing_distance_is_the_median_over_cameras_of_medians():
+    points = torch.tensor([[0.0, 0, 2], [0, 0, 3], [0, 0, 7]])
+    at = [camera_at((0.0, 0.0, -z), torch.tensor([0.0, 0, 9]).double()) for z in (0.0, 10.0, 1.0)]
+    assert viewing_distance(at, points) == pytest.approx(4.0)  # of 3, 4 and 13
+    assert viewing_distance([ahead()], torch.zeros(1, 3)) == 1.0  # the point is at the camera
+
+
+def test_the_typical_camera_has_the_median_field_of_view():
+    pose = torch.eye(3, 4, dtype=torch.float64)
+    cameras = [Camera(w, 9, f, f, 1.0, 1.0, pose) for w, f in ((10, 50.0), (90, 90.0), (10, 20.0))]
+    assert typical(cameras) is cameras[2]  # ratios 5, 1 and 2
+
+
+@pytest.mark.parametrize(("degrees", "depth"), [(7.0, 10.0), (9.0, 4.0)])
+def test_axes_within_eight_degrees_of_their_mean_are_parallel(degrees, depth):
+    """Both cameras look at (0, 0, 4); the viewing distance is 10."""
+    x = 4 * math.tan(math.radians(degrees))
+    target = torch.tensor([0.0, 0.0, 4.0]).double()
+    focus = focus_of([camera_at((-x, 0.0, 0.0), target), camera_at((x, 0.0, 0.0), target)], 10.0)
+    torch.testing.assert_close(focus, torch.tensor([0.0, 0.0, depth]).double())
+
+
+def test_axes_that_intersect_behind_the_cameras():
+    cameras = [
+        camera_at((x, 0.0, 0.0), torch.tensor([2.0 * x, 0.0, 2.0]).double()) for x in (-1.0, 1.0)
+    ]
+    expected = torch.tensor([0.0, 0.0, 10.0]).double()
+    torch.testing.assert_close(focus_of(cameras, 10.0), expected)
+
+
+def test_up_is_the_default_if_cameras_are_level_and_upright():
+    x, y, z = FOCUS.tolist()
+    for height in (-1.0, 0.5):  # the cameras look down, or up
+        cameras = [camera_at((x + math.cos(t), y + height, z + math.sin(t))) for t in range(7)]
+        assert torch.equal(up_of(cameras), DEFAULT_UP)
+    inverted = [camera_at((x + math.cos(t), y, z + math.sin(t)), up=-UP) for t in range(7)]
+    torch.testing.assert_close(up_of(inverted), -DEFAULT_UP)
+
+
+@pytest.mark.parametrize(("degrees", "level"), [(4.0, True), (6.0, False)])
+def test_cameras_are_level_up_to_a_roll_of_five_degrees(degrees, level):
+    roll = math.radians(degrees)
+    tilted = torch.tensor([math.sin(roll), -math.cos(roll), 0.0]).double()
+    cameras = [
+        camera_at((0.1 * i, 0.0, 0.0), torch.tensor([0.1 * i, 0.0, 5.0]).double(), tilted)
+        for i in range(5)
+    ]
+    assert torch.equal(up_of(cameras), DEFAULT_UP) == level
+    if not level:
+        torch.testing.assert_close(up_of(cameras), tilted)

@@ -2,6 +2,7 @@
 
 import itertools
 
+import pytest
 import torch
 
 from snowsplat.trajectory.tour import MOST_CAMERAS, in_order, short_tour
@@ -48,3 +49,18 @@ def test_many_cameras_are_subsampled():
     cameras = [camera_at((0.01 * i, 0.0, -3.0)) for i in range(count)]
     order = in_order(cameras, [f"{i:05d}" for i in range(count)], 3.0)
     assert order == list(range(0, count, 3))
+
+
+@pytest.mark.parametrize(("detours", "by_name"), [(2, True), (3, False)])
+def test_names_are_used_up_to_one_point_six_times_a_short_tour(detours, by_name):
+    """Ten cameras in a line: a tour of length 9, to which each pair that is exchanged adds 2."""
+    places = list(range(10))
+    for i in (1, 4, 7)[:detours]:
+        places[i], places[i + 1] = places[i + 1], places[i]
+    cameras = [
+        camera_at((float(x), 0.0, -3.0), torch.tensor([x, 0.0, 9.0]).double()) for x in places
+    ]
+    order = in_order(cameras, [f"photo {i}" for i in range(10)], 1.0)
+    assert (order == list(range(10))) == by_name
+    if not by_name:
+        assert [places[i] for i in order] in (list(range(10)), list(range(9, -1, -1)))

@@ -58,6 +58,31 @@ def test_size_rate_length_and_index(tmp_path):
     assert 0 < content.find(b"moov") < content.find(b"mdat")
 
 
+def test_quality_is_that_of_h264_at_crf_18(tmp_path):
+    """x264 writes its settings into the stream."""
+    write(tmp_path / "a.mp4")
+    assert b"crf=18.0" in (tmp_path / "a.mp4").read_bytes()
+
+
+def test_other_encoders_get_a_bit_rate(tmp_path, monkeypatch):
+    """0.25 bits per pixel, of blocks that change with every frame and need more."""
+    monkeypatch.setattr(film_module, "_ENCODERS", ("mpeg4",))
+    random = np.random.default_rng(0)
+    with film(tmp_path / "a.mp4", 128, 96, 24) as add:
+        for _ in range(48):
+            blocks = np.kron(random.random((12, 16, 3)), np.ones((8, 8, 1)))
+            add((60 * blocks + 90).astype(np.uint8))
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        bits = container.streams.video[0].codec_context.bit_rate
+    assert bits == pytest.approx(0.25 * 128 * 96 * 24, rel=0.4)
+
+
+def test_the_smallest_video(tmp_path):
+    with film(tmp_path / "a.mp4", 2, 2, 24) as add:
+        add(np.full((2, 2, 3), 255, np.uint8))
+    assert decoded(tmp_path / "a.mp4")[0].min() > 250
+
+
 def interrupted(path: Path, stop: type[BaseException]) -> None:
     with film(path, WIDTH, HEIGHT, 24) as add:
         add(image(0))
