@@ -1,4 +1,4 @@
-"""The page about a training: whole, alone, true, and silent about the machine's owner."""
+"""The report of a training: complete, self-contained, correct, and without private paths."""
 
 import json
 import re
@@ -20,7 +20,7 @@ NAME = "mon <château>"
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> dict[str, Any]:
-    """Arguments of `Trained`; the dataset's names are nasty, one photo has a mask."""
+    """Arguments of `Trained`, with a name that needs escaping."""
     folder = tmp_path_factory.mktemp("report") / "capture"
     write_toy_dataset(folder, n_views=17, width=48, height=36, n_points=300)
     dataset = load_dataset(folder, hold_out=2)
@@ -36,7 +36,7 @@ def trained(tmp_path_factory) -> dict[str, Any]:
     trainer.run(record)
     return {
         "name": NAME,
-        "capture": dataset,
+        "dataset": dataset,
         "gaussians": trainer.gaussians,
         "step": 40,
         "background": (0.0, 0.0, 0.0),
@@ -51,7 +51,7 @@ def words(page: Path) -> str:
     return " ".join("".join(ET.parse(page).getroot().find("body").itertext()).split())
 
 
-def test_page_is_well_formed_and_needs_nothing_else(trained, tmp_path):
+def test_the_page_is_well_formed_and_self_contained(trained, tmp_path):
     page = tmp_path / "report.html"
     write_training_report(page, Trained(**trained))
     text = page.read_text(encoding="utf-8")
@@ -67,45 +67,45 @@ def test_page_is_well_formed_and_needs_nothing_else(trained, tmp_path):
     assert titles == ["loss", "PSNR, dB", "Gaussians", "time of a step, ms"]
 
 
-def test_page_tells_what_came_of_it(trained, tmp_path):
+def test_the_page_contains_the_results(trained, tmp_path):
     write_training_report(tmp_path / "report.html", Trained(**trained))
-    told = words(tmp_path / "report.html")
+    content = words(tmp_path / "report.html")
     evaluation = trained["evaluation"]
     for expected in (
         NAME,
         f"{evaluation.psnr:.2f} dB",
         f"{evaluation.ssim:.3f}",
         f"{len(trained['gaussians']):,}",
-        "9 photos that the training has never seen",
+        "9 photos that were not used for training",
         "8 to train on, 9 held out",
         "48 × 36",
         "a & b",
-        "0.1 GB used at most",
+        "0.1 GB peak",
         "instruction set",
         f"snowsplat view '{NAME}'",
     ):
-        assert expected in told
-    # The worst first; the best first among the best; each view in the list.
+        assert expected in content
+    # The worst first; the best first among the best; each view in the table.
     order = sorted(evaluation.views, key=lambda view: view.psnr)
     shown = [f"{view.name}: PSNR" for view in (*order[:3], order[-1], order[-2])]
-    places = [told.index(name) for name in shown]
+    places = [content.index(name) for name in shown]
     assert places == sorted(places)
-    assert all(told.count(view.name) >= 1 for view in evaluation.views)
+    assert all(content.count(view.name) >= 1 for view in evaluation.views)
 
 
-def test_without_held_out_photos_those_of_the_training_are_measured(trained, tmp_path):
-    dataset = trained["capture"]
+def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path):
+    dataset = trained["dataset"]
     whole = type(dataset)(dataset.train, [], dataset.points, dataset.extent)
-    changed = trained | {"capture": whole, "evaluation": None, "history": History()}
+    changed = trained | {"dataset": whole, "evaluation": None, "history": History()}
     write_training_report(tmp_path / "report.html", Trained(**changed))
-    told = words(tmp_path / "report.html")
-    assert "No photos were held out" in told
-    assert "8 photos of the training" in told
-    assert "8 to train on, 0 held out" in told
+    content = words(tmp_path / "report.html")
+    assert "No photos were held out" in content
+    assert "8 photos used for training" in content
+    assert "8 to train on, 0 held out" in content
 
 
-def test_train_writes_it_and_a_resumed_training_goes_on_with_its_curves(tmp_path):
-    """On the command line; and it tells no more of paths than names."""
+def test_train_writes_it_and_a_resumed_training_continues_its_curves(tmp_path):
+    """On the command line. The page contains names, but no absolute paths."""
     from snowsplat.cli.main import main
 
     write_toy_dataset(tmp_path / "photos", n_views=9, width=48, height=36, n_points=300)
@@ -127,7 +127,7 @@ def test_train_writes_it_and_a_resumed_training_goes_on_with_its_curves(tmp_path
     assert sum(stretch["steps"] for stretch in history["stretches"]) == 10
 
 
-def test_what_a_kill_left_of_a_file_goes_with_the_next_training(tmp_path):
+def test_the_next_training_removes_temporary_files_of_a_kill(tmp_path):
     from snowsplat.cli.main import main
 
     write_toy_dataset(tmp_path / "photos", n_views=9, width=48, height=36, n_points=300)

@@ -1,4 +1,4 @@
-"""Photo, render and error of a view."""
+"""Photo, rendering and error of a view."""
 
 import base64
 import io
@@ -16,8 +16,8 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.report.pictures import compared
 
 
-def test_error_is_where_they_differ_and_not_where_the_mask_is(tmp_path):
-    """An empty scene is black: it is off where the photo is white, but for the masked part."""
+def test_the_error_is_zero_where_the_mask_is_false(tmp_path):
+    """An empty scene is black: the error is where the photo is white and not masked."""
     photo = np.zeros((40, 60, 3), np.uint8)
     photo[:, 20:] = 255
     Image.fromarray(photo).save(tmp_path / "a.png")
@@ -37,9 +37,9 @@ def test_error_is_where_they_differ_and_not_where_the_mask_is(tmp_path):
     assert "a &lt;b&gt;.png: PSNR" in html
     sources = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', html)
     shown = [np.asarray(Image.open(io.BytesIO(base64.b64decode(s)))) for s in sources]
-    assert [picture.shape for picture in shown] == [(40, 60, 3)] * 3
+    assert [image.shape for image in shown] == [(40, 60, 3)] * 3
     means = [
-        [picture[5:35, start + 4 : start + 16].mean() for start in (0, 20, 40)] for picture in shown
+        [image[5:35, start + 4 : start + 16].mean() for start in (0, 20, 40)] for image in shown
     ]
     expected = [[0, 255, 255], [0, 0, 0], [0, 255, 0]]
     np.testing.assert_allclose(means, expected, atol=6)

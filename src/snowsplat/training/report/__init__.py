@@ -1,4 +1,4 @@
-"""report.html: how a training went and what came of it."""
+"""report.html: the course and the result of a training."""
 
 from snowsplat.training.report.page import Trained, write_training_report
 

@@ -1,4 +1,4 @@
-"""report.html: how a training went and what came of it, on one page that needs nothing else."""
+"""report.html: the course and the result of a training, as one self-contained page."""
 
 from __future__ import annotations
 
@@ -22,9 +22,12 @@ from snowsplat.util.html import bar, cards, duration, page, table, text
 from snowsplat.util.machine import memory_bytes, processor_name, system_name
 from snowsplat.util.process import single_threaded
 
-_TRAINING_VIEWS = 8  # that are measured where none were held out
-_LISTED = 200  # views
-_SMOOTHED = 40  # the loss is the mean of so many parts of the training
+#: Number of training views that are evaluated if no views were held out.
+_TRAINING_VIEWS = 8
+#: Largest number of views in the table.
+_LISTED = 200
+#: Curves are averaged over this many parts of the training.
+_SMOOTHED = 40
 
 _STYLE = (
     charts.STYLE
@@ -39,15 +42,15 @@ td { font-variant-numeric: tabular-nums; }
 
 @dataclass(frozen=True)
 class Trained:
-    """What the page tells about.
+    """The content of the page.
 
     Attributes:
         name: of the scene.
         step: the last one.
-        background: of the views, in 0..1.
-        evaluation: of the held-out views; without any, some training views are measured.
-        settings: by name: what was set, as JSON values.
-        peak_bytes: the most memory that was held; 0 if that is not known.
+        background: of the views, RGB in 0..1.
+        evaluation: of the held-out views; without any, some training views are evaluated.
+        settings: by name, as JSON values.
+        peak_bytes: peak memory; 0 if unknown.
     """
 
     name: str
@@ -65,7 +68,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
     """Write the page, atomically.
 
     Raises:
-        UserError: a photo is absent or damaged.
+        UserError: a photo is missing or damaged.
         OSError: the file cannot be written.
     """
     held_out = trained.evaluation is not None and bool(trained.evaluation.views)
@@ -97,11 +100,11 @@ def _headline(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
     count = len(evaluation.views)
     photos = f"{count} photo" if count == 1 else f"{count} photos"
     if held_out:
-        verdict = f"Measured on {photos} that the training has never seen."
+        verdict = f"Evaluated on {photos} that were not used for training."
     else:
         verdict = (
-            f"No photos were held out, so this was measured on {photos} of the training, which "
-            "flatters it; --eval holds out every 8th."
+            f"No photos were held out: these are the metrics of {photos} used for training, which "
+            "are better than those of new views. Use --eval to hold out every 8th photo."
         )
     return f"<h1>{text(trained.name)}</h1>\n<p>{verdict}</p>"
 
@@ -132,7 +135,7 @@ def _curves(history: History) -> str:
         (
             "PSNR of the held-out photos, dB",
             charts.chart(
-                psnr if len(psnr) > 1 else [],  # one is told above
+                psnr if len(psnr) > 1 else [],  # a single value is in the headline
                 x_label="steps",
                 y_label="PSNR, dB",
                 dots=True,
@@ -166,7 +169,7 @@ def _curves(history: History) -> str:
 
 
 def _figures(evaluation: Evaluation, held_out: bool) -> str:
-    """The list of views, and how far each is off: a bar that begins at zero."""
+    """The table of views, with a bar of the error of each."""
     errors = [_rms(figures.psnr) for figures in evaluation.views]
     largest = max([*errors, 1e-9])
     rows = [
@@ -181,8 +184,8 @@ def _figures(evaluation: Evaluation, held_out: bool) -> str:
     ]
     more = len(evaluation.views) - _LISTED
     rest = f'<p class="soft">… and {more:,} more, see metrics.json.</p>' if more > 0 else ""
-    which = "held-out" if held_out else "measured"
-    heads = ["photo", "PSNR", "SSIM", "mean error (RMS)", ""]
+    which = "held-out" if held_out else "evaluated"
+    heads = ["photo", "PSNR", "SSIM", "RMS error", ""]
     return f"<h2>Each {which} photo</h2>\n{table(heads, rows)}{rest}"
 
 
@@ -193,13 +196,13 @@ def _settings(trained: Trained) -> str:
     rows = [
         ["photos", f"{len(dataset.train)} to train on, {len(dataset.test)} held out"],
         ["size", f"{camera.width} × {camera.height}"],
-        ["points at the start", points],
-        ["degree of the colours (SH)", str(trained.gaussians.sh_degree)],
+        ["initial points", points],
+        ["degree of the spherical harmonics", str(trained.gaussians.sh_degree)],
     ]
     everything = text(json.dumps(trained.settings, indent=2, ensure_ascii=False))
     return (
         f"<h2>Settings</h2>\n{table([], rows)}\n"
-        f"<details><summary>All of them</summary><pre>{everything}</pre></details>"
+        f"<details><summary>All settings</summary><pre>{everything}</pre></details>"
     )
 
 
@@ -210,9 +213,9 @@ def _machine(trained: Trained) -> str:
         ["threads", f"{threads}, instruction set {native.isa()}"],
         ["system", text(system_name())],
     ]
-    memory = [f"{trained.peak_bytes / 1e9:.1f} GB used at most"] if trained.peak_bytes else []
+    memory = [f"{trained.peak_bytes / 1e9:.1f} GB peak"] if trained.peak_bytes else []
     if memory_bytes():
-        memory.append(f"{memory_bytes() / 1e9:.0f} GB there")
+        memory.append(f"{memory_bytes() / 1e9:.0f} GB installed")
     if memory:
         rows.append(["memory", ", ".join(memory)])
     return f"<h2>Machine</h2>\n{table([], rows)}"
@@ -224,5 +227,5 @@ def _next(name: str) -> str:
 
 
 def _rms(psnr: float) -> float:
-    """Root of the mean square of the differences, of a range of 1."""
+    """Root mean square error, with values in 0..1."""
     return 0.0 if math.isinf(psnr) else 10.0 ** (-psnr / 20.0)

@@ -1,4 +1,4 @@
-"""Views beside their photos, and where they differ: the best and the worst."""
+"""The best and the worst views: photo, rendering, and error."""
 
 from __future__ import annotations
 
@@ -15,11 +15,15 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.html import picture, text
 
-_WORST, _BEST = 3, 2  # views that are shown
-_PICTURE_SIDE = 360  # pixels of the longer side
-_WHITE_ERROR = 0.25  # mean difference of the channels that is drawn white
+#: Number of views that are shown, of those with the lowest and the highest PSNR.
+_WORST = 3
+_BEST = 2
+#: The longer side of an image, in pixels.
+_IMAGE_SIDE = 360
+#: The mean difference of the channels that is drawn white.
+_WHITE_ERROR = 0.25
 
-# From no error to `_WHITE_ERROR`: black, red, orange, white.
+# From 0 to `_WHITE_ERROR`: black, red, orange, white.
 _ERROR_COLORS = np.array(
     [[0, 0, 0], [96, 14, 30], [200, 60, 20], [250, 170, 60], [255, 255, 255]], np.float32
 )
@@ -42,16 +46,16 @@ def compared(
     """HTML of the views with the lowest and the highest PSNR in ``evaluation``.
 
     Raises:
-        UserError: a photo is absent or damaged.
+        UserError: a photo is missing or damaged.
     """
     color = torch.tensor(background, device=gaussians.means.device)
     order = sorted(evaluation.views, key=lambda figures: figures.psnr)
     if len(order) <= _WORST + _BEST:
-        groups = [("Photo, render, error", order)]
+        groups = [("Photo, rendering, error", order)]
     else:
         groups = [
-            ("Least like their photos", order[:_WORST]),
-            ("Most like them", order[: -_BEST - 1 : -1]),
+            ("Lowest PSNR", order[:_WORST]),
+            ("Highest PSNR", order[: -_BEST - 1 : -1]),
         ]
     by_name = {view.name: view for view in views}
     parts = []
@@ -65,8 +69,8 @@ def compared(
             parts.append(f'<h2>{title}</h2>\n<div class="views">{figures}</div>')
     white = f"{100 * _WHITE_ERROR:.0f}%"
     parts.append(
-        '<p class="soft">Photo, render, and error: the mean difference of red, green and blue, '
-        f"from black (none) to white ({white} of the range, or more).</p>"
+        '<p class="soft">Photo, rendering, and error: the mean difference of red, green and blue, '
+        f"from black (0) to white ({white} of the range, or more).</p>"
     )
     return "\n".join(parts)
 
@@ -85,7 +89,7 @@ def _triple(
         picture(_small(pixels), f"{view.name}: {what}", quality=80)
         for what, pixels in (
             ("photo", _bytes(photo)),
-            ("render", _bytes(image)),
+            ("rendering", _bytes(image)),
             ("error", _error_in_color(difference.cpu().numpy())),
         )
     )
@@ -108,6 +112,6 @@ def _error_in_color(difference: np.ndarray) -> np.ndarray:
 
 def _small(pixels: np.ndarray) -> Image.Image:
     image = Image.fromarray(pixels)
-    scale = min(1.0, _PICTURE_SIDE / max(image.size))
+    scale = min(1.0, _IMAGE_SIDE / max(image.size))
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
     return image.resize(size, Image.Resampling.LANCZOS)
