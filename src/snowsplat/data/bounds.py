@@ -14,9 +14,9 @@ from snowsplat.scene.camera import Camera
 _SHARE_OF_VIEW = 0.9
 # A cube whose distance or size cannot be measured is placed with this many scene extents.
 _GUESSED_EXTENTS = 5.0
-# The scene extent is 1.1 × the largest distance of a camera from the mean; see `scene_extent`.
-_EXTENT_FACTOR = 1.1
-# Fewer points than this are not used.
+#: The scene extent is this times the largest distance of a camera centre from the mean centre.
+EXTENT_FACTOR = 1.1
+# With fewer points than this, the box is computed from the cameras.
 _MIN_POINTS = 100
 # Below this smallest eigenvalue, all optical axes are within about two degrees of each other.
 _PARALLEL_AXES = 1e-3
@@ -68,10 +68,10 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
 
     direction = axes.mean(0)
     if float(direction.norm()) > 0.5:
-        distance = _GUESSED_EXTENTS * _EXTENT_FACTOR * spread
+        distance = _GUESSED_EXTENTS * EXTENT_FACTOR * spread
         centre = middle + direction / direction.norm() * distance
         return _cube(centre, _SHARE_OF_VIEW * distance * float(tangent))
-    return _cube(middle, _GUESSED_EXTENTS * _EXTENT_FACTOR * spread)
+    return _cube(middle, _GUESSED_EXTENTS * EXTENT_FACTOR * spread)
 
 
 def _half_view(camera: Camera) -> float:

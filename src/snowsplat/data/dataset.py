@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snowsplat.data.bounds import scene_bounds
+from snowsplat.data.bounds import EXTENT_FACTOR, scene_bounds
 from snowsplat.data.decode import ImageSource
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
@@ -146,4 +146,4 @@ def scene_extent(cameras: list[Camera]) -> float:
     """
     centres = torch.stack([camera.position.detach() for camera in cameras])
     radius = float((centres - centres.mean(0)).norm(dim=1).max())
-    return 1.1 * radius if radius > 0.0 else 1.0
+    return EXTENT_FACTOR * radius if radius > 0.0 else 1.0

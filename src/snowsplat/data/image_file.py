@@ -55,7 +55,7 @@ def open_image(path: Path, formats: Sequence[str], *, header_only: bool = False)
         _check_header(file)
     image = Image.open(path, formats=list(formats))
     try:
-        _check(image)
+        _check_size(image)
         if not header_only and image.format in ("JPEG", "MPO"):
             _check_scans(image, path)
     except BaseException:
@@ -90,7 +90,7 @@ def _check_header(file: BinaryIO) -> None:
             raise ValueError("too many bytes before its pixels")
 
 
-def _check(image: Image.Image) -> None:
+def _check_size(image: Image.Image) -> None:
     width, height = image.size
     if width * height > MOST_PIXELS or max(width, height) > LONGEST_SIDE:
         raise ValueError(TOO_LARGE)

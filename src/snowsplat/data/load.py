@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 # Values of ``resolution`` that divide the image size; any other value is a width.
 _DIVISORS = (1, 2, 4, 8)
-# Pixels. A resolution that makes smaller images is a mistake.
+# Smallest width and height of a scaled image in pixels. A resolution below this is a mistake.
 _SMALLEST_SIDE = 16
 # The largest ratio between the size of a camera and the size of its image file.
 _LARGEST_FACTOR = 16

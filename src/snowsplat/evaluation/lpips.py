@@ -15,7 +15,7 @@ Names in the file:
     (or net.sliceM.N.weight, …)           the same, as the `lpips` package spells it
     linK.model.1.weight                   (1, C, 1, 1), K = 0..4, the heads
 
-The shape of the first layer tells AlexNet from VGG16.
+The shape of the first layer shows whether the backbone is AlexNet or VGG16.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Comparing rendered views with their photos: PSNR, SSIM and, on request, LPIPS.
 
 The rendered image is clamped to 0..1, as for a screen or a file, but it is not rounded to 8 bits.
-(The script `metrics.py` of the reference implementation reads rendered images from PNG files, that
-is, rounded. At 30 dB this rounding costs less than 0.01 dB.) Transparent photos are composited over
+(The script `metrics.py` of the reference implementation reads rendered images from PNG files, where
+they are rounded. At 30 dB this costs less than 0.01 dB.) Transparent photos are composited over
 the background colour. If a view has a mask, PSNR ignores the masked pixels. SSIM and LPIPS treat
 them as equal in both images.
 """

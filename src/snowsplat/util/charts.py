@@ -52,8 +52,8 @@ def chart(
     points, raw = _finite(points), _finite(raw)
     if not points:
         return ""
-    # The axis leaves out the 2% most extreme raw values at each end, so that a single outlier does
-    # not flatten the curve.
+    # The range of the y axis ignores the lowest and the highest 2% of the raw values. Otherwise a
+    # single outlier would flatten the curve.
     ys = [y for _, y in points] + sorted(y for _, y in raw)[len(raw) // 50 : -(len(raw) // 50) - 1]
     x_ticks = ticks(min(0.0, points[0][0]), max(points[-1][0], 1e-9), _TICKS_X)
     y_ticks = ticks(0.0 if from_zero else min(ys), max(ys), _TICKS_Y)

@@ -83,7 +83,7 @@ class _Cursor:
 
 
 def count_images(path: Path) -> int:
-    """Number of images that the head of an images.bin promises, at most as many as can fit."""
+    """Number of images according to the head of images.bin, limited to what the file can hold."""
     with open(path, "rb") as file:
         head = file.read(_COUNT.size)
     if len(head) < _COUNT.size:

@@ -24,8 +24,8 @@ from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
 
-# Number of focal lengths, one (f, cx, cy) or two (fx, fy, cx, cy), of each camera model that is a
-# pinhole camera if all parameters after the principal point are 0.
+# The supported camera models. They are pinhole cameras if all parameters after the principal point
+# are 0. The value is the number of focal lengths: 1 (f, cx, cy) or 2 (fx, fy, cx, cy).
 _FOCAL_LENGTHS = {
     "SIMPLE_PINHOLE": 1,
     "PINHOLE": 2,
