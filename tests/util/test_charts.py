@@ -30,7 +30,7 @@ def test_ticks_of_a_single_value(value):
     assert found[0] <= value <= found[-1]
 
 
-def test_tick_words():
+def test_tick_labels():
     assert tick_labels([0, 20000, 40000]) == ["0", "20k", "40k"]
     assert tick_labels([0, 0.02, 0.04]) == ["0", "0.02", "0.04"]
     assert tick_labels([0, 500, 1000, 1500]) == ["0", "500", "1000", "1500"]

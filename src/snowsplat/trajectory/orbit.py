@@ -21,7 +21,7 @@ from snowsplat.trajectory.focus import (
 )
 from snowsplat.util.errors import UserError
 
-# Cameras surround the focus if every sector of azimuths that is wider than this has a camera.
+# Cameras surround the focus if no gap between the azimuths of neighbours is wider than this.
 _WIDEST_GAP = math.radians(110)
 # Largest elevation. Closer to the vertical, the image would rotate quickly.
 _STEEPEST = math.radians(80)

@@ -32,9 +32,9 @@ class Spline:
         count = len(times)
         second = torch.zeros_like(values)  # second derivatives at the knots
         if count > 2:
-            # The second divided differences are Qᵀ y. Multiplied by R, the second derivatives at
-            # the inner knots equal them. Q has three entries per column, so the matrix
-            # R + smoothing · Qᵀ Q has five diagonals.
+            # Solve (R + smoothing · Qᵀ Q) γ = Qᵀ y for the second derivatives γ at the inner
+            # knots. Qᵀ y are the second divided differences. Q has three entries per column and R
+            # three diagonals, so the matrix has five diagonals.
             first, last = 1 / steps[:-1], 1 / steps[1:]
             middle = -first - last
             diagonal = (steps[:-1] + steps[1:]) / 3

@@ -11,8 +11,8 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.trajectory.focus import positions_of, rotations_of
 
-#: Of more cameras than this, every n-th is used. A tour through all would take long to compute and
-#: would not look different.
+#: If there are more cameras than this, only every n-th camera is used. A tour through all of them
+#: would take long to compute and would look the same.
 MOST_CAMERAS = 400
 # The order of names is used if its length is at most this many times that of a short tour.
 _LONGEST_BY_NAME = 1.6
