@@ -63,6 +63,17 @@ def test_round_trip(tmp_path, make_scene, psnr, degree, n):
     assert psnr(scene, read) > 90
 
 
+def test_zeros_are_exact(tmp_path, make_scene):
+    """Without a transform in its node, a scene does not pass through a rotation of its SH."""
+    scene = make_scene(10, 3)
+    scene.sh_rest[:, ::2] = 0
+    scene.means[:, 1] = 0
+    write_gaussians(tmp_path / "a.glb", scene)
+    read = read_gaussians(tmp_path / "a.glb")
+    assert torch.equal(read.sh_rest, scene.sh_rest)
+    assert torch.equal(read.means, scene.means)
+
+
 def test_a_real_scene(tmp_path, shared, psnr):
     scene = read_gaussians(shared / "reference_layout_sh3.ply")
     write_gaussians(tmp_path / "a.glb", scene)

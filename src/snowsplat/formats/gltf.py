@@ -102,12 +102,12 @@ def _parts(
 def _merge(parts: list[GaussianArrays]) -> GaussianArrays:
     """All rows of ``parts`` in order, at the highest SH degree among them."""
     rest = max((part.sh_rest.shape[1] for part in parts), default=0)
-    padded = [
-        part._replace(
-            sh_rest=np.pad(part.sh_rest, ((0, 0), (0, rest - part.sh_rest.shape[1]), (0, 0)))
-        )
-        for part in [GaussianArrays.empty(rest), *parts]
-    ]
+    padded = [GaussianArrays.empty(rest)]
+    for part in parts:
+        missing = rest - part.sh_rest.shape[1]
+        if missing:
+            part = part._replace(sh_rest=np.pad(part.sh_rest, ((0, 0), (0, missing), (0, 0))))
+        padded.append(part)
     return GaussianArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
 
 
