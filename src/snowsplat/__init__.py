@@ -42,7 +42,7 @@ _MODULES = {
     "load_dataset": "data",
     "read_gaussians": "formats",
     "recipe": "training.recipes",
-    "write_gaussians": "pipeline.convert",
+    "write_gaussians": "pipeline.scene_files",
 }
 
 __all__ = [

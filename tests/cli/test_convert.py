@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.cli.convert import _keep
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
+from snowsplat.pipeline.convert import gaussians_to_keep
 from snowsplat.scene import edit
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
@@ -127,22 +127,22 @@ def test_mistakes(refused, ply, tmp_path):
     assert "cannot be read" in refused("convert", tmp_path / "absent.ply", out)
     assert "is a folder" in refused("convert", ply, tmp_path)
     assert "0 to 3" in refused("convert", ply, out, "--sh-degree", 4)
-    assert "more than 0" in refused("convert", ply, out, "--scale", 0)
-    assert "more than 0" in refused("convert", ply, out, "--scale", "nan")
+    assert "above 0" in refused("convert", ply, out, "--scale", 0)
+    assert "above 0" in refused("convert", ply, out, "--scale", "nan")
     assert "finite" in refused("convert", ply, out, "--translate", "inf", 0, 0)
     assert "lower corner first" in refused("convert", ply, out, "--crop", 0, 0, 0, 1, -1, 1)
-    assert "none of the Gaussians" in refused("convert", ply, out, "--crop", 9, 9, 9, 10, 10, 10)
+    assert "no Gaussian is in" in refused("convert", ply, out, "--crop", 9, 9, 9, 10, 10, 10)
     for wrong in ("some", "-3", "101%", "1.5", "%"):
         assert "--decimate" in refused("convert", ply, out, f"--decimate={wrong}")
     assert not out.exists()
 
 
 def test_how_many_to_keep():
-    assert [_keep(text, 400) for text in ("0", "17", "0%", "50%", "12.5%", "100%")] == [
+    assert [gaussians_to_keep(text, 400) for text in ("0", "17", "0%", "50%", "12.5%", "100%")] == [
         *(0, 17, 0, 200, 50, 400)
     ]
     with pytest.raises(UserError):
-        _keep("¾", 400)
+        gaussians_to_keep("¾", 400)
 
 
 @pytest.mark.parametrize("format", READ_BACK, ids=lambda format: format.name)

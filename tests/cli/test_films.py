@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from snowsplat.cli.main import main
-from snowsplat.pipeline.films import FilmSize, frames_in
+from snowsplat.pipeline.videos import VideoOptions, VideoSize
 from snowsplat.util.errors import UserError
 
 from ..trajectory.rigs import camera_at
@@ -34,8 +34,8 @@ def frames(path: Path) -> list[np.ndarray]:
 def test_film_of_a_training(run, trained, way):
     result = run("render", trained, "--path", way, *SHORT)
     assert result.code == 0, result.err
-    assert f"{trained}/films/{way}.mp4: 10 frames 48x36" in result.out
-    pictures = frames(trained / "films" / f"{way}.mp4")
+    assert f"{trained}/videos/{way}.mp4: 10 frames 48x36" in result.out
+    pictures = frames(trained / "videos" / f"{way}.mp4")
     assert [picture.shape for picture in pictures] == [(36, 48, 3)] * 10
     # The scene is in them, and it moves.
     assert all(20 < picture.mean() < 250 and picture.std() > 5 for picture in pictures)
@@ -47,7 +47,7 @@ def test_depth_beside_or_in_a_film_of_its_own(run, trained, tmp_path):
     assert run(*common, "--depth", "color", "-o", tmp_path / "a.mp4").code == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mp4", "a_depth.mp4"]
     assert run(*common, "--side-by-side", "--size", "64x32").code == 0
-    both = frames(trained / "films/ellipse_side_by_side.mp4")[3]
+    both = frames(trained / "videos/ellipse_side_by_side.mp4")[3]
     assert both.shape == (32, 128, 3)
     depth = frames(tmp_path / "a_depth.mp4")[3]
     # From far (violet) to near (yellow): green is what tells.
@@ -60,7 +60,7 @@ def test_film_through_saved_cameras(run, trained, tmp_path):
     flags = ("--path", tmp_path / "my keys.json", *SHORT, "--size", 64)
     result = run("render", trained, *flags)
     assert result.code == 0, result.err
-    assert frames(trained / "films/my keys.mp4")[0].shape == (48, 64, 3)
+    assert frames(trained / "videos/my keys.mp4")[0].shape == (48, 64, 3)
     assert run("render", trained, *flags, "--film", tmp_path / "a.mp4").code == 0
     assert (tmp_path / "a.mp4").exists()
 
@@ -86,35 +86,35 @@ def test_film_of_a_file(run, refused, trained, tmp_path):
 
 def test_refused(refused, trained, tmp_path):
     film = ("render", trained, "--path", "ellipse")
-    assert "must be training, ellipse, spiral or a file" in refused(
+    assert "use training, ellipse, spiral or a file" in refused(
         "render", trained, "--path", "helix"
     )
     assert "no such file" in refused("render", trained, "--path", tmp_path / "absent.json")
     assert "use an ellipse" in refused("render", trained, "--path", "spiral")
     assert "must end in .mp4" in refused(*film, "--film", tmp_path / "a.gif")
-    assert "must be like 1280x720" in refused(*film, "--size", "large")
+    assert "use e.g. 1280x720" in refused(*film, "--size", "large")
     assert "16 to 8192" in refused(*film, "--size", "64x9000")
-    assert "a film takes --depth color" in refused(*film, "--depth", "16bit")
-    assert "more than 0" in refused(*film, "--seconds", 0)
-    assert "make it shorter" in refused(*film, "--seconds", 1e9)
-    assert "say which by --path" in refused("render", trained, "--size", "64x48")
+    assert "a video takes --depth color" in refused(*film, "--depth", "16bit")
+    assert "above 0" in refused(*film, "--seconds", 0)
+    assert "make the video shorter" in refused(*film, "--seconds", 1e9)
+    assert "name a camera path with --path" in refused("render", trained, "--size", "64x48")
     assert "no such folder" in refused("render", tmp_path / "absent", "--path", "ellipse")
-    assert "--threads is 0" in refused(*film, "--threads", 0)
+    assert "--threads: 0 is too small" in refused(*film, "--threads", 0)
 
 
 def test_sizes_are_even():
     camera = camera_at((0.0, 0.0, -3.0))  # 64×48
-    assert FilmSize.parse(None).of(camera) == (64, 48)
-    assert FilmSize.parse("127").of(camera) == (126, 94)
-    assert FilmSize.parse("33x21").of(camera) == (32, 20)
+    assert VideoSize.parse(None).of(camera) == (64, 48)
+    assert VideoSize.parse("127").of(camera) == (126, 94)
+    assert VideoSize.parse("33x21").of(camera) == (32, 20)
     large = camera.scaled(4000, 3000)
-    assert FilmSize.parse(None).of(large) == (1920, 1440)
-    assert FilmSize.parse("8192").of(camera.scaled(1, 100_000)) == (8192, 8192)
+    assert VideoSize.parse(None).of(large) == (1920, 1440)
+    assert VideoSize.parse("8192").of(camera.scaled(1, 100_000)) == (8192, 8192)
 
 
 def test_number_of_frames():
-    assert frames_in(2.0, 12.5) == 25
-    assert frames_in(0.001, 1.0) == 1
+    assert VideoOptions(seconds=2.0, fps=12.5).frames == 25
+    assert VideoOptions(seconds=0.001, fps=1.0).frames == 1
     for wrong in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(UserError, match="more than 0"):
-            frames_in(wrong, 30.0)
+        with pytest.raises(UserError, match="above 0"):
+            VideoOptions(seconds=wrong)

@@ -13,10 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.cli.make import RECORD
 from snowsplat.pipeline import make as making
-from snowsplat.pipeline.make import STAGES
-from snowsplat.pipeline.presets import PRESETS, quality_within
+from snowsplat.pipeline.make import RECORD, STAGES
+from snowsplat.pipeline.quality import PRESETS, quality_within
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.util.stages import Stages
 
@@ -162,11 +161,11 @@ def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
         lambda: max(out.glob("scene/checkpoints/step*"), default=newest) > newest,
         signal.SIGINT,
     )
-    assert f"going on from {newest}" in text
-    assert text.count("go on with: snowsplat make") == 1
+    assert f"resuming from {newest}" in text
+    assert text.count("resume with: snowsplat make") == 1
     result = run("make", photos, "-o", out, "--quality", "draft", "--threads", 1)
     assert result.code == 0, result.err
-    assert "going on from" in result.out
+    assert "resuming from" in result.out
     assert (out / "Häuser am See.ply").is_file()
     assert len(list(out.glob("scene/test/ours_120/renders/*.png"))) == 3
     assert not list(out.rglob("*.tmp"))
@@ -189,8 +188,8 @@ def test_places_that_are_taken(refused, dataset, tmp_path):
     [
         ([], "needs photos"),
         (["absent"], "absent"),
-        (["PHOTOS", "--minutes", 0], "--minutes is 0"),
-        (["PHOTOS", "--threads", 0], "--threads is 0"),
+        (["PHOTOS", "--minutes", 0], "--minutes: 0 is not"),
+        (["PHOTOS", "--threads", 0], "--threads: 0 is too small"),
     ],
 )
 def test_mistakes_write_nothing(refused, dataset, tmp_path, flags, expected):

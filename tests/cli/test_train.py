@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.cli.train import _KNOBS, Train
+from snowsplat.cli.config_flags import ConfigFlags
+from snowsplat.cli.train import Train
 from snowsplat.formats import read_gaussians
-from snowsplat.pipeline.train import TrainingRun
+from snowsplat.pipeline.training_run import TrainingRun, TrainResult
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training import checkpoint
 from snowsplat.training.recipes import RECIPES, recipe
@@ -106,9 +107,11 @@ def test_the_reference_spelling_of_flags(run, dataset, tmp_path):
     assert b"f_rest_9\n" not in scene(out, 20)
 
 
-def test_every_knob_is_a_flag_and_a_knob_of_some_recipe():
+def test_every_setting_is_a_flag_and_a_setting_of_some_recipe():
     flags = {field.name for field in fields(Train)}
-    for name in _KNOBS:
+    settings = [field.name for field in fields(ConfigFlags)]
+    assert len(settings) == 23
+    for name in settings:
         assert name in flags
         value: object = (5,) if name == "test_iterations" else 1
         value = "white" if name == "background" else value
@@ -116,7 +119,7 @@ def test_every_knob_is_a_flag_and_a_knob_of_some_recipe():
     assert set(RECIPES) == {"default", "paper", "mcmc"}
 
 
-def test_a_knob_that_the_recipe_does_not_have(refused, dataset, tmp_path):
+def test_a_setting_that_the_recipe_does_not_have(refused, dataset, tmp_path):
     line = refused(
         "train", dataset, "-o", tmp_path / "out", "--recipe", "mcmc", "--percent-dense", 0.1
     )
@@ -163,7 +166,7 @@ def test_kill_9_and_resume_give_the_same_scene(run, start, dataset, tmp_path):
     assert result.code == 0, result.err
     assert "damaged" in result.err
     assert len(result.err.splitlines()) == 1
-    assert "going on from" in result.out
+    assert "resuming from" in result.out
     assert scene(killed, 120) == scene(whole, 120)
     assert (killed / "metrics.json").read_bytes() == (whole / "metrics.json").read_bytes()
 
@@ -178,7 +181,7 @@ def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path):
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, (out, err)
     assert err == ""
-    assert f"go on with: snowsplat train -o {stopped} --resume" in out
+    assert f"resume with: snowsplat train -o {stopped} --resume" in out
     checkpoints = list((stopped / "checkpoints").iterdir())
     assert len(checkpoints) == 1
     step = int(checkpoints[0].stem.removeprefix("step_"))
@@ -207,7 +210,7 @@ def test_a_second_ctrl_c_saves_no_half_step(run, dataset, tmp_path, monkeypatch)
         result = run("train", dataset, "-o", stopped, *flags)
     assert (result.code, result.err) == (130, "snowsplat: stopped by Ctrl-C\n")
     newest = stopped / "checkpoints/step_000020.safetensors"
-    assert f"not saved; the last good checkpoint is {newest}," in result.out
+    assert f"not saved; the last good checkpoint is {newest};" in result.out
     assert checkpoint.files(stopped / "checkpoints")[0] == (20, newest)
     assert not (stopped / "point_cloud").exists()
     assert run("train", "-o", stopped, "--resume").code == 0
@@ -234,7 +237,7 @@ def test_resume_refuses_another_training(refused, run, dataset, tmp_path):
 
 def test_resume_where_nothing_is(refused, run, dataset, tmp_path):
     out = tmp_path / "out"
-    assert "no whole checkpoint" in refused("train", "-o", out, "--resume")
+    assert "no complete checkpoint" in refused("train", "-o", out, "--resume")
     assert not out.exists()
     result = run("train", dataset, "-o", out, "--resume", *QUICK)
     assert result.code == 0
@@ -250,7 +253,7 @@ def test_resume_with_less_memory_than_its_gaussians_take(refused, run, tmp_path)
     assert run("train", dataset, "-o", out, *flags, "--iterations", 2).code == 0
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     more = ("train", "-o", out, "--resume", "--iterations", 4)
-    assert "to go on with 5,000 Gaussians" in refused(*more, "--memory", "70MB", "-q")
+    assert "to resume with 5,000 Gaussians" in refused(*more, "--memory", "70MB", "-q")
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert run(*more, "--memory", "80MB").code == 0
 
@@ -266,7 +269,7 @@ def test_resume_keeps_no_second_copy_of_the_state(run, dataset, tmp_path, monkey
         read.extend(weakref.ref(tensor) for tensor in start.tensors.values())
         return start
 
-    def looking(training: TrainingRun) -> int:
+    def looking(training: TrainingRun) -> TrainResult:
         assert read
         assert not [tensor for tensor in read if tensor() is not None]
         return train(training)
@@ -286,7 +289,7 @@ def test_minutes(run, dataset, tmp_path):
     assert result.code == 0, result.err
     lines = result.out.splitlines()
     assert re.fullmatch(r"3.0 s on this machine: 48x36, at most 864 Gaussians, .*steps", lines[1])
-    assert re.fullmatch(r"\S+ s in all, of 3.0 s", lines[-1])
+    assert re.fullmatch(r"\S+ s in total, of 3.0 s", lines[-1])
     step = json.loads((out / "metrics.json").read_text())["iteration"]
     assert len(scene(out, step)) > 1000
     training = json.loads((out / "config.json").read_text())["training"]
@@ -312,7 +315,7 @@ def test_a_stopped_training_keeps_to_its_time(start, run, dataset, tmp_path):
     result = run("train", "-o", out, "--resume", "--minutes", 0.03)
     assert result.code == 0, result.err
     assert f"step {newest.step} of {newest.meta['schedule']['iterations']}" in result.out
-    assert "in all, of 1.8 s" in result.out
+    assert "in total, of 1.8 s" in result.out
 
 
 # Refused
@@ -346,8 +349,8 @@ def test_places_that_are_taken(refused, run, dataset, tmp_path):
         (["--iterations", 0], "--iterations: 0 is too small; use at least 1"),
         (["--sh-degree", 4], "--sh-degree"),
         (["--threads", 0], "--threads"),
-        (["--minutes", 0], "--minutes is 0"),
-        (["--minutes", 1e308], "--minutes is 1e+308"),
+        (["--minutes", 0], "--minutes: 0 is not"),
+        (["--minutes", 1e308], "--minutes: 1e+308 is not"),
         (["--lr-means", 0], "--lr-means: 0 is not positive; use"),
         (["--position-lr-final", 0], "--lr-means-final: 0 is not positive"),
         (["--lr-means", -1], "--lr-means: -1 is not positive"),
@@ -360,7 +363,7 @@ def test_places_that_are_taken(refused, run, dataset, tmp_path):
         (["--initial-points", 0], "--initial-points: 0 is too small"),
         (["--seed", 2**62], "--seed: 4611686018427387904 is too large"),
         (["--minutes", 1, "--iterations", 100], "leave one out"),
-        (["--background", "black", "-w"], "different colours"),
+        (["--background", "black", "-w"], "different colors"),
         (["-s", "elsewhere"], "twice"),
         (["--test-list", "absent.txt"], "absent.txt"),
     ],
@@ -401,7 +404,7 @@ def test_divergence_names_the_last_good_checkpoint(refused, run, dataset, tmp_pa
     diverged = int(re.search(r"step (\d+): non-finite .* means \(", line)[1])
     step = diverged // 3 * 3
     path = out / "checkpoints" / f"step_{step:06d}.safetensors"
-    assert f"the last good checkpoint is {path}, --resume --iterations {step} " in line
+    assert f"the last good checkpoint is {path}; --resume with --iterations {step} " in line
     assert all(tensor.isfinite().all() for tensor in checkpoint.load(path).tensors.values())
     assert run("train", "-o", out, "--resume", "--iterations", step, "-q").code == 0
     assert read_gaussians(out / f"point_cloud/iteration_{step}/point_cloud.ply").finite_rows().all()

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat.cli.watch import NewestScene, Watch
 from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.pipeline.watch import NewestScene, watched_folder
 from snowsplat.training import checkpoint
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.live.server import free_port
@@ -144,8 +144,8 @@ def test_the_page_of_a_training_stays_until_ctrl_c(start, run, dataset, tmp_path
 
 def test_the_folder_of_make_holds_that_of_a_training(trained, tmp_path):
     shutil.copytree(trained, tmp_path / "made" / "scene")
-    assert Watch(output=tmp_path / "made").folder().path == tmp_path / "made" / "scene"
-    assert Watch(output=trained).folder().path == trained
+    assert watched_folder(tmp_path / "made").path == tmp_path / "made" / "scene"
+    assert watched_folder(trained).path == trained
 
 
 def test_other_computers_are_told_an_address_that_cannot_be_guessed(start, trained):

@@ -421,10 +421,10 @@ def _make_checkpoint(folder: Path) -> None:
 
 
 def _read_checkpoint(folder: Path) -> Any:
-    from snowsplat.cli.train import read_meta
+    from snowsplat.pipeline.checkpoint_meta import CheckpointMeta
 
     loaded = checkpoint.load(folder / "step_000005.safetensors")
-    read_meta(loaded)
+    CheckpointMeta.of(loaded)
     return loaded
 
 

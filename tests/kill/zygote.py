@@ -32,9 +32,9 @@ def _import_all() -> None:
     import snowsplat.cli.main
     import snowsplat.evaluation.metrics
     import snowsplat.formats
-    import snowsplat.pipeline.films
     import snowsplat.pipeline.make
-    import snowsplat.pipeline.memory
+    import snowsplat.pipeline.memory_use
+    import snowsplat.pipeline.videos
     import snowsplat.scene.edit
     import snowsplat.sfm.dataset_folder
     import snowsplat.sfm.orient

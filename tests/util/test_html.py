@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from snowsplat.util import html
+from snowsplat.util.duration import duration
 
 
 def test_page_is_xml_for_any_text():
@@ -34,4 +35,4 @@ def test_page_is_xml_for_any_text():
     [(0.0, "0.0 s"), (5.12, "5.1 s"), (99, "99 s"), (130, "2 min 10 s"), (6000, "1 h 40 min")],
 )
 def test_duration(seconds, words):
-    assert html.duration(seconds) == words
+    assert duration(seconds) == words

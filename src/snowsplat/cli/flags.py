@@ -1,8 +1,13 @@
-"""How a field of a subcommand's dataclass becomes a flag."""
+"""How a field of a subcommand's dataclass becomes a flag; the flags of settings in messages."""
 
+import re
 from typing import Any
 
 import tyro
+
+_SETTING = re.compile(r"`([a-z][a-z0-9_]*)`")
+# Settings whose flag has another name.
+_OTHER_NAMES = {"hold_out": "--eval"}
 
 
 def flag(metavar: str, *aliases: str, default: str = "") -> Any:
@@ -18,3 +23,10 @@ def flag(metavar: str, *aliases: str, default: str = "") -> Any:
 def switch(*aliases: str) -> Any:
     """A flag without a value."""
     return tyro.conf.arg(aliases=list(aliases) or None, help_behavior_hint="")
+
+
+def with_flags(message: str) -> str:
+    """A message of the library for the command line: "use `overwrite`" -> "use --overwrite"."""
+    return _SETTING.sub(
+        lambda match: _OTHER_NAMES.get(match[1], "--" + match[1].replace("_", "-")), message
+    )

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import tyro
 
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.scene import training_folder
 from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.pipeline.scene_source import training_folder
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import printable, read_json
 

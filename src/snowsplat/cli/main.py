@@ -18,25 +18,22 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from snowsplat.cli.flags import with_flags
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import printable
 
 #: The subcommands with the first line of their docstrings. The subcommand ``train`` is the
 #: dataclass ``Train`` in the module ``snowsplat.cli.train``, which is imported when it is called.
 SUBCOMMANDS = {
-    "make": "Make a scene from photos or a video: cameras, training, pictures, in one command.",
-    "sfm": (
-        "Find out where photos were taken from: what training needs, from a folder or a video."
-    ),
-    "train": "Train a scene from photos whose cameras are known (COLMAP, or transforms.json).",
-    "evaluate": (
-        "Measure a scene on the photos that were held out: PSNR, SSIM and, with weights, LPIPS."
-    ),
-    "render": "Render a scene from the cameras of its photos, beside the photos; or a film of it.",
+    "make": "Make a scene from photos or a video: camera poses, training, images, in one command.",
+    "sfm": "Estimate the camera poses of photos or of a video: the dataset that training needs.",
+    "train": "Train a scene from photos with known camera poses (COLMAP, or transforms.json).",
+    "evaluate": "Measure a scene on the held-out photos: PSNR, SSIM and, with weights, LPIPS.",
+    "render": "Render a scene from the cameras of its photos, beside the photos; or a video of it.",
     "view": "Fly through a finished scene in the browser; Ctrl-C ends it.",
-    "watch": "Look at the scene of a training in a browser, with its cameras and photos.",
+    "watch": "Show the scene of a training in the browser, with its cameras and photos.",
     "convert": (
-        "Write a scene in another format; or cut, thinned out, turned, put together with others."
+        "Write a scene in another format; crop, decimate, rotate it, or merge it with others."
     ),
     "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }
@@ -77,9 +74,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return int(parse(arguments or ["--help"]).run())
     except SettingError as error:
-        return _fail(f"--{error.setting.replace('_', '-')}: {error.problem}", 2)
+        return _fail(with_flags(f"`{error.setting}`: {error.problem}"), 2)
     except UserError as error:
-        return _fail(str(error), 2)
+        return _fail(with_flags(str(error)), 2)
     except KeyboardInterrupt:
         return _fail("stopped by Ctrl-C", 130)
     except BrokenPipeError:  # the reader of the output has closed it, as `| head` does

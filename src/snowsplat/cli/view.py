@@ -9,17 +9,12 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.scene import cameras_of, folder_around, training_folder
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from snowsplat.scene.camera import Camera
-    from snowsplat.scene.gaussians import Gaussians
 
 
 @dataclass
@@ -31,37 +26,38 @@ class View:
       snowsplat view garden.spz
       snowsplat view out/garden --no-browser --port 8080
 
-    The page is on this machine alone, at an address that nobody can guess. It starts at the first
-    photo of a training. Drag to turn, scroll to come near, W A S D to fly; the page has the rest.
+    Only this computer can open the page, whose URL contains a secret token. The first view is that
+    of the first photo of the training. Drag to turn, scroll to zoom, W A S D to fly; the page lists
+    all controls.
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
     """A scene file of any format, or the output folder of train or make."""
     iteration: Annotated[int | None, flag("N", default="the last")] = None
     """Which of the scenes in OUT."""
-    host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this machine alone")] = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 lets other computers in."""
+    host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this computer only")] = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 accepts connections from the network."""
     port: Annotated[int, flag("N", default="a free one")] = 0
     """Port to listen on."""
     no_browser: Annotated[bool, switch()] = False
-    """Only print the address."""
+    """Print the address without opening a browser."""
 
     def run(self) -> int:
-        """Gives the exit code: 0, after Ctrl-C too, which is how one leaves."""
+        """Returns the exit code: 0, also after Ctrl-C, the usual end."""
+        if self.path is None:
+            raise UserError("view needs a scene; name a file or the output folder of a training")
+        from snowsplat.pipeline.scene_source import load_viewable
         from snowsplat.viewer.hosts import ANY_HOST
         from snowsplat.viewer.web.scene import site
         from snowsplat.viewer.web.server import StaticServer
 
-        if self.path is None:
-            raise UserError("view needs a scene; name a file or the output folder of a training")
-        name, gaussians, cameras, background = self._load(self.path)
-        if not len(gaussians):
-            raise UserError(f"{name}: holds no Gaussians; there is nothing to see")
-        files, headers = site(
-            f"{self.path.resolve().name} - snowsplat", gaussians, cameras, background
-        )
+        scene = load_viewable(self.path, self.iteration)
+        if not len(scene.gaussians):
+            raise UserError(f"{scene.file}: holds no Gaussians; there is nothing to see")
+        title = f"{self.path.resolve().name} - snowsplat"
+        files, headers = site(title, scene.gaussians, scene.cameras, scene.background)
         with StaticServer(files, headers, self.host, self.port) as server:
-            print(f"{name}: {len(gaussians):,} Gaussians")
+            print(f"{scene.file}: {len(scene.gaussians):,} Gaussians")
             print(server.url, flush=True)
             if self.host in ANY_HOST:
                 print(f"from other computers: {server.url_at(socket.gethostname())}", flush=True)
@@ -72,58 +68,39 @@ class View:
             wait_for_interrupt()
         return 0
 
-    def _load(self, path: Path) -> tuple[Path, Gaussians, list[Camera], tuple[float, float, float]]:
-        """The scene's file, the scene, the cameras of its photos, the background colour."""
-        from snowsplat.formats import read_gaussians
-
-        if not path.exists():
-            raise UserError(f"{path}: no such file or folder")
-        if path.is_dir():
-            folder = training_folder(path)
-            iteration, gaussians = folder.read_scene(self.iteration)
-            scene = folder.scene_path(iteration)
-        else:
-            if self.iteration is not None:
-                raise UserError("--iteration chooses a scene of an output folder, not of a file")
-            scene, gaussians = path, read_gaussians(path)
-            folder = folder_around(path)
-        cameras = cameras_of(folder)
-        background = folder.settings()[1] if folder.is_one() else (0.0, 0.0, 0.0)
-        return scene, gaussians, cameras, background
-
 
 def over_ssh() -> bool:
-    """Whether this shell is on another computer than the one that the user sits at."""
+    """Whether this shell is a remote one."""
     return any(name in os.environ for name in ("SSH_CONNECTION", "SSH_TTY"))
 
 
 def forwarding(port: int) -> str:
-    """The command that makes a port of this machine one of the user's own."""
+    """The command that forwards a port of this machine to the computer of the user."""
     import getpass
 
     return f"ssh -L {port}:127.0.0.1:{port} {getpass.getuser()}@{socket.gethostname()}"
 
 
 def has_screen() -> bool:
-    """Whether a browser that is opened here can be seen: else one of text would take the shell."""
+    """Whether a browser opened here has a screen; otherwise a text browser would take the shell."""
     if sys.platform in ("win32", "darwin"):
         return not over_ssh()
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def open_browser(url: str) -> None:
-    """In the background: some browsers hold the program that opens them."""
+    """In the background: some browsers block the program that opens them."""
     import webbrowser
 
     threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 
 def wait_for_interrupt() -> None:
-    """Returns at Ctrl-C, or when the process is asked to end."""
+    """Returns at Ctrl-C, or at SIGTERM."""
     ended = threading.Event()
     before = signal.signal(signal.SIGTERM, lambda *_: ended.set())
     try:
-        while not ended.wait(1.0):  # Windows lets Ctrl-C through between two waits only
+        while not ended.wait(1.0):  # on Windows Ctrl-C arrives only between two waits
             pass
     except KeyboardInterrupt:
         pass

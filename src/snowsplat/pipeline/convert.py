@@ -1,5 +1,154 @@
-"""Scene files of every format, the HTML page included."""
+"""`convert`: scene files into another format, edited and merged."""
 
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from snowsplat.formats import Format
 from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
+from snowsplat.pipeline.scene_source import cameras_of, folder_around, scene_file
+from snowsplat.scene import edit
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import Similarity, rotation_from_quat
+from snowsplat.util.errors import SettingError, UserError
 
-__all__ = ["format_for_writing", "read_gaussians", "write_gaussians"]
+Vector = tuple[float, float, float]
+Box = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Edits:
+    """Changes to a scene, applied in this order. The frame is that of a PLY: x right, y down, z
+    forward.
+
+    Attributes:
+        crop: keep the Gaussians in this box: x, y, z of the lower corner, then of the higher one.
+        rotate: degrees about x, then about y, then about z.
+        scale: factor, about the origin.
+        translate: offset.
+        decimate: number of Gaussians to keep, or a percentage such as "50%": the largest and most
+            opaque.
+        sh_degree: 0 to 3, of the view-dependent color that is kept.
+
+    Raises:
+        UserError: a value out of its range.
+    """
+
+    crop: Box | None = None
+    rotate: Vector = (0.0, 0.0, 0.0)
+    scale: float = 1.0
+    translate: Vector = (0.0, 0.0, 0.0)
+    decimate: int | str | None = None
+    sh_degree: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= 3:
+            raise SettingError("sh_degree", f"{self.sh_degree} is out of range; use 0 to 3")
+        if not all(map(math.isfinite, (*self.rotate, *self.translate, *(self.crop or ())))):
+            raise UserError("`rotate`, `translate` and `crop` need finite numbers")
+        if not 0 < self.scale < math.inf:
+            raise SettingError("scale", f"{self.scale} is not a factor; use a number above 0")
+        if self.crop and any(
+            low > high for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
+        ):
+            raise SettingError("crop", "the corners are swapped; give the lower corner first")
+        if self.decimate is not None:
+            gaussians_to_keep(self.decimate, 0)
+
+    def apply(self, scene: Gaussians) -> Gaussians:
+        """The edited scene.
+
+        Raises:
+            UserError: no Gaussian is in the box.
+        """
+        if self.crop:
+            before = len(scene)
+            scene = edit.crop(scene, torch.tensor(self.crop).reshape(2, 3))
+            if before and not len(scene):
+                raise SettingError("crop", "no Gaussian is in this box; see snowsplat info")
+        movement = self.movement()
+        if movement:
+            scene = edit.transform(scene, movement)
+        if self.decimate is not None:
+            scene = edit.decimate(scene, gaussians_to_keep(self.decimate, len(scene)))
+        if self.sh_degree is not None:
+            scene = edit.with_sh_degree(scene, self.sh_degree)
+        return scene
+
+    def movement(self) -> Similarity | None:
+        """From the old frame to the new one; None if nothing moves: then all bits stay the same."""
+        if not any(self.rotate) and self.scale == 1 and not any(self.translate):
+            return None
+        rotation = torch.eye(3, dtype=torch.float64)
+        for axis, degrees in enumerate(self.rotate):
+            half = math.radians(degrees) / 2
+            quat = torch.zeros(4, dtype=torch.float64)
+            quat[0], quat[1 + axis] = math.cos(half), math.sin(half)
+            rotation = rotation_from_quat(quat) @ rotation
+        return Similarity(self.scale, rotation, torch.tensor(self.translate, dtype=torch.float64))
+
+
+def convert(
+    sources: Path | str | Sequence[Path | str],
+    target: Path | str,
+    edits: Edits | None = None,
+    *,
+    overwrite: bool = False,
+) -> Format:
+    """Merge scenes, edit the result, and write it, maybe in another format.
+
+    Args:
+        sources: scene files of any format, or output folders, whose last scene is used.
+        target: the file to write; its ending selects the format.
+        overwrite: replace ``target``.
+
+    Returns:
+        The format that was written.
+
+    Raises:
+        UserError: a missing or damaged scene, an unknown format, or ``target`` exists.
+        OSError: ``target`` cannot be written.
+    """
+    target, edits = Path(target), edits or Edits()
+    if target.is_dir():
+        raise UserError(f"{target}: is a folder; name a file to write")
+    if target.exists() and not overwrite:
+        raise UserError(f"{target}: exists; use `overwrite` to replace it")
+    format = format_for_writing(target)
+    given = [sources] if isinstance(sources, Path | str) else sources
+    files = [scene_file(Path(source)) for source in given]
+    scene = edits.apply(edit.merge([read_gaussians(file) for file in files]))
+    if format.name == "HTML" and len(files) == 1 and edits.movement() is None:
+        _write_page(target, scene, files[0])
+    else:
+        write_gaussians(target, scene)
+    return format
+
+
+def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
+    """A page that starts at the camera of a photo, if the cameras are known."""
+    from snowsplat.viewer.web.html import write_html
+    from snowsplat.viewer.web.scene import ready
+
+    write_html(target, *ready(scene, cameras_of(folder_around(source))))
+
+
+def gaussians_to_keep(decimate: int | str, count: int) -> int:
+    """The number of ``count`` Gaussians that a number or a percentage means.
+
+    Raises:
+        UserError: neither.
+    """
+    text = str(decimate)
+    if re.fullmatch(r"\d+", text):
+        return int(text)
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)%", text)
+    if not match or float(match[1]) > 100:
+        raise SettingError("decimate", f"{text!r} is not a share; use a number, or 0% to 100%")
+    return round(count * float(match[1]) / 100)

@@ -1,4 +1,4 @@
-"""The stages of `snowsplat make`: dataset, training, pictures."""
+"""`make`: photos or a video become a scene: camera poses, training, rendered test views."""
 
 from __future__ import annotations
 
@@ -6,239 +6,326 @@ import hashlib
 import json
 import shutil
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.cli.progress import duration
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
-from snowsplat.pipeline.presets import PRESETS, Preset, Quality
-from snowsplat.util.files import atomic_path
+from snowsplat.pipeline.quality import PRESETS, Preset, Quality, quality_within
+from snowsplat.pipeline.time_budget import check_minutes
+from snowsplat.util.duration import duration
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path, remove_temporaries
 
 if TYPE_CHECKING:
-    from snowsplat.cli.train import Train
-    from snowsplat.cli.viewing import PageFlags
-    from snowsplat.util.stages import Outcome, Stages
+    from snowsplat.pipeline.live_page import LivePage
+    from snowsplat.pipeline.train import TrainOptions
+    from snowsplat.util.stages import Outcome
 
-STAGES = ("scene", "pictures")  # the dataset keeps its own record
+STAGES = ("scene", "pictures")  # the dataset has a record of its own
+RECORD = "make.json"
 HOLD_OUT = 8
-# What of a preset is about the training.
+# The part of a preset that concerns the training.
 _OF_TRAINING = ("side", "iterations", "max_gaussians", "densify_interval")
-# What a kill may cost.
+# What a kill may cost, in seconds.
 _CHECKPOINT_SECONDS = 15.0
-# The shortest training that is worth it: seconds, and as a part of the time given.
+# The shortest training that is useful: in seconds, and as a share of the given time.
 _SHORTEST, _SHORTEST_SHARE = 15.0, 0.15
-# Pictures of the held-out views take about so long each.
-_PICTURE_SECONDS = 0.3
+# About the time to render one of the held-out views.
+_RENDER_SECONDS = 0.3
 
 
-class TrainingStopped(KeyboardInterrupt):
-    """Ctrl-C in the training, which has saved what is reached and said how to go on."""
+@dataclass(frozen=True)
+class MakeOptions:
+    """How to make a scene.
+
+    Attributes:
+        quality: None: "normal", or what ``minutes`` allow. Together with ``minutes`` it determines
+            the effort to find the camera poses; the training uses the rest of the time.
+        minutes: finish within this time. Stages that earlier runs have finished take none of it;
+            an interrupted training resumes with the time that it had left.
+        memory: for the training, see `TrainOptions`.
+        compute: device and threads.
+
+    Raises:
+        UserError: ``minutes`` is not positive.
+    """
+
+    quality: Quality | None = None
+    minutes: float | None = None
+    memory: int | str | None = None
+    compute: Compute = field(default_factory=Compute)
+
+    def __post_init__(self) -> None:
+        if self.minutes is not None:
+            check_minutes(self.minutes)
+
+
+@dataclass(frozen=True)
+class MakeResult:
+    """A finished scene.
+
+    Attributes:
+        scene: the PLY file.
+        folder: the output folder of the training.
+        dataset_report: the HTML page about the camera poses.
+        renders, photos: folders with the rendered test views and the held-out photos.
+        psnr, ssim, views: the mean figures on the held-out photos, and their number.
+        seconds: duration of this run.
+    """
+
+    scene: Path
+    folder: OutputFolder
+    dataset_report: Path
+    renders: Path
+    photos: Path
+    psnr: float
+    ssim: float
+    views: int
+    seconds: float
+
+
+def scene_name(inputs: Sequence[Path]) -> str:
+    """The name of a scene: that of the first input.
+
+    Raises:
+        UserError: no inputs.
+    """
+    if not inputs:
+        raise UserError("make needs photos; name a folder of photos, or a video")
+    first = inputs[0].absolute()
+    return (first.stem if first.is_file() else first.resolve().name) or "scene"
+
+
+def make(
+    inputs: Path | str | Sequence[Path | str],
+    output: Path | str | None = None,
+    options: MakeOptions | None = None,
+    *,
+    overwrite: bool = False,
+    observer: Observer = SILENT,
+    page: LivePage | None = None,
+) -> MakeResult:
+    """Make a scene from folders of photos, photos and videos.
+
+    Finished stages are recorded in ``output``: after an interruption the same call resumes. A stage
+    is repeated if its photos or settings have changed.
+
+    Args:
+        output: default: NAME_scene in the current folder, NAME being that of the first input. It
+            contains capture/ (the dataset), scene/ (the training) and NAME.ply (the scene).
+        overwrite: replace a scene of other photos that is in ``output``.
+        page: shows the training in the browser.
+
+    Raises:
+        UserError: unusable photos or settings; poses that cannot be found; a folder with other
+            files; see also `snowsplat.pipeline.train.train`.
+        TrainingStopped, KeyboardInterrupt: Ctrl-C; finished stages and checkpoints remain.
+    """
+    started = time.monotonic()
+    options = options or MakeOptions()
+    paths = [Path(each) for each in ([inputs] if isinstance(inputs, Path | str) else inputs)]
+    name = scene_name(paths)
+    out = Path(output) if output is not None else Path(f"{name}_scene")
+    if options.compute.device is not None:  # an unusable device is reported before hours of work
+        options.compute.apply()
+    _check_free(out)
+    return _Job(paths, name, out, options, overwrite, observer, page, started).run()
+
+
+def _check_free(out: Path) -> None:
+    """Raises: UserError: ``out`` is a file, or contains something else."""
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{out}: is a file; name a folder for the output")
+    if out.is_dir():
+        remove_temporaries(out, (RECORD,))
+    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
+        raise UserError(f"{out}: holds other files; name a new or an empty folder")
 
 
 @dataclass
-class Making:
-    """The stages in their order, each unless it is finished.
+class _Job:
+    """One call of `make`: the stages in their order, except for those that are finished."""
 
-    Attributes:
-        inputs: folders of photos, photos, videos.
-        name: of the scene.
-        out: the folder for all, which is there.
-        stages: their record.
-        command: that goes on, for people.
-        minutes, threads, device, memory, overwrite: as the flags of the verb.
-        started: when it was, by `time.monotonic`.
-        page: where the training is to be watched, and the scene in the end.
-    """
-
-    inputs: tuple[Path, ...]
+    inputs: list[Path]
     name: str
     out: Path
-    quality: Quality
-    stages: Stages
-    command: str
-    minutes: float | None
-    threads: int | None
-    device: str | None
-    memory: str | None
+    options: MakeOptions
     overwrite: bool
-    started: float
-    page: PageFlags | None = None
+    observer: Observer
+    page: LivePage | None
+    started: float  # by `time.monotonic`
 
-    def run(self) -> int:
-        """Gives the exit code, 0.
+    def run(self) -> MakeResult:
+        from snowsplat.sfm.ingest.sources import find_sources
+        from snowsplat.util.stages import Stages
 
-        Raises:
-            UserError: see each stage.
-            KeyboardInterrupt: Ctrl-C; what is finished stays.
-        """
-        self._make_dataset()
-        settings: dict[str, Any] = {"capture": _fingerprint(self.out / CAPTURE)}
-        if self.minutes is None:
-            preset = PRESETS[self.quality]
-            settings |= {word: getattr(preset, word) for word in _OF_TRAINING}
-        else:
-            settings |= {"minutes": self.minutes}
-        folder = OutputFolder(self.out / SCENE)
-        outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
-        scene = self._stage("scene", settings, outputs, lambda: self._train(settings))
-        shutil.rmtree(folder.checkpoints, ignore_errors=True)  # now that it is finished
-        pictures = folder.path / "test" / f"ours_{scene.result['iteration']}"
-        self._stage("pictures", {}, [pictures], self._render)
-        print(
-            f"\nThe scene, for any viewer:  {self.file}\n"
-            f"How its cameras were found: {self.out / CAPTURE / 'capture_report.html'}\n"
-            f"How the training went:      {folder.report}\n"
-            f"Pictures of it:             {pictures / 'renders'}\n"
-            f" and photos held out:       {pictures / 'gt'}\n"
-            f"On those:                   PSNR {scene.result['psnr']:.2f} dB, "
-            f"SSIM {scene.result['ssim']:.3f} ({scene.result['views']} photos)\n"
-            f"This took:                  {duration(self._elapsed())}",
-            flush=True,
-        )
-        if self.page is not None:
-            self._watch(folder.path, self.page)
-        return 0
+        kinds = [source.kind for source in find_sources(self.inputs).sources]
+        existed = self.out.exists()
+        self.out.mkdir(parents=True, exist_ok=True)
+        self.stages = Stages(self.out / RECORD, STAGES)
+        with self._removed_if_empty(existed):
+            self.quality = self._quality(kinds.count("photo"), kinds.count("video"))
+            self.stages.save()  # from here on the folder is recognised as one of `make`
+            self._make_dataset()
+            return self._make_scene()
 
-    @property
-    def file(self) -> Path:
-        """The scene, where viewers are pointed to. The old one stays until the new one is ready."""
-        return self.out / f"{self.name}.ply"
+    @contextmanager
+    def _removed_if_empty(self, existed: bool) -> Iterator[None]:
+        """If nothing comes of the job, the record goes, and with it a new folder."""
+        try:
+            yield
+        finally:
+            if self.out.is_dir() and {entry.name for entry in self.out.iterdir()} <= {RECORD}:
+                (self.out / RECORD).unlink(missing_ok=True)
+                if not existed:
+                    self.out.rmdir()
 
-    def _elapsed(self) -> float:
-        return time.monotonic() - self.started
+    def _quality(self, photos: int, videos: int) -> Quality:
+        """As requested, or what the time allows; decided once, since the poses depend on it."""
+        quality, minutes = self.options.quality, self.options.minutes
+        if quality is not None or minutes is None:
+            return quality or "normal"
+        from snowsplat import ops
 
-    def _stage(
-        self, name: str, settings: dict[str, Any], outputs: list[Path], work: Any
-    ) -> Outcome:
-        def on_change(reason: str) -> None:
-            print(f"{name}: done again ({reason})", flush=True)
-
-        outcome = self.stages.run(name, settings, outputs, work, on_change)
-        if outcome.again:
-            print(f"{name:<10}done before", flush=True)
-        return outcome
+        about = {"minutes": minutes, "photos": photos, "videos": videos}
+        before = self.stages.about.get("effort", {})
+        if {key: before.get(key) for key in about} != about:
+            threads = self.options.compute.threads or ops.get_num_threads()
+            quality = quality_within(60.0 * minutes, photos, videos, threads)
+            self.stages.about["effort"] = about | {"quality": quality}
+        chosen: Quality = self.stages.about["effort"]["quality"]
+        return chosen
 
     def _make_dataset(self) -> None:
-        from snowsplat.cli.sfm import SfmProgress
-        from snowsplat.cli.stages import StageProgress
         from snowsplat.sfm.colmap import SfmOptions
         from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
         from snowsplat.sfm.ingest.inputs import GatherOptions
 
         options = DatasetOptions(
             gather=GatherOptions(size=PRESETS[self.quality].photos),
-            sfm=SfmOptions(effort=self.quality, threads=self.threads),
+            sfm=SfmOptions(effort=self.quality, threads=self.options.compute.threads),
         )
-        with StageProgress() as progress:
-            watcher = SfmProgress(progress)
-            make_dataset(*(self.inputs, self.out / CAPTURE, options, watcher, self.overwrite))
+        make_dataset(self.inputs, self.dataset, options, self.observer, self.overwrite)
+
+    def _make_scene(self) -> MakeResult:
+        settings: dict[str, Any] = {"capture": _fingerprint(self.dataset)}
+        if self.options.minutes is None:
+            preset = PRESETS[self.quality]
+            settings |= {key: getattr(preset, key) for key in _OF_TRAINING}
+        else:
+            settings |= {"minutes": self.options.minutes}
+        folder = OutputFolder(self.out / SCENE)
+        outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
+        scene = self._stage("scene", settings, outputs, lambda: self._train(settings)).result
+        shutil.rmtree(folder.checkpoints, ignore_errors=True)  # not needed any more
+        target = folder.path / "test" / f"ours_{scene['iteration']}"
+        self._stage("pictures", {}, [target], self._render)
+        return MakeResult(
+            scene=self.file,
+            folder=folder,
+            dataset_report=self.dataset / "capture_report.html",
+            renders=target / "renders",
+            photos=target / "gt",
+            psnr=scene["psnr"],
+            ssim=scene["ssim"],
+            views=scene["views"],
+            seconds=self._elapsed(),
+        )
+
+    @property
+    def dataset(self) -> Path:
+        return self.out / CAPTURE
+
+    @property
+    def file(self) -> Path:
+        """The scene. An old one remains until the new one is ready."""
+        return self.out / f"{self.name}.ply"
+
+    def _elapsed(self) -> float:
+        return time.monotonic() - self.started
+
+    def _stage(
+        self,
+        name: str,
+        settings: dict[str, Any],
+        outputs: list[Path],
+        work: Callable[[], dict[str, Any]],
+    ) -> Outcome:
+        def on_change(reason: str) -> None:
+            self.observer.note(f"{name}: done again ({reason})")
+
+        self.observer.begin(name)
+        outcome = self.stages.run(name, settings, outputs, work, on_change)
+        self.observer.end(name, outcome)
+        return outcome
 
     def _train(self, settings: dict[str, Any]) -> dict[str, Any]:
-        """Begin, or go on with, the training; copy its scene to where it is looked for."""
+        """Start or resume the training; copy its scene to the top of the folder."""
+        from snowsplat.pipeline.train import TrainOptions, resume, train
         from snowsplat.training import checkpoint
 
         folder = OutputFolder(self.out / SCENE)
-        going_on = self.stages.about.get("training") == settings
-        going_on = going_on and checkpoint.exists(folder.checkpoints)
-        if not going_on:
+        options = TrainOptions(
+            memory=self.options.memory,
+            checkpoint_seconds=_CHECKPOINT_SECONDS,
+            compute=self.options.compute,
+        )
+        same = self.stages.about.get("training") == settings
+        if same and checkpoint.exists(folder.checkpoints):
+            resume(folder.path, options, observer=self.observer, page=self.page)
+        else:
             shutil.rmtree(folder.path, ignore_errors=True)
             self.stages.about["training"] = settings
             self.stages.save()
-        train = self._resumed(folder.path) if going_on else self._new(folder.path)
-        if self._viewed(train).run() != 0:
-            raise TrainingStopped
+            new = self._new_training(options)
+            train(self.dataset, folder.path, new, observer=self.observer, page=self.page)
         metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
         with atomic_path(self.file) as temporary:
             shutil.copyfile(folder.scene_path(metrics["iteration"]), temporary)
-        kept = {word: metrics[word] for word in ("iteration", "psnr", "ssim")}
-        return kept | {"views": len(metrics["views"])}
+        result = {key: metrics[key] for key in ("iteration", "psnr", "ssim")}
+        return result | {"views": len(metrics["views"])}
 
-    def _watch(self, folder: Path, page: PageFlags) -> None:
-        """Show the scene until Ctrl-C."""
-        from snowsplat.cli.watch import Watch
-
-        Watch(
-            output=folder,
-            threads=self.threads,
-            device=self.device,
-            port=page.port,
-            host=page.host,
-        ).run()
-
-    def _viewed(self, train: Train) -> Train:
-        """With the page of the training, which makes way for that of the scene."""
-        if self.page is not None:
-            train.view, train.stay = True, False
-            train.port, train.host = self.page.port, self.page.host
-        return train
-
-    def _resumed(self, folder: Path) -> Train:
-        from snowsplat.cli.train import Train
-
-        return Train(
-            output=folder,
-            resume=True,
-            threads=self.threads,
-            device=self.device,
-            memory=self.memory,
-            checkpoint_seconds=_CHECKPOINT_SECONDS,
-            again=self.command,
+    def _new_training(self, options: TrainOptions) -> TrainOptions:
+        if self.options.minutes is not None:
+            minutes = self._minutes_left(60.0 * self.options.minutes)
+            return replace(options, hold_out=HOLD_OUT, minutes=minutes)
+        preset = PRESETS[self.quality]
+        settings = ("iterations", "max_gaussians", "densify_interval")
+        return replace(
+            options,
+            hold_out=HOLD_OUT,
+            resolution=_width(self.dataset, preset),
+            settings={name: getattr(preset, name) for name in settings},
         )
 
-    def _new(self, folder: Path) -> Train:
-        from snowsplat.cli.train import Train
-
-        dataset = self.out / CAPTURE
-        train = Train(
-            dataset=dataset,
-            output=folder,
-            eval=True,
-            threads=self.threads,
-            device=self.device,
-            memory=self.memory,
-            checkpoint_seconds=_CHECKPOINT_SECONDS,
-            again=self.command,
-        )
-        if self.minutes is None:
-            preset = PRESETS[self.quality]
-            train.iterations, train.max_gaussians = preset.iterations, preset.max_gaussians
-            train.densify_interval = preset.densify_interval
-            train.resolution = _width(dataset, preset)
-        else:
-            train.minutes = self._minutes_left(dataset)
-        return train
-
-    def _minutes_left(self, dataset: Path) -> float:
-        """For the training."""
-        assert self.minutes is not None
-        given = 60.0 * self.minutes
-        held_out = -(-len(_photos(dataset)) // HOLD_OUT)
-        left = given - self._elapsed() - _PICTURE_SECONDS * held_out
+    def _minutes_left(self, given: float) -> float:
+        """For the training, of ``given`` seconds."""
+        photos = sum(path.is_file() for path in (self.dataset / "images").rglob("*"))
+        left = given - self._elapsed() - _RENDER_SECONDS * -(-photos // HOLD_OUT)
         shortest = max(_SHORTEST, _SHORTEST_SHARE * given)
         if left < shortest:
-            print(
-                f"{duration(given)} is too short: {duration(self._elapsed())} went into the "
-                f"cameras; training for {duration(shortest)} all the same",
-                flush=True,
+            self.observer.note(
+                f"{duration(given)} is too short: finding the camera poses took "
+                f"{duration(self._elapsed())}; training for {duration(shortest)} anyway"
             )
         return max(left, shortest) / 60.0
 
     def _render(self) -> dict[str, Any]:
-        from snowsplat.cli.render import Render
+        from snowsplat.pipeline.render import render_images
+        from snowsplat.pipeline.scene_source import load_trained
 
-        Render(
-            output=self.out / SCENE, split="test", threads=self.threads, device=self.device
-        ).run()
+        scene = load_trained(self.out / SCENE, compute=self.options.compute)
+        render_images(scene, splits=("test",))
         return {}
 
 
-def _photos(dataset: Path) -> list[Path]:
-    return sorted(path for path in (dataset / "images").rglob("*") if path.is_file())
-
-
 def _width(dataset: Path, preset: Preset) -> int | None:
-    """What -r has to be; None where the photos are small enough as they are."""
+    """The width to train at; None if the photos are small enough."""
     cameras = [view.camera for view in DatasetSettings(str(dataset)).load().train]
     camera = max(cameras, key=lambda camera: max(camera.width, camera.height))
     longer = max(camera.width, camera.height)
@@ -246,7 +333,7 @@ def _width(dataset: Path, preset: Preset) -> int | None:
 
 
 def _fingerprint(dataset: Path) -> str:
-    """Of the cameras, and of names and sizes of photos and masks."""
+    """Of the cameras, and of the names and sizes of photos and masks."""
     digest = hashlib.sha256()
     for path in sorted((dataset / "sparse" / "0").glob("*.bin")):
         digest.update(path.read_bytes())

@@ -1,18 +1,18 @@
-"""The output folder of a training, laid out as the reference implementation does, for its tools.
+"""`OutputFolder`: the output folder of a training, in the layout of the reference implementation.
 
-    OUT/cfg_args                                   its settings, in the reference's spelling
+    OUT/cfg_args                                   settings, in the spelling of the reference
     OUT/cameras.json                               all cameras
-    OUT/input.ply                                  the points that training began with
+    OUT/input.ply                                  the points that the training started from
     OUT/point_cloud/iteration_N/point_cloud.ply    the scene after N steps
-    OUT/config.json                                ours: every setting, exactly
-    OUT/checkpoints/step_N.safetensors             ours: see snowsplat.training.checkpoint
+    OUT/config.json                                *all settings
+    OUT/checkpoints/step_N.safetensors             *see snowsplat.training.checkpoint
     OUT/metrics.json                               figures of the last evaluation
-    OUT/history.json                               ours: the curves of the training
-    OUT/report.html                                ours: how the training went, to look at
-    OUT/test/ours_N/renders, gt                    what `snowsplat render` makes; train/ alike
-    OUT/films/                                     ours: and its films
+    OUT/history.json                               *the curves of the training
+    OUT/report.html                                *a page about the training
+    OUT/test/ours_N/renders, gt                    rendered images and photos; also train/
+    OUT/videos/                                    *rendered videos (films/ in earlier versions)
 
-Folders that the reference itself made are read as well.
+Entries marked * are additions. Folders written by the reference are read too.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.config import TrainConfig
 
-#: What `make` has in its folder: the dataset, and the output folder of its training.
+#: Folders inside the folder of `make`: the dataset, and the output folder of its training.
 CAPTURE, SCENE = "capture", "scene"
-# A text, a name or number, or a sign; and those of which the value is taken.
-# Spaces are no part of it: looking beyond each of a million is a million times a million steps.
+# A string, a name or number, or a sign; and the literals whose value is used.
+# The expression has no spaces: trying each of a million spaces takes quadratic time.
 _WORD = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S""", re.DOTALL)
 _LITERAL = re.compile(r"""['"].*['"]|True|False|None|-?[\d.]+(?:e[+-]?\d+)?""", re.DOTALL)
 _NAMESPACE_LIMIT = 1 << 20  # characters
-_PART = 4  # words of a part that are kept: one more than are wanted
+_PART = 4  # words of a part that are stored: one more than are used
 _SCENE = re.compile(r"iteration_(\d+)")
-_RESULTS = ("point_cloud", "checkpoints", "train", "test", "films")
+_RESULTS = ("point_cloud", "checkpoints", "train", "test", "videos", "films")
 _REPORTS = ("metrics.json", "history.json", "report.html")
 _FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
 
 
 @dataclass(frozen=True)
 class DatasetSettings:
-    """How the dataset of a training was read: the arguments of `load_dataset`."""
+    """How the dataset of a training is read: the arguments of `load_dataset`."""
 
     path: str
     images: str = "images"
@@ -80,7 +80,7 @@ class DatasetSettings:
 
 @dataclass(frozen=True)
 class OutputFolder:
-    """An output folder, existing or to come."""
+    """An output folder, existing or not."""
 
     path: Path
 
@@ -96,17 +96,22 @@ class OutputFolder:
     def report(self) -> Path:
         return self.path / "report.html"
 
+    @property
+    def videos(self) -> Path:
+        return self.path / "videos"
+
     def is_one(self) -> bool:
-        """Whether a training, ours or the reference's, has written here."""
+        """Whether a training of snowsplat or of the reference has written here."""
         return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))
 
     # Before a training
 
     def check_free(self, *, resume: bool, overwrite: bool) -> None:
-        """Refuse a place that is taken; writes nothing.
+        """Check that a training may write here; writes nothing.
 
         Raises:
-            UserError: a file, a folder of something else, or a training that is not to be touched.
+            UserError: a file, a folder with other files, or a training that is to be neither
+                resumed nor overwritten.
         """
         if not self.path.exists():
             return
@@ -117,12 +122,12 @@ class OutputFolder:
             raise UserError(f"{self.path}: holds other files; name a new or an empty folder")
         if self.is_one() and not resume and not overwrite:
             raise UserError(
-                f"{self.path}: holds a training already; add --resume to go on with it, "
-                "--overwrite to replace it, or name another folder"
+                f"{self.path}: holds a training already; use `resume` to continue it, "
+                "`overwrite` to replace it, or name another folder"
             )
 
     def begin(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
-        """Make the folder, without old results, and `describe` the training."""
+        """Create the folder, remove old results, and `describe` the training."""
         for name in _RESULTS:
             shutil.rmtree(self.path / name, ignore_errors=True)
         for name in _REPORTS:
@@ -134,7 +139,7 @@ class OutputFolder:
         from snowsplat.scene.camera_json import write_cameras
 
         self.path.mkdir(parents=True, exist_ok=True)
-        self.write_config(settings, config)  # from here on the folder is known to be ours
+        self.write_config(settings, config)  # from here on `is_one`
         if dataset.points is not None:
             from snowsplat.data.points_ply import write_points
 
@@ -145,7 +150,7 @@ class OutputFolder:
         write_cameras(self.path / "cameras.json", cameras)
 
     def write_config(self, settings: DatasetSettings, config: TrainConfig) -> None:
-        """`config.json` and `cfg_args`; what a kill has left of earlier ones goes."""
+        """Write `config.json` and `cfg_args`; remove what a kill has left of earlier ones."""
         from snowsplat.training.config import config_to_json
 
         remove_temporaries(self.path, _FILES)
@@ -169,19 +174,19 @@ class OutputFolder:
         write_text(self.path / "cfg_args", repr(namespace))
 
     def _remove_unwritten_scenes(self) -> None:
-        """Folders of scenes that a kill or a full disk prevented."""
+        """Remove folders whose scene was not written because of a kill or a full disk."""
         for folder in (self.path / "point_cloud").glob("iteration_*"):
             if not (folder / "point_cloud.ply").exists():
                 shutil.rmtree(folder, ignore_errors=True)
 
     def discard(self) -> None:
-        """Take back what `begin` wrote, if nothing has come of it."""
+        """Remove what `begin` wrote, if there is neither a scene nor a checkpoint."""
         if self.scenes() or self.checkpoints.exists():
             return
         for name in _FILES:
             (self.path / name).unlink(missing_ok=True)
         self._remove_unwritten_scenes()
-        with suppress(OSError):  # it is not there, or something else is in it
+        with suppress(OSError):  # missing, or not empty
             (self.path / "point_cloud").rmdir()
         if self.path.is_dir() and not any(self.path.iterdir()):
             self.path.rmdir()
@@ -189,7 +194,7 @@ class OutputFolder:
     # Scenes
 
     def scenes(self) -> list[int]:
-        """The iterations whose scene is there, ascending."""
+        """The iterations that have a scene, ascending."""
         folder = self.path / "point_cloud"
         if not folder.is_dir():
             return []
@@ -201,7 +206,7 @@ class OutputFolder:
         return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
     def write_scene(self, iteration: int, gaussians: Gaussians) -> Path:
-        """Save the scene; gives its file."""
+        """Save the scene; returns the file."""
         from snowsplat.formats import write_gaussians
 
         path = self.scene_path(iteration)
@@ -210,7 +215,7 @@ class OutputFolder:
         return path
 
     def read_scene(self, iteration: int | None) -> tuple[int, Gaussians]:
-        """The scene of an iteration, the last one by default.
+        """An iteration and its scene; None: the last one.
 
         Raises:
             UserError: no such folder or scene, or a damaged one.
@@ -229,17 +234,17 @@ class OutputFolder:
         return chosen, read_gaussians(self.scene_path(chosen))
 
     def write_metrics(self, iteration: int, split: str, evaluation: Evaluation) -> None:
-        """`metrics.json`: which scene, which views, the mean figures, and those of each view."""
+        """Write `metrics.json`: iteration, split, the mean figures, and those of each view."""
         head = {"iteration": iteration, "split": split}
         write_json(self.path / "metrics.json", head | evaluation.as_json())
 
     # Settings
 
     def settings(self) -> tuple[DatasetSettings, tuple[float, float, float]]:
-        """How the dataset was read, and the background colour.
+        """How the dataset was read, and the background color (red, green, blue in 0..1).
 
         Raises:
-            UserError: no settings here, or damaged ones.
+            UserError: missing or damaged settings.
         """
         ours, theirs = self.path / "config.json", self.path / "cfg_args"
         try:
@@ -267,10 +272,10 @@ class OutputFolder:
 
 
 def _namespace(path: Path) -> dict[str, Any]:
-    """Texts, numbers, True, False and None of ``Namespace(name=value, …)``; all else is left out.
+    """Strings, numbers, True, False and None of ``Namespace(name=value, …)``; others are ignored.
 
-    Only single words are given to Python's own reader of literals: it runs nothing, but deep
-    nesting may end the program.
+    Only single words are passed to `ast.literal_eval`: it executes nothing, but deep nesting may
+    crash the interpreter.
     """
     with open(path, encoding="utf-8") as file:
         words = (match[0] for match in _WORD.finditer(file.read(_NAMESPACE_LIMIT)))
@@ -279,7 +284,7 @@ def _namespace(path: Path) -> dict[str, Any]:
         values, depth, part = {}, 1, list[str]()
         for word in words:
             if word in ("'", '"'):
-                raise ValueError("a text without an end")
+                raise ValueError("a string without an end")
             depth += (word in "([{") - (word in ")]}")
             if depth > 1 or (depth == 1 and word != ","):
                 part = [*part, word][:_PART]

@@ -1,237 +1,342 @@
-"""The steps of one training and what is written on the way: the work of `snowsplat train`."""
+"""`train` and `resume`: a posed dataset becomes a scene in an output folder."""
 
 from __future__ import annotations
 
 import time
-import warnings
-from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from snowsplat.cli.progress import TrainingProgress, duration, held_out_line, peak_bytes
-from snowsplat.pipeline.memory import MemoryBudget
+from snowsplat.pipeline.checkpoint_meta import CheckpointMeta, Recipe
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.memory_use import MemoryUse
+from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
-from snowsplat.pipeline.timed import TimeBudget
-from snowsplat.training.history import History
+from snowsplat.pipeline.time_budget import TimeBudget, check_minutes
 from snowsplat.util.errors import UserError
+from snowsplat.util.process_memory import reset_peak, resident_bytes
 
 if TYPE_CHECKING:
-    from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.training.time_budget.pace import Pace
-    from snowsplat.training.trainer import Progress, Trainer
-    from snowsplat.viewer.live.training import TrainingViewer
+    from snowsplat.data import Dataset
+    from snowsplat.pipeline.live_page import LivePage
+    from snowsplat.pipeline.training_run import TrainResult
+    from snowsplat.training.checkpoint import Checkpoint
+    from snowsplat.training.config import TrainConfig
+    from snowsplat.training.trainer import Trainer
+
+# Settings that may differ from those of the checkpoint that is resumed.
+_FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
 
 
-@dataclass
-class TrainingRun:
-    """One training, to its end or to Ctrl-C.
+@dataclass(frozen=True)
+class TrainOptions:
+    """How to train. None leaves a value to the recipe or, on `resume`, to the checkpoint.
+
+        TrainOptions(hold_out=8, settings={"iterations": 7000, "max_gaussians": 200_000})
 
     Attributes:
-        settings, recipe: as they are written down.
-        budget, pace: of a training with a time.
-        memory: what it takes, and may take.
-        save_iterations: steps after which the scene is written too.
-        checkpoint_seconds: between checkpoints, where the configuration names no steps.
-        again: the command that goes on where Ctrl-C stopped.
-        viewer: the page that shows it.
+        recipe: the origin of all settings: "default", "paper" or "mcmc".
+        settings: changed settings by name, see `snowsplat.training.config.changed`.
+        images: name of the folder of photos in the dataset; default: "images".
+        resolution: 1, 2, 4 or 8 divide the size of the photos; any other number is a width in
+            pixels; default: unchanged.
+        hold_out: every so many-th photo is held out for testing, if the dataset has no split of its
+            own; default: none.
+        test_list: a text file that names the photos to hold out instead.
+        minutes: finish within this time: picks the steps, the size of the photos and the number of
+            Gaussians, as far as they are not set here. On `resume`: the time for the rest.
+        memory: bytes, or a text such as "4GB", that the training may use beside Python and its
+            libraries; on a GPU, of its memory. Default: what is available.
+        save_iterations: steps after which to save the scene, in addition to the last one.
+        checkpoint_seconds: time between checkpoints, if ``settings`` has no checkpoint_every.
+        compute: device, threads, determinism.
+
+    Raises:
+        UserError: ``minutes`` is not positive, or given together with iterations.
     """
 
-    out: OutputFolder
-    settings: DatasetSettings
-    recipe: str
-    trainer: Trainer
-    budget: TimeBudget | None
-    pace: Pace | None
-    memory: MemoryBudget
+    recipe: Recipe | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    images: str | None = None
+    resolution: int | None = None
+    hold_out: int | None = None
+    test_list: Path | None = None
+    minutes: float | None = None
+    memory: int | str | None = None
     save_iterations: tuple[int, ...] = ()
     checkpoint_seconds: float | None = None
-    again: str = ""
-    quiet: bool = False
-    viewer: TrainingViewer | None = None
+    compute: Compute = field(default_factory=Compute)
 
     def __post_init__(self) -> None:
-        self.config = self.trainer.config
-        self.first_step = self.trainer.step
-        self.progress = TrainingProgress(self.trainer.schedule.iterations, self.trainer.step)
-        self.last_checkpoint = time.monotonic()
-        self.evaluation: tuple[int, Evaluation] | None = None  # the newest, and its step
-        self.history = History.read(self.out.history, self.first_step)
+        if self.minutes is None:
+            return
+        if self.iterations is not None:
+            raise UserError("`minutes` and `iterations` exclude each other; leave one out")
+        check_minutes(self.minutes)
 
-    def run(self) -> int:
-        """Gives the exit code: 0, or 130 after Ctrl-C.
+    @property
+    def iterations(self) -> int | None:
+        """The requested number of steps."""
+        return self.settings.get("iterations")
 
-        Raises:
-            UserError: the training came to numbers that are not finite.
-        """
-        from snowsplat.training.finite import Diverged
-
-        stopped = False
-        try:
-            with nullcontext() if self.quiet else self.progress:
-                self._do_what_a_kill_prevented()
-                self.history.step_begins()
-                self.trainer.run(self._record)
-        except KeyboardInterrupt:
-            if self.trainer.step == 0 or self.trainer.within_step:  # there is nothing whole to save
-                if self.trainer.step > 0:
-                    print(f"stopped within a step, which is not saved; {self._kept()}")
-                self.out.discard()
-                raise
-            stopped = True
-        except Diverged as error:
-            self.out.discard()
-            raise UserError(f"{error}; {self._kept()}") from None
-        except BaseException:
-            self.out.discard()
-            raise
-        return self._stopped() if stopped else self._finished()
-
-    def _record(self, progress: Progress) -> None:
-        measured = progress.metrics is not None  # within the step, as it seems from here
-        self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=not measured)
-        self._after_step(progress)
-        self.history.step_begins()
-
-    def _after_step(self, progress: Progress) -> None:
-        if progress.metrics is not None and progress.metrics.views:
-            self._measured(progress.step, progress.metrics)
-        if not self.quiet:
-            self.progress(progress)
-        if self._checkpoint_is_due(progress.step):
-            self._save_checkpoint()
-        if progress.step in self.save_iterations:
-            self._save_scene()
-        if self.viewer is not None:
-            paused = self.viewer.after_step(
-                progress.step, progress.iterations, progress.loss, self.trainer.gaussians
-            )
-            if self.pace is not None and self.budget is not None:
-                self.pace.put_off(paused)
-                self.budget.started += paused
-        if self.pace is not None:
-            schedule = self.trainer.schedule
-            length = self.pace.iterations_after(
-                schedule, progress.step, progress.downscale, progress.gaussians
-            )
-            if length is not None:
-                schedule.stretch(progress.step, length)
-
-    def _checkpoint_is_due(self, step: int) -> bool:
-        every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
-        if every:
-            return step % every == 0
-        return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
-
-    def _do_what_a_kill_prevented(self) -> None:
-        """Between a checkpoint and the removal of an old one, or the scene of the same step."""
-        from snowsplat.training import checkpoint
-
-        step = self.first_step
-        checkpoint.remove_old(self.out.checkpoints, step)
-        if step in self.save_iterations and step not in self.out.scenes():
-            self._save_scene()
-
-    def _save_scene(self) -> Path:
-        self._look_for_the_folder()
-        return self.out.write_scene(self.trainer.step, self.trainer.gaussians)
-
-    def _look_for_the_folder(self) -> None:
-        """Hours of training are not lost because somebody moved or removed it."""
-        if not self.out.is_one():
-            warnings.warn(f"{self.out.path}: is gone; it is made anew, to go on in", stacklevel=2)
-            self.out.describe(self.trainer.dataset, self.settings, self.config)
-
-    def _save_checkpoint(self) -> Path:
-        from snowsplat.training import checkpoint
-        from snowsplat.training.config import config_to_json
-
-        self._look_for_the_folder()
-        meta = {
-            "capture": asdict(self.settings),
-            "recipe": self.recipe,
-            "training": config_to_json(self.config),
+    def dataset_settings(
+        self, dataset: Path | str | None, before: DatasetSettings | None = None
+    ) -> DatasetSettings:
+        """How to read the dataset: as ``before``, with the changes of these options."""
+        changes: dict[str, Any] = {
+            "path": None if dataset is None else str(Path(dataset).absolute()),
+            "images": self.images,
+            "resolution": self.resolution,
+            "hold_out": 8
+            if self.hold_out is None and self.test_list is not None
+            else self.hold_out,
+            "test_list": None if self.test_list is None else str(Path(self.test_list).absolute()),
         }
-        if self.budget is not None:
-            meta["time"] = self.budget.as_json()
-            meta["schedule"] = asdict(self.trainer.schedule)
-        self.history.write(self.out.history)  # first: who goes on from there finds it whole
-        path = checkpoint.save(
-            self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta
-        )
-        self.last_checkpoint = time.monotonic()
-        return path
+        settings = before or DatasetSettings(path="")
+        return replace(settings, **{k: v for k, v in changes.items() if v is not None})
 
-    def _kept(self) -> str:
+
+def train(
+    dataset: Path | str,
+    output: Path | str,
+    options: TrainOptions | None = None,
+    *,
+    overwrite: bool = False,
+    observer: Observer = SILENT,
+    page: LivePage | None = None,
+) -> TrainResult:
+    """Train the scene of a posed dataset.
+
+    Args:
+        dataset: a folder of photos and cameras, see `snowsplat.data.load_dataset`.
+        output: the folder for the result, see `snowsplat.pipeline.output_folder`; created if
+            missing.
+        overwrite: replace a training that is in ``output``.
+        page: shows the training in the browser.
+
+    Raises:
+        UserError: an unusable dataset, setting, device or folder; too little memory; numbers that
+            are no longer finite. A folder that was created is removed if nothing came of it.
+        TrainingStopped: Ctrl-C. Scene and checkpoint are saved; `resume` continues.
+        KeyboardInterrupt: Ctrl-C before the first step; nothing is left.
+    """
+    started = time.monotonic()
+    options = options or TrainOptions()
+    out = OutputFolder(Path(output))
+    out.check_free(resume=False, overwrite=overwrite)
+    return _Job(out, options, observer, page, started).train(dataset)
+
+
+def resume(
+    output: Path | str,
+    options: TrainOptions | None = None,
+    *,
+    dataset: Path | str | None = None,
+    observer: Observer = SILENT,
+    page: LivePage | None = None,
+) -> TrainResult:
+    """Continue a training from its newest checkpoint, to the same result as without interruption.
+
+    Args:
+        output: the folder of the training.
+        options: may change iterations, test_iterations and checkpoint_every of the settings, and
+            what does not affect the result; anything else must be as it was.
+        dataset: where the photos are now, if they were moved. If there is no checkpoint yet, the
+            training starts from this dataset.
+
+    Raises:
+        UserError: as `train`; no checkpoint, and no ``dataset`` to start from; other settings.
+        TrainingStopped, KeyboardInterrupt: as `train`.
+    """
+    started = time.monotonic()
+    options = options or TrainOptions()
+    out = OutputFolder(Path(output))
+    out.check_free(resume=True, overwrite=False)
+    return _Job(out, options, observer, page, started).resume(dataset)
+
+
+class _Job:
+    """One call of `train` or `resume`: prepares a `TrainingRun` and runs it."""
+
+    def __init__(
+        self,
+        out: OutputFolder,
+        options: TrainOptions,
+        observer: Observer,
+        page: LivePage | None,
+        started: float,
+    ) -> None:
+        from snowsplat.training import trainer  # noqa: F401 (what it imports is used before)
+
+        self.out, self.options, self.observer, self.page = out, options, observer, page
+        self.started = started
+        self.device = options.compute.apply()
+        reset_peak()
+        self.memory_before = resident_bytes()
+
+    def train(self, path: Path | str) -> TrainResult:
+        from snowsplat.training.recipes import recipe
+        from snowsplat.training.trainer import Trainer
+
+        options = self.options
+        budget = TimeBudget.of(options.minutes, None, self.started)
+        settings = options.dataset_settings(path)
+        name = options.recipe or "default"
+        config = recipe(name, **options.settings)
+        dataset = settings.load()
+        plan = None
+        if budget is not None:
+            plan = budget.plan(
+                *(dataset, config, self.device),
+                resize=options.resolution is None,
+                more_gaussians=options.settings.get("max_gaussians") is None,
+                more_often=all(
+                    options.settings.get(setting) is None
+                    for setting in ("densify_interval", "densify_from")
+                ),
+            )
+            config = plan.config
+            if plan.resolution is not None:
+                settings = replace(settings, resolution=plan.resolution)
+                dataset = settings.load()
+        memory = self._memory(dataset, config)
+        trainer = Trainer(dataset, memory.plan.config, device=self.device)
+        self.out.begin(dataset, settings, memory.plan.config)
+        self.observer.note(_described(dataset))
+        if budget is not None and plan is not None:
+            self.observer.note(budget.described(plan))
+        slowness = 1.0 if plan is None else plan.slowness
+        return self._run(settings, name, trainer, budget, slowness, memory)
+
+    def resume(self, path: Path | str | None) -> TrainResult:
+        from snowsplat.training.trainer import Trainer
+
+        start = self._newest_checkpoint(path)
+        if start is None:
+            assert path is not None
+            return self.train(path)
+        options, meta = self.options, CheckpointMeta.of(start)
+        budget, schedule = None, None
+        if options.iterations is None:  # otherwise it replaces both
+            budget = TimeBudget.of(options.minutes, meta.time, self.started)
+            schedule = meta.schedule
+        settings = _resumed_dataset(options, path, start, meta)
+        config = _resumed_config(options, start, meta)
+        dataset = settings.load()
+        memory = self._memory(dataset, config, _gaussians_in(start))
+        trainer = Trainer(dataset, memory.plan.config, schedule, self.device)
+        trainer.load_state(start.tensors)
+        start.tensors.clear()  # copied by now: a second copy is not part of the planned memory
+        self.out.write_config(settings, memory.plan.config)
+        self.observer.note(_described(dataset))
+        iterations = trainer.schedule.iterations
+        self.observer.note(f"resuming from {start.path}, step {start.step} of {iterations}")
+        return self._run(settings, meta.recipe, trainer, budget, 1.0, memory)
+
+    def _memory(self, dataset: Dataset, config: TrainConfig, present: int = 0) -> MemoryUse:
+        return MemoryUse.planned(
+            self.options.memory, dataset, config, self.device, self.memory_before, present
+        )
+
+    def _run(
+        self,
+        settings: DatasetSettings,
+        recipe: Recipe,
+        trainer: Trainer,
+        budget: TimeBudget | None,
+        slowness: float,
+        memory: MemoryUse,
+    ) -> TrainResult:
+        from snowsplat.pipeline.training_run import TrainingRun
+
+        self.observer.note(str(memory))
+        pace = None if budget is None else budget.pace(trainer, slowness)
+        run = TrainingRun(
+            *(self.out, settings, recipe, trainer, budget, pace, memory, self.observer),
+            save_iterations=self.options.save_iterations,
+            checkpoint_seconds=self.options.checkpoint_seconds,
+            page=self.page,
+        )
+        if self.page is not None:
+            self.page.open_training(trainer, self.out.path.name, self.observer)
+        return run.run()
+
+    def _newest_checkpoint(self, path: Path | str | None) -> Checkpoint | None:
+        """None if there is nothing yet: the training starts at step 0."""
         from snowsplat.training import checkpoint
 
-        kept = checkpoint.files(self.out.checkpoints)
-        if not kept:
-            return "there is no checkpoint yet"
-        step, path = kept[0]
-        return f"the last good checkpoint is {path}, --resume --iterations {step} makes it a scene"
+        out = self.out
+        newest = checkpoint.latest(out.checkpoints)
+        if newest is not None:
+            return newest
+        if path is None:
+            raise UserError(
+                f"{out.path}: holds no complete checkpoint to resume; name the dataset to start "
+                "from step 0"
+            )
+        if out.scenes() or checkpoint.exists(out.checkpoints):
+            what = "a scene" if out.scenes() else "checkpoints"
+            raise UserError(
+                f"{out.path}: holds {what} but no complete checkpoint to resume; use `overwrite` "
+                "instead of `resume` to start from step 0"
+            )
+        self.observer.note(f"{out.path}: no checkpoint yet; starting at step 0")
+        return None
 
-    def _measured(self, step: int, evaluation: Evaluation) -> None:
-        self.evaluation = (step, evaluation)
-        self.history.measure(step, evaluation.psnr, evaluation.ssim)
 
-    def _stopped(self) -> int:
-        path = self._save_scene()
-        self._save_checkpoint()
-        print(f"stopped after step {self.trainer.step}: {path}")
-        print(f"go on with: {self.again}")
-        return 130
+def _resumed_dataset(
+    options: TrainOptions, path: Path | str | None, start: Checkpoint, meta: CheckpointMeta
+) -> DatasetSettings:
+    """As in the checkpoint; only the place of the dataset and of the test list may have changed."""
 
-    def _finished(self) -> int:
-        step = self.trainer.step
-        path = self._save_scene()
-        steps = f"{step - self.first_step} more steps" if self.first_step else f"{step} steps"
-        print(
-            f"{path}: {len(self.trainer.gaussians):,} Gaussians, {steps} in "
-            f"{duration(self.progress.seconds)}, {self.memory.taken()}"
+    def relevant(settings: DatasetSettings) -> tuple[Any, ...]:
+        resolution = max(1, settings.resolution)  # -1 is full resolution too
+        tests = settings.test_list and Path(settings.test_list).name
+        return settings.images, resolution, settings.hold_out, tests
+
+    settings = options.dataset_settings(path, meta.capture)
+    if relevant(settings) != relevant(meta.capture):
+        raise _other_settings(start)
+    return settings
+
+
+def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMeta) -> TrainConfig:
+    """As in the checkpoint; only changes that leave the finished steps as they are."""
+    from snowsplat.training.config import changed, config_from_json
+
+    config = config_from_json(meta.training)
+    if options.recipe not in (None, meta.recipe):
+        raise UserError(f"{start.path}: was made with the recipe {meta.recipe}; leave `recipe` out")
+    resumed = changed(config, **options.settings)
+    same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
+    if same != config:
+        raise _other_settings(start)
+    # A training with a time budget may have exceeded its first plan.
+    if options.iterations is not None and resumed.iterations < start.step:
+        raise UserError(
+            f"{start.path}: is of step {start.step}, beyond `iterations` {resumed.iterations}; "
+            "use a larger number"
         )
-        for line in self.memory.plan.given_up:
-            print(f"for lack of memory: {line}")
-        if self.trainer.dataset.test:
-            if self.evaluation is None or self.evaluation[0] != step:
-                self._measured(step, self.trainer.evaluate())
-            assert self.evaluation is not None
-            self.out.write_metrics(step, "test", self.evaluation[1])
-        self.history.write(self.out.history)
-        print(f"{self._write_report()}: how it went")
-        if self.evaluation is not None:
-            print(held_out_line(*self.evaluation))
-        if self.budget is not None:
-            self.out.write_config(self.settings, replace(self.config, iterations=step))
-            spent = self.budget.as_json()["spent"]
-            print(f"{duration(spent)} in all, of {duration(self.budget.seconds)}")
-        return 0
+    return resumed
 
-    def _write_report(self) -> Path:
-        from snowsplat.training.config import config_to_json
-        from snowsplat.training.report import Trained, write_training_report
 
-        # The page may be given away: of paths it tells no more than names.
-        out = self.out.path
-        dataset = asdict(self.settings)
-        for word in ("path", "test_list"):
-            dataset[word] = dataset[word] and Path(dataset[word]).name
-        write_training_report(
-            self.out.report,
-            Trained(
-                name=out.resolve().name if out.is_absolute() else str(out),
-                dataset=self.trainer.dataset,
-                gaussians=self.trainer.gaussians,
-                step=self.trainer.step,
-                background=self.out.settings()[1],
-                history=self.history,
-                evaluation=None if self.evaluation is None else self.evaluation[1],
-                settings={
-                    "recipe": self.recipe,
-                    "capture": dataset,
-                    "training": config_to_json(self.config),
-                },
-                peak_bytes=peak_bytes(),
-            ),
-        )
-        return self.out.report
+def _other_settings(start: Checkpoint) -> UserError:
+    return UserError(
+        f"{start.path}: was made with other settings; resume without changing the training "
+        "(`iterations`, `test_iterations`, `checkpoint_every` may change)"
+    )
+
+
+def _gaussians_in(start: Checkpoint) -> int:
+    means = start.tensors.get("gaussians.means")  # checked when the state is loaded
+    return 0 if means is None else means.numel() // 3
+
+
+def _described(dataset: Dataset) -> str:
+    camera = dataset.train[0].camera
+    points = "no points" if dataset.points is None else f"{len(dataset.points):,} points"
+    return (
+        f"{dataset.description}: {len(dataset.train)} photos to train on, {len(dataset.test)} "
+        f"held out, {camera.width}x{camera.height}, {points}"
+    )

@@ -14,8 +14,9 @@ from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
+from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
-from snowsplat.util.html import bar, cards, duration, page, picture, table, text
+from snowsplat.util.html import bar, cards, page, picture, table, text
 from snowsplat.util.safe_json import printable
 
 _FILE = "capture_report.html"

@@ -4,7 +4,8 @@
 class UserError(Exception):
     """An error with a one-line message: what is wrong, and what to do.
 
-    The command line prints the message and exits with status 2.
+    The command line prints the message and exits with status 2. Settings inside the message are in
+    backquotes, "use `overwrite` to replace it"; the command line prints their flags instead.
     """
 
 

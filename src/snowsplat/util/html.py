@@ -102,16 +102,6 @@ def picture(image: Image.Image, alt: str, quality: int = 75) -> str:
     return f'<img src="data:image/jpeg;base64,{source}" alt="{text(alt)}" title="{text(alt)}"/>'
 
 
-def duration(seconds: float) -> str:
-    """5.1 s, 2 min 10 s or 1 h 40 min."""
-    if seconds < 100:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"
-
-
 def text(value: object) -> str:
     """``value`` as escaped text, for elements and for quoted attributes."""
     return escape(printable(str(value)))

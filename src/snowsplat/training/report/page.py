@@ -17,8 +17,9 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.history import History
 from snowsplat.training.report import pictures
 from snowsplat.util import charts
+from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
-from snowsplat.util.html import bar, cards, duration, page, table, text
+from snowsplat.util.html import bar, cards, page, table, text
 from snowsplat.util.machine import memory_bytes, processor_name, system_name
 from snowsplat.util.process import single_threaded
 

@@ -1,11 +1,11 @@
-"""The flag `--memory`: what a training takes, said before it starts, and what it took."""
+"""The memory of one training: the plan made before it starts, and what it took."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from snowsplat.cli.progress import peak_bytes
+from snowsplat.util.process_memory import peak_bytes
 
 if TYPE_CHECKING:
     import torch
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class MemoryBudget:
-    """What one training takes.
+class MemoryUse:
+    """The memory of one training.
 
     Attributes:
-        device: whose memory.
+        device: the device whose memory is planned.
         plan: with the configuration that fits.
-        before: bytes that the process held when only Python and PyTorch were there.
+        before: resident bytes of the process before the training: Python and its libraries.
     """
 
     device: torch.device
@@ -30,24 +30,28 @@ class MemoryBudget:
     before: int
 
     @classmethod
-    def of(
+    def planned(
         cls,
-        asked: str | None,
+        budget: int | str | None,
         dataset: Dataset,
         config: TrainConfig,
         device: torch.device,
         before: int,
         present: int = 0,
-    ) -> MemoryBudget:
-        """``asked``: the flag; ``present``: Gaussians of a training that goes on.
+    ) -> MemoryUse:
+        """
+        Args:
+            budget: bytes, or a text such as "4GB"; None: what is available.
+            present: number of Gaussians of a training that is resumed.
 
         Raises:
-            UserError: no number of bytes, or too few.
+            UserError: not a number of bytes, or too few.
         """
         from snowsplat.data.image_loader import available_memory
         from snowsplat.training.memory_budget import parse_bytes, plan_memory
 
-        budget = None if asked is None else parse_bytes(asked)
+        if isinstance(budget, str):
+            budget = parse_bytes(budget)
         available = available_memory(device)
         plan = plan_memory(dataset, config, device, available, budget, present)
         return cls(device, plan, before)
@@ -57,11 +61,11 @@ class MemoryBudget:
         return f"{where}: {self.plan}"
 
     def taken(self) -> str:
-        """What it took, in words."""
+        """The peak so far, as text."""
         if self.device.type == "cuda":
             import torch
 
             peak = torch.cuda.max_memory_allocated(self.device)
             return f"at most {peak / 1e6:.0f} MB of the GPU"
         peak, before = peak_bytes(), self.before
-        return f"at most {peak / 1e6:.0f} MB, {before / 1e6:.0f} of them Python and PyTorch"
+        return f"at most {peak / 1e6:.0f} MB, {before / 1e6:.0f} of them Python and its libraries"

@@ -1,8 +1,10 @@
-"""Pictures as PNG files: colours in 8 bits, depth in 16 bits or in colours."""
+"""Renders as PNG files: colors in 8 bits, depth in 16 bits or in colors."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,12 @@ from torch import Tensor
 
 from snowsplat.util.files import atomic_path
 
-# Anchors of a map from far (0) to near (1) whose lightness only grows: violet, blue, green, yellow.
+# Anchors of a color map from far (0) to near (1) of increasing lightness: violet to yellow.
 _DEPTH_COLORS = np.array(
     [[68, 1, 84], [65, 68, 135], [42, 120, 142], [34, 168, 132], [122, 209, 81], [253, 231, 37]],
     np.float32,
 )
-_OPAQUE_ENOUGH = 0.5  # below this alpha a pixel shows background, which has no depth
+_OPAQUE_ENOUGH = 0.5  # below this alpha a pixel mostly shows the background, which has no depth
 
 
 def to_8bit(image: Tensor) -> np.ndarray:
@@ -31,9 +33,9 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def mean_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:
-    """(H, W) float32, world units: mean camera z of what a pixel shows, Σ T α z / Σ T α.
+    """(H, W) float32, world units: mean camera z of a pixel, Σ T α z / Σ T α.
 
-    0 where it shows mostly background, which has no depth.
+    0 where the pixel mostly shows the background, which has no depth.
     """
     mean = depth / alpha.clamp_min(1e-6)
     mean[alpha < _OPAQUE_ENOUGH] = 0.0
@@ -41,7 +43,7 @@ def mean_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:
 
 
 def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Near and far of some depth images, without the outermost 1% at each end."""
+    """Near and far of depth images (H, W): percentiles 1 and 99 of the depths that are not 0."""
     shown = np.concatenate([np.zeros(0, np.float32), *(depth[depth > 0] for depth in depths)])
     if not shown.size:
         return 1.0, 2.0
@@ -50,7 +52,7 @@ def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def depth_in_16_bits(depth: np.ndarray) -> tuple[np.ndarray, float]:
-    """(H, W) uint16, and how many world units one step is."""
+    """(H, W) uint16, and the world units of one step."""
     step = (float(depth.max()) or 1.0) / 65535.0
     return np.clip(np.rint(depth / step), 0, 65535).astype(np.uint16), step
 
@@ -58,7 +60,7 @@ def depth_in_16_bits(depth: np.ndarray) -> tuple[np.ndarray, float]:
 def depth_in_color(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """(H, W, 3) uint8, from near (yellow) to far (violet); black where there is no depth.
 
-    Even steps of disparity, 1/z, which is how the eye tells distances.
+    Colors are linear in disparity, 1/z, which resolves near distances better.
     """
     with np.errstate(divide="ignore"):
         t = (1.0 / depth - 1.0 / far) / (1.0 / near - 1.0 / far)
@@ -67,3 +69,26 @@ def depth_in_color(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     share = (position - low)[:, :, None]
     color = _DEPTH_COLORS[low] * (1.0 - share) + _DEPTH_COLORS[low + 1] * share
     return np.where(depth[:, :, None] > 0, np.rint(color), 0.0).astype(np.uint8)
+
+
+class PngQueue:
+    """Writes images in the background, a few behind: encoding PNG takes longer than rendering."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(2)
+        self._pending: deque[Future[None]] = deque()
+
+    def __enter__(self) -> PngQueue:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with self._pool:
+            if error[0] is None:
+                while self._pending:
+                    self._pending.popleft().result()
+
+    def write(self, path: Path, pixels: np.ndarray) -> None:
+        """Raises: OSError: an earlier image could not be written."""
+        self._pending.append(self._pool.submit(write_png, path, pixels))
+        if len(self._pending) > 8:
+            self._pending.popleft().result()

@@ -1,35 +1,37 @@
-"""The progress of a training: a bar in a terminal, a line every few seconds in a file."""
+"""`StepProgress`: the steps of a training, as a bar in a terminal or as lines in a file."""
 
 from __future__ import annotations
 
 import math
 import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
+from snowsplat.util.duration import duration
+from snowsplat.util.process_memory import resident_bytes
+
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.training import trainer
 
 _LINE_SECONDS = 5.0
-_RATE_SECONDS = 3.0  # the rate shown is the mean of about this long
-_LOSS_STEPS = 50  # and the loss of about as many views
+_RATE_SECONDS = 3.0  # the displayed rate is a running mean over about this time
+_LOSS_STEPS = 50  # the displayed loss is a running mean over about this number of steps
 
 
-class TrainingProgress:
-    """Callback for `Trainer.run`; use it as a context, so that the terminal is left in order."""
+class StepProgress:
+    """Called after each step. `close` removes the bar's thread and leaves its last line."""
 
     def __init__(self, total: int, start: int = 0, stream: TextIO | None = None) -> None:
         self.total = total
         self.stream = stream or sys.stdout
         self._start_step = start
         self._start_time = self._last_time = time.monotonic()
-        self._last_line = self._start_time - _LINE_SECONDS + 1.0  # the first one comes soon
+        self._last_line = self._start_time - _LINE_SECONDS + 1.0  # the first line after a second
         self._last_step = start
         self._rate = 0.0  # steps a second
         self._loss = math.nan
@@ -46,19 +48,16 @@ class TrainingProgress:
                 refresh_per_second=4,
             )
             self._task = self._bar.add_task("starting", total=total, completed=start)
-
-    def __enter__(self) -> TrainingProgress:
-        if self._bar is not None:
             self._bar.start()
-        return self
 
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Stop updating the bar."""
         if self._bar is not None:
             self._bar.stop()
 
     @property
     def seconds(self) -> float:
-        """Since this was made."""
+        """Since the first step began."""
         return time.monotonic() - self._start_time
 
     def __call__(self, progress: trainer.Progress) -> None:
@@ -85,7 +84,7 @@ class TrainingProgress:
             print(f"{counted}  {self._text(progress)}", file=self.stream, flush=True)
 
     def say(self, line: str) -> None:
-        """A line that stays, above the bar."""
+        """Print a line, above the bar."""
         if self._bar is not None:
             self._bar.console.print(line, highlight=False)
         else:
@@ -111,53 +110,14 @@ class TrainingProgress:
 
 
 def _whole(total: int) -> Column:
-    """Where the terminal is narrow, half a number would be another number: the rest is cut."""
+    """In a narrow terminal a truncated number would be misread: other columns are truncated."""
     return Column(no_wrap=True, min_width=2 * len(str(total)) + 1)
 
 
 def held_out_line(step: int, evaluation: Evaluation) -> str:
-    """Step, number of views, and their mean figures."""
+    """Step, number of views, and the mean figures."""
     count = len(evaluation.views)
     figures = f"PSNR {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.3f}"
     if evaluation.lpips is not None:
         figures += f"  LPIPS {evaluation.lpips:.3f}"
     return f"step {step}: {count} views  {figures}"
-
-
-def duration(seconds: float) -> str:
-    """12 s, 3:25 or 1:02:45."""
-    if not math.isfinite(seconds):
-        return "?"
-    if seconds < 60:
-        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
-    minutes, s = divmod(round(seconds), 60)
-    hours, m = divmod(minutes, 60)
-    return f"{hours}:{m:02d}:{s:02d}" if hours else f"{m}:{s:02d}"
-
-
-def resident_bytes() -> int:
-    """Memory that this process holds now (where the system does not tell: has held at most)."""
-    try:
-        import resource
-
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-        return pages * resource.getpagesize()
-    except (ImportError, OSError, ValueError, IndexError):
-        pass
-    return peak_bytes()
-
-
-def peak_bytes() -> int:
-    """The most memory that this process has held; 0 where the system does not tell."""
-    try:
-        # Not what getrusage says on Linux: there a process begins with the figure of its parent.
-        lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) << 10
-    except (OSError, StopIteration, ValueError, IndexError):
-        pass
-    try:
-        import resource
-    except ImportError:
-        return 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024

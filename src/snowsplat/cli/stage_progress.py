@@ -1,4 +1,4 @@
-"""The progress of a job of several stages: a line for each, with a bar in a terminal."""
+"""`StageProgress`: one line per stage of a job, with a progress bar in a terminal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from snowsplat.cli.progress import duration
+from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:
     from snowsplat.sfm.progress import Report
@@ -19,9 +19,10 @@ _WIDTH = 10  # of the names of stages
 
 
 class StageProgress:
-    """Lines about stages on ``stream``; use it as a context, so that the terminal is left in order.
+    """Lines about stages on ``stream``.
 
-    In a terminal a bar shows the stage that runs now; in a file a line comes every few seconds.
+    In a terminal a bar shows the current stage, from `begin` to `end` or `hide`; otherwise a line
+    is printed every few seconds.
     """
 
     def __init__(self, quiet: bool = False, stream: TextIO | None = None) -> None:
@@ -31,7 +32,13 @@ class StageProgress:
         self._task = TaskID(0)
         self._stage = self._what = ""
         self._start = self._last_line = time.monotonic()
-        if self.stream.isatty() and not quiet:
+
+    def begin(self, stage: str) -> Report:
+        """A stage begins; returns its progress callback."""
+        self._stage, self._what = stage, ""
+        self._last_line = time.monotonic()
+        self.hide()
+        if self.stream.isatty() and not self.quiet:
             self._bar = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(bar_width=None),
@@ -41,34 +48,24 @@ class StageProgress:
                 transient=True,
                 refresh_per_second=4,
             )
-            self._task = self._bar.add_task("", total=None, visible=False, text="")
-
-    def __enter__(self) -> StageProgress:
-        if self._bar is not None:
+            self._task = self._bar.add_task(stage, total=None, text="")
             self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def begin(self, stage: str) -> Report:
-        """A stage begins; gives what it reports to."""
-        self._stage, self._what = stage, ""
-        self._last_line = time.monotonic()
-        if self._bar is not None:
-            self._bar.reset(self._task, total=None, description=stage, visible=True, text="")
         return self._report
 
-    def end(self, line: str, seconds: float, again: bool = False) -> None:
-        """The stage is finished: the line that stays."""
+    def hide(self) -> None:
+        """Remove the bar."""
         if self._bar is not None:
-            self._bar.update(self._task, visible=False)
+            self._bar.stop()
+            self._bar = None
+
+    def end(self, line: str, seconds: float, again: bool = False) -> None:
+        """The stage is finished; ``again``: in an earlier run."""
+        self.hide()
         took = "done before" if again else duration(seconds)
         self.say(f"{self._stage:<{_WIDTH}}{line}  ({took})")
 
     def say(self, line: str) -> None:
-        """A line that stays, above the bar."""
+        """Print a line, above the bar."""
         if self.quiet:
             return
         if self._bar is not None:

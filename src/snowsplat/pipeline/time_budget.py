@@ -1,4 +1,4 @@
-"""A training with a time: how much of it is left, what is planned for it, how it is kept."""
+"""`TimeBudget`: the time of a training: how much is left, and the plan and the pace that fit it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.cli.progress import duration
-from snowsplat.util.errors import UserError
+from snowsplat.util.duration import duration
+from snowsplat.util.errors import SettingError
 
 if TYPE_CHECKING:
     import torch
@@ -19,14 +19,20 @@ if TYPE_CHECKING:
     from snowsplat.training.trainer import Trainer
 
 
+def check_minutes(minutes: float) -> None:
+    """Raises: UserError: not a positive, finite number."""
+    if not 0.0 < 60.0 * minutes < float("inf"):
+        raise SettingError("minutes", f"{minutes:g} is not a duration; use a number above 0")
+
+
 @dataclass
 class TimeBudget:
     """The time of one training, from the start of the command to its end.
 
     Attributes:
-        seconds: in all, those of the runs before included.
-        spent: in the runs before, up to the checkpoint.
-        started: when this run was, by `time.monotonic`.
+        seconds: in total, including earlier runs.
+        spent: seconds in earlier runs, up to the checkpoint.
+        started: when this run started, by `time.monotonic`.
     """
 
     seconds: float
@@ -39,18 +45,17 @@ class TimeBudget:
     ) -> TimeBudget | None:
         """
         Args:
-            minutes: those that were asked for; for a training that goes on: for what is left of it.
-            before: what `as_json` gave for the checkpoint from which it goes on.
+            minutes: the requested time; for a resumed training, the time for the rest of it.
+            before: the value of `as_json` in the checkpoint that is resumed.
 
         Returns:
-            None where no time was ever asked for.
+            None if no time was requested, neither now nor in an earlier run.
 
         Raises:
-            UserError: no time at all.
+            UserError: not a positive number of minutes.
         """
         if minutes is not None:
-            if not 0.0 < 60.0 * minutes < float("inf"):
-                raise UserError(f"--minutes is {minutes:g}; it must be more than 0")
+            check_minutes(minutes)
             return cls(60.0 * minutes, 0.0, started)
         return None if before is None else cls(before["seconds"], before["spent"], started)
 
@@ -66,7 +71,11 @@ class TimeBudget:
     def plan(
         self, dataset: Dataset, config: TrainConfig, device: torch.device, **may: bool
     ) -> Plan:
-        """What to train. ``capture`` is at full resolution; ``may``: see `make_plan`."""
+        """What to train. ``dataset`` has full resolution; ``may``: see `make_plan`.
+
+        The speed is measured by a small sample training, since the plan decides the resolution,
+        the cap and the schedule that a trainer is built with.
+        """
         from snowsplat.training.time_budget.plan import make_plan, measure_slowness
 
         slowness = measure_slowness(dataset, config, device, resize=may.get("resize", True))
@@ -77,7 +86,7 @@ class TimeBudget:
         return f"{duration(self.seconds)} on this machine: {plan}"
 
     def pace(self, trainer: Trainer, slowness: float) -> Pace:
-        """What keeps the trainer to the time that is left."""
+        """Keeps the training within the time that is left."""
         from snowsplat.training.time_budget.pace import Pace
         from snowsplat.training.time_budget.step_cost import Work
 

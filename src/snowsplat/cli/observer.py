@@ -1,0 +1,99 @@
+"""`TerminalObserver`: prints the progress of a pipeline function."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from snowsplat.cli.stage_lines import described
+from snowsplat.cli.stage_progress import StageProgress
+from snowsplat.cli.step_progress import StepProgress, held_out_line
+from snowsplat.pipeline.live_page import LOCAL_HOST
+from snowsplat.pipeline.observer import Observer
+from snowsplat.util.duration import duration
+
+if TYPE_CHECKING:
+    from snowsplat.pipeline.training_run import TrainResult
+    from snowsplat.sfm.progress import Report
+    from snowsplat.training.trainer import Progress
+    from snowsplat.util.stages import Outcome
+    from snowsplat.viewer.live.viewer import NetworkViewer
+
+
+class TerminalObserver(Observer):
+    """Notes and progress go to stdout, unless ``quiet``; results always do.
+
+    Use it as a context, so that no progress bar is left in the terminal after an error.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._stages = StageProgress(quiet)
+        self._steps: StepProgress | None = None
+
+    def __enter__(self) -> TerminalObserver:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stages.hide()
+        self.steps_end()
+
+    def note(self, line: str) -> None:
+        self._stages.say(line)
+
+    def begin(self, stage: str) -> Report:
+        return self._stages.begin(stage)
+
+    def end(self, stage: str, outcome: Outcome) -> None:
+        line, *details = described(stage, outcome.result)
+        self._stages.end(line, outcome.seconds, outcome.again)
+        if not outcome.again:
+            for detail in details:
+                self._stages.say(f"          {detail}")
+
+    def steps_begin(self, step: int, iterations: int) -> None:
+        self._stages.hide()
+        if not self._quiet:
+            self._steps = StepProgress(iterations, step)
+
+    def step(self, progress: Progress) -> None:
+        if self._steps is not None:
+            self._steps(progress)
+
+    def steps_end(self) -> None:
+        if self._steps is not None:
+            self._steps.close()
+            self._steps = None
+
+    def trained(self, result: TrainResult) -> None:
+        steps = result.step - result.first_step
+        count = f"{steps} more steps" if result.first_step else f"{steps} steps"
+        print(
+            f"{result.scene}: {result.gaussians:,} Gaussians, {count} in "
+            f"{duration(result.seconds)}, {result.memory}"
+        )
+        for line in result.given_up:
+            print(f"for lack of memory: {line}")
+        print(f"{result.report}: the report of the training")
+        if result.evaluation is not None:
+            print(held_out_line(*result.evaluation))
+        if result.time is not None:
+            spent, given = map(duration, result.time)
+            print(f"{spent} in total, of {given}")
+        sys.stdout.flush()
+
+    def page_opened(self, viewer: NetworkViewer) -> None:
+        print(f"watch it in a browser: {viewer.url}", flush=True)
+        if viewer.others is not None:
+            print(f"from other computers: {viewer.others}", flush=True)
+        if viewer.url.startswith(f"http://{LOCAL_HOST}:"):
+            port = viewer.url.rpartition(":")[2]
+            print(f"from another computer: ssh -L {port}:localhost:{port} THIS_ONE", flush=True)
+
+
+class WatchObserver(TerminalObserver):
+    """Of a page that shows saved scenes."""
+
+    def page_opened(self, viewer: NetworkViewer) -> None:
+        super().page_opened(viewer)
+        print("Ctrl-C ends it", flush=True)

@@ -1,0 +1,60 @@
+"""The flags of the subcommands that take the output folder of a training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from snowsplat.cli.flags import flag
+from snowsplat.pipeline.compute import Compute
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.pipeline.scene_source import TrainedScene
+
+
+@dataclass
+class SceneFlags:
+    """Base of these subcommands."""
+
+    output: Annotated[Path | None, tyro.conf.Positional, flag("OUT")] = None
+    """Output folder of a training, of snowsplat or of the reference implementation."""
+    model_path: Annotated[Path | None, flag("OUT", "-m", "-o")] = None
+    """The same, as the reference implementation spells it."""
+    iteration: Annotated[int | None, flag("N", default="the last")] = None
+    """Which of the scenes in OUT."""
+    dataset: Annotated[
+        Path | None, flag("DATASET", "-s", "--source-path", "--capture", default="as trained")
+    ] = None
+    """The photos and their cameras, if they were moved."""
+    resolution: Annotated[int | None, flag("N", "-r", default="as trained")] = None
+    """1, 2, 4 or 8 divide the size of the photos; any other number is a width in pixels."""
+    threads: Annotated[int | None, flag("N", default="all cores")] = None
+    """Number of CPU threads."""
+    device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
+    """Device to compute on."""
+
+    def output_path(self) -> Path:
+        """The output folder. Raises: UserError: none named, or two."""
+        if (self.output is None) == (self.model_path is None):
+            raise UserError("name the output folder of a training, once")
+        return self.output or self.model_path or Path()
+
+    def compute(self) -> Compute:
+        """Raises: UserError: fewer than 1 thread."""
+        return Compute(self.device, self.threads)
+
+    def load(self) -> TrainedScene:
+        """The scene with its dataset. Raises: UserError: one of them is missing or damaged."""
+        from snowsplat.pipeline.scene_source import load_trained
+
+        return load_trained(
+            self.output_path(),
+            iteration=self.iteration,
+            dataset=self.dataset,
+            resolution=self.resolution,
+            compute=self.compute(),
+        )

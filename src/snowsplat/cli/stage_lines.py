@@ -1,0 +1,83 @@
+"""The lines about finished stages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+_NAMED = 5  # photos that are listed one by one
+
+
+def described(stage: str, result: dict[str, Any]) -> list[str]:
+    """One line about the result of a stage, and lines of details."""
+    return _LINES[stage](result)
+
+
+def _photos(gathered: dict[str, Any]) -> list[str]:
+    photos, skipped = gathered["photos"], gathered["skipped"]
+    line = f"{len(photos)} photos"
+    if skipped:
+        line += f", {len(skipped)} skipped"
+    return [line, *_listed([f"{source}: {why}" for source, why in skipped])]
+
+
+def _poses(sfm: dict[str, Any]) -> list[str]:
+    lost = sfm["unregistered"]
+    placed = len(sfm["registered"])
+    line = (
+        f"{placed} of {placed + len(lost)} photos placed, {sfm['points']:,} points, "
+        f"reprojection error {sfm['reprojection_error']:.2f} px"
+    )
+    details = []
+    if len(sfm["sub_models"]) > 1:
+        sizes = ", ".join(map(str, sfm["sub_models"]))
+        details.append(
+            f"the photos form {len(sfm['sub_models'])} groups without common points ({sizes} "
+            "photos); the largest group is used"
+        )
+    if len(sfm["attempts"]) > 1:
+        details.append("attempts: " + "; ".join(sfm["attempts"]))
+    return [line, *details, *_listed([f"{name}: {why}" for name, why in lost.items()])]
+
+
+def _images(undistorted: dict[str, Any]) -> list[str]:
+    sizes = sorted(undistorted["sizes"], key=lambda size: -size[2])
+    width, height, _ = sizes[0]
+    others = f" and {len(sizes) - 1} other sizes" if len(sizes) > 1 else ""
+    line = f"{undistorted['images']} images of {width}x{height}{others}"
+    line += ", lens distortion removed" if undistorted["resampled"] else ""
+    return [line + (f", {undistorted['masks']} masks" if undistorted["masks"] else "")]
+
+
+def _report(written: dict[str, Any]) -> list[str]:
+    return [written["file"]]
+
+
+def _scene(trained: dict[str, Any]) -> list[str]:
+    return [f"{trained['iteration']} steps, PSNR {trained['psnr']:.2f} dB"]
+
+
+def _pictures(rendered: dict[str, Any]) -> list[str]:
+    return ["test views rendered"]
+
+
+def _video(written: dict[str, Any]) -> list[str]:
+    files = " and ".join(written["files"])
+    width, height = written["size"]
+    return [f"{files}: {written['frames']} frames {width}x{height}"]
+
+
+def _listed(lines: list[str]) -> list[str]:
+    more = len(lines) - _NAMED
+    return lines[:_NAMED] + ([f"and {more} more, see capture_report.html"] if more > 0 else [])
+
+
+_LINES: dict[str, Callable[[dict[str, Any]], list[str]]] = {
+    "photos": _photos,
+    "poses": _poses,
+    "images": _images,
+    "report": _report,
+    "scene": _scene,
+    "pictures": _pictures,
+    "video": _video,
+}

@@ -1,0 +1,54 @@
+"""`CheckpointMeta`: what a checkpoint stores about its training, beside the tensors."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from snowsplat.pipeline.output_folder import DatasetSettings
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import from_json
+
+if TYPE_CHECKING:
+    from snowsplat.training.checkpoint import Checkpoint
+
+Recipe = Literal["default", "paper", "mcmc"]
+
+
+@dataclass(frozen=True)
+class CheckpointMeta:
+    """The JSON value of a checkpoint; the fields are the keys in the file.
+
+    Attributes:
+        capture: how the dataset was read.
+        recipe: the origin of the configuration.
+        training: the configuration, see `config_to_json`.
+        time: of a training with a time budget, see `TimeBudget.as_json`.
+        schedule: of a training with a time budget.
+    """
+
+    capture: DatasetSettings
+    recipe: Recipe
+    training: dict[str, Any]
+    time: dict[str, float] | None = None
+    schedule: Schedule | None = None
+
+    @classmethod
+    def of(cls, start: Checkpoint) -> CheckpointMeta:
+        """The checked value of a checkpoint.
+
+        Raises:
+            UserError: not the checkpoint of a training, or damaged.
+        """
+        try:
+            meta = from_json(CheckpointMeta, start.meta)
+            if meta.time is not None and meta.time.keys() != {"seconds", "spent"}:
+                raise ValueError("no time")
+        except ValueError as error:
+            raise UserError(f"{start.path}: not the checkpoint of a training ({error})") from None
+        return meta
+
+    def as_json(self) -> dict[str, Any]:
+        """Without the fields that are None."""
+        return {key: value for key, value in asdict(self).items() if value is not None}

@@ -1,0 +1,62 @@
+"""`evaluate`: PSNR, SSIM and LPIPS of a trained scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.data import View
+    from snowsplat.evaluation.lpips import Lpips
+    from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
+    from snowsplat.pipeline.scene_source import TrainedScene
+
+Split = Literal["test", "train"]
+
+
+def evaluate(
+    scene: TrainedScene,
+    *,
+    split: Split = "test",
+    lpips: Lpips | Path | str | None = None,
+    on_view: Callable[[ViewMetrics], None] | None = None,
+) -> Evaluation:
+    """Compare the renders of a scene with its photos; write OUT/metrics.json.
+
+        evaluate(load_trained("out/garden")).psnr
+
+    Args:
+        split: the held-out photos, or those of the training.
+        lpips: a weights file, see `snowsplat.evaluation.lpips`; None: LPIPS is not measured.
+        on_view: called after each view.
+
+    Raises:
+        UserError: no photos in this split, a damaged photo or weights file.
+    """
+    from snowsplat.evaluation.lpips import Lpips
+    from snowsplat.evaluation.metrics import evaluate_views
+    from snowsplat.util.process import single_threaded
+
+    views = views_of(scene, split)
+    if isinstance(lpips, Path | str):
+        lpips = Lpips.load(Path(lpips))
+    with single_threaded():  # the figures do not depend on the number of cores
+        evaluation = evaluate_views(
+            scene.gaussians, views, background=scene.background, lpips=lpips, on_view=on_view
+        )
+    scene.folder.write_metrics(scene.iteration, split, evaluation)
+    return evaluation
+
+
+def views_of(scene: TrainedScene, split: Split) -> list[View]:
+    """The views of a split. Raises: UserError: there are none."""
+    views = scene.dataset.test if split == "test" else scene.dataset.train
+    if not views:
+        raise UserError(
+            "no photos were held out for testing; train with `hold_out`, or evaluate the `split` "
+            "train"
+        )
+    return views

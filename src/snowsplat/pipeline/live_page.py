@@ -1,0 +1,112 @@
+"""`LivePage`: a page that shows a training, or its output folder, in the browser."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.observer import SILENT, Observer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from snowsplat.data import Dataset
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.training.trainer import Trainer
+    from snowsplat.viewer.live.training import TrainingViewer
+    from snowsplat.viewer.live.viewer import NetworkViewer, Scene
+
+LOCAL_HOST = "127.0.0.1"
+
+
+class LivePage:
+    """A page at http://localhost:``port``. Use it as a context: its end closes the page.
+
+    with LivePage() as page:
+        train("garden", "out/garden", page=page)
+        page.hold()
+    """
+
+    def __init__(self, port: int | None = None, host: str | None = None) -> None:
+        """
+        Args:
+            port: None: 8080, or the next free one.
+            host: address to listen on; None: accept connections from this computer only.
+
+        Raises:
+            UserError: the port is taken, or this machine cannot listen at ``host``.
+        """
+        from snowsplat.viewer.live.server import free_port
+
+        self.port, self.host = port, host or LOCAL_HOST
+        self._viewer: NetworkViewer | None = None
+        self._training: TrainingViewer | None = None
+        self._trainer: Trainer | None = None
+        free_port(self.host, port)
+
+    def __enter__(self) -> LivePage:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def open(
+        self,
+        dataset: Dataset,
+        background: tuple[float, float, float],
+        label: str,
+        observer: Observer = SILENT,
+    ) -> NetworkViewer:
+        """Open the page, and report its address to the observer.
+
+        Raises:
+            UserError: the port is taken by now.
+        """
+        from snowsplat.viewer.live.viewer import NetworkViewer
+
+        viewer = NetworkViewer(dataset, background, host=self.host, port=self.port, label=label)
+        self._viewer = viewer
+        observer.page_opened(viewer)
+        return viewer
+
+    def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
+        """Open the page of a training, which calls `after_step`."""
+        from snowsplat.viewer.live.gauge import Gauge
+        from snowsplat.viewer.live.training import TrainingViewer
+
+        white = trainer.config.background == "white"
+        background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+        viewer = self.open(trainer.dataset, background, label, observer)
+        views = trainer.dataset.test or trainer.dataset.train
+        self._training = TrainingViewer(viewer, Gauge(views, viewer.background))
+        self._trainer = trainer
+
+    def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
+        """Returns the seconds that the training was paused; see `TrainingViewer.after_step`."""
+        assert self._training is not None
+        return self._training.after_step(step, steps, loss, gaussians)
+
+    @property
+    def url(self) -> str:
+        assert self._viewer is not None
+        return self._viewer.url
+
+    def hold(self) -> None:
+        """Show the scene of the finished training until Ctrl-C."""
+        assert self._training is not None
+        assert self._trainer is not None
+        with suppress(KeyboardInterrupt):
+            self._training.end(self._trainer.step, self._trainer.gaussians)
+
+    def show(self, scene: Callable[[], Scene]) -> None:
+        """Show the newest scene, read repeatedly, until Ctrl-C."""
+        assert self._viewer is not None
+        with suppress(KeyboardInterrupt):
+            self._viewer.hold(scene)
+
+    def close(self) -> None:
+        """Close the page, if it is open; the trainer it has shown is released."""
+        viewer, self._viewer = self._viewer, None
+        self._training = self._trainer = None
+        if viewer is not None:
+            viewer.close()

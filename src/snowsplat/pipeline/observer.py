@@ -1,0 +1,50 @@
+"""`Observer`: receives the progress of the functions of this package."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from snowsplat.sfm.progress import Report, silent
+
+if TYPE_CHECKING:
+    from snowsplat.pipeline.training_run import TrainResult
+    from snowsplat.training.trainer import Progress
+    from snowsplat.util.stages import Outcome
+    from snowsplat.viewer.live.viewer import NetworkViewer
+
+
+class Observer:
+    """Derive a class and override the methods of interest: those of this class do nothing.
+
+    A job such as `make` consists of stages. `begin` and `end` enclose each stage; the training
+    also reports its steps.
+    """
+
+    def note(self, line: str) -> None:
+        """A line of information for the user."""
+
+    def begin(self, stage: str) -> Report:
+        """A stage begins, or a finished one is found. Returns its progress callback."""
+        return silent
+
+    def end(self, stage: str, outcome: Outcome) -> None:
+        """The stage has finished, now or in an earlier run."""
+
+    def steps_begin(self, step: int, iterations: int) -> None:
+        """A training begins after ``step`` of ``iterations`` steps."""
+
+    def step(self, progress: Progress) -> None:
+        """A training step is finished."""
+
+    def steps_end(self) -> None:
+        """The last step is finished, or the training was interrupted."""
+
+    def trained(self, result: TrainResult) -> None:
+        """The training has finished; its files are written."""
+
+    def page_opened(self, viewer: NetworkViewer) -> None:
+        """A page shows the scene in the browser at ``viewer.url``."""
+
+
+#: An observer that does nothing.
+SILENT = Observer()

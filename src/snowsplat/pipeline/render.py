@@ -1,0 +1,99 @@
+"""`render_images`: a trained scene from the cameras of its photos, beside the photos."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from snowsplat.pipeline.evaluate import Split
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from snowsplat.data import View
+    from snowsplat.pipeline.scene_source import TrainedScene
+    from snowsplat.scene.camera import Camera
+
+Depth = Literal["none", "16bit", "color"]
+
+_RANGE_VIEWS = 8  # determine which depths get which colors
+
+
+def render_images(
+    scene: TrainedScene, *, splits: Sequence[Split] = ("test", "train"), depth: Depth = "none"
+) -> dict[Path, int]:
+    """Render the views of a scene into OUT/SPLIT/ours_N.
+
+    Files are numbered in the order of the names of the photos: renders/00000.png, the photo
+    gt/00000.png, and depth/00000.png. Depth is either the mean camera z as 16-bit gray values, one
+    step being the world units in depth/world_units_per_step.json, or colored from near to far.
+
+    Returns:
+        The folders renders/ and the number of images in each.
+
+    Raises:
+        UserError: there are no views in these splits, or a photo is damaged.
+        OSError: an image cannot be written.
+    """
+    views = {"test": scene.dataset.test, "train": scene.dataset.train}
+    chosen = {split: views[split] for split in splits if views[split]}
+    if not chosen:
+        raise UserError(
+            "no views to render: no photos were held out for testing; use the `split` train"
+        )
+    rendered = {}
+    for split, of_split in chosen.items():
+        target = scene.folder.path / split / f"ours_{scene.iteration}"
+        _render(scene, of_split, target, depth)
+        rendered[target / "renders"] = len(of_split)
+    return rendered
+
+
+def _render(scene: TrainedScene, views: Sequence[View], target: Path, depth: Depth) -> None:
+    import torch
+
+    from snowsplat.data import ImageLoader
+    from snowsplat.pipeline import image_files
+    from snowsplat.scene.render import render
+    from snowsplat.util.files import write_json
+
+    gaussians = scene.gaussians
+    device = gaussians.means.device
+    color = torch.tensor(scene.background, device=device)
+    with_depth = depth != "none"
+
+    def depth_of(camera: Camera) -> np.ndarray:
+        output = render(gaussians, camera, color, with_depth=True)
+        assert output.depth is not None
+        return image_files.mean_depth(output.depth, output.alpha)
+
+    for name in ("renders", "gt", *(["depth"] if with_depth else [])):
+        (target / name).mkdir(parents=True, exist_ok=True)
+    steps: dict[str, float] = {}
+    with (
+        image_files.PngQueue() as queue,
+        ImageLoader(views, device=device) as loader,
+        torch.no_grad(),
+    ):
+        loader.prefetch(views)
+        if depth == "color":  # one range for all images, from a sample of them
+            sample = views[:: -(-len(views) // _RANGE_VIEWS)]
+            near, far = image_files.depth_range([depth_of(view.camera) for view in sample])
+        for i, view in enumerate(views):
+            file = f"{i:05d}.png"
+            output = render(gaussians, view.camera, color, with_depth=with_depth)
+            queue.write(target / "renders" / file, image_files.to_8bit(output.image))
+            photo = loader.get(view).over(color)
+            queue.write(target / "gt" / file, image_files.to_8bit(photo))
+            if output.depth is None:
+                continue
+            mean = image_files.mean_depth(output.depth, output.alpha)
+            if depth == "color":
+                shown = image_files.depth_in_color(mean, near, far)
+            else:
+                shown, steps[file] = image_files.depth_in_16_bits(mean)
+            queue.write(target / "depth" / file, shown)
+    if steps:
+        write_json(target / "depth" / "world_units_per_step.json", steps)

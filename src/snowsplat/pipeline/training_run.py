@@ -1,0 +1,279 @@
+"""`TrainingRun`: the steps of one training and the files written in between."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.checkpoint_meta import CheckpointMeta, Recipe
+from snowsplat.pipeline.memory_use import MemoryUse
+from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.time_budget import TimeBudget
+from snowsplat.training.history import History
+from snowsplat.util.errors import UserError
+from snowsplat.util.process_memory import peak_bytes
+
+if TYPE_CHECKING:
+    from snowsplat.evaluation.metrics import Evaluation
+    from snowsplat.pipeline.live_page import LivePage
+    from snowsplat.training.time_budget.pace import Pace
+    from snowsplat.training.trainer import Progress, Trainer
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """A finished training.
+
+    Attributes:
+        scene: the PLY file.
+        report: the HTML page about the training.
+        step: the last step.
+        first_step: the step of the checkpoint that was resumed, or 0.
+        gaussians: their number.
+        seconds: duration of the steps of this run.
+        memory: the peak of the steps, as text.
+        given_up: what more memory would have allowed, as text.
+        evaluation: figures of the last evaluation on held-out photos, and its step.
+        time: seconds spent in all runs and seconds given; None without a time budget.
+    """
+
+    scene: Path
+    report: Path
+    step: int
+    first_step: int
+    gaussians: int
+    seconds: float
+    memory: str
+    given_up: tuple[str, ...]
+    evaluation: tuple[int, Evaluation] | None
+    time: tuple[float, float] | None
+
+
+class TrainingStopped(KeyboardInterrupt):
+    """Ctrl-C during a training.
+
+    Attributes:
+        scene: the file with everything that was reached, beside a checkpoint; None if a second
+            Ctrl-C interrupted a step: then the older checkpoints remain.
+    """
+
+    def __init__(self, message: str, scene: Path | None) -> None:
+        super().__init__(message)
+        self.scene = scene
+
+
+@dataclass
+class TrainingRun:
+    """One training, to its end or to Ctrl-C.
+
+    Attributes:
+        settings, recipe: as they are written to checkpoints.
+        budget, pace: of a training with a time budget.
+        save_iterations: steps after which the scene is written too.
+        checkpoint_seconds: between checkpoints, where the configuration names no steps.
+        page: shows the training in the browser.
+    """
+
+    out: OutputFolder
+    settings: DatasetSettings
+    recipe: Recipe
+    trainer: Trainer
+    budget: TimeBudget | None
+    pace: Pace | None
+    memory: MemoryUse
+    observer: Observer
+    save_iterations: tuple[int, ...] = ()
+    checkpoint_seconds: float | None = None
+    page: LivePage | None = None
+
+    def __post_init__(self) -> None:
+        self.config = self.trainer.config
+        self.first_step = self.trainer.step
+        self.started = self.last_checkpoint = time.monotonic()
+        self.evaluation: tuple[int, Evaluation] | None = None  # the newest, and its step
+        self.history = History.read(self.out.history, self.first_step)
+
+    def run(self) -> TrainResult:
+        """
+        Raises:
+            UserError: loss, gradients or parameters are no longer finite.
+            TrainingStopped: Ctrl-C; see there.
+            KeyboardInterrupt: Ctrl-C before the first step was finished; nothing is left.
+        """
+        from snowsplat.training.finite import Diverged
+
+        try:
+            self.observer.steps_begin(self.first_step, self.trainer.schedule.iterations)
+            try:
+                self._finish_interrupted_writes()
+                self.history.step_begins()
+                self.trainer.run(self._record)
+            finally:
+                self.observer.steps_end()
+        except KeyboardInterrupt:
+            if self.trainer.step == 0 or self.trainer.within_step:  # no complete state to save
+                self.out.discard()
+                if self.trainer.step == 0:
+                    raise
+                raise TrainingStopped(
+                    f"stopped within a step, which is not saved; {self._last_good()}", None
+                ) from None
+        except Diverged as error:
+            self.out.discard()
+            raise UserError(f"{error}; {self._last_good()}") from None
+        except BaseException:
+            self.out.discard()
+            raise
+        else:
+            return self._finish()
+        scene = self._save_scene()
+        self._save_checkpoint()
+        raise TrainingStopped(f"stopped after step {self.trainer.step}: {scene}", scene)
+
+    def _record(self, progress: Progress) -> None:
+        measured = progress.metrics is not None  # an evaluation is part of the step, seen from here
+        self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=not measured)
+        self._after_step(progress)
+        self.history.step_begins()
+
+    def _after_step(self, progress: Progress) -> None:
+        if progress.metrics is not None and progress.metrics.views:
+            self._measured(progress.step, progress.metrics)
+        self.observer.step(progress)
+        if self._checkpoint_is_due(progress.step):
+            self._save_checkpoint()
+        if progress.step in self.save_iterations:
+            self._save_scene()
+        if self.page is not None:
+            paused = self.page.after_step(
+                progress.step, progress.iterations, progress.loss, self.trainer.gaussians
+            )
+            if self.pace is not None and self.budget is not None:
+                self.pace.put_off(paused)
+                self.budget.started += paused
+        if self.pace is not None:
+            schedule = self.trainer.schedule
+            length = self.pace.iterations_after(
+                schedule, progress.step, progress.downscale, progress.gaussians
+            )
+            if length is not None:
+                schedule.stretch(progress.step, length)
+
+    def _checkpoint_is_due(self, step: int) -> bool:
+        every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
+        if every:
+            return step % every == 0
+        return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
+
+    def _finish_interrupted_writes(self) -> None:
+        """A kill may fall between a checkpoint and the removal of an old one or the scene."""
+        from snowsplat.training import checkpoint
+
+        step = self.first_step
+        checkpoint.remove_old(self.out.checkpoints, step)
+        if step in self.save_iterations and step not in self.out.scenes():
+            self._save_scene()
+
+    def _save_scene(self) -> Path:
+        self._restore_folder()
+        return self.out.write_scene(self.trainer.step, self.trainer.gaussians)
+
+    def _restore_folder(self) -> None:
+        """Hours of training are not lost because the folder was moved or removed."""
+        if not self.out.is_one():
+            warnings.warn(f"{self.out.path}: was removed; it is created again", stacklevel=2)
+            self.out.describe(self.trainer.dataset, self.settings, self.config)
+
+    def _save_checkpoint(self) -> Path:
+        from snowsplat.training import checkpoint
+        from snowsplat.training.config import config_to_json
+
+        self._restore_folder()
+        meta = CheckpointMeta(self.settings, self.recipe, config_to_json(self.config))
+        if self.budget is not None:
+            meta = replace(meta, time=self.budget.as_json(), schedule=self.trainer.schedule)
+        # First: a run that resumes from the checkpoint needs the curves up to it.
+        self.history.write(self.out.history)
+        path = checkpoint.save(
+            self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta.as_json()
+        )
+        self.last_checkpoint = time.monotonic()
+        return path
+
+    def _last_good(self) -> str:
+        from snowsplat.training import checkpoint
+
+        saved = checkpoint.files(self.out.checkpoints)
+        if not saved:
+            return "there is no checkpoint yet"
+        step, path = saved[0]
+        return (
+            f"the last good checkpoint is {path}; `resume` with `iterations` {step} saves its scene"
+        )
+
+    def _measured(self, step: int, evaluation: Evaluation) -> None:
+        self.evaluation = (step, evaluation)
+        self.history.measure(step, evaluation.psnr, evaluation.ssim)
+
+    def _finish(self) -> TrainResult:
+        step = self.trainer.step
+        scene = self._save_scene()
+        seconds, memory = time.monotonic() - self.started, self.memory.taken()
+        if self.trainer.dataset.test:
+            if self.evaluation is None or self.evaluation[0] != step:
+                self._measured(step, self.trainer.evaluate())
+            assert self.evaluation is not None
+            self.out.write_metrics(step, "test", self.evaluation[1])
+        self.history.write(self.out.history)
+        report = self._write_report()
+        time_used = None
+        if self.budget is not None:
+            self.out.write_config(self.settings, replace(self.config, iterations=step))
+            time_used = self.budget.as_json()["spent"], self.budget.seconds
+        result = TrainResult(
+            scene=scene,
+            report=report,
+            step=step,
+            first_step=self.first_step,
+            gaussians=len(self.trainer.gaussians),
+            seconds=seconds,
+            memory=memory,
+            given_up=self.memory.plan.given_up,
+            evaluation=self.evaluation,
+            time=time_used,
+        )
+        self.observer.trained(result)
+        return result
+
+    def _write_report(self) -> Path:
+        from snowsplat.training.config import config_to_json
+        from snowsplat.training.report import Trained, write_training_report
+
+        # The page may be given to others: it contains names of files, no paths.
+        out = self.out.path
+        dataset = asdict(self.settings)
+        for key in ("path", "test_list"):
+            dataset[key] = dataset[key] and Path(dataset[key]).name
+        write_training_report(
+            self.out.report,
+            Trained(
+                name=out.resolve().name if out.is_absolute() else str(out),
+                dataset=self.trainer.dataset,
+                gaussians=self.trainer.gaussians,
+                step=self.trainer.step,
+                background=self.out.settings()[1],
+                history=self.history,
+                evaluation=None if self.evaluation is None else self.evaluation[1],
+                settings={
+                    "recipe": self.recipe,
+                    "capture": dataset,
+                    "training": config_to_json(self.config),
+                },
+                peak_bytes=peak_bytes(),
+            ),
+        )
+        return self.out.report

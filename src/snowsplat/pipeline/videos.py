@@ -1,0 +1,342 @@
+"""`render_video`: a video of a scene along a camera path."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.util.errors import SettingError, UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
+
+#: The camera paths that are computed from the cameras of a training.
+CAMERA_PATHS = ("training", "ellipse", "spiral")
+
+_LONGEST_SIDE = 1920  # of a video without a requested size
+_SMALLEST, _LARGEST = 16, 8192  # pixels along a side
+_MOST_FRAMES = 100_000
+_RANGE_FRAMES = 8  # determine which depths get which colors
+
+
+@dataclass(frozen=True)
+class VideoSize:
+    """The requested size of a video.
+
+    Attributes:
+        width, height: pixels; None if not requested.
+    """
+
+    width: int | None = None
+    height: int | None = None
+
+    @classmethod
+    def parse(cls, text: str | None) -> VideoSize:
+        """Parse "1280x720", "1280" or None.
+
+        Raises:
+            UserError: anything else, or too small or large.
+        """
+        if text is None:
+            return cls()
+        match = re.fullmatch(r"(\d{1,6})(?:[xX×](\d{1,6}))?", text)
+        if match is None:
+            raise SettingError(
+                "size", f"{text!r} is not a size; use e.g. 1280x720, or a width, 1280"
+            )
+        width, height = int(match[1]), int(match[2]) if match[2] else None
+        if not all(_SMALLEST <= side <= _LARGEST for side in (width, height) if side is not None):
+            raise SettingError(
+                "size", f"{text} is out of range; use {_SMALLEST} to {_LARGEST} pixels"
+            )
+        return cls(width, height)
+
+    def of(self, camera: Camera) -> tuple[int, int]:
+        """Width and height, both even; what was not requested follows ``camera``."""
+        width, height = camera.width, camera.height
+        if self.width is None:
+            scale = min(1.0, _LONGEST_SIDE / max(width, height))
+        else:
+            scale = self.width / width
+        wanted = (self.width or width * scale, self.height or height * scale)
+        # Cameras come from files too: one that is narrow would be very high at a large width.
+        width, height = (min(_LARGEST, max(_SMALLEST, 2 * int(side / 2 + 0.25))) for side in wanted)
+        return width, height
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """What a video shows.
+
+    Attributes:
+        path: "training": along the cameras of the photos, smoothed; "ellipse": around what they
+            show; "spiral": in front of a scene whose cameras look in one direction; or a file of
+            key cameras in the format of cameras.json.
+        seconds: length.
+        fps: frames per second.
+        size: such as "1280x720" or "1280"; None: that of the photos.
+        depth: render a second video of the depth in colors.
+        side_by_side: color and depth beside each other in one video instead.
+
+    Raises:
+        UserError: an unusable length, rate or size.
+    """
+
+    path: str = "ellipse"
+    seconds: float = 10.0
+    fps: float = 30.0
+    size: str | None = None
+    depth: bool = False
+    side_by_side: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value in (("seconds", self.seconds), ("fps", self.fps)):
+            if not 0 < value < float("inf"):
+                raise SettingError(name, f"{value:g} is not positive; use a number above 0")
+        if self.seconds * self.fps > _MOST_FRAMES:
+            raise SettingError(
+                "seconds",
+                f"{self.seconds:g} with `fps` {self.fps:g} is more than {_MOST_FRAMES:,} frames; "
+                "make the video shorter",
+            )
+        VideoSize.parse(self.size)
+
+    @property
+    def frames(self) -> int:
+        """Their number."""
+        return max(1, round(self.seconds * self.fps))
+
+    @property
+    def name(self) -> str:
+        """The name of the file, without its ending."""
+        way = self.path if Path(self.path).suffix == "" else Path(self.path).stem
+        return f"{way}_side_by_side" if self.side_by_side else way
+
+
+def render_video(
+    scene: Path | str,
+    options: VideoOptions | None = None,
+    *,
+    target: Path | str | None = None,
+    iteration: int | None = None,
+    compute: Compute | None = None,
+    observer: Observer = SILENT,
+) -> list[Path]:
+    """Render a video of a scene; the photos are not needed.
+
+    Args:
+        scene: the output folder of a training, or a scene file.
+        target: an .mp4 file; default: OUT/videos/PATH.mp4, or SCENE_PATH.mp4 beside a scene file.
+            A video of the depth has _depth in its name.
+        iteration: of an output folder; default: the last one.
+
+    Returns:
+        The files.
+
+    Raises:
+        UserError: a missing or damaged scene or camera file; a camera path that needs the cameras
+            of a training.
+        KeyboardInterrupt: Ctrl-C; no file is left.
+    """
+    options = options or VideoOptions()
+    if target is not None and Path(target).suffix.lower() != ".mp4":
+        raise UserError(f"{target}: the name of a video must end in .mp4")
+    device = (compute or Compute()).apply()
+    source = _load(Path(scene), iteration, options.name)
+    cameras = cameras_along(
+        *(options.path, source.gaussians, source.cameras, options.frames),
+        VideoSize.parse(options.size),
+    )
+    video = Video(
+        gaussians=source.gaussians.to(device),
+        cameras=cameras,
+        background=source.background,
+        file=source.file if target is None else Path(target),
+        fps=options.fps,
+        depth=options.depth,
+        side_by_side=options.side_by_side,
+    )
+    return video.write(observer)
+
+
+@dataclass(frozen=True)
+class _Source:
+    gaussians: Gaussians
+    cameras: tuple[list[str], list[Camera]] | None  # names and cameras of the photos
+    background: tuple[float, float, float]
+    file: Path  # of the video
+
+
+def _load(scene: Path, iteration: int | None, name: str) -> _Source:
+    from snowsplat.formats import read_gaussians
+    from snowsplat.pipeline.scene_source import existing_folder, folder_around
+    from snowsplat.scene.camera_json import read_cameras
+
+    if scene.is_file():
+        file = scene.with_name(f"{scene.stem}_{name}.mp4")
+        folder, gaussians = folder_around(scene), read_gaussians(scene)
+        if not folder.is_one():
+            return _Source(gaussians, None, (0.0, 0.0, 0.0), file)
+    else:
+        folder = existing_folder(scene)
+        _, gaussians = folder.read_scene(iteration)
+        file = folder.videos / f"{name}.mp4"
+    _, background = folder.settings()
+    return _Source(gaussians, read_cameras(folder.path / "cameras.json"), background, file)
+
+
+def cameras_along(
+    path: str,
+    gaussians: Gaussians,
+    trained: tuple[list[str], list[Camera]] | None,
+    frames: int,
+    size: VideoSize,
+) -> list[Camera]:
+    """One camera per frame.
+
+    Args:
+        path: one of `CAMERA_PATHS`, or a file of key cameras.
+        trained: names and cameras of the photos; None for a scene file without its training.
+
+    Raises:
+        UserError: no such path or file, or one that needs the cameras of a training.
+    """
+    from snowsplat import trajectory
+    from snowsplat.scene.camera_json import read_cameras
+
+    if path not in CAMERA_PATHS:
+        if Path(path).suffix.lower() != ".json":
+            known = ", ".join(CAMERA_PATHS)
+            raise SettingError(
+                "path", f"{path} is unknown; use {known} or a file of cameras (.json)"
+            )
+        _, keys = read_cameras(Path(path))
+        distance = trajectory.viewing_distance(keys, gaussians.means)
+        cameras = trajectory.key_path(keys, frames, distance)
+    elif trained is not None:
+        names, given = trained
+        distance = trajectory.viewing_distance(given, gaussians.means)
+        if path == "training":
+            cameras = trajectory.training_path(given, names, frames, distance)
+        else:
+            around = trajectory.ellipse_path if path == "ellipse" else trajectory.spiral_path
+            cameras = around(given, frames, distance)
+    elif path == "ellipse":
+        width, height = size.width or 1280, size.height or (size.width or 1280) * 9 // 16
+        cameras = trajectory.orbit_path(gaussians.means, gaussians.opacities, frames, width, height)
+    else:
+        raise SettingError(
+            "path",
+            f"{path} needs the cameras of a training; name its output folder, or use ellipse or a "
+            "file of cameras",
+        )
+    width, height = size.of(cameras[0])
+    return [trajectory.resized(camera, width, height) for camera in cameras]
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video to be rendered.
+
+    Attributes:
+        cameras: one per frame, all of one even size.
+        file: of the video in color; that of the depth has _depth in its name.
+        depth: render a video of the depth too.
+        side_by_side: color on the left and depth on the right in one video instead.
+    """
+
+    gaussians: Gaussians
+    cameras: Sequence[Camera]
+    background: tuple[float, float, float]
+    file: Path
+    fps: float
+    depth: bool
+    side_by_side: bool
+
+    def write(self, observer: Observer = SILENT) -> list[Path]:
+        """Render and write; returns the files.
+
+        Raises:
+            UserError: a file cannot be written.
+            KeyboardInterrupt: Ctrl-C; no file is left.
+        """
+        import torch
+
+        from snowsplat.trajectory.video import film
+        from snowsplat.util.files import remove_temporaries
+        from snowsplat.util.stages import Outcome
+
+        first = self.cameras[0]
+        width, height = first.width, first.height
+        files = self._files()
+        with torch.no_grad(), ExitStack() as stack:
+            started = time.monotonic()
+            report = observer.begin("video")
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            remove_temporaries(self.file.parent, [file.name for file, _ in files])
+            near, far = self._depth_range()
+            adds = [
+                stack.enter_context(film(file, factor * width, height, self.fps))
+                for file, factor in files
+            ]
+            for i, camera in enumerate(self.cameras):
+                for add, pixels in zip(adds, self._frame(camera, near, far), strict=True):
+                    add(pixels)
+                report(i + 1, len(self.cameras), "frames")
+        result = {
+            "files": [str(file) for file, _ in files],
+            "frames": len(self.cameras),
+            "size": [files[0][1] * width, height],
+        }
+        observer.end("video", Outcome(result, time.monotonic() - started, False))
+        return [file for file, _ in files]
+
+    def _files(self) -> list[tuple[Path, int]]:
+        """Each video, and the number of images beside each other in it."""
+        if self.side_by_side:
+            return [(self.file, 2)]
+        depth = self.file.with_name(f"{self.file.stem}_depth{self.file.suffix}")
+        return [(self.file, 1), (depth, 1)] if self.depth else [(self.file, 1)]
+
+    def _frame(self, camera: Camera, near: float, far: float) -> list[np.ndarray]:
+        import numpy as np
+
+        from snowsplat.pipeline import image_files
+
+        color, depth = self._render(camera)
+        if depth is None:
+            return [color]
+        shown = image_files.depth_in_color(depth, near, far)
+        return [np.concatenate([color, shown], axis=1)] if self.side_by_side else [color, shown]
+
+    def _depth_range(self) -> tuple[float, float]:
+        """One range for the whole video, which avoids flicker."""
+        from snowsplat.pipeline import image_files
+
+        if not (self.depth or self.side_by_side):
+            return 1.0, 2.0
+        sample = self.cameras[:: -(-len(self.cameras) // _RANGE_FRAMES)]
+        depths = [self._render(camera)[1] for camera in sample]
+        return image_files.depth_range([depth for depth in depths if depth is not None])
+
+    def _render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:
+        import torch
+
+        from snowsplat.pipeline import image_files
+        from snowsplat.scene.render import render
+
+        with_depth = self.depth or self.side_by_side
+        background = torch.tensor(self.background)
+        output = render(self.gaussians, camera, background, with_depth=with_depth)
+        depth = None if output.depth is None else image_files.mean_depth(output.depth, output.alpha)
+        return image_files.to_8bit(output.image), depth

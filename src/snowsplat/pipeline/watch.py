@@ -1,0 +1,120 @@
+"""`watch`: the newest scene of an output folder in the browser, also while it is trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.live_page import LivePage
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output_folder import SCENE, OutputFolder
+from snowsplat.pipeline.scene_source import existing_folder, load_dataset_of
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
+
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.viewer.live.viewer import Scene
+
+_NOTHING = [
+    "Nothing is saved yet.",
+    "A training with --checkpoint-every N saves as it runs; the scene appears here.",
+]
+
+
+def watch(
+    output: Path | str,
+    page: LivePage,
+    *,
+    iteration: int | None = None,
+    dataset: Path | str | None = None,
+    resolution: int | None = None,
+    compute: Compute | None = None,
+    observer: Observer = SILENT,
+) -> None:
+    """Show the newest scene or checkpoint of a training, with its cameras and photos, until Ctrl-C.
+
+    Args:
+        output: the folder of `train` or `make`.
+        iteration: show this one only.
+        dataset, resolution, compute: as of `load_trained`.
+
+    Raises:
+        UserError: scene, settings or dataset are missing or damaged; an unusable device.
+    """
+    folder = watched_folder(Path(output))
+    data, background = load_dataset_of(folder, dataset, resolution)
+    newest = NewestScene(folder, iteration, (compute or Compute()).apply())
+    newest()  # a scene that cannot be shown is reported before the page opens
+    page.open(data, background, folder.path.absolute().name, observer)
+    page.show(newest)
+
+
+def watched_folder(path: Path) -> OutputFolder:
+    """As `existing_folder`; also if the training inside the folder of `make` has no scene yet."""
+    folder = existing_folder(path)
+    made = OutputFolder(folder.path / SCENE)
+    return made if made.is_one() and not folder.is_one() else folder
+
+
+class NewestScene:
+    """The newest scene or checkpoint of a folder; each file is read once."""
+
+    def __init__(
+        self, folder: OutputFolder, iteration: int | None, device: torch.device | None = None
+    ) -> None:
+        """``iteration``: always show this one. ``device``: default: the CPU."""
+        self._folder, self._iteration, self._device = folder, iteration, device
+        self._read: tuple[Path, int] | None = None  # the file shown, and when it was written
+        self._scene: Scene | None = None
+
+    def __call__(self) -> Scene:
+        """The newest scene or checkpoint; the previous one if a newer one cannot be read.
+
+        Raises:
+            UserError: the first one cannot be read.
+        """
+        from snowsplat.viewer.live.viewer import Scene
+
+        try:
+            step, path = self._newest()
+            if path is None:
+                return self._scene or Scene(None, -1, _NOTHING)
+            found = path, path.stat().st_mtime_ns
+            if self._scene is None or self._read != found:
+                gaussians = self._gaussians(path).to(self._device)
+                name = path.relative_to(self._folder.path).as_posix()
+                about = [f"After {step:,} steps", f"{len(gaussians):,} Gaussians", name]
+                self._scene, self._read = Scene(gaussians, found[1], about), found
+        except (OSError, UserError):  # replaced or removed while it was read: retried later
+            if self._scene is None:
+                raise
+        return self._scene
+
+    def _newest(self) -> tuple[int, Path | None]:
+        from snowsplat.training import checkpoint
+
+        if self._iteration is not None:
+            if self._iteration not in self._folder.scenes():
+                self._folder.read_scene(self._iteration)  # raises an error that lists the scenes
+            return self._iteration, self._folder.scene_path(self._iteration)
+        found = [(step, self._folder.scene_path(step)) for step in self._folder.scenes()]
+        found += checkpoint.files(self._folder.checkpoints)
+        return max(found, key=lambda each: each[0], default=(0, None))
+
+    def _gaussians(self, path: Path) -> Gaussians:
+        from snowsplat.formats import read_gaussians
+        from snowsplat.scene.gaussians import Gaussians
+        from snowsplat.training import checkpoint
+
+        if path.parent != self._folder.checkpoints:
+            return read_gaussians(path)
+        tensors = checkpoint.load(path).tensors
+        part = "gaussians."
+        own = {name[len(part) :]: t for name, t in tensors.items() if name.startswith(part)}
+        try:
+            return Gaussians(**own)
+        except (TypeError, ValueError):
+            raise UserError(f"{path}: not the checkpoint of a training") from None
