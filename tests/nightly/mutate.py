@@ -41,7 +41,8 @@ _OPS = ("adam_step", "neighbours", "photometric", "project", "rasterize", "stati
 ROOMS = {
     "density": Room(("training/density/*.py",), ("tests/training/density",)),
     "optim": Room(
-        ("training/optim.py", "training/lr_schedule.py"), ("tests/training/test_optim.py",)
+        ("training/optim.py", "training/lr_schedule.py"),
+        ("tests/training/test_optim.py", "tests/training/test_lr_schedule.py"),
     ),
     "config": Room(("training/config.py",), ("tests/training/test_config.py",)),
     "losses": Room(("training/losses.py",), ("tests/training/test_losses.py",)),

@@ -80,9 +80,9 @@ def test_no_checkpoint(tmp_path):
 def test_truncated_at_any_length_falls_back_with_a_warning(tmp_path):
     checkpoint.save(tmp_path, 500, some_tensors(), {})
     newest = checkpoint.save(tmp_path, 1000, some_tensors(), {})
-    whole = newest.read_bytes()
-    for length in {0, 1, 7, 8, 9, 100, len(whole) - 1, *range(0, len(whole), 211)}:
-        newest.write_bytes(whole[:length])
+    content = newest.read_bytes()
+    for length in {0, 1, 7, 8, 9, 100, len(content) - 1, *range(0, len(content), 211)}:
+        newest.write_bytes(content[:length])
         with pytest.warns(UserWarning, match=r"step_001000.*using the previous one"):
             used = checkpoint.latest(tmp_path)
         assert used is not None
@@ -120,10 +120,10 @@ def test_an_unreadable_file_is_not_treated_as_damaged(tmp_path):
 
 def test_any_damaged_byte_is_detected(tmp_path):
     path = checkpoint.save(tmp_path, 500, some_tensors(), {"seed": 1})
-    whole = path.read_bytes()
-    header = 8 + int.from_bytes(whole[:8], "little")
-    for position in {*range(0, len(whole), 97), header, header + 1, len(whole) - 1}:
-        damaged = bytearray(whole)
+    content = path.read_bytes()
+    header = 8 + int.from_bytes(content[:8], "little")
+    for position in {*range(0, len(content), 97), header, header + 1, len(content) - 1}:
+        damaged = bytearray(content)
         damaged[position] ^= 0x10
         path.write_bytes(damaged)
         if position >= header:

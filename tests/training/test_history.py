@@ -51,11 +51,11 @@ def test_it_continues_from_a_checkpoint(tmp_path):
     for step in (400, 800):
         history.measure(step, 20.0 + step / 100, 0.5)
     history.write(tmp_path / "history.json")
-    whole = History.read(tmp_path / "history.json", 1000)
-    assert whole == history
+    read = History.read(tmp_path / "history.json", 1000)
+    assert read == history
     again = History.read(tmp_path / "history.json", 600)
     assert again.stretches[-1].step == 600
-    assert [figures.step for figures in again.measured] == [400]
+    assert [metrics.step for metrics in again.measured] == [400]
     for step in range(601, 1001):
         again.step_ends(step, 1.0 / step, 10 * step)
     assert sum(stretch.steps for stretch in again.stretches) == 1000
@@ -66,14 +66,21 @@ def test_measuring_a_step_again_replaces_its_metrics():
     history = History()
     history.measure(5, 20.0, 0.5)
     history.measure(5, 21.0, 0.6)
-    assert [figures.psnr for figures in history.measured] == [21.0]
+    assert [metrics.psnr for metrics in history.measured] == [21.0]
 
 
 def test_a_missing_or_damaged_file_is_an_empty_history(tmp_path):
     path = tmp_path / "history.json"
     assert History.read(path, 10) == History()
-    whole = json.dumps({"stretches": [{"step": 1}], "measured": [], "stride": 1})
-    for content in ("", "{", "[]", "{}", whole, '{"stretches": 1, "measured": 2, "stride": 3}'):
+    incomplete = json.dumps({"stretches": [{"step": 1}], "measured": [], "stride": 1})
+    for content in (
+        "",
+        "{",
+        "[]",
+        "{}",
+        incomplete,
+        '{"stretches": 1, "measured": 2, "stride": 3}',
+    ):
         path.write_text(content)
         assert History.read(path, 10) == History()
 

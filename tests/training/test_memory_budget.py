@@ -116,13 +116,13 @@ def test_too_little_memory_names_the_required_amount() -> None:
 
 def test_gaussians_of_a_resumed_training_have_to_fit() -> None:
     dataset, config = dataset_of(9, 100, 100), recipe("default", max_gaussians=50_000)
-    whole = plan_memory(dataset, config, DEVICE, 10**10)
-    plan = plan_memory(dataset, config, DEVICE, 10**10, whole.total, present=50_000)
+    unlimited = plan_memory(dataset, config, DEVICE, 10**10)
+    plan = plan_memory(dataset, config, DEVICE, 10**10, unlimited.total, present=50_000)
     assert plan.given_up == ()
     with pytest.raises(
         SettingError, match=r"to resume with 50,000 Gaussians, which need \d+ MB; use more$"
     ):
-        plan_memory(dataset, config, DEVICE, 10**10, whole.total - 1_000_000, present=50_000)
+        plan_memory(dataset, config, DEVICE, 10**10, unlimited.total - 1_000_000, present=50_000)
 
 
 def test_a_million_gaussians_take_less_than_a_gigabyte_on_a_gpu() -> None:

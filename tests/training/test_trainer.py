@@ -156,7 +156,7 @@ def test_another_seed_gives_another_scene(dataset):
 @pytest.mark.parametrize("stop", [30, 37])
 def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
     """Before a step that densifies (30), and before one that does not."""
-    whole = trained(dataset, config)
+    uninterrupted = trained(dataset, config)
     first = Trainer(dataset, config)
     first.run(until=stop)
     path = checkpoint.save(tmp_path, first.step, first.state_tensors(), {})
@@ -164,7 +164,7 @@ def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
     second.load_state(checkpoint.load(path).tensors)
     assert second.step == stop
     second.run()
-    assert_identical(second.gaussians, whole)
+    assert_identical(second.gaussians, uninterrupted)
 
 
 @pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
@@ -212,22 +212,22 @@ def test_a_checkpoint_of_inconsistent_tensors_is_rejected(dataset):
     """The kernels take one number of rows for all tensors and would read out of bounds."""
     trainer = Trainer(dataset, BUSY)
     trainer.run(until=1)
-    whole = trainer.state_tensors()
+    state = trainer.state_tensors()
     for name, changed in (
-        ("gaussians.means", whole["gaussians.means"][:3]),
-        ("optimizer.exp_avg.quats", whole["optimizer.exp_avg.quats"][:3]),
-        ("gaussians.quats", whole["gaussians.quats"].to(torch.int32)),
-        ("gaussians.opacity_logits", whole["gaussians.opacity_logits"][0]),
-        ("random.views", whole["random.views"][:5]),
-        ("order", whole["order"] - 100),
+        ("gaussians.means", state["gaussians.means"][:3]),
+        ("optimizer.exp_avg.quats", state["optimizer.exp_avg.quats"][:3]),
+        ("gaussians.quats", state["gaussians.quats"].to(torch.int32)),
+        ("gaussians.opacity_logits", state["gaussians.opacity_logits"][0]),
+        ("random.views", state["random.views"][:5]),
+        ("order", state["order"] - 100),
         ("step", torch.tensor([1, 2])),
         ("step", torch.tensor(-2)),
-        ("random.views", torch.zeros_like(whole["random.views"])),
+        ("random.views", torch.zeros_like(state["random.views"])),
     ):
-        assert name in whole
+        assert name in state
         with pytest.raises(UserError, match="another dataset or recipe|is damaged"):
-            Trainer(dataset, BUSY).load_state({**whole, name: changed})
-    Trainer(dataset, BUSY).load_state(whole)
+            Trainer(dataset, BUSY).load_state({**state, name: changed})
+    Trainer(dataset, BUSY).load_state(state)
 
 
 def test_refinement_waits_for_the_next_step(dataset):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
@@ -77,6 +78,14 @@ def test_opaque_gaussians_and_many_copies_stay_finite():
     new, shrink = shared_opacity(torch.tensor([1.0, 1.0, 1e-6]), torch.tensor([51, 1000, 1000]))
     assert ((new > 0) & (new < 1)).all()
     assert ((shrink > 0) & (shrink <= 1.001)).all()
+
+
+def test_equation_9_stays_on_its_device():
+    """With fake tensors: mixing devices is an error."""
+    with FakeTensorMode():
+        opacities = torch.rand(5, device="cuda")
+        copies = torch.ones(5, dtype=torch.int64, device="cuda")
+        assert [part.device.type for part in shared_opacity(opacities, copies)] == ["cuda", "cuda"]
 
 
 def test_copies_keep_the_integral_along_a_line():

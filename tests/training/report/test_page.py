@@ -95,8 +95,8 @@ def test_the_page_contains_the_results(trained, tmp_path):
 
 def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path):
     dataset = trained["dataset"]
-    whole = type(dataset)(dataset.train, [], dataset.points, dataset.extent)
-    changed = trained | {"dataset": whole, "evaluation": None, "history": History()}
+    without_test = type(dataset)(dataset.train, [], dataset.points, dataset.extent)
+    changed = trained | {"dataset": without_test, "evaluation": None, "history": History()}
     write_training_report(tmp_path / "report.html", Trained(**changed))
     content = words(tmp_path / "report.html")
     assert "No photos were held out" in content

@@ -140,10 +140,11 @@ class McmcDensityControl:
         moved = max(count, grown) - len(survivors)
         if moved == 0:
             return gaussians
+        # On the CPU, where the generator is, also if the Gaussians are on a GPU.
         picks = torch.multinomial(
-            opacities[survivors], moved, replacement=True, generator=self.generator
+            opacities[survivors].cpu(), moved, replacement=True, generator=self.generator
         )
-        sources = survivors[picks]
+        sources = survivors[picks.to(survivors.device)]
         copies = 1 + torch.bincount(sources, minlength=count)
 
         index = torch.cat([survivors, sources])
@@ -186,8 +187,9 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     binomials = torch.tensor(
         [[math.comb(n, k) for k in range(1, MAX_COPIES + 1)] for n in range(MAX_COPIES + 1)],
         dtype=torch.float64,
+        device=o.device,
     )
-    k = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64)
+    k = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64, device=o.device)
     weights = torch.where(k % 2 == 1, 1.0, -1.0) / k.sqrt()
     # The sum of absolute terms is at most (1 + o_new)^N ~ 5e4 (N = 51, o = 1 − 1e-6): in double
     # precision the cancellation is harmless.

@@ -171,17 +171,17 @@ def _curves(history: History) -> str:
 
 def _figures(evaluation: Evaluation, held_out: bool) -> str:
     """The table of views, with a bar of the error of each."""
-    errors = [_rms(figures.psnr) for figures in evaluation.views]
+    errors = [_rms(metrics.psnr) for metrics in evaluation.views]
     largest = max([*errors, 1e-9])
     rows = [
         [
-            text(figures.name),
-            f"{figures.psnr:.2f}&#160;dB",
-            f"{figures.ssim:.3f}",
+            text(metrics.name),
+            f"{metrics.psnr:.2f}&#160;dB",
+            f"{metrics.ssim:.3f}",
             f"{100 * error:.1f}%",
             bar(error / largest),
         ]
-        for figures, error in list(zip(evaluation.views, errors, strict=True))[:_LISTED]
+        for metrics, error in list(zip(evaluation.views, errors, strict=True))[:_LISTED]
     ]
     more = len(evaluation.views) - _LISTED
     rest = f'<p class="soft">… and {more:,} more, see metrics.json.</p>' if more > 0 else ""

@@ -49,7 +49,7 @@ def compared(
         UserError: a photo is missing or damaged.
     """
     color = torch.tensor(background, device=gaussians.means.device)
-    order = sorted(evaluation.views, key=lambda figures: figures.psnr)
+    order = sorted(evaluation.views, key=lambda metrics: metrics.psnr)
     if len(order) <= _WORST + _BEST:
         groups = [("Photo, rendering, error", order)]
     else:
