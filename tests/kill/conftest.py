@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
@@ -26,13 +25,7 @@ def dataset(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory) -> Path:
     """8 photos, 320×240; not to be changed."""
-    folder = tmp_path_factory.mktemp("kill") / "photos"
-    folder.mkdir()
-    boards = scenes.boards()
-    for i, pose in enumerate(scenes.arc(8)):
-        photo = Image.fromarray(scenes.photograph(boards, pose, i))
-        photo.save(folder / f"{i:03}.jpg", quality=95)
-    return folder
+    return scenes.write_photos(tmp_path_factory.mktemp("kill") / "photos", 8)
 
 
 @pytest.fixture(scope="session")

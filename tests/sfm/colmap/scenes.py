@@ -108,6 +108,16 @@ def _sample(texture: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
     return upper * (1 - a) + (texture[i2, j] * (1 - b) + texture[i2, j2] * b) * a
 
 
+def write_photos(folder: Path, count: int) -> Path:
+    """``count`` photos of the boards, 000.jpg …, as files that a user has; returns the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    scene = boards()
+    for i, pose in enumerate(arc(count)):
+        photo = Image.fromarray(photograph(scene, pose, i))
+        photo.save(folder / f"{i:03}.jpg", quality=95)
+    return folder
+
+
 def write(dataset: Path, images: list[np.ndarray], **of_all) -> list[Photo]:
     """Write images to ``input/`` of a dataset as 000.png …; returns their `Photo` records."""
     names = [f"{i:03}.png" for i in range(len(images))]
