@@ -13,11 +13,14 @@ from pathlib import Path
 
 import pytest
 
+from snowsplat import synthetic
 from snowsplat.pipeline import make as making
 from snowsplat.pipeline.make import RECORD, STAGES
 from snowsplat.pipeline.quality import PRESETS, quality_within
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.util.stages import Stages
+
+from ..cache import cached
 
 QUICK = replace(PRESETS["draft"], iterations=120)
 #: The command with as short a training, and a checkpoint every moment, in a process of its own.
@@ -36,8 +39,11 @@ sys.exit(main())
 def photos(tmp_path_factory) -> Path:
     """20 photos, 320×240; not to be changed. The name is one that people use."""
     folder = tmp_path_factory.mktemp("make") / "Häuser am See"
-    write_synthetic_photos(folder, n_views=20, width=320, height=240)
-    return folder
+    sources = Path(synthetic.__file__).parent.glob("*.py")
+    photos = cached(
+        "photos-20", sources, lambda out: write_synthetic_photos(out, 20, width=320, height=240)
+    )
+    return Path(shutil.copytree(photos, folder))
 
 
 @pytest.fixture
