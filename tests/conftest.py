@@ -21,8 +21,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 _HERE = Path(__file__).parent
 #: Marks that follow from the folder of a test, and from the fixtures that it uses.
-_OF_FOLDERS = {"kill": "kill"}
-_OF_FIXTURES = {"recorder": "build"}
+_OF_FOLDERS = {"kill": "kill", "fuzz": "slow"}
+_OF_FIXTURES = {"recorder": "build", "start": "slow"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -24,6 +24,9 @@ BENCHMARKS = ROOT / "benchmarks"
 LONG = 70 + os.getpid() * 1e-7
 
 
+pytestmark = pytest.mark.slow
+
+
 def benchmark(script: str, *arguments: object) -> str:
     """What the script prints. Without the garden's points, so that it is the same everywhere."""
     environment = os.environ | {"SNOWSPLAT_GARDEN": "none", "PYTHONPATH": str(ROOT / "src")}

@@ -21,6 +21,9 @@ WIDTH, HEIGHT, BUDGET = 640, 480, 170_000_000
 COUNT = 10 * BUDGET // (3 * WIDTH * HEIGHT)
 
 
+pytestmark = pytest.mark.slow
+
+
 def snowsplat_cli(*words: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(SOURCES), "SNOWSPLAT_DEVICE": "cpu"}
     command = [sys.executable, "-m", "snowsplat", *words]

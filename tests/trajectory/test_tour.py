@@ -14,6 +14,7 @@ def length(lengths: torch.Tensor, tour: list[int]) -> float:
     return float(lengths[tour[:-1], tour[1:]].sum())
 
 
+@pytest.mark.slow
 def test_short_tours_are_nearly_the_shortest():
     for seed in range(5):
         random = torch.Generator().manual_seed(seed)

@@ -1,5 +1,6 @@
 """Ports that are in use, hosts that are not local, and no output."""
 
+import contextlib
 import socket
 import urllib.request
 
@@ -42,6 +43,17 @@ def test_a_page_is_served_and_the_port_is_released(capfd):
         stop_server(server)
     assert free_port("127.0.0.1", port) == port
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_viser_that_does_not_start_through_the_guard_is_stopped(monkeypatch):
+    """It would accept anyone: no page is better."""
+    monkeypatch.setattr(
+        "snowsplat.viewer.live.server._guarded", lambda guard: contextlib.nullcontext()
+    )
+    port = free_port("127.0.0.1", None)
+    with pytest.raises(RuntimeError, match="is not supported: it starts differently"):
+        start_server("127.0.0.1", port, "")
+    assert free_port("127.0.0.1", port) == port
 
 
 def test_unavailable_ports(taken):
