@@ -27,6 +27,8 @@ from mutmut.mutation import mutators
 _SKIPPED = (cst.Annotation, cst.Decorator, cst.Import, cst.ImportFrom, cst.Raise, cst.Assert)
 #: Nor are these: names for `import *`, and `strict=True`, which is an assertion.
 _NEVER = m.Assign(targets=[m.AssignTarget(m.Name("__all__"))]) | m.Arg(keyword=m.Name("strict"))
+#: Blocks within each other that are expected.
+_DEEPEST = 8
 #: Calls whose arguments are not removed or replaced: each such call would fail.
 _WHOLE_CALLS = {"len", "isinstance", "range", "super", "zip"}
 
@@ -166,16 +168,28 @@ def _mutated(
     source: bytes, wrapper: MetadataWrapper, node: cst.CSTNode, changed: cst.CSTNode
 ) -> bytes:
     """The file with ``changed`` in the place of ``node``."""
-    span = wrapper.resolve(ByteSpanPositionProvider).get(node)
-    if span is not None:
-        end = span.start + span.length
-        code = wrapper.module.code_for_node(node).strip().encode()
-        if code and source[span.start : end] == code:
-            text = wrapper.module.code_for_node(changed).strip().encode()
-            return source[: span.start] + text + source[end:]
-    # The span is not the code of the node (parentheses, lines that take their indentation from
-    # around it): slower.
-    return cst.ensure_type(wrapper.module.deep_replace(node, changed), cst.Module).bytes
+    module = wrapper.module
+    spans = wrapper.resolve(ByteSpanPositionProvider)
+    # The span of a node is not always its code, for example if it is in parentheses. Then that of
+    # the node around it is.
+    while node is not module:
+        start = spans[node].start if node in spans else 0
+        end = start + spans[node].length if node in spans else 0
+        # The code of a node does not have the indentation of the block that it is in.
+        for depth in range(_DEEPEST if end else 0):
+            newline = "\n" + depth * module.default_indent
+            code, text = (
+                module.code_for_node(n).strip().replace("\n", newline).encode()
+                for n in (node, changed)
+            )
+            if code and source[start:end] == code:
+                return source[:start] + text + source[end:]
+            if b"\n" not in code:
+                break
+        parent = wrapper.resolve(ParentNodeProvider)[node]
+        changed = cst.ensure_type(parent.deep_replace(node, changed), cst.CSTNode)
+        node = parent
+    return cst.ensure_type(changed, cst.Module).bytes
 
 
 def _changed_lines(before: bytes, after: bytes) -> tuple[int, str, str]:
