@@ -80,6 +80,11 @@ def test_invalid_values_name_their_setting(name, value):
     assert error.value.setting == name
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_every_sh_degree_is_accepted(degree):
+    assert recipe("paper", sh_degree=degree).sh_degree_at(30_000) == degree
+
+
 def test_the_largest_seeds_are_accepted():
     for seed in (2**61 - 1, -(2**61)):
         torch.Generator().manual_seed(4 * recipe("paper", seed=seed).seed + 3)

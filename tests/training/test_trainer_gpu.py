@@ -18,10 +18,11 @@ from snowsplat.ops.cuda.kernels import Argument, Kernel
 from snowsplat.ops.cuda.launches import launch_by
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.training.config import TrainConfig
+from snowsplat.training.finite import Diverged
 from snowsplat.training.trainer import Trainer
 
 from ..ops.engines import launcher
-from .test_trainer import BUSY, BUSY_MCMC, CALM, dataset
+from .test_trainer import BUSY, BUSY_MCMC, dataset
 
 __all__ = ["dataset"]  # a fixture
 
@@ -52,8 +53,9 @@ def test_the_kernels_of_a_gpu_train_as_those_of_the_cpu(
     assert torch.equal(losses(narrow), found)
     assert narrow._runner.capacity.instances > 3
     monkeypatch.undo()
-    for name, parameter in narrow.gaussians.parameters().items():
-        assert torch.equal(parameter, ample.gaussians.parameters()[name]), name
+    expected_state = ample.state_tensors()
+    for name, tensor in narrow.state_tensors().items():  # moments and statistics too
+        assert torch.equal(tensor, expected_state[name]), name
 
 
 @pytest.mark.emulated
@@ -61,14 +63,16 @@ def test_a_loss_that_is_not_finite_changes_nothing(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(LAUNCHERS, "cpu", launcher("emulated"))
-    trainer = with_capacity(Trainer(dataset, CALM), 100_000)
+    trainer = with_capacity(Trainer(dataset, BUSY), 100_000)
     trainer.step_once()
     trainer._background = torch.full((3,), torch.nan)
-    before = trainer.gaussians.clone()
-    with pytest.raises(Exception, match="step 2, photo .*: the loss is nan"):
+    before = {name: tensor.clone() for name, tensor in trainer.state_tensors().items()}
+    with pytest.raises(Diverged, match="step 2, photo .*: the loss is nan"):
         trainer.step_once()
-    for name, parameter in trainer.gaussians.parameters().items():
-        assert torch.equal(parameter, before.parameters()[name]), name
+    assert before["density.views"].any()
+    for name, tensor in trainer.state_tensors().items():
+        if name != "order":  # the view was taken from it
+            assert torch.equal(tensor, before[name]), name
 
 
 def backward_by_hand(loss: Tensor) -> None:
