@@ -10,6 +10,7 @@ from snowsplat.formats import (
     format_for_reading,
     format_for_writing,
     read_gaussians,
+    register_format,
     write_gaussians,
 )
 from snowsplat.scene.gaussians import Gaussians
@@ -32,6 +33,11 @@ def test_no_suffix_belongs_to_two_formats():
     assert len(suffixes) == len(set(suffixes))
     assert all(s.startswith(".") and s == s.lower() for s in suffixes)
     assert len({format.name for format in FORMATS}) == len(FORMATS)
+
+
+def test_a_format_is_registered_once():
+    with pytest.raises(ValueError, match="already registered"):
+        register_format(FORMATS[0])
 
 
 @pytest.mark.parametrize(
