@@ -1,18 +1,17 @@
-"""A floor for blending: the time that its arithmetic takes if nothing else does.
+"""A lower bound for the time of blending: that of its arithmetic alone.
 
-Counted from `native/cpu/blend.cpp` for 3 channels, in vector operations a step (a vector of W
-pixels, one splat). Loads, broadcasts, mask logic and branches go through other ports of the
-processor and are not counted; neither is what comes once for a whole (tile, splat): the rows'
-quadratics, the test which blocks are touched, the final fold over lanes. AVX2 and narrower sets
-need more operations for the same step (masks, 2^x, no FMA in the baseline); that counts against
-them.
+The operations are counted in `native/cpu/blend.cpp` for 3 channels, as vector operations per step
+(a vector of W pixels, one splat). Loads, broadcasts, mask logic and branches use other ports of the
+processor and are not counted. Neither is the work per (tile, splat): the quadratics of the rows,
+the test which blocks are touched, the final sum over lanes. AVX2 and narrower instruction sets need
+more operations per step (masks, 2^x, no FMA in the baseline); these are not part of the bound.
 
-    floor a pair = OPERATIONS / (W · lane use) / (operations a clock · clock)
+    floor per pair = OPERATIONS / (W · lane use) / (operations per clock · clock)
 
-The share of the floor that is reached, floor / measured, says how far the rest (instances, idle
-ports, cache misses) is from free. It assumes two vector operations a clock, which the common cores
-of servers and desktops do; a core with more pipes (AMD Zen 5) can come nearer to its floor than 1.
-The clock is what the system names, or `--ghz`: clouds rarely tell the true one.
+The ratio floor / measured shows the cost of everything else (instances, idle ports, cache misses).
+Two vector operations per clock are assumed, as on common server and desktop cores. A core with more
+ports (AMD Zen 5) can reach a ratio above 1. The clock is that reported by the system, or `--ghz`:
+virtual machines rarely report the true one.
 """
 
 from __future__ import annotations
@@ -46,12 +45,12 @@ OPERATIONS_A_CLOCK = 2.0
 
 
 def floor_ns(lanes: int, lane_use: float, ghz: float) -> float:
-    """Nanoseconds a pair, forward and backward together, on one core."""
+    """Nanoseconds per pair, forward and backward together, on one core."""
     return OPERATIONS / (lanes * lane_use) / (OPERATIONS_A_CLOCK * ghz)
 
 
 def system_ghz() -> float:
-    """The highest clock that /proc/cpuinfo names now; 3 where there is none."""
+    """The highest clock that /proc/cpuinfo reports, in GHz; 3 if it reports none."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
             clocks = [float(line.split(":")[1]) for line in file if line.startswith("cpu MHz")]

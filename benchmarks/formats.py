@@ -3,10 +3,10 @@
     python benchmarks/formats.py SCENE
     python benchmarks/formats.py SCENE --dataset DATASET
 
-SCENE is a trained scene of any readable format. Times are measured with copies of it next to each
-other, `--gaussians` in total; bytes per Gaussian are those of SCENE itself. With the dataset of its
+SCENE is a trained scene of any readable format. Times are measured with copies of it side by side,
+`--gaussians` in total; bytes per Gaussian are those of SCENE itself. With the dataset of its
 training, two mean PSNRs are computed over the cameras of every 8th photo: renderings of the scene
-that was read back against renderings of SCENE, and against the photos.
+that was read back compared with renderings of SCENE, and with the photos.
 """
 
 from __future__ import annotations

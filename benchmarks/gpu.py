@@ -1,16 +1,16 @@
-"""All that only a GPU can show, in one run of less than nine minutes.
+"""All measurements that need a GPU, in one run of less than nine minutes.
 
     python benchmarks/gpu.py --out OUT --captures CAPTURES
     python benchmarks/gpu.py --out OUT --only device stages        some of the parts
 
-The tests that need a GPU; compute-sanitizer over every op; a training step by stages beside their
-floors, its memory, and what sums in a fixed order cost; trainings beside those of the CPU; and the
-same step beside gsplat's. What is measured how: benchmarks/README.md.
+The parts are: tests that need a GPU; compute-sanitizer over every op; the stages of a training step
+with their lower bounds, its memory, and the cost of sums in a fixed order; trainings compared with
+the CPU; and the same step with gsplat. benchmarks/README.md explains the measurements.
 
-Each part is a process with a time limit, so that one that crashes or hangs stops no other. The page
-OUT/gpu.md is written anew whenever something is found, and printed at the end; OUT/gpu.json has
-every figure, OUT/gpu.log what the parts printed. Exit code: 0 if all is well, 1 if something failed
-or was late, 2 without a GPU.
+Each part is a process with a time limit, so a part that crashes or hangs does not affect others.
+The page OUT/gpu.md is rewritten after each finding, and printed at the end. OUT/gpu.json has all
+figures, OUT/gpu.log the output of the parts. Exit code: 0 if all is well, 1 if something failed or
+exceeded its time, 2 without a GPU.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CAPTURES = ("fox", "lego400")
 
 
 def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
-    """In their order; those that are not timed run side by side before the others."""
+    """The jobs in their order; those that are not timed run side by side, before the others."""
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
@@ -100,7 +100,7 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         part = ["train", *datasets, "--iterations", "7000"]
         late.append(job("train on the GPU, 7000 steps", part, 90, alone=True))
     wanted = {group: found[group] if group in flags.only else [] for group in GROUPS}
-    # The sanitizers take longest, the tests are many.
+    # First the sanitizers, which take longest, then the tests, which are many.
     side_by_side = [*found["beside"], *wanted["sanitizer"], *wanted["tests"]]
     timed = [*wanted["train"], *wanted["stages"], *wanted["peer"]]
     return [*wanted["device"], *side_by_side, *timed, *late]

@@ -1,7 +1,7 @@
-"""Runs child processes within a given time: side by side, or alone where they measure times.
+"""Runs child processes with time limits: in parallel, or alone if they measure times.
 
-A child prints what it finds as lines of JSON behind a mark (`finding`), as soon as it has it: what
-a child that crashes or is late has found until then counts. Nothing here needs more than Python.
+A child prints each finding at once as a line of JSON with a mark (`finding`), so the findings of a
+child that crashes or exceeds its time are not lost. This module only needs Python.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from typing import Any
 
 MARK = "@@ "
 Finding = dict[str, Any]
-_LOG_BYTES = 1 << 20  # of the log, of one job
+_LOG_BYTES = 1 << 20  # in the log, per job
 
 
 def finding(kind: str, **values: Any) -> None:
-    """In a child: tell the parent."""
+    """Called in a child: report a finding to the parent."""
     print(MARK + json.dumps({"kind": kind, **values}), flush=True)
 
 
@@ -32,9 +32,9 @@ class Job:
     """A child process.
 
     Attributes:
-        limit: seconds; it is ended then.
-        alone: begins when nothing else runs, and nothing begins beside it.
-        least: with less than so many seconds left it does not begin.
+        limit: seconds after which it is ended.
+        alone: starts when no other job runs, and no other job starts beside it.
+        least: seconds that must be left in the run for it to start.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Job:
 
 @dataclass
 class Outcome:
-    """How a job ended: "done", "failed", "late" or "not run", and why."""
+    """How a job ended: "done", "failed", "late" or "not run", and the reason."""
 
     job: str
     state: str
@@ -56,10 +56,10 @@ class Outcome:
 
 
 class Runner:
-    """Runs jobs in their order, until a moment at most.
+    """Runs jobs in order, until a deadline.
 
     Attributes:
-        outcomes: of the jobs that are over.
+        outcomes: of the finished jobs.
     """
 
     def __init__(
@@ -71,8 +71,9 @@ class Runner:
         on_finding: Callable[[str, Finding], None],
         say: Callable[[str], None] = print,
     ) -> None:
-        """``folder``: for what children print. ``until``: of `time.monotonic`. ``width``: how many
-        run side by side. ``on_finding(job, finding)`` is called for each, ``say`` for each job."""
+        """``folder``: for the output of children. ``until``: deadline of `time.monotonic`.
+        ``width``: number of parallel jobs. ``on_finding(job, finding)`` is called for each finding,
+        ``say`` for each job."""
         self.outcomes: list[Outcome] = []
         self._folder, self._log, self._until, self._width = folder, log, until, width
         self._on_finding, self._say = on_finding, say
@@ -80,11 +81,11 @@ class Runner:
         self._stopped = False
 
     def stop(self) -> None:
-        """Ends `run` soon. For handlers of signals: an exception could lose a child."""
+        """End `run` soon. For signal handlers, where an exception could leave a child running."""
         self._stopped = True
 
     def run(self, jobs: Sequence[Job]) -> None:
-        """Runs all, or until `stop`. Whatever ends this ends the children too."""
+        """Run all jobs, or until `stop`. The children end with it in any case."""
         waiting = list(jobs)
         try:
             while (waiting or self._running) and not self._stopped:
@@ -148,7 +149,7 @@ class _Child:
         self._partial = b""
         self.last_line = ""
         try:
-            # A session of its own: what it starts ends with it.
+            # A session of its own, so that its children can be ended with it.
             self._process = subprocess.Popen(
                 list(job.command),
                 stdin=subprocess.DEVNULL,
@@ -166,7 +167,7 @@ class _Child:
         return time.monotonic() - self._began
 
     def outcome(self) -> Outcome | None:
-        """None while it runs; ends it when it is late."""
+        """The outcome; None while it runs. Ends it after its time limit."""
         code = self._process.poll()
         if code is None:
             if self.seconds <= self._limit:
@@ -183,11 +184,11 @@ class _Child:
         return Outcome(self.job.name, "failed", self.seconds)
 
     def read(self, on_finding: Callable[[str, Finding], None]) -> None:
-        """Takes note of the whole lines that are there by now."""
+        """Read the complete lines that are there."""
         *lines, self._partial = (self._partial + self._read.read()).split(b"\n")
         for line in lines:
             text = line.decode(errors="replace").strip()
-            # Others may have begun the line, such as pytest with its dots.
+            # Other output may precede the mark in a line, such as the dots of pytest.
             _, marked, rest = text.partition(MARK)
             if marked:
                 with contextlib.suppress(ValueError):
@@ -196,7 +197,7 @@ class _Child:
                 self.last_line = text
 
     def output(self, most: int) -> bytes:
-        """What it printed beside its findings, without the middle where that is long."""
+        """Its output without findings; a long output is shortened in the middle."""
         lines = self._path.read_bytes().splitlines(keepends=True)
         content = b"".join(line for line in lines if MARK.encode() not in line)
         if len(content) <= most:
@@ -207,7 +208,7 @@ class _Child:
         with contextlib.suppress(OSError):
             os.killpg(self._process.pid, signal.SIGKILL)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(10)  # a process that the driver holds on to may stay
+            self._process.wait(10)  # the driver may keep a process alive
 
     def close(self) -> None:
         self._file.close()

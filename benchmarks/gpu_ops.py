@@ -1,7 +1,7 @@
-"""Every op once, forward and backward: the program that compute-sanitizer looks at.
+"""Runs every op once, forward and backward: the program for compute-sanitizer.
 
-Scenes are small and of odd sizes, so that blocks, warps and tiles are cut off everywhere. In both
-dtypes, with sums of gradients by atomics and in order, and last the training step.
+Scenes are small and have odd sizes, so blocks, warps and tiles are incomplete everywhere. Both
+dtypes, with gradient sums by atomics and in a fixed order, then a training step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from snowsplat import ops
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 
-#: Gaussians, width, height. From one of each to a few thousand, none a multiple of anything.
+#: Gaussians, width, height: from one of each to a few thousand, not multiples of block sizes.
 SIZES = ((0, 1, 1), (1, 5, 3), (33, 17, 31), (999, 95, 53), (4099, 161, 99))
 SMALL = ((0, 1, 1), (1, 5, 3), (41, 19, 33))
 WIDE = 16 * (1 << 16) + 5
@@ -31,7 +31,7 @@ def every_op(
     wide: bool = True,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Runs them all; says what comes next. ``wide``: an image of many tiles, too.
+    """Run all ops; announces each. ``wide``: also an image of many tiles.
 
     Raises:
         AssertionError: a result is not finite.
@@ -49,7 +49,7 @@ def every_op(
             for in_order in (False, True):
                 say(f"training: {count} Gaussians, {width}x{height}, in order: {in_order}")
                 with sums_in_order(in_order):
-                    # Too little room at first: lists that are cut off.
+                    # The capacity is too small at first, so lists are truncated.
                     step = Step(scene, device, capacity=max(1, count // 2))
                     assert math.isfinite(step.run())
                     assert math.isfinite(step.run())
@@ -61,7 +61,7 @@ def every_op(
 
 
 def random_scene(count: int, width: int, height: int) -> Workload:
-    """Gaussians all over the view and beyond it, some behind the camera, a few large ones."""
+    """Gaussians inside and outside of the view, some behind the camera, a few large ones."""
     g = torch.Generator().manual_seed(count)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -98,7 +98,7 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
     pose = camera.cam_from_world.to(device, dtype, copy=True).requires_grad_()
     background = torch.rand(3, device=device, dtype=dtype).requires_grad_()
 
-    # The gradient all the way to the parameters and the pose; depth is a second group of channels.
+    # Gradients down to the parameters and the pose; depth is a second group of channels.
     splats = ops.project(**params, cam_from_world=pose, **view, sh_degree=3)
     image, alpha, depth = ops.rasterize(splats, *size, background, with_depth=True)
     assert depth is not None
@@ -107,7 +107,7 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
     (loss + alpha.mean() + depth.mean()).backward()
     _finite(loss, background.grad, pose.grad, *(p.grad for p in params.values()))
 
-    # The course of a training step: the gradient of the splats, at a lower degree.
+    # As in a training step: the gradient of the splats, at a lower degree.
     with torch.no_grad():
         splats = ops.project(**params, cam_from_world=pose.detach(), **view, sh_degree=1)
         splats.packed.requires_grad_()

@@ -1,6 +1,6 @@
-"""The parts of `gpu.py`, each a process of its own: `python gpu_parts.py PART …` prints findings.
+"""The parts of `gpu.py`, each in its own process: `python gpu_parts.py PART …` prints findings.
 
-Nothing of the package that needs more than PyTorch, numpy, Pillow and cuda-bindings is imported.
+Of the package, only modules that need PyTorch, numpy, Pillow and cuda-bindings are imported.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from gpu_jobs import finding
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Datasets whose pictures are transparent.
+#: Datasets with transparent images.
 BACKGROUNDS = {"lego400": "white"}
 
 
@@ -30,7 +30,7 @@ BACKGROUNDS = {"lego400": "white"}
 
 
 def probe() -> None:
-    """Whether there is a GPU that the package can use, and which."""
+    """Report whether the package can use a GPU, and which."""
     from snowsplat.ops.cuda.availability import why_unusable
 
     why = why_unusable()
@@ -63,7 +63,7 @@ def device() -> None:
     try:
         rate = _multiply_add_rate()
         finding("rate", operations_a_second=rate, clocks=_clocks())
-    except Exception as error:  # a figure less, and floors are of bytes alone
+    except Exception as error:  # then the lower bounds are those of bytes alone
         print(f"multiply-adds were not measured: {error!r}")
     finding("mark", milliseconds=_mark_time())
 
@@ -77,7 +77,7 @@ def _built_kernels(major: int, minor: int) -> str:
 
 
 def _clocks() -> str:
-    """As nvidia-smi tells; read, never set."""
+    """State of the card from nvidia-smi; nothing is changed."""
     wanted = "driver_version,clocks.sm,clocks.max.sm,clocks.mem,power.draw,temperature.gpu"
     try:
         run = subprocess.run(
@@ -96,7 +96,7 @@ def _clocks() -> str:
 
 
 def _copy_bandwidth() -> float:
-    """Bytes read and written a second, by copies many times the size of the caches."""
+    """Bytes read and written per second, by copies much larger than the caches."""
     import gpu_step
     import torch
 
@@ -111,7 +111,7 @@ def _copy_bandwidth() -> float:
 
 
 def _multiply_add_rate() -> float:
-    """Multiply-adds a second, of gpu_rate.cu."""
+    """Multiply-adds per second, by gpu_rate.cu."""
     import torch
     from gpu_step import gpu_times
 
@@ -144,7 +144,7 @@ def _multiply_add_rate() -> float:
 
 
 def _mark_time() -> float:
-    """Milliseconds between two marks with nothing in between: in the time of every kernel."""
+    """Milliseconds between two events with nothing between them; part of every kernel's time."""
     from gpu_step import gpu_times
 
     return statistics.median(gpu_times(lambda: None, 21))
@@ -153,12 +153,12 @@ def _mark_time() -> float:
 # ------------------------------------------------------------------------------------------ tests
 
 
-@dataclass(eq=False)  # pytest wants to hash it
+@dataclass(eq=False)  # pytest needs to hash it
 class Reporter:
-    """A plugin of pytest: tells each failure at once, and counts what has been done.
+    """A pytest plugin: reports each failure at once, and counts the tests.
 
-    ``done`` is a file of the tests that are over. Where a test leaves the GPU unusable for this
-    process, the tests after it need another one: `lost` is True then.
+    ``done`` is a file that lists the finished tests. If a test leaves the GPU unusable for this
+    process, the remaining tests need another process: then `lost` is True.
     """
 
     done: Path
@@ -203,7 +203,7 @@ class Reporter:
         crash = getattr(report.longrepr, "reprcrash", None)
         text = crash.message if crash is not None else str(report.longrepr)
         lines = [line.strip() for line in text.splitlines() if line.strip()] or ["no message"]
-        # A file that cannot be collected has its error last.
+        # If a file cannot be collected, the error is on the last line.
         line = lines[0] if crash is not None else lines[-1].removeprefix("E").strip()
         finding("failure", test=report.nodeid, line=line[:200])
         print(report.longreprtext)
@@ -218,7 +218,7 @@ class Reporter:
 
 
 def gpu_is_lost() -> bool:
-    """Whether an error of a kernel has made the GPU unusable for this process."""
+    """Whether a kernel's error has made the GPU unusable for this process."""
     import torch
 
     try:
@@ -233,7 +233,7 @@ _MOST_PROCESSES = 5
 
 
 def tests(path: str, marker: str, done: Path, attempt: int) -> None:
-    """The tests of a file that carry a marker, in new processes where one loses the GPU."""
+    """Run the tests of a file that have a marker, in a new process after a lost GPU."""
     import pytest
 
     os.chdir(ROOT)
@@ -243,7 +243,7 @@ def tests(path: str, marker: str, done: Path, attempt: int) -> None:
             "-o",
             "addopts=--import-mode=importlib",
             "-q",
-            "-s",  # findings are printed while tests run
+            "-s",  # print findings while tests run
             "-p",
             "no:cacheprovider",
             "-m",
@@ -257,7 +257,7 @@ def tests(path: str, marker: str, done: Path, attempt: int) -> None:
         sys.stdout.flush()
         again = [path, "--marker", marker, "--done", str(done), "--attempt", str(attempt + 1)]
         os.execv(sys.executable, [sys.executable, __file__, "tests", *again])
-    # Failures are findings; that no test has the marker is none.
+    # Failures are reported as findings. A file without tests of this marker is fine.
     if code not in (0, 1, 2, 5) or (code == 2 and not reporter.lost):
         raise SystemExit(f"pytest ends with {int(code)}")
 
@@ -266,7 +266,7 @@ def tests(path: str, marker: str, done: Path, attempt: int) -> None:
 
 
 def ops() -> None:
-    """The program that the sanitizer looks at."""
+    """The program that runs under the sanitizer."""
     import torch
     from gpu_ops import every_op
 
@@ -282,13 +282,13 @@ _NO_ERROR = ("COMPUTE-SANITIZER", "Target application", "LEAK SUMMARY")
 
 
 class SanitizerLog:
-    """What compute-sanitizer says, line by line.
+    """Parses the output of compute-sanitizer, line by line.
 
     Attributes:
-        errors: its own count; until it gives that, the number of errors seen.
+        errors: the sanitizer's own count; before that is known, the number of errors so far.
         first: first lines of the first few errors.
-        last: what the program was doing.
-        finished: whether the program came to its end.
+        last: the last operation of the program.
+        finished: whether the program ended normally.
     """
 
     def __init__(self, most: int = 4) -> None:
@@ -297,11 +297,11 @@ class SanitizerLog:
         self.last = ""
         self.counted = False
         self._most = most
-        self._begins = True  # the next line begins an error
+        self._begins = True  # the next line is the first of an error
         self._second = False
 
     def read(self, line: str) -> bool:
-        """Gives whether something changed that is worth telling."""
+        """Parse a line; returns whether there is something new to report."""
         match = _SANITIZER_LINE.match(line)
         if match is None:
             self.finished = self.finished or line.strip() == OPS_DONE
@@ -311,7 +311,7 @@ class SanitizerLog:
         text = match[1].strip()
         summary = _ERRORS.match(text)
         if summary is not None:
-            # A second one says how many of them were not printed.
+            # A second summary has the number of errors that were not printed.
             count = int(summary[1])
             self.errors, self.counted = max(count, self.errors if self.counted else 0), True
             return True
@@ -327,7 +327,7 @@ class SanitizerLog:
                 self.first.append(text[:160])
                 self._second = True
             return True
-        if self._second:  # where it is
+        if self._second:  # the location of the error
             self.first[-1] += f", {text[:80]}"
             self._second = False
         return False
@@ -350,11 +350,11 @@ def sanitize(tool: str) -> None:
         raise SystemExit("compute-sanitizer is not here")
     environment = dict(os.environ)
     if tool in ("memcheck", "initcheck"):
-        # Each tensor in memory of its own, so that its end is known.
+        # Allocate each tensor separately, so that accesses beyond its end are detected.
         environment["PYTORCH_NO_CUDA_MEMORY_CACHING"] = "1"
     command = [program, "--tool", tool, "--print-limit", "20"]
     if tool == "memcheck":
-        command += ["--report-api-errors", "no"]  # torch asks for what is not there, and copes
+        command += ["--report-api-errors", "no"]  # torch makes calls that may fail
     log = SanitizerLog()
     with subprocess.Popen(
         [*command, sys.executable, __file__, "ops"],
@@ -375,7 +375,7 @@ def sanitize(tool: str) -> None:
 
 
 def find_tool(name: str) -> str | None:
-    """A program of the CUDA toolkit."""
+    """Path of a program of the CUDA toolkit."""
     homes = [os.environ.get("CUDA_HOME", ""), "/usr/local/cuda"]
     folders = [f"{home}/bin" for home in homes if home]
     return shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), *folders]))
@@ -385,7 +385,7 @@ def find_tool(name: str) -> str | None:
 
 
 def scenes(sizes: Iterable[str], folder: Path) -> None:
-    """Makes workloads ready, since that takes the CPU its time."""
+    """Prepare workloads in advance, since that uses the CPU."""
     import torch
     from workloads import workload
 
@@ -417,7 +417,7 @@ def stages(size: str, folder: Path, repeats: int) -> None:
     scene = _scene(folder, size)
     finding("scene", size=size, source=scene.source)
     step = Step(scene, GPU)
-    for _ in range(4):  # room for the instances, kernels, torch's memory
+    for _ in range(4):  # warm-up: capacity for the instances, kernels, torch's memory
         step.run()
     torch.cuda.synchronize()
     held = torch.cuda.memory_allocated()
@@ -446,7 +446,7 @@ def stages(size: str, folder: Path, repeats: int) -> None:
 def train(
     datasets: Iterable[Path], seeds: Iterable[int], device: str, iterations: int | None
 ) -> None:
-    """Held-out PSNR, time, memory of the default recipe; a seed of all datasets, then the next."""
+    """Held-out PSNR, time and memory of the default recipe; all datasets for each seed."""
     for seed in seeds:
         for path in datasets:
             if path.is_dir():
@@ -472,7 +472,7 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
         **({} if iterations is None else {"iterations": iterations}),
     )
     if on_gpu:
-        torch.cuda.synchronize()  # what follows asks for a GPU that is in use
+        torch.cuda.synchronize()  # initialises the GPU before memory is measured
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     begin = time.perf_counter()
@@ -487,7 +487,7 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     found = trainer.evaluate()
     same = None
-    if on_gpu:  # the scene as the CPU sees it
+    if on_gpu:  # evaluate the same scene on the CPU
         white = (1.0 if background == "white" else 0.0,) * 3
         same = evaluate_views(trainer.gaussians.to("cpu"), dataset.test, background=white).psnr
     finding(

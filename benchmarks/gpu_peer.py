@@ -1,8 +1,8 @@
-"""Our step beside that of gsplat (Apache 2.0), where it is installed, on the same tensors.
+"""Compares our training step with gsplat's (Apache 2.0), if installed, on the same tensors.
 
-Three pairs of times: an image; an image and its gradient, up to the parameters, by autograd on both
-sides; and a whole training step, where ours is the trainer's and theirs has our loss, which is
-fused, and PyTorch's fused Adam. Of their two layouts the faster one counts.
+Three comparisons: an image; an image and the gradients of the parameters, by autograd; and a
+complete training step. There, ours is the trainer's, and gsplat's uses our fused loss and PyTorch's
+fused Adam. The faster of gsplat's two layouts counts.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from snowsplat.evaluation.metrics import psnr
 
 
 def build() -> None:
-    """Has gsplat compile what it needs, by a first image."""
+    """Render a first image, so that gsplat compiles its kernels."""
     try:
         import gsplat
     except ImportError as error:
@@ -38,7 +38,7 @@ def build() -> None:
 
 
 class Peer:
-    """A scene as gsplat's own trainer holds it."""
+    """A scene in the representation of gsplat's own trainer."""
 
     def __init__(self, scene: Workload) -> None:
         gaussians, camera = scene.gaussians.to(GPU), scene.camera
@@ -80,7 +80,7 @@ class Peer:
     def gradient(self, photo: Tensor) -> None:
         for p in self.parameters.values():
             p.grad = None
-        # As our op has it best: by planes.
+        # The layout that our op reads fastest: planar.
         image = self._render().permute(2, 0, 1).contiguous().permute(1, 2, 0)
         ops.photometric_loss(image, photo).backward()
 
@@ -92,7 +92,7 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
     try:
         import gsplat  # noqa: F401
     except ImportError:
-        return  # `build` has said so
+        return  # reported by `build`
     peer, step = Peer(scene), Step(scene, GPU)
     for _ in range(3):
         step.run()
@@ -149,7 +149,7 @@ def _our_image(step: Step) -> Tensor:
 
 
 def _each(work: Callable[[], object], repeats: int) -> float:
-    """Milliseconds of one among many that follow each other, as in a training."""
+    """Milliseconds per call of many in a row, as in a training."""
     for _ in range(3):
         work()
     times = []

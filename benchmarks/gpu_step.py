@@ -1,8 +1,8 @@
-"""A training step on a GPU under the stopwatch: the trainer's own, on a scene that stays as it is.
+"""Times a training step on a GPU: that of the trainer, on a scene that does not change.
 
-Three times are told apart. `host`: how long the CPU takes to queue a step. `gpu`: how long the GPU
-takes for it when all of it is queued already. `wall`: how long a step takes in a training, where
-the CPU waits for each loss. The longer of the first two is what limits the last.
+There are three times. `host`: the CPU queues a step. `gpu`: the GPU runs a step that is already
+queued. `wall`: a step in a training, where the CPU waits for each loss. The longer of the first two
+limits the last.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from snowsplat.training.trainer import Trainer
 GPU = torch.device("cuda")
 EXTENT = 4.0
 
-#: The paper's, with rates so small that every repeat does the same on the same numbers.
+#: The paper's, with learning rates so small that all repetitions compute the same.
 CONFIG = TrainConfig(
     sh_interval=0,
     learning_rates=replace(LearningRates().scaled(1e-30), means_final=1e-36, means_steps=1.0),
     density=AdaptiveDensity(densify_until=0.5, prune_screen_size=0.0),
     test_iterations=(),
 )
-STEP = 1000  # of CONFIG's: the statistics of density control are taken
+STEP = 1000  # of CONFIG: a step that updates the statistics of density control
 
 
 @contextmanager
 def sums_in_order(wanted: bool) -> Iterator[None]:
-    """What `snowsplat train --deterministic` asks for."""
+    """The settings of `snowsplat train --deterministic`."""
     before = torch.utils.deterministic.fill_uninitialized_memory
     torch.use_deterministic_algorithms(wanted, warn_only=True)
     torch.utils.deterministic.fill_uninitialized_memory = False
@@ -60,7 +60,7 @@ def sums_in_order(wanted: bool) -> Iterator[None]:
 
 
 class Step:
-    """The step of one workload, on a device."""
+    """The training step of one workload, on a device."""
 
     def __init__(self, scene: Workload, device: torch.device, capacity: int | None = None) -> None:
         """``capacity``: initial capacity in instances; None uses the trainer's estimate."""
@@ -95,7 +95,7 @@ class Step:
 
     @torch.no_grad()
     def _planes(self) -> Tensor:
-        """(3, H, W) uint8: what the camera sees, with noise, so that every pixel has a gradient."""
+        """(3, H, W) uint8: the camera's image with noise, so that every pixel has a gradient."""
         image = render(self.trainer.gaussians, self.camera, self.background).image.permute(2, 0, 1)
         noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
         return (255 * image + 10 * noise.to(image.device)).clamp(0, 255).to(torch.uint8)
@@ -115,7 +115,7 @@ class Step:
 
     @torch.no_grad()
     def counts(self) -> dict[str, int]:
-        """What a step has to do: see `gpu_floor.Frame`."""
+        """The size of the task of a step: see `gpu_floor.Frame`."""
         camera, gaussians = self.camera, self.trainer.gaussians
         splats = project(gaussians, camera)
         assert splats.ids is not None
@@ -133,9 +133,9 @@ Execute = Callable[[Kernel, str, int, Sequence[Argument]], None]
 
 
 class KernelClock:
-    """Marks the times before and after every kernel that the ops launch.
+    """Records events before and after every kernel that the ops launch.
 
-    ``mark()`` makes a mark in the stream. ``laps`` are (native function, kernel, before, after).
+    ``mark()`` records an event. ``laps`` are (native function, kernel, before, after).
     """
 
     def __init__(self, execute: Execute, mark: Callable[[], Any]) -> None:
@@ -144,7 +144,7 @@ class KernelClock:
 
     @contextmanager
     def on(self, device: str) -> Iterator[None]:
-        """In the block, what is launched for tensors on this device is marked."""
+        """Inside the with block, launches for tensors on this device are recorded."""
         before = LAUNCHERS[device]
         LAUNCHERS[device] = self._launch
         try:
@@ -164,7 +164,7 @@ class KernelClock:
 def kernel_times(
     laps: Sequence[tuple[str, str, Any, Any]], between: Callable[[Any, Any], float]
 ) -> dict[str, dict[str, float]]:
-    """{native function: {kernel: its time, all its launches together}}."""
+    """{native function: {kernel: total time of its launches}}."""
     found: dict[str, dict[str, float]] = {}
     for function, kernel, before, after in laps:
         kernels = found.setdefault(function, {})
@@ -173,7 +173,7 @@ def kernel_times(
 
 
 def medians(repeats: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Of the times of each kernel."""
+    """Medians of the times of each kernel."""
     return {
         function: {
             kernel: statistics.median(times[function][kernel] for times in repeats)
@@ -197,17 +197,17 @@ def milliseconds(before: torch.cuda.Event, after: torch.cuda.Event) -> float:
 
 
 class Behind:
-    """Keeps the GPU busy until all that is to be timed is queued: else it would be waited for.
+    """Keeps the GPU busy until all work to be timed is queued, so that it does not wait for it.
 
         with behind:
             before = event(); work(); after = event()
 
-    Where the pause was too short for that, `late` is True and the next one is longer.
+    If the pause was too short, `late` is True and the next pause is longer.
     """
 
     def __init__(self, seconds: float = 0.02) -> None:
         self.late = False
-        self._cycles = int(2e9 * seconds)  # clocks are lower than 2 GHz
+        self._cycles = int(2e9 * seconds)  # clocks are below 2 GHz
 
     def __enter__(self) -> Behind:
         torch.cuda.synchronize()
@@ -223,7 +223,7 @@ class Behind:
 
 
 def gpu_times(work: Callable[[], object], repeats: int) -> list[float]:
-    """Milliseconds of the GPU for what ``work`` queues, without waiting in between."""
+    """Milliseconds of GPU time for the work that ``work`` queues, without gaps."""
     times: list[float] = []
     behind = Behind()
     for _ in range(repeats + 6):
@@ -241,7 +241,7 @@ def gpu_times(work: Callable[[], object], repeats: int) -> list[float]:
 
 
 def step_times(step: Step, repeats: int) -> dict[str, float]:
-    """Milliseconds {"host", "gpu", "wall"}, medians; the rest is a mean."""
+    """Milliseconds {"host", "gpu", "wall"}: medians of the first two, a mean of the last."""
     gpu = statistics.median(gpu_times(step.queue, repeats))
     host = []
     torch.cuda.synchronize()

@@ -1,4 +1,4 @@
-"""The findings of `gpu.py` as a page of Markdown. Nothing here needs more than Python."""
+"""The findings of `gpu.py` as a page of Markdown. This module only needs Python."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from gpu_floor import Frame, works
 from gpu_jobs import Finding, Outcome
 
-#: Native functions in words; one that is not here appears under its own name.
+#: Names of native functions for readers; functions without one appear under their own name.
 NAMES = {
     "project_cull": "project: cull",
     "project_fwd": "project: forward",
@@ -25,15 +25,15 @@ NAMES = {
 }
 REST, TOTAL = "rest (PyTorch)", "whole step"
 PSNR_GOAL, MEMORY_GOAL, PEER_GOAL = 0.1, 1e9, 2.0
-#: Told again and again; the last one of a job counts.
+#: Kinds of findings that are repeated; only the last one of a job counts.
 _COUNTS = ("tests", "sanitizer")
-#: Of failures and errors on the page; gpu.json has all.
+#: Lines of failures and errors on the page; gpu.json has all.
 _MOST_LINES = 12
 _MOST_CHARACTERS = 11_000
 
 
 class Findings:
-    """What the children told, job by job."""
+    """The findings of all children, by job."""
 
     def __init__(self) -> None:
         self._all: list[tuple[str, Finding]] = []
@@ -50,14 +50,14 @@ class Findings:
         return {job: found for job, found in self._all if found["kind"] == kind}
 
     def one(self, kind: str, **where: object) -> Finding | None:
-        """The last one of these values."""
+        """The last finding of a kind with these values."""
         for found in reversed(self.of(kind)):
             if all(found.get(name) == value for name, value in where.items()):
                 return found
         return None
 
     def sizes(self, kind: str) -> list[str]:
-        """In the order of the Gaussians."""
+        """Sizes, sorted by the number of Gaussians."""
         frames = {found["size"]: found["gaussians"] for found in self.of("frame")}
         sizes = {found["size"] for found in self.of(kind)}
         return sorted(sizes, key=lambda size: (frames.get(size, 0), size))
@@ -66,13 +66,13 @@ class Findings:
         return [{"job": job, **found} for job, found in self._all]
 
     def wrong(self) -> int:
-        """Failures of tests and errors of the sanitizer."""
+        """Number of failed tests and sanitizer errors."""
         errors = (found["errors"] for found in self.last_by_job("sanitizer").values())
         return len(self.of("failure")) + sum(errors)
 
 
 def page(findings: Findings, outcomes: Sequence[Outcome], when: str, running: bool) -> str:
-    """The whole page; it fits into the last 12,000 characters of an output."""
+    """The page; its length is limited to 12,000 characters."""
     card = findings.one("device") or findings.one("gpu") or {}
     name = str(card.get("name", "a GPU without a name"))
     sections = [
@@ -204,7 +204,7 @@ def _stages(findings: Findings, name: str, in_order: bool) -> str:
     names = [n for n in order if any(n in column for column in columns.values())]
     names += sorted({n for c in columns.values() for n in c} - {*names, REST, TOTAL})
     names += [REST, TOTAL]
-    if in_order:  # only what differs
+    if in_order:  # only the functions that differ
         names = [n for n in names if n in ("tiles_fill", "blend_bwd", "splats_reduce", TOTAL)]
     rows = []
     for n in names:
@@ -235,7 +235,7 @@ def _frame_line(findings: Findings, size: str) -> str:
 def _floors(
     frame: Finding | None, in_order: bool, bandwidth: Finding | None, rate: Finding | None
 ) -> dict[str, float]:
-    """Milliseconds by native function; of bytes alone where no rate was measured."""
+    """Milliseconds by native function; from bytes alone if no rate was measured."""
     if frame is None or bandwidth is None:
         return {}
     counts = {key: frame[key] for key in ("gaussians", "seen", "instances", "pairs")}
@@ -295,7 +295,7 @@ def _steps(findings: Findings, name: str) -> str:
 
 
 def _memory_each(findings: Findings) -> float | None:
-    """Bytes a Gaussian: the difference of two scenes in images of the same size."""
+    """Bytes per Gaussian: the difference between two scenes at the same image size."""
     found = []
     for size in ("1m", "3m"):
         memory, frame = findings.one("memory", size=size), findings.one("frame", size=size)
@@ -337,7 +337,7 @@ def _jobs(outcomes: Sequence[Outcome]) -> str:
 
 
 def _some(lines: list[str]) -> list[str]:
-    """Not too many of them, as a list below a paragraph."""
+    """The first of the lines, as a list below a paragraph."""
     if not lines:
         return []
     more = len(lines) - _MOST_LINES

@@ -1,7 +1,7 @@
-"""One training iteration under the stopwatch, launch by launch.
+"""Times one training iteration, launch by launch.
 
-The steps are those of `Trainer.step_once`, on a workload that stays as it is: learning rates are 0,
-so every repeat does the same work on the same numbers.
+The steps are those of `Trainer.step_once`. Learning rates are 0, so the workload does not change
+and all repetitions do the same work.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from snowsplat.ops.adam import PARAMETERS
 from snowsplat.ops.scratch import take_rows
 from snowsplat.util.process import single_threaded
 
-#: Native functions by the stage that they are. One that is not here appears under its own name.
+#: Native functions by stage. Functions without one appear under their own name.
 STAGES = {
     "project_cull": "project: cull",
     "project_fwd": "project: forward",
@@ -38,10 +38,10 @@ STAGES = {
     "accumulate_screen_statistics": "density statistics",
     "adam_step": "adam step",
 }
-#: Everything between the stages: Python, autograd, memory.
+#: Everything outside of the stages: Python, autograd, memory.
 REST = "rest (Python)"
 TOTAL = "total"
-#: These answer a question about sizes at once: part of the rest.
+#: Queries of sizes, which return at once: counted with the rest.
 QUERIES = (
     "blend_sums_in_order",
     "splat_record_bytes",
@@ -52,7 +52,7 @@ QUERIES = (
 
 
 class Stopwatch:
-    """Wall and processor seconds by stage; those of all threads of the process together."""
+    """Wall and processor seconds by stage; processor time of all threads of the process."""
 
     def __init__(self) -> None:
         self.wall: dict[str, float] = {}
@@ -68,7 +68,7 @@ class Stopwatch:
 
     @contextmanager
     def on_launches(self) -> Iterator[None]:
-        """Time each `launch` of the op modules, which hold the name that is replaced here."""
+        """Time each `launch`: replaces that name in all op modules."""
 
         def timed(name: str, n: int, *args: Any, **options: Any) -> int:
             if name in QUERIES:
@@ -102,7 +102,7 @@ class Iteration:
         self.ops = reference if twin else ops
         self.parameters = workload.gaussians.parameters()
         count = len(workload.gaussians)
-        # Rows taken from zeros: in the memory in which density control leaves them in a training.
+        # Parameters are rows of larger tensors, as density control leaves them in a training.
         rows = torch.arange(count)
         self.exp_avg, self.exp_avg_sq = (
             {name: take_rows(torch.zeros_like(p), rows) for name, p in self.parameters.items()}
@@ -119,7 +119,7 @@ class Iteration:
 
     @torch.no_grad()
     def _photo(self) -> Tensor:
-        """(H, W, 3) uint8: what the camera sees, with noise, so that every pixel has a gradient."""
+        """(H, W, 3) uint8: the camera's image with noise, so that every pixel has a gradient."""
         splats = self._project(ops)
         height, width = self.workload.camera.height, self.workload.camera.width
         image, _, _ = ops.rasterize(splats, width, height, self.background)
@@ -139,7 +139,7 @@ class Iteration:
         watch: Stopwatch,
         look: Callable[[ops.Splats2D, Tensor], None] | None = None,
     ) -> None:
-        """One iteration. ``look`` is given the splats and the image, before the backward pass."""
+        """One iteration. ``look`` is called with the splats and the image before the backward."""
         step, camera, module = 1000, self.workload.camera, self.ops
         splats = self._project(module)
         with torch.enable_grad():
@@ -168,7 +168,7 @@ class Iteration:
 
     def measure(self, repeats: int, threads: int) -> dict[str, dict[str, list[float]]]:
         """{"wall": {stage: [seconds of each repeat]}, "cpu": the same}; cpu over all threads."""
-        # Modules that hold `launch` must be there before it is replaced.
+        # All modules that import `launch` must be loaded before it is replaced.
         importlib.import_module("snowsplat.ops")
         ops.set_num_threads(threads)
         laps = [self._lap(threads) for _ in range(repeats)]

@@ -1,12 +1,12 @@
-"""What a frame consists of, counted exactly and apart from the kernels.
+"""Counts the elements of a frame exactly, independent of the kernels.
 
 - splat: a Gaussian that the camera sees;
-- instance: a (tile, splat) that the tiles' lists hold;
-- pair: a (pixel, splat) that is blended, α ≥ 1/255 and before the pixel is finished. It is the unit
-  of work that no method gets around;
-- step: a vector of W neighbouring pixels that the kernels work on for one splat. Its lanes that are
-  no pair (outside of the ellipse, the image, finished) are idle: pairs / (W · steps) is the lane
-  use.
+- instance: a (tile, splat) in the lists of the tiles;
+- pair: a (pixel, splat) that is blended: α ≥ 1/255, and the pixel is not finished. It is the unit
+  of work that every method must do;
+- step: a vector of W neighbouring pixels that the kernels process for one splat. Lanes without a
+  pair (outside of the ellipse or the image, or finished) are idle: the lane use is
+  pairs / (W · steps).
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from snowsplat.ops import Splats2D
 
 TILE = 16
 ALPHA_MIN, ALPHA_MAX, LEAST_LIGHT = 1 / 255, 0.99, 1e-4
-#: Pixels that share a vector, in float32.
+#: Pixels per vector, in float32.
 LANES = {"avx512": 16, "avx2": 8, "baseline": 4}
 
 
 def frame_of(image: Tensor) -> Any:
-    """The lists that blending used, kept for the backward pass of ``image``."""
+    """The lists that blending used, which are stored for the backward pass of ``image``."""
     nodes = [image.grad_fn]
     while nodes:
         node = nodes.pop()
@@ -39,11 +39,11 @@ def frame_of(image: Tensor) -> Any:
 
 
 def count_steps(frame: Any) -> dict[str, int]:
-    """Instances, how many of them blending visited, and its vector steps (in one direction)."""
+    """Number of instances, of those visited by blending, and of its vector steps (one pass)."""
     start, end = _numbers(frame.tile_start), _numbers(frame.tile_end)
     bits_each = 8 * frame.instance_blocks.numel() // max(1, frame.instances)
     bits = np.unpackbits(frame.instance_blocks.numpy()).reshape(-1, bits_each).sum(axis=1)
-    before = np.concatenate([[0], np.cumsum(bits)])  # what lies beyond a tile's end is undefined
+    before = np.concatenate([[0], np.cumsum(bits)])  # bits beyond a tile's end are undefined
     return {
         "instances": int(frame.instances),
         "visited": int((end - start[:-1]).sum()),
@@ -52,7 +52,7 @@ def count_steps(frame: Any) -> dict[str, int]:
 
 
 def count_pairs(splats: Splats2D, frame: Any, width: int, height: int) -> int:
-    """Blended (pixel, splat) pairs, by the definition, tile by tile from the frame's lists."""
+    """Number of blended (pixel, splat) pairs, by the definition, from the frame's tile lists."""
     start, end = _numbers(frame.tile_start), _numbers(frame.tile_end)
     splat_of = frame.instance_splat.long()
     rows = splats.packed.detach()[:, :6]
@@ -68,7 +68,7 @@ def count_pairs(splats: Splats2D, frame: Any, width: int, height: int) -> int:
 
 
 def _pairs_of_tile(rows: Tensor, x: Tensor, y: Tensor, chunk: int = 64) -> int:
-    """Front to back; rows (M, 6) are x, y, a, b, c, opacity of the tile's splats in order."""
+    """Pairs of a tile, front to back; rows (M, 6) are x, y, a, b, c, opacity of its splats."""
     light = torch.ones(len(y), len(x))
     unfinished = torch.ones(len(y), len(x), dtype=torch.bool)
     pairs = 0
@@ -79,7 +79,7 @@ def _pairs_of_tile(rows: Tensor, x: Tensor, y: Tensor, chunk: int = 64) -> int:
         seen = alpha >= ALPHA_MIN
         through = torch.where(seen, 1 - alpha.clamp(max=ALPHA_MAX), 1.0)
         after = torch.cumprod(through, dim=0) * light
-        # The light only falls: from the first splat on that leaves too little, none is blended.
+        # Transmittance only decreases: once it is too small, no further splat is blended.
         blended = (after >= LEAST_LIGHT) & unfinished
         pairs += int((seen & blended).sum())
         light, unfinished = after[-1], blended[-1]

@@ -1,4 +1,4 @@
-"""A line chart as SVG, by hand: it needs no library, and any browser shows it."""
+"""A line chart as SVG, without a plotting library."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEFT, RIGHT, TOP, BOTTOM = 60, 700, 40, 390
 def line_chart(
     curves: Mapping[str, Sequence[tuple[float, float]]], title: str, x_label: str, y_label: str
 ) -> str:
-    """SVG text of named curves of (x, y), x > 0 on a logarithmic axis. At least one point."""
+    """SVG of named curves of (x, y); x > 0 on a logarithmic axis. Needs at least one point."""
     points = [point for curve in curves.values() for point in curve]
     x_low, x_high = _decades([x for x, _ in points])
     step = _tick_step(min(y for _, y in points), max(y for _, y in points))
@@ -64,14 +64,14 @@ def line_chart(
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:
-    """Ends of a logarithmic axis, at 1, 2 or 5 times a power of ten."""
+    """Limits of a logarithmic axis: 1, 2 or 5 times a power of ten."""
     stops = [math.log10(m * 10.0**e) for e in range(-6, 10) for m in (1, 2, 5)]
     low, high = math.log10(min(values)), math.log10(max(values))
     return max(s for s in stops if s <= low), min(s for s in stops if s > high)
 
 
 def _tick_step(low: float, high: float) -> float:
-    """1, 2 or 5 times a power of ten, some six in the range."""
+    """1, 2 or 5 times a power of ten, for about six steps in the range."""
     rough = max(high - low, 1e-3) / 6
     scale = 10.0 ** math.floor(math.log10(rough))
     return next(m * scale for m in (1, 2, 5, 10) if m * scale >= rough)

@@ -1,12 +1,12 @@
-"""Where the time of a training iteration goes, stage by stage.
+"""Times the stages of a training iteration.
 
     python benchmarks/stages.py                                 50k, the best instruction set
     python benchmarks/stages.py --size 50k 200k 1m small --isa all --threads 1 2
-    python benchmarks/stages.py --twin                          beside plain PyTorch
-    python benchmarks/stages.py --versus avx2                   two instruction sets, in turns
-    python benchmarks/stages.py --versus ../before/src          two builds, in turns
+    python benchmarks/stages.py --twin                          compared with plain PyTorch
+    python benchmarks/stages.py --versus avx2                   two instruction sets, alternating
+    python benchmarks/stages.py --versus ../before/src          two builds, alternating
 
-What the columns mean, and how to read them on a busy machine: benchmarks/README.md.
+benchmarks/README.md explains the columns, and how to read them on a busy machine.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BLEND = ("blend forward", "blend backward")
 
 
 class Worker:
-    """A process with one library: an instruction set, and optionally another source tree."""
+    """A process with one library: an instruction set, optionally of another source tree."""
 
     def __init__(self, isa: str, source: Path | None = None) -> None:
         environment = os.environ | {"SNOWSPLAT_ISA": isa}
@@ -58,7 +58,7 @@ class Worker:
         twin: bool = False,
         count: bool = False,
     ) -> Measured:
-        """See worker.py. Raises UserError where it cannot."""
+        """Send a request; see worker.py. Raises UserError if it fails."""
         request = {
             "size": size,
             "threads": threads,
@@ -116,7 +116,7 @@ def main() -> None:
 
 def _absolute(flags: argparse.Namespace, size: str, isas: list[str], ghz: float) -> list[Measured]:
     results: list[Measured] = []
-    pairs = 0  # the same with every library
+    pairs = 0  # equal for all libraries
     for isa in isas:
         columns: list[Measured] = []
         with Worker(isa) as worker:
@@ -175,7 +175,7 @@ def _print_counts(size: str, found: Measured) -> None:
 
 
 def _paired(flags: argparse.Namespace, size: str, isa: str) -> list[Measured]:
-    """A and B in turns: what the machine does to one, it does to the other a moment later."""
+    """Measure A and B alternately, so that the load of the machine affects both equally."""
     clock = "cpu" if flags.cpu_time else "wall"
     if flags.versus in native.ISAS:
         other, source, label = flags.versus, None, flags.versus
@@ -218,7 +218,7 @@ def _beside_twin(flags: argparse.Namespace, isa: str) -> list[Measured]:
     with Worker(isa) as worker:
         for threads in flags.threads:
             own = worker.ask(flags.twin, threads, flags.repeats)
-            # It takes seconds an iteration, so a few must do.
+            # An iteration takes seconds, so only a few are made.
             twin = worker.ask(flags.twin, threads, min(3, flags.repeats), twin=True)
             (theirs, _, their_cpu), (ours, _, our_cpu) = (_least(f, TOTAL) for f in (twin, own))
             cells = f"{1e3 * theirs:>9.0f}{1e3 * ours:>9.2f}{theirs / ours:>7.0f}x"
@@ -239,13 +239,13 @@ def _beside_twin(flags: argparse.Namespace, isa: str) -> list[Measured]:
 
 
 def _least(found: Measured, name: str) -> list[float]:
-    """Seconds: least and median wall time, least processor time of one of the threads."""
+    """Seconds: least and median wall time, least processor time, over the numbers of threads."""
     wall, cpu = found["wall"].get(name, [0.0]), found["cpu"].get(name, [0.0])
     return [min(wall), statistics.median(wall), min(cpu) / found["threads"]]
 
 
 def _blend_core_seconds(found: Measured) -> list[float]:
-    """As `_least`, of blending in both directions, times the cores that it occupies."""
+    """As `_least`, for blending in both directions, times the number of cores in use."""
     wall, cpu = (
         [sum(times) for times in zip(*(found[clock][name] for name in BLEND), strict=True)]
         for clock in ("wall", "cpu")

@@ -4,8 +4,8 @@
     python benchmarks/train.py CAPTURE -o OUT --recipe default paper --iterations 7000
     python benchmarks/train.py CAPTURE -o OUT --set max_gaussians=50000 sh_interval=100
 
-Writes OUT/CAPTURE.csv, .json and .svg. The clock stands still while the held-out views are
-measured; it runs while the first Gaussians are made.
+Writes OUT/CAPTURE.csv, .json and .svg. The clock is stopped while held-out views are evaluated. It
+includes the initialisation of the Gaussians.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Milestone:
     """A row of the table.
 
     Attributes:
-        seconds: wall time of training alone so far.
-        cpu_seconds: processor time of it, all threads together (with those that decode photos).
-        peak_mb: the most memory of the process so far, Python and PyTorch included.
+        seconds: wall time of the training so far.
+        cpu_seconds: processor time of the training, all threads (also those that decode photos).
+        peak_mb: peak memory of the process so far, with Python and PyTorch.
     """
 
     recipe: str
@@ -48,7 +48,7 @@ class Milestone:
 
 
 def milestones(iterations: int, count: int) -> list[int]:
-    """Steps at which to measure, ever farther apart: half of the last one is two rows before."""
+    """Steps at which to evaluate, at growing distances: every second one doubles the step."""
     steps = {max(1, round(iterations * 2.0 ** (-i / 2))) for i in range(count)}
     return sorted(steps)
 

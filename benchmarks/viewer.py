@@ -1,11 +1,11 @@
-"""What the network viewer takes: a picture, the answer to a camera that moves, and of a training.
+"""Times of the live viewer: rendering, response to a moving camera, and its cost for a training.
 
     python benchmarks/viewer.py                      200k Gaussians at 960×540
-    python benchmarks/viewer.py --capture DIR        a training too: alone, watched, with a camera
-                                                     that moves all the time
+    python benchmarks/viewer.py --capture DIR        also a training: alone, watched, and watched
+                                                     with a camera that always moves
 
-The browser is a client of ours that takes the pictures and draws nothing, so that a real one (which
-may be on another machine) costs nothing here.
+The browser is replaced by a client that receives the images but does not draw them, since a real
+browser may run on another machine.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ MODES = ("color", "depth", "alpha", "normals", "points", "ellipsoids", "cost")
 
 
 class Client:
-    """What a browser is to the server, without a screen."""
+    """The protocol of a browser, without a display."""
 
     def __init__(self, viewer: NetworkViewer, width: int, height: int) -> None:
         address = viewer.url.replace("http", "ws")
@@ -52,7 +52,7 @@ class Client:
         self.pictures = 0
 
     def move(self, cam_from_world: torch.Tensor, fov: float, shift: float) -> None:
-        """Look from there, ``shift`` to the right."""
+        """Set the camera, shifted by ``shift`` to the right."""
         width, height = self._size
         rotation = cam_from_world[:, :3]
         position = -rotation.T @ cam_from_world[:, 3] + shift * rotation[0]
@@ -64,7 +64,7 @@ class Client:
         self._socket.send(msgspec.msgpack.encode(message.as_serializable_dict([])))
 
     def wait(self, timeout: float | None = None) -> bool:
-        """For a picture; False if none came in time."""
+        """Wait for an image; False if none arrived in time."""
         end = None if timeout is None else time.monotonic() + timeout
         while True:
             left = None if end is None else max(0.0, end - time.monotonic())
@@ -89,7 +89,7 @@ def milliseconds(times: list[float]) -> str:
 
 
 def pictures(name: str, repeats: int) -> None:
-    """Every mode, without a server."""
+    """Render every mode, without a server."""
     scene = workload(name)
     print(
         f"{len(scene.gaussians):,} Gaussians of {scene.source}, ops on "
@@ -105,7 +105,7 @@ def pictures(name: str, repeats: int) -> None:
 
 
 def answers(name: str, repeats: int) -> None:
-    """From a camera that moves to its picture at the client."""
+    """Time from a camera message to the image at the client."""
     scene = workload(name)
     camera = scene.camera
     nowhere = ImageSource(Path("nowhere.jpg"), camera.width, camera.height)
@@ -126,7 +126,7 @@ def answers(name: str, repeats: int) -> None:
             first = time.perf_counter() - started
             sizes.append(client.newest.width)
             client.wait()
-            if i >= 5:  # until then it learns what is quick
+            if i >= 5:  # before that, the viewer adapts the image size
                 times["answer"].append(first)
                 times["full"].append(time.perf_counter() - started)
         client.close()
@@ -145,9 +145,9 @@ def answers(name: str, repeats: int) -> None:
 
 
 def training(path: Path, seconds: float, rounds: int) -> None:
-    """Steps a second of one training, in turns: without a viewer, watched by nobody, …"""
+    """Steps per second of one training, alternately without viewer, without browser, …"""
     dataset = load_dataset(path)
-    # Beyond its first steps a training of this length is the same all the time.
+    # After its first steps, the speed of a training of this length is constant.
     config = recipe("default", iterations=1_000_000, coarse_to_fine=(1, 2), densify_until=900)
     trainer = Trainer(dataset, config)
     trainer.run(until=1000)

@@ -1,6 +1,6 @@
-"""The process that `stages.py` measures in: one library, chosen at load, stays for its lifetime.
+"""The process in which `stages.py` measures: a library stays loaded for the process's lifetime.
 
-A request is a line of JSON on the standard input, the answer one on the standard output:
+A request is a line of JSON on standard input, the response is a line on standard output:
 {"size", "threads", "repeats", "visible_only", "twin", "count"} →
 {"size", "threads", "isa", "source", "gaussians", "wall", "cpu", "counts"}, or {"error"}.
 Between requests it sleeps.
@@ -23,7 +23,7 @@ from snowsplat.util.process import single_threaded
 
 
 def counts(iteration: Iteration, with_pairs: bool) -> dict[str, int]:
-    """Splats, instances, visited ones and steps; pairs on request, for they take seconds."""
+    """Numbers of splats, instances, visited ones and steps; pairs on request: they take seconds."""
     found: dict[str, int] = {}
     camera = iteration.workload.camera
 
@@ -45,14 +45,14 @@ def main() -> None:
         try:
             wanted = (request["size"], request["visible_only"], request["twin"])
             if iteration is None or key != wanted:
-                iteration = None  # the old one's memory goes first
+                iteration = None  # release its memory first
                 scene = workload(request["size"])
                 key = wanted
                 iteration = Iteration(
                     scene, visible_only=request["visible_only"], twin=request["twin"]
                 )
                 if not request["twin"]:
-                    iteration.measure(2, request["threads"])  # buffers, caches
+                    iteration.measure(2, request["threads"])  # warm-up: buffers, caches
             answer: dict[str, Any] = {
                 "isa": native.isa(),
                 "size": request["size"],

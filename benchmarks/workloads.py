@@ -1,10 +1,10 @@
-"""Scenes to measure with: what a trained scene is like, without having to train one.
+"""Workloads for measurements: scenes similar to trained ones, without a training.
 
 The points are those of a real garden (`../shared/captures/garden_points.npz` beside the checkout,
-or the file that SNOWSPLAT_GARDEN names). Each Gaussian is a flat leaf along the surface that its
-neighbours lie on; sizes, opacities and colours spread as in trained scenes. Without the file, a
-procedural courtyard of similar statistics takes its place, and `Workload.source` says so: figures
-of the two are not to be compared.
+or the file named by SNOWSPLAT_GARDEN). Each Gaussian is a flat disc on the surface of its
+neighbours. Sizes, opacities and colours are distributed as in trained scenes. Without the file, a
+procedural courtyard with similar statistics is used, and `Workload.source` says so: results of the
+two must not be compared.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from snowsplat.scene.geometry import look_at, morton_order, quat_from_rotation
 
 GARDEN = Path(__file__).resolve().parents[2] / "shared" / "captures" / "garden_points.npz"
 
-#: name -> Gaussians, width, height. "small" is an image with more Gaussians than pixels to fill:
-#: most of a SIMD register is idle there, as in the first steps of a coarse-to-fine training.
+#: name -> Gaussians, width, height. "small" has more Gaussians than pixels: most SIMD lanes are
+#: idle, as in the first steps of a coarse-to-fine training.
 SIZES = {
     "tiny": (2_000, 96, 54),
     "10k": (10_000, 240, 135),
@@ -41,17 +41,17 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Workload:
-    """Gaussians in Morton order, as the trainer keeps them, and a camera that sees them."""
+    """Gaussians in Morton order, as the trainer stores them, and a camera that sees them."""
 
     name: str
-    source: str  # where the points are from
+    source: str  # of the points
     gaussians: Gaussians
     camera: Camera
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Coloured points and a view of them, whose focal lengths are in units of the image width."""
+    """Coloured points and a view of them; focal lengths in units of the image width."""
 
     source: str
     xyz: Tensor  # (P, 3) float32
@@ -61,7 +61,7 @@ class Cloud:
 
 
 def workload(name: str, seed: int = 0) -> Workload:
-    """The workload of one of `SIZES`; the same every time, on every machine."""
+    """The workload of one of `SIZES`; deterministic on every machine."""
     count, width, height = SIZES[name]
     cloud = _cloud()
     gaussians = _leaves(count, np.random.default_rng(seed))
@@ -73,8 +73,9 @@ def workload(name: str, seed: int = 0) -> Workload:
 def _leaves(count: int, random: np.random.Generator) -> Gaussians:
     """``count`` Gaussians of SH degree 3 along the surface of the cloud.
 
-    More Gaussians than points: points serve several times, strewn over their neighbourhood. The
-    sizes shrink with the root of the count, so that all of them cover the surface equally often.
+    If there are more Gaussians than points, points are used several times, with random offsets in
+    their neighbourhood. Sizes are proportional to the inverse root of the count, so the surface is
+    covered equally.
     """
     cloud, (axes, spacing) = _cloud(), _surface()
     points = len(cloud.xyz)
@@ -92,7 +93,7 @@ def _leaves(count: int, random: np.random.Generator) -> Gaussians:
     flat = torch.stack([0.15 * (0.5 * normal()).exp(), 0.6 * (0.4 * normal()).exp()], dim=1)
     shape = torch.cat([flat, torch.ones(count, 1)], dim=1)
     size = spacing * math.sqrt(points / count) * (0.55 * normal()).exp()
-    # A third nearly opaque, the others faint.
+    # A third is nearly opaque, the others are transparent.
     opaque = torch.from_numpy(random.random(count) < 0.35)
     logits = 1.5 * normal() + torch.where(opaque, 2.5, -1.2)
     return Gaussians(
@@ -107,9 +108,9 @@ def _leaves(count: int, random: np.random.Generator) -> Gaussians:
 
 @functools.cache
 def _surface() -> tuple[Tensor, Tensor]:
-    """Of each point of the cloud, the axes of its surface (P, 3, 3) and the spacing (P,)."""
+    """For each point of the cloud, the axes of its surface (P, 3, 3) and the spacing (P,)."""
     xyz = _cloud().xyz
-    # Root mean square distance to 3 neighbours; stray points get no giants.
+    # Root mean square distance to 3 neighbours, limited for outliers.
     spacing = ops.neighbours(xyz, k=3).square().mean(dim=1).sqrt()
     return _surface_axes(xyz), spacing.clamp(1e-4, float(spacing.quantile(0.98)))
 
@@ -117,8 +118,8 @@ def _surface() -> tuple[Tensor, Tensor]:
 def _surface_axes(xyz: Tensor, k: int = 8, window: int = 16) -> Tensor:
     """(P, 3, 3) rotations whose columns are the principal axes of near points, normal first.
 
-    The k nearest of the 2 · ``window`` neighbours along a Morton curve: nearly the nearest of all,
-    and the surface is the same.
+    Uses the k nearest of the 2 · ``window`` neighbours along a Morton curve: these are nearly the
+    nearest of all, which is enough for the surface.
     """
     order = morton_order(xyz)
     along = xyz[order]
@@ -126,7 +127,7 @@ def _surface_axes(xyz: Tensor, k: int = 8, window: int = 16) -> Tensor:
     axes = torch.empty(len(xyz), 3, 3)
     for start in range(0, len(xyz), 16384):
         rows = torch.arange(start, min(start + 16384, len(xyz)))
-        # At the ends of the curve, the same as many points from one side.
+        # At the ends of the curve, the same number of neighbours is taken from one side.
         middle = rows.clamp(window, max(window, len(xyz) - window - 1))
         near = along[(middle[:, None] + steps).clamp(0, len(xyz) - 1)]
         distance = (near - along[rows, None]).square().sum(dim=2)
@@ -156,7 +157,7 @@ def _cloud() -> Cloud:
 
 
 def courtyard(points: int = 138_766, seed: int = 0) -> Cloud:
-    """A round table on rough ground, in front of hedges: a stand-in for the garden."""
+    """A round table on rough ground in front of hedges: replaces the garden."""
     random = np.random.default_rng(seed)
     ground, table, vase, hedge = np.split(
         np.arange(points), np.cumsum([int(points * share) for share in (0.45, 0.47, 0.04)])

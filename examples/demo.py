@@ -1,10 +1,10 @@
-"""The whole way, from photos to a scene, on photos that it takes itself: `make demo`.
+"""The complete pipeline, from photos to a scene, on rendered photos: `make demo`.
 
     python examples/demo.py [FOLDER]
 
-Takes photos of a still life that exists in numbers only (ray traced, with lens distortion and
-noise), then runs what a user types, `snowsplat make`, which gets the photos and nothing else. Since
-it is known where they were taken from, it then tells how near the found places are.
+Renders photos of a procedural still life (ray traced, with lens distortion and noise). Then runs
+`snowsplat make` on the photos alone. At the end, the estimated poses are compared with the true
+ones.
 """
 
 import subprocess
@@ -16,12 +16,13 @@ from snowsplat.data.colmap import posed_camera, read_model
 from snowsplat.synthetic import Truth, write_synthetic_photos
 from snowsplat.synthetic.compare_poses import compare_poses
 
-_MINUTES = 2.2  # for all that `snowsplat make` does
-_DEGREES, _SHARE = 0.1, 0.002  # what is demanded of each photo
+_MINUTES = 2.2  # for `snowsplat make`
+_DEGREES = 0.1  # largest accepted rotation error of a photo
+_SHARE = 0.002  # largest accepted position error of a photo, relative to the extent of the cameras
 
 
 def take_photos(folder: Path) -> Truth:
-    """Photos in ``folder``/photos; those that are there are kept. Their poses are kept aside."""
+    """Render photos to ``folder``/photos, keeping existing ones; write the poses elsewhere."""
 
     def report(done: int, total: int, what: str = "") -> None:
         if sys.stdout.isatty() and done < total:
@@ -35,24 +36,24 @@ def take_photos(folder: Path) -> Truth:
 
 
 def snowsplat(*arguments: str | Path) -> None:
-    """Show a command, then run it; where it fails the demo ends."""
+    """Print a command, then run it; raises CalledProcessError if it fails."""
     shown = " ".join(str(argument) for argument in arguments)
     print(f"\n$ snowsplat {shown}", flush=True)
     subprocess.run([sys.executable, "-m", "snowsplat", *map(str, arguments)], check=True)
 
 
 def compare(dataset: Path, truth: Truth) -> bool:
-    """Print how near the poses of a dataset are to the true ones; whether that is near enough."""
+    """Print the errors of a dataset's poses; returns whether they are small enough."""
     model = read_model(dataset / "sparse" / "0")
     found = {image.name: posed_camera(model, image).cam_from_world for image in model.images}
     errors = compare_poses(found, truth.poses)
     degrees, shares = errors.rotations, errors.centres
     print(
         f"""
-The poses that were found, against the true ones ({len(errors.names)} of {len(truth.poses)} photos)
-                        median     worst      demanded
-  orientation           {degrees.median():.3f}°     {degrees.max():.3f}°     {_DEGREES}°
-  place, of the extent  {shares.median():.3%}     {shares.max():.3%}     {_SHARE:.1%}"""
+Estimated poses compared with the true ones ({len(errors.names)} of {len(truth.poses)} photos)
+                            median     worst      limit
+  rotation                  {degrees.median():.3f}°     {degrees.max():.3f}°     {_DEGREES}°
+  position, of the extent   {shares.median():.3%}     {shares.max():.3%}     {_SHARE:.1%}"""
     )
     near = float(degrees.max()) <= _DEGREES and float(shares.max()) <= _SHARE
     return near and not errors.missing
@@ -67,14 +68,14 @@ def main(folder: Path) -> int:
     near = compare(made / "capture", truth)
     print(
         f"""
-The photos:      {folder / "photos"}
-The true poses:  {folder / "truth"}
-This took:       {time.monotonic() - started:.0f} s
+Photos:      {folder / "photos"}
+True poses:  {folder / "truth"}
+Time:        {time.monotonic() - started:.0f} s
 
-With photos or a video of your own: snowsplat make YOUR_FOLDER -o out/yours"""
+To use your own photos or video: snowsplat make YOUR_FOLDER -o out/yours"""
     )
     if not near:
-        print("The poses are farther off than they may be.", file=sys.stderr)
+        print("demo: the errors of the poses are too large", file=sys.stderr)
     return 0 if near else 1
 
 
@@ -82,4 +83,4 @@ if __name__ == "__main__":
     try:
         sys.exit(main(Path(sys.argv[1] if len(sys.argv) > 1 else "out/demo")))
     except subprocess.CalledProcessError as error:
-        sys.exit(error.returncode)  # the command has said why
+        sys.exit(error.returncode)  # the command has printed the error

@@ -1,4 +1,4 @@
-"""The benchmarks run, on workloads small enough for a test, and count what they say they count."""
+"""The benchmarks run on small workloads, and their counts are correct."""
 
 import argparse
 import json
@@ -20,7 +20,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 BENCHMARKS = ROOT / "benchmarks"
-#: Seconds that no other process sleeps, so that it is known whose they are.
+#: A sleep duration that no other process uses, which identifies the children of these tests.
 LONG = 70 + os.getpid() * 1e-7
 
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 
 def benchmark(script: str, *arguments: object) -> str:
-    """What the script prints. Without the garden's points, so that it is the same everywhere."""
+    """The output of a script. Without the garden's points, so that it is the same everywhere."""
     environment = os.environ | {"SNOWSPLAT_GARDEN": "none", "PYTHONPATH": str(ROOT / "src")}
     run = subprocess.run(
         [sys.executable, str(BENCHMARKS / script), *map(str, arguments)],
@@ -81,18 +81,18 @@ def test_stages_of_an_iteration(tmp_path):
     assert row(text, "  floor, ns")[0] == pytest.approx(one_thread["floor_ns"], abs=0.01)
 
 
-def test_two_libraries_in_turns():
+def test_two_libraries_are_measured_alternately():
     text = benchmark(
         *("stages.py", "--size", "tiny", "--threads", 1, "--repeats", 2),
         *("--isa", "baseline", "--versus", ROOT / "src"),
     )
     total = next(line for line in text.splitlines() if line.startswith("total"))
     median = float(total.split()[1])
-    assert 0.1 < median < 10  # the same library on both sides, on a machine that may be busy
+    assert 0.1 < median < 10  # both are the same library; the machine may be busy
 
 
-def test_pairs_are_those_of_the_twin(monkeypatch):
-    """Counted from the kernels' lists, and from the twin's alphas without any list."""
+def test_pairs_are_those_of_the_reference(monkeypatch):
+    """Counted from the lists of the kernels, and from the alphas of the reference."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     monkeypatch.setenv("SNOWSPLAT_GARDEN", "none")
     import pairs
@@ -116,7 +116,7 @@ def test_pairs_are_those_of_the_twin(monkeypatch):
         pixels = reference._pixel_centres(0, top, camera.width, 6)
         alpha, _, _ = reference._blend_weights(pixels, rows[:, :2], rows[:, 2:5], rows[:, 5])
         expected += int((alpha > 0).sum())
-    # At the very thresholds the last bit decides.
+        # At the thresholds, rounding decides.
     found = pairs.count_pairs(splats, frame, camera.width, camera.height)
     assert found == pytest.approx(expected, rel=1e-4)
     counts = pairs.count_steps(frame)
@@ -144,7 +144,7 @@ def test_psnr_against_time(tmp_path):
     assert [len(line.attrib["points"].split()) for line in lines] == [3, 3]
 
 
-def test_a_wrong_dataset_is_one_line(tmp_path):
+def test_a_wrong_dataset_is_a_one_line_error(tmp_path):
     run = subprocess.run(
         [sys.executable, str(BENCHMARKS / "train.py"), str(tmp_path / "none")],
         env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
@@ -179,7 +179,7 @@ def test_formats(tmp_path):
 
 @pytest.fixture
 def gpu_modules(monkeypatch):
-    """The modules beside gpu.py, to be imported by their names."""
+    """The modules beside gpu.py, which can then be imported by name."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     monkeypatch.setenv("SNOWSPLAT_GARDEN", "none")
 
@@ -207,7 +207,7 @@ def job(name, code, limit=30.0, **more):
     return gpu_jobs.Job(name, [sys.executable, "-c", code], limit, **more)
 
 
-def test_without_a_gpu_one_line_says_so(tmp_path):
+def test_without_a_gpu_it_prints_one_line(tmp_path):
     run = subprocess.run(
         [sys.executable, str(BENCHMARKS / "gpu.py"), "--out", str(tmp_path / "out")],
         env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
@@ -221,7 +221,7 @@ def test_without_a_gpu_one_line_says_so(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_job_that_crashes_or_is_late_stops_no_other(gpu_modules, tmp_path):
+def test_a_job_that_crashes_or_hangs_does_not_affect_others(gpu_modules, tmp_path):
     tell = 'print(\'@@ {"kind": "x", "value": 1}\', flush=True); '
     outcomes, found, log = run_jobs(
         tmp_path,
@@ -245,7 +245,7 @@ def test_a_job_that_crashes_or_is_late_stops_no_other(gpu_modules, tmp_path):
     assert outcomes["error"].reason == "ValueError: what was wrong"
     assert outcomes["late"].reason == "ended after 2 s"
     assert 1.5 <= outcomes["late"].seconds < 10
-    # What they found before is there.
+    # Their earlier findings are not lost.
     assert sorted(name for name, _ in found) == ["crash", "error", "late", "well"]
     assert "===== crash: failed" in log
     assert "last words" in log
@@ -254,7 +254,7 @@ def test_a_job_that_crashes_or_is_late_stops_no_other(gpu_modules, tmp_path):
     assert f"sleep {LONG}" not in running
 
 
-def test_what_is_timed_runs_alone_and_nothing_begins_too_late(gpu_modules, tmp_path):
+def test_timed_jobs_run_alone_and_no_job_starts_too_late(gpu_modules, tmp_path):
     note = (
         "import time, pathlib; p = pathlib.Path(r'{}'); a = time.time(); time.sleep(0.4); "
         "f = p.open('a'); f.write(f'{} {{a}} {{time.time()}}\\n')"
@@ -284,7 +284,7 @@ def test_what_is_timed_runs_alone_and_nothing_begins_too_late(gpu_modules, tmp_p
     assert outcomes["absent"].state == "failed"
 
 
-def test_floors_by_hand(gpu_modules):
+def test_lower_bounds_computed_by_hand(gpu_modules):
     import gpu_floor
 
     frame = gpu_floor.Frame(1000, 600, 5000, 100_000, 320, 160)
@@ -294,9 +294,9 @@ def test_floors_by_hand(gpu_modules):
     assert works["project_cull"].bytes == 1000 * (11 * 4 + 4)
     assert works["project_fwd"].bytes == 1000 * (4 + 64) + 600 * 59 * 4
     assert works["splats_prepare"].bytes == 1000 * 36
-    # 4 passes of 8 bytes in and out, 4 for the histogram, no values read in the first one.
+    # 4 passes of 8 bytes read and written, 4 for the histogram; the first pass reads no values.
     assert works["splats_sort"].bytes == 1000 * 64
-    # Tiles in 8 bits: one pass over keys of 2 bytes, values of 4.
+    # Tiles in 8 bits: one pass over keys of 2 bytes and values of 4.
     fill = 1000 * 20 + 600 * 32 + 5000 * 6
     assert works["tiles_fill"].bytes == fill + 5000 * (2 + 12) + 5000 * 2 + 200 * 4
     assert works["blend_fwd"].bytes == 5000 * 5 + 200 * 8 + 600 * 64 + pixels * 16
@@ -306,7 +306,7 @@ def test_floors_by_hand(gpu_modules):
     assert works["photometric_u8"] == gpu_floor.Work(pixels * 27, pixels * 3 * 154)
     assert works["adam_step"].bytes == 1000 * (59 * 4 * 6 + 4) + 600 * 64
     assert "splats_reduce" not in works
-    # Of bytes: 1.42 MB at 1 TB/s; of operations where these take longer.
+    # From bytes: 1.42 MB at 1 TB/s; from operations if these take longer.
     adam = works["adam_step"]
     assert adam.seconds(1e12, 1e12) == pytest.approx(adam.bytes * 1e-12)
     assert works["blend_fwd"].seconds(1e12, 1e11) == pytest.approx(100_000 * 19e-11)
@@ -326,8 +326,8 @@ def test_floors_by_hand(gpu_modules):
 
 
 @pytest.mark.emulated
-def test_every_op_and_kernel_is_in_the_program_of_the_sanitizer(gpu_modules, monkeypatch):
-    """And a step's stages are those that have floors and names."""
+def test_the_sanitizer_program_runs_every_op_and_kernel(gpu_modules, monkeypatch):
+    """All stages of a step have a lower bound and a name."""
     import gpu_floor
     import gpu_ops
     import gpu_step
@@ -345,13 +345,13 @@ def test_every_op_and_kernel_is_in_the_program_of_the_sanitizer(gpu_modules, mon
     torch.set_num_threads(1)
     monkeypatch.setitem(LAUNCHERS, "cpu", lambda *args: launch_by(execute, *args))
     gpu_ops.every_op(torch.device("cpu"), gpu_ops.SMALL, wide=False, say=lambda line: None)
-    # This one is for more tiles than the emulation does in a moment.
+    # This scene has more tiles than the emulation can process in a short time.
     assert set(KERNELS) - {name.removesuffix("_f64") for name in launched} == {"tiles_start_u32"}
 
     step = gpu_step.Step(gpu_ops.random_scene(60, 40, 30), torch.device("cpu"), capacity=7)
     photo, gaussians = step.photo.planes.clone(), step.trainer.gaussians.clone()
     losses = [step.run(), step.run()]
-    assert losses[0] == losses[1] > 0  # it stays as it is
+    assert losses[0] == losses[1] > 0  # the workload does not change
     assert step.trainer._runner.capacity.instances > 7
     assert torch.equal(photo, step.photo.planes)
     for name, parameter in gaussians.parameters().items():
@@ -375,8 +375,8 @@ def test_every_op_and_kernel_is_in_the_program_of_the_sanitizer(gpu_modules, mon
     torch.set_num_threads(before)
 
 
-def test_tests_are_counted_and_go_on_after_one_that_loses_the_gpu(gpu_modules, tmp_path):
-    """The GPU is lost when a test leaves a file; each process afterwards has it again."""
+def test_tests_continue_in_a_new_process_after_a_lost_gpu(gpu_modules, tmp_path):
+    """The GPU is lost after a test; each new process can use it again."""
     test = tmp_path / "test_them.py"
     test.write_text(
         "import pytest\n"
@@ -420,7 +420,7 @@ def part(name, *arguments, limit=100.0, **environment):
     )
 
 
-def test_what_the_sanitizer_says(gpu_modules, monkeypatch, tmp_path):
+def test_parsing_the_sanitizer_output(gpu_modules, monkeypatch, tmp_path):
     import gpu_parts
 
     log = gpu_parts.SanitizerLog()
@@ -448,7 +448,7 @@ all ops ran
             log.read(line)
         assert (log.errors, log.first, log.finished) == (0, [], False)
 
-    # With a program in the sanitizer's place, which never runs ours to its end.
+    # A program instead of the sanitizer, which does not run ours to its end.
     fake = tmp_path / "compute-sanitizer"
     fake.write_text("#!/bin/sh\nprintf '%s\\n' \"$*\" '========= COMPUTE-SANITIZER' 'ops: first'\n")
     fake.chmod(0o755)
@@ -461,8 +461,8 @@ all ops ran
     assert gpu_parts.find_tool("no such tool") is None
 
 
-def test_training_as_on_a_machine_with_little_installed(gpu_modules, tmp_path):
-    """The child that trains on the CPU, where nothing can be imported that is not there."""
+def test_cpu_training_with_few_packages_installed(gpu_modules, tmp_path):
+    """The child process may only import packages that a machine with a GPU has."""
     with torch.random.fork_rng():
         write_toy_dataset(tmp_path / "lego400", n_views=9, width=48, height=36, n_points=200)
     blocked = tmp_path / "site"
@@ -503,7 +503,7 @@ def test_training_as_on_a_machine_with_little_installed(gpu_modules, tmp_path):
 
 
 def test_the_page_of_a_gpu(gpu_modules):
-    """Figures in, and beside them what follows from them; every heading has the card's name."""
+    """The page has the figures and derived values; every heading has the name of the card."""
     import gpu_table
     from gpu_jobs import Outcome
 
@@ -563,7 +563,7 @@ def test_the_page_of_a_gpu(gpu_modules):
     )
     assert "fox: mean difference +0.250 dB, NOT within 0.1 dB" in text
     assert "Not here, so not trained: lego400" in text
-    # 1m: 1000000 × (59 × 24 + 4) + 500000 × 64 bytes at 2 TB/s are 0.726 ms, of 2.832.
+    # 1m: 1000000 × (59 × 24 + 4) + 500000 × 64 bytes at 2 TB/s take 0.726 of the 2.832 ms.
     assert "| Adam | 2.832 | 0.726 | 26% |" in text
     assert "| new | 1.000 |  |  |" in text
     assert "| rest (PyTorch) | 1.168 |" in text
@@ -577,8 +577,8 @@ def test_the_page_of_a_gpu(gpu_modules):
     assert kinds.count("tests") == 1
 
 
-def test_the_plan_of_a_run(gpu_modules, tmp_path):
-    """Every part is there, what is timed runs alone, and `gpu_parts.py` knows all the flags."""
+def test_the_jobs_of_a_run(gpu_modules, tmp_path):
+    """All parts are included, timed jobs run alone, and `gpu_parts.py` accepts all flags."""
     import gpu
     import gpu_parts
 
@@ -604,7 +604,7 @@ def test_the_plan_of_a_run(gpu_modules, tmp_path):
 
 
 class FakeEvent:
-    """An event of a GPU that is as fast as the CPU."""
+    """A GPU event, implemented by the time of the CPU."""
 
     def __init__(self, enable_timing=False):
         self.time = 0.0
@@ -624,7 +624,7 @@ class FakeEvent:
 
 @pytest.fixture
 def fake_gpu(gpu_modules, monkeypatch):
-    """The emulation, under the names by which the parts know a GPU: that they run, not how fast."""
+    """The emulation instead of a GPU: checks that the parts run, not their speed."""
     import gpu_peer
     import gpu_step
 
@@ -641,7 +641,7 @@ def fake_gpu(gpu_modules, monkeypatch):
     begun = []
 
     def reset():
-        assert begun  # as PyTorch does
+        assert begun  # required by PyTorch
 
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: begun.append(True))
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", reset)
@@ -678,8 +678,8 @@ def page_of(found):
 
 
 @pytest.mark.emulated
-def test_the_parts_that_measure_run(fake_gpu, capsys, tmp_path):
-    """From what they print to the page."""
+def test_the_measuring_parts_run(fake_gpu, capsys, tmp_path):
+    """From their output to the page."""
     import gpu_floor
     import gpu_ops
     import gpu_parts
@@ -691,7 +691,7 @@ def test_the_parts_that_measure_run(fake_gpu, capsys, tmp_path):
     found = found_in(text)
     kinds = [one["kind"] for one in found]
     assert kinds[:2] == ["device", "bandwidth"]
-    assert "rate" not in kinds  # there is no driver
+    assert "rate" not in kinds  # needs a driver
     assert "multiply-adds were not measured" in text
     assert kinds[-6:] == ["frame", "memory", "step", "stages", "step", "stages"]
     stages = [one for one in found if one["kind"] == "stages"]
@@ -709,8 +709,8 @@ def test_the_parts_that_measure_run(fake_gpu, capsys, tmp_path):
 
 
 @pytest.mark.emulated
-def test_beside_a_peer(fake_gpu, capsys, monkeypatch):
-    """One that is our own twin: the same images."""
+def test_comparison_with_a_peer(fake_gpu, capsys, monkeypatch):
+    """The peer is our reference implementation, so the images are equal."""
     import gpu_ops
     import gpu_peer
 
@@ -779,7 +779,7 @@ sys.exit(gpu.main())
 
 
 @pytest.mark.parametrize("long", [0, LONG], ids=["to its end", "killed"])
-def test_a_whole_run_leaves_its_page(tmp_path, long):
+def test_a_complete_run_writes_its_page(tmp_path, long):
     run = subprocess.Popen(
         [sys.executable, "-c", FAKE_RUN.replace("LONG", str(long)), "--out", str(tmp_path)],
         env=os.environ | {"PYTHONPATH": str(BENCHMARKS)},

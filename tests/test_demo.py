@@ -1,4 +1,4 @@
-"""What the demo says of poses is so; the demo itself is run by `make demo`."""
+"""The demo's check of the poses; the demo itself is run by `make demo`."""
 
 import runpy
 from pathlib import Path
@@ -23,7 +23,7 @@ TRUTH = Truth(
 @pytest.mark.parametrize(
     ("moved", "count", "near"), [(0.0, 20, True), (0.02, 20, False), (0.0, 19, False)]
 )
-def test_poses_that_are_off_or_missing_fail(tmp_path, capsys, moved, count, near):
+def test_wrong_or_missing_poses_fail(tmp_path, capsys, moved, count, near):
     images = []
     for name, pose in list(TRUTH.poses.items())[:count]:
         shift = pose[:, 3] + torch.tensor([moved * (not images), 0, 0])

@@ -17,14 +17,14 @@ if sys.platform != "linux":
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory) -> Path:
-    """9 views, 48×36; not to be changed."""
+    """9 views, 48×36; read-only for the tests."""
     root = tmp_path_factory.mktemp("kill")
     return write_toy_dataset(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory) -> Path:
-    """8 photos, 320×240; not to be changed."""
+    """8 photos, 320×240; read-only for the tests."""
     return scenes.write_photos(tmp_path_factory.mktemp("kill") / "photos", 8)
 
 

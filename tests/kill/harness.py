@@ -1,8 +1,9 @@
-"""Kill a verb of the command line again and again; see that nothing is torn, lost or left behind.
+"""Kills a subcommand repeatedly, and checks that no file is damaged, lost or left behind.
 
-A `Job` is a command and what must come of it. `Killer.round` runs it on a new folder, kills it some
-times in a row by SIGKILL with its whole group, looks at all that has a final name after each kill,
-and runs the same command to its end, which must come with exit code 0 and the right result.
+A `Job` is a command and its expected result. `Killer.round` runs it in a new folder and kills it
+several times with SIGKILL, with its whole process group. After each kill it checks all files that
+have their final names. Then it runs the same command to its end, which must have exit code 0 and
+the correct result.
 """
 
 from __future__ import annotations
@@ -41,16 +42,16 @@ _SOURCE = str(Path(snowsplat.__file__).parents[1])
 
 
 class Defect(AssertionError):
-    """A promise that was not kept."""
+    """A violated guarantee."""
 
 
 @dataclass
 class Ended:
-    """How a run ended: by itself, or killed; and what it printed."""
+    """How a run ended: by itself or killed; and its output."""
 
     code: int
     text: str
-    changes: int  # of files, by its Python, where it ended by itself
+    changes: int  # of files made by Python, if the run ended by itself
     seconds: float
 
     @property
@@ -59,9 +60,9 @@ class Ended:
 
 
 class Zygote:
-    """Starts commands; its own process has all modules, so that a kill hits work and not imports.
+    """Starts commands from a process that has loaded all modules, so kills do not hit imports.
 
-    Use it as a context. ``folder`` is where commands run, logs and temporary files lie.
+    Use it as a context manager. ``folder`` is the working folder, for logs and temporary files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -104,10 +105,10 @@ class Zygote:
 
         Args:
             at: kill it before the at-th change of a file, or ``delay`` seconds after that.
-            after: kill it so many seconds after its start.
-            limits: RLIMIT_… that it has; of open files, so many more than it has already.
-            columns: of the terminal that it has, else none.
-            while_it_runs: called with its number once it is started.
+            after: kill it this many seconds after its start.
+            limits: RLIMIT_… values; for open files, relative to the number of open files.
+            columns: width of its terminal; None: no terminal.
+            while_it_runs: called with its process id once it is started.
         """
         log = self.folder / "log.txt"
         changes = self.folder / "log.txt.changes"
@@ -150,12 +151,12 @@ class Zygote:
 
 
 def _kill(group: int) -> None:
-    with suppress(ProcessLookupError):  # it was quicker
+    with suppress(ProcessLookupError):  # it has already ended
         os.killpg(group, signal.SIGKILL)
 
 
 def _wait_for_the_group(pid: int) -> None:
-    """Until the children of a process that was killed are gone, too: they write no more."""
+    """Wait until the children of a killed process have ended: then they write no more."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         try:
@@ -185,18 +186,18 @@ def _is_dead(process: Path) -> bool:
         return True
 
 
-# What has a final name is whole
+# Checks of files with final names
 
 
 def check_whole(folder: Path) -> int:
-    """Raises: Defect: a file under a final name cannot be read to its end. Gives their number."""
+    """Read all files; returns their number. Raises Defect if one cannot be read to its end."""
     count = 0
     for path in sorted(folder.rglob("*")):
         parts = path.relative_to(folder).parts
         if any(part.startswith(".") for part in parts) or not path.is_file():
             continue
         if any(part.startswith("database") for part in parts) and path.suffix != ".db":
-            continue  # what COLMAP and SQLite keep beside the database
+            continue  # files of COLMAP and SQLite beside the database
         try:
             _open(path)
         except Exception as error:
@@ -209,11 +210,11 @@ def _open(path: Path) -> None:
     name = path.name
     if name in ("colmap.log", "cfg_args", "cameras.bin", "images.bin", "frames.bin", "rigs.bin"):
         assert name == "colmap.log" or path.stat().st_size
-    elif name == "points3D.bin":  # the last one of a model: the others are there
+    elif name == "points3D.bin":  # the last file of a model: the others must exist
         read_model(path.parent)
         read_points(path.parent)
     elif path.suffix == ".db":
-        with TemporaryDirectory() as copies:  # as opening it takes back what was half done
+        with TemporaryDirectory() as copies:  # opening rolls back an unfinished transaction
             for file in path.parent.glob(f"{name}*"):
                 shutil.copy(file, copies)
             with closing(sqlite3.connect(Path(copies) / name)) as connection:
@@ -251,7 +252,7 @@ def names_in(folder: Path) -> set[str]:
 
 
 def digest(path: Path) -> str:
-    """Of its bytes; of a checkpoint, whose header has no fixed order, of its tensors and words."""
+    """A digest of its bytes; of a checkpoint, whose header has no fixed order, of its content."""
     if path.suffix != ".safetensors":
         return hashlib.sha256(path.read_bytes()).hexdigest()
     with safetensors.safe_open(path, framework="np") as file:
@@ -282,12 +283,12 @@ def some_gaussians(count: int, seed: int) -> Gaussians:
 
 @dataclass
 class Job:
-    """A command, and what must come of it.
+    """A command and its expected result.
 
     Attributes:
-        command: its words for an output; ``again``: whether it goes on after a kill.
-        prepare: puts into place what the output is to replace.
-        check_killed: looks at the output after a kill, beside `check_whole`.
+        command: its arguments for an output folder; ``again``: whether it resumes after a kill.
+        prepare: creates an older output that is to be replaced.
+        check_killed: checks the output after a kill, in addition to `check_whole`.
         check_done: compares the output with that of an undisturbed run.
     """
 
@@ -302,17 +303,17 @@ class Job:
 
 @dataclass
 class Tally:
-    """What was done to a job."""
+    """Statistics of a job."""
 
     kills: int = 0
     rounds: int = 0
-    files: int = 0  # that were looked at after kills
-    ended: int = 0  # runs that were quicker than the kill
+    files: int = 0  # checked after kills
+    ended: int = 0  # runs that ended before the kill
 
 
 @dataclass
 class Killer:
-    """Kills jobs at moments that a seed decides."""
+    """Kills jobs at random times that depend on a seed."""
 
     zygote: Zygote
     seed: int
@@ -320,7 +321,7 @@ class Killer:
     _references: dict[str, tuple[Path, Ended]] = field(default_factory=dict)
 
     def reference(self, job: Job) -> tuple[Path, Ended]:
-        """The folder with the output of an undisturbed run, and how that was."""
+        """The output folder and the result of an undisturbed run."""
         if job.name not in self._references:
             folder = self.zygote.folder / f"whole {job.name}"
             folder.mkdir()
@@ -333,7 +334,7 @@ class Killer:
         return self._references[job.name]
 
     def kill(self, jobs: Sequence[Job], kills: int, number: int = 0) -> list[Defect]:
-        """Rounds of the jobs in turn until so many kills were done; what was found."""
+        """Rounds of the jobs in turn until this number of kills; returns the findings."""
         moments = random.Random(f"{self.seed} {number}")
         found: list[Defect] = []
         before = sum(tally.kills for tally in self.tallies.values())
@@ -348,10 +349,10 @@ class Killer:
         return found
 
     def round(self, job: Job, kills: int, number: int) -> None:
-        """Kill a job so many times in a row, then let it end.
+        """Kill a job this many times in a row, then let it finish.
 
         Raises:
-            Defect: see `Job`; the folder stays, to be looked at.
+            Defect: see `Job`; the folder is kept for inspection.
         """
         tally = self.tallies.setdefault(job.name, Tally())
         moments = random.Random(f"{self.seed} {job.name} {number}")
@@ -390,7 +391,7 @@ class Killer:
 
 
 def _moment(moments: random.Random, undisturbed: Ended) -> dict[str, float]:
-    """Half of them at any time, the others near a change of a file."""
+    """Half of the kills at random times, the others near a change of a file."""
     kind = moments.random()
     if kind < 0.5:
         return {"after": moments.uniform(0.0, undisturbed.seconds)}
@@ -399,7 +400,7 @@ def _moment(moments: random.Random, undisturbed: Ended) -> dict[str, float]:
 
 
 def convert_jobs(scene: Path, other: Path) -> list[Job]:
-    """Into each format that is written; over a file that is there, and with changes."""
+    """Into each format; over an existing file, and with edits."""
     targets = ["ply", "compressed.ply", "spz", "sog", "glb", "splat", "html"]
 
     def job(suffix: str) -> Job:
@@ -407,7 +408,7 @@ def convert_jobs(scene: Path, other: Path) -> list[Job]:
             return ["convert", scene, output, "--sh-degree", 1, "--overwrite"]
 
         def prepare(output: Path) -> None:
-            if suffix != "html":  # what is read back is told by its first bytes
+            if suffix != "html":  # files are recognised by their first bytes
                 shutil.copyfile(other, output)
 
         def check_killed(output: Path, whole: Path) -> None:
@@ -418,7 +419,7 @@ def convert_jobs(scene: Path, other: Path) -> list[Job]:
             if digest(output) != digest(whole):
                 raise Defect("not the file of an undisturbed run")
 
-        # The name is the same in all rounds: a page has it as its title.
+        # The name is the same in all rounds, since it is the title of a page.
         return Job(
             f"convert {suffix}",
             "convert",
@@ -443,7 +444,7 @@ def train_jobs(dataset: Path) -> list[Job]:
     """With checkpoints, then --resume; with --memory; with --minutes; over an older training."""
 
     def check_same(output: Path, whole: Path) -> None:
-        # But for times: in the curves and on the page, and where the folder is.
+        # Without times, which are in the curves and on the page, and without the folder's path.
         expected = names_in(whole)
         if names_in(output) != expected:
             raise Defect(f"files differ: {sorted(names_in(output) ^ expected)}")
@@ -480,7 +481,7 @@ def train_jobs(dataset: Path) -> list[Job]:
         return ["train", dataset, "-o", output, *_PLAIN, "--overwrite"]
 
     def older(output: Path) -> None:
-        """What a training of other settings leaves."""
+        """The output of a training with other settings."""
         shutil.copytree(_older_training(output.parents[1], dataset), output)
 
     return [
@@ -514,7 +515,7 @@ def sfm_jobs(photos: Path) -> list[Job]:
 
 
 def make_jobs(photos: Path) -> list[Job]:
-    """From photos to pictures."""
+    """From photos to rendered images."""
 
     def command(output: Path, _: bool) -> list[object]:
         words = ["make", photos, "-o", output, "--quality", "draft", "--threads", 1]
@@ -536,7 +537,7 @@ def make_jobs(photos: Path) -> list[Job]:
 
 
 def _check_dataset(output: Path, whole: Path) -> None:
-    """The same files, and the same cameras but for rounding."""
+    """The same files, and the same cameras except for rounding."""
     if names_in(output) != names_in(whole):
         raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
     record = json.loads((output / "capture.json").read_text())

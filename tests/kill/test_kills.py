@@ -1,4 +1,4 @@
-"""Some kills of each verb, at moments that a seed decides; nightly/kill_anywhere.py has more."""
+"""Some kills of each subcommand, at times that depend on a seed; see nightly/kill_anywhere.py."""
 
 import json
 import os
@@ -46,8 +46,8 @@ def test_make(killer, photos):
     assert not killer.kill(make_jobs(photos), 3)
 
 
-def test_train_at_its_very_beginning(zygote, dataset):
-    """Before each of the first changes of files: the folder is ours from the first one on."""
+def test_train_killed_at_its_start(zygote, dataset):
+    """Before each of the first changes of files: the folder is recognised from the first one."""
     out = zygote.folder / "begun"
     command = ["train", dataset, "-o", out, "--iterations", 3, "--device", "cpu", "--threads", 1]
     for at in range(1, 8):
@@ -58,7 +58,7 @@ def test_train_at_its_very_beginning(zygote, dataset):
     assert not list(out.rglob("*.tmp"))
 
 
-def test_a_scene_that_a_kill_prevented(zygote, dataset, tmp_path):
+def test_a_scene_is_written_after_a_kill_prevented_it(zygote, dataset, tmp_path):
     """Killed between the checkpoint of step 20 and the scene of step 20."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
@@ -73,8 +73,8 @@ def test_a_scene_that_a_kill_prevented(zygote, dataset, tmp_path):
     assert digest(early) == whole
 
 
-def test_an_old_checkpoint_that_a_kill_left(zygote, dataset, tmp_path):
-    """Killed between the last checkpoint and the removal of the one before the one before it."""
+def test_an_old_checkpoint_left_by_a_kill_is_removed(zygote, dataset, tmp_path):
+    """Killed between writing the last checkpoint and removing the third last."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
     command += ["--device", "cpu", "--threads", 1]
@@ -89,7 +89,7 @@ def test_an_old_checkpoint_that_a_kill_left(zygote, dataset, tmp_path):
     assert names_in(out / "checkpoints") == kept
 
 
-def test_damaged_checkpoints_are_not_begun_over(zygote, dataset, tmp_path):
+def test_damaged_checkpoints_are_not_overwritten(zygote, dataset, tmp_path):
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--iterations", 20, "--checkpoint-every", 10]
     command += ["--device", "cpu", "--threads", 1]
@@ -104,8 +104,8 @@ def test_damaged_checkpoints_are_not_begun_over(zygote, dataset, tmp_path):
     assert {name: (out / name).read_bytes() for name in names_in(out)} == before
 
 
-def test_a_training_with_a_time_that_took_more_steps_than_planned(zygote, dataset, tmp_path):
-    """The checkpoint at its end is beyond the plan that is written in it."""
+def test_a_timed_training_with_more_steps_than_planned(zygote, dataset, tmp_path):
+    """The final checkpoint is beyond the plan that is stored in it."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--minutes", 0.02, "--checkpoint-every", 5]
     command += ["--device", "cpu", "--threads", 1]
@@ -118,8 +118,8 @@ def test_a_training_with_a_time_that_took_more_steps_than_planned(zygote, datase
     assert done.code == 0, done.text
 
 
-def test_make_keeps_its_checkpoints_until_the_scene_is_written_down(zygote, photos, tmp_path):
-    """Killed as soon as they are gone: what is made from them is finished, and stays so."""
+def test_make_keeps_checkpoints_until_the_scene_is_recorded(zygote, photos, tmp_path):
+    """Killed as soon as they are removed: the stage must be recorded as finished."""
     out = tmp_path / "made"
     command = ["make", photos, "-o", out, "--quality", "draft", "--device", "cpu", "--threads", 1]
     checkpoints = out / "scene/checkpoints"
@@ -132,7 +132,7 @@ def test_make_keeps_its_checkpoints_until_the_scene_is_written_down(zygote, phot
 
     assert zygote.run(command, while_it_runs=kill_when_gone).killed
     assert "scene" in json.loads((out / "make.json").read_text())["stages"]
-    # As if it had been killed before.
+    # The state after an earlier kill.
     checkpoints.mkdir()
     again = zygote.run(command)
     assert again.code == 0, again.text

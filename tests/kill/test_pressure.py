@@ -1,4 +1,4 @@
-"""A full or read-only disk, folders that vanish, limits, a narrow terminal: one line, no loss."""
+"""Full and read-only disks, lost folders, limits, narrow terminals: one-line errors, no loss."""
 
 import json
 import os
@@ -21,7 +21,7 @@ CPU = ("--device", "cpu", "--threads", 1)
 
 @pytest.fixture(scope="module")
 def trained(zygote, dataset) -> Path:
-    """With checkpoints of steps 20 and 30; not to be changed."""
+    """A training with checkpoints of steps 20 and 30; read-only for the tests."""
     out = zygote.folder / "trained"
     ended = zygote.run(
         ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10, "--eval", *CPU]
@@ -32,7 +32,7 @@ def trained(zygote, dataset) -> Path:
 
 @pytest.fixture
 def place(zygote, tmp_path) -> Iterator[Path]:
-    """Where commands write; nothing of theirs stays in the folder for temporary files."""
+    """The output folder; checks that nothing remains in the folder for temporary files."""
     folder = tmp_path / "place"
     folder.mkdir()
     yield folder
@@ -41,7 +41,7 @@ def place(zygote, tmp_path) -> Iterator[Path]:
 
 @contextmanager
 def mounted(folder: Path, *options: str) -> Iterator[None]:
-    """With a mount over ``folder``; skipped where that is not allowed."""
+    """With a file system mounted over ``folder``; skipped without permission."""
     done = subprocess.run(["mount", *options, folder], capture_output=True, text=True)
     if done.returncode:
         pytest.skip(f"needs the right to mount: {done.stderr.strip()}")
@@ -53,7 +53,7 @@ def mounted(folder: Path, *options: str) -> Iterator[None]:
 
 @contextmanager
 def read_only(folder: Path) -> Iterator[None]:
-    """Even root writes nothing there."""
+    """A read-only file system, also for root."""
     with mounted(folder, "--bind", str(folder)):
         subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
         yield
@@ -61,7 +61,7 @@ def read_only(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def full(folder: Path, kilobytes: int) -> Iterator[None]:
-    """A disk of this size."""
+    """A file system of this size."""
     with mounted(folder, "-t", "tmpfs", "-o", f"size={kilobytes}k", "none"):
         yield
 
@@ -73,7 +73,7 @@ def fill(folder: Path) -> None:
 
 
 def refused(ended: Ended, pattern: str) -> None:
-    """It ended with one line on stderr, and the exit code of a mistake."""
+    """It ended with one line on stderr and the exit code of a user error."""
     assert ended.code == 2, ended.text
     lines = [line for line in ended.text.splitlines() if line.startswith("snowsplat: ")]
     assert len(lines) == 1, ended.text
@@ -82,7 +82,7 @@ def refused(ended: Ended, pattern: str) -> None:
 
 
 def commands(place: Path, trained: Path, dataset: Path, photos: Path) -> dict[str, list[object]]:
-    """One a verb, which writes below ``place``; ``place``/trained is a training."""
+    """One command per subcommand, which writes below ``place``; ``place``/trained is a training."""
     output = place / "trained"
     return {
         "convert": ["convert", trained, place / "a.html"],
@@ -114,7 +114,7 @@ def test_a_read_only_folder(verb, zygote, place, trained, dataset, photos):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_full_disk(verb, zygote, place, trained, dataset, photos):
-    # What is there fits, and hardly more.
+    # There is hardly more space than the existing files need.
     used = sum((trained / name).stat().st_size // 4096 + 1 for name in names_in(trained)) * 4
     with full(place, used + 60 + 4 * len(names_in(trained))):
         shutil.copytree(trained, place / "trained")
@@ -129,7 +129,7 @@ def test_a_full_disk(verb, zygote, place, trained, dataset, photos):
 
 
 def test_a_disk_that_becomes_full_during_a_training(zygote, place, dataset):
-    """The checkpoint before it stays whole; with room again it goes on to the same scene."""
+    """The last checkpoint stays valid; with free space it resumes to the same scene."""
     out = place / "out"
     command = ["train", dataset, "-o", out, "--iterations", 60, "--checkpoint-every", 10, *CPU]
     assert zygote.run(command).code == 0
@@ -137,7 +137,7 @@ def test_a_disk_that_becomes_full_during_a_training(zygote, place, dataset):
     whole = digest(scene)
     size = max(path.stat().st_size for path in out.glob("checkpoints/*"))
     shutil.rmtree(out)
-    # Two checkpoints and a half, and what else is there at first.
+    # Space for two and a half checkpoints and the other files.
     with full(place, 32 + int(2.5 * size) // 1024):
         refused(zygote.run(command), rf"{out}/checkpoints/step_\S+: No space left on device")
         check_whole(place)
@@ -152,7 +152,7 @@ def test_a_disk_that_becomes_full_during_a_training(zygote, place, dataset):
 
 
 def test_a_disk_too_full_for_the_first_scene(zygote, place, dataset):
-    """Nothing has come of that training, so nothing stays, and the same command begins anew."""
+    """The training has no result, so nothing is kept, and the same command starts again."""
     out = place / "out"
     command = ["train", dataset, "-o", out, "--iterations", 20, "--save-iterations", 10, *CPU]
     with full(place, 90):
@@ -164,7 +164,7 @@ def test_a_disk_too_full_for_the_first_scene(zygote, place, dataset):
 
 
 def test_a_disk_that_becomes_full_during_a_dataset(zygote, place, photos):
-    """Finished stages stay; with room again the same command goes on."""
+    """Finished stages are kept; with free space the same command resumes."""
     out = place / "garden"
     command = ["capture", photos, "-o", out, "--quality", "draft", "--threads", 1]
     with full(place, 700):
@@ -181,7 +181,7 @@ def test_a_disk_that_becomes_full_during_a_dataset(zygote, place, photos):
 
 
 def when(condition: Callable[[], bool], then: Callable[[], object]) -> Callable[[int], None]:
-    """For `Zygote.run`: do something as soon as something is so."""
+    """For `Zygote.run`: call a function as soon as a condition is true."""
 
     def wait(pid: int) -> None:
         while not condition():
@@ -197,8 +197,8 @@ def has_checkpoint(out: Path) -> Callable[[], bool]:
     return lambda: any(out.glob("checkpoints/step_*"))
 
 
-def test_a_training_whose_folder_is_moved_goes_on(zygote, place, dataset):
-    """In a new one: hours of work are worth more than order."""
+def test_a_training_whose_folder_is_moved_continues(zygote, place, dataset):
+    """It creates a new folder, so that hours of work are not lost."""
     out, elsewhere = place / "out", place / "elsewhere"
     command = ["train", dataset, "-o", out, "--iterations", 400, "--checkpoint-every", 10, "--eval"]
     ended = zygote.run(
@@ -216,7 +216,7 @@ def test_a_training_whose_folder_is_moved_goes_on(zygote, place, dataset):
 
 
 def test_a_training_whose_photos_vanish(zygote, place, dataset):
-    """At its beginning, and before it goes on: what is saved stays."""
+    """At the start, and before it resumes: saved files are kept."""
     mine, out = place / "capture", place / "out"
     shutil.copytree(dataset, mine)
     command = ["train", mine, "-o", out, "--iterations", 40, "--checkpoint-every", 10, *CPU]
@@ -233,19 +233,19 @@ def test_a_training_whose_photos_vanish(zygote, place, dataset):
         ["train", mine, "-o", place / "two", "--iterations", 40, *CPU],
         while_it_runs=when(begun, lambda: shutil.rmtree(mine / "images")),
     )
-    if ended.code:  # else all were read by then
+    if ended.code:  # else all photos had been read
         refused(ended, rf"{mine}/images/\S+")
     assert not leftovers(place)
 
 
 @pytest.mark.parametrize("verb", ["capture", "make"])
-def test_photos_or_the_folder_vanish_under_a_dataset(verb, zygote, place, photos):
+def test_photos_or_the_folder_vanish_during_sfm(verb, zygote, place, photos):
     mine, out = place / "photos", place / "out"
     shutil.copytree(photos, mine)
     command = [verb, mine, "-o", out, "--quality", "draft", "--threads", 1]
     inner = out / "capture" if verb == "make" else out
     begun = (inner / "distorted" / "database.db").exists
-    # The photos are copied by then: it may end well, and does.
+    # The photos have been copied already, so it may succeed.
     ended = zygote.run(command, while_it_runs=when(begun, lambda: shutil.rmtree(inner / "input")))
     refused(ended, r"input|images")
     shutil.rmtree(out, ignore_errors=True)
@@ -274,7 +274,7 @@ def test_a_limit_of_the_size_of_files(verb, zygote, place, trained, dataset, pho
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_limit_of_open_files(verb, zygote, place, trained, dataset, photos):
-    """So low that hardly one can be opened."""
+    """So low that hardly any file can be opened."""
     shutil.copytree(trained, place / "trained")
     before = names_in(place)
     ended = zygote.run(commands(place, trained, dataset, photos)[verb], limits={"RLIMIT_NOFILE": 1})
@@ -288,7 +288,7 @@ def test_a_limit_of_open_files(verb, zygote, place, trained, dataset, photos):
 
 
 def shown(text: str) -> list[str]:
-    """What ends up on the screen, line by line; lines that are longer than it are wrapped there."""
+    """The lines on the screen; longer lines are wrapped."""
     lines = []
     for line in text.split("\n"):
         last = ""
@@ -300,7 +300,7 @@ def shown(text: str) -> list[str]:
 
 
 def bars(text: str) -> list[str]:
-    """Each picture of the line that changes, which the next one takes the place of."""
+    """All states of the progress line, which overwrites itself."""
     found = re.findall(r"\r\x1b\[2K([^\r\n]*)(?=\r\x1b)", text)
     return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", bar) for bar in found]
 
@@ -318,22 +318,22 @@ def test_a_narrow_terminal(zygote, place, trained, dataset, photos):
         if command is longer:
             steps = [re.match(r"(\d+)/500\b", bar) for bar in bars(ended.text)]
             assert steps, ended.text
-            assert all(steps), bars(ended.text)  # not half a number
+            assert all(steps), bars(ended.text)  # numbers are not truncated
             assert ended.text.count("\x1b[?25l") == ended.text.count("\x1b[?25h") == 1  # cursor
     ended = zygote.run(["train", dataset, "-o", place / "t", *CPU], columns=24)
     assert ended.code == 2
     assert len(shown(ended.text.strip())) == 1
 
 
-def test_view_of_what_is_not_there(zygote, place, trained):
-    """The one verb that writes nothing: a folder without its scene is one line."""
+def test_view_of_a_missing_scene(zygote, place, trained):
+    """The only subcommand that writes nothing: a folder without a scene is a one-line error."""
     shutil.copytree(trained, place / "trained")
     shutil.rmtree(place / "trained" / "point_cloud")
     refused(zygote.run(["view", place / "trained", "--no-browser"]), "holds no scene")
 
 
-def test_zygote_runs_what_the_command_runs(zygote, trained, tmp_path):
-    """The harness is no other program: the file is that of a process started by the shell."""
+def test_zygote_has_the_result_of_the_command(zygote, trained, tmp_path):
+    """The file is the same as that of a separate process."""
     assert isinstance(zygote, Zygote)
     for folder in (zygote.folder / "by zygote", tmp_path):
         folder.mkdir(exist_ok=True)

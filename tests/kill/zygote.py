@@ -1,12 +1,11 @@
-"""Runs `snowsplat` in forks of a process that has all its modules: a start takes milliseconds.
+"""Runs `snowsplat` in forks of a process that has loaded all modules: a start takes milliseconds.
 
-    python zygote.py      one line of JSON a run on stdin, lines of JSON on stdout
+    python zygote.py      one line of JSON per run on stdin, lines of JSON on stdout
 
-A run is {"argv", "log", "watched", "at", "delay", "limits", "columns"}. It is a process, and a
-group of processes, of its own. With "at" it kills its whole group by SIGKILL before the at-th time
-that its Python changes a file below a folder of "watched", or "delay" seconds after that; the
-changes are counted in the file LOG.changes where it ends by itself. The answers are {"pid"} and
-{"code"}.
+A run is {"argv", "log", "watched", "at", "delay", "limits", "columns"}. It is a process with its
+own process group. With "at" it kills its group with SIGKILL before the at-th time that its Python
+code changes a file below a folder of "watched", or "delay" seconds after that. If it ends by
+itself, the number of changes is written to LOG.changes. The responses are {"pid"} and {"code"}.
 """
 
 import fcntl
@@ -48,7 +47,7 @@ def _import_all() -> None:
     import snowsplat.viewer.web.scene
     import snowsplat.viewer.web.server
 
-    # After zlib: its own would take the place of Python's.
+    # After Python's zlib, since pycolmap would replace it by its own.
     importlib.import_module("pycolmap")
     for name in snowsplat.cli.main.SUBCOMMANDS:
         snowsplat.cli.main.parse([name])
@@ -69,7 +68,7 @@ def _kill_at(at: int | None, delay: float, watched: list[str], changes: list[int
         path = args[0]
         if not isinstance(path, str | bytes | os.PathLike):
             return
-        # What has a folder's handle goes by a bare name, as in rmtree.
+        # With a folder's file descriptor, the name is relative to it, as in rmtree.
         name = os.fsdecode(path)
         if os.path.isabs(name) and not name.startswith(tuple(watched)):
             return
@@ -84,7 +83,7 @@ def _kill_at(at: int | None, delay: float, watched: list[str], changes: list[int
 
 
 def _terminal(log: int, columns: int) -> int:
-    """One so wide, whose output goes into the log."""
+    """A terminal of this width whose output goes to the log."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
 
@@ -110,14 +109,14 @@ def _child(run: dict) -> None:
     from snowsplat.cli.main import main
     from snowsplat.pipeline import make as making
 
-    # `make` with a training of a moment, and checkpoints all the time.
+    # `make` with a very short training that always writes checkpoints.
     making._CHECKPOINT_SECONDS = 0.1
     making.PRESETS["draft"] = replace(making.PRESETS["draft"], iterations=120)
     count = os.open(run["log"] + ".changes", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for name, value in run.get("limits", {}).items():
         which = getattr(resource, name)
         if name == "RLIMIT_NOFILE":
-            value += len(os.listdir("/proc/self/fd")) - 1  # one of them was for this list
+            value += len(os.listdir("/proc/self/fd")) - 1  # one of them is that of listdir
         resource.setrlimit(which, (value, resource.getrlimit(which)[1]))
     changes = [0]
     _kill_at(run.get("at"), run.get("delay", 0.0), run["watched"], changes)
@@ -130,7 +129,7 @@ def _child(run: dict) -> None:
         code = 1
     sys.stdout.flush()
     if run.get("columns"):
-        time.sleep(0.1)  # until the last words are copied
+        time.sleep(0.1)  # until the last output is copied
     os.write(count, str(changes[0]).encode())
     os._exit(code)
 
@@ -147,7 +146,7 @@ def serve() -> None:
                 _child(run)
             finally:
                 os._exit(1)
-        with suppress(OSError):  # it was quicker
+        with suppress(OSError):  # it has already ended
             os.setpgid(pid, pid)
         print(json.dumps({"pid": pid}), flush=True)
         _, status = os.waitpid(pid, 0)

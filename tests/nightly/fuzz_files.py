@@ -1,15 +1,15 @@
-"""Every reader of the project on damaged files, guided by coverage, for as long as one likes.
+"""Runs every reader on damaged files, guided by code coverage, for as long as requested.
 
     python tests/nightly/fuzz_files.py                       20,000 runs of each reader
     python tests/nightly/fuzz_files.py --runs 5000 --only spz --only glb
     python tests/nightly/fuzz_files.py --seconds 600         ten minutes of each
 
-Each reader runs in a process of its own. A run is a failure where the reader takes more than 10 s,
-or more memory than tests/fuzz/limits.py grants it, leaves its folder, runs a program, ends the
-process, or raises anything but a `UserError` of one line. The file is then kept in --findings.
+Each reader runs in its own process. A run fails if the reader takes more than 10 s or more memory
+than tests/fuzz/limits.py allows, accesses files outside of its folder, runs a program, ends the
+process, or raises anything but a one-line `UserError`. The file is then stored in --findings.
 
-The fuzzer is atheris, which tells by the branches taken in our code which damage leads somewhere
-new: `pip install atheris`. Without it the damage is random, which the report says.
+The fuzzer is atheris, which uses the branches taken in our code to select promising damage:
+`pip install atheris`. Without it the damage is random, and the report says so.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
-_GRACE = 60.0  # seconds that a process may take beyond its time, to begin and to end
+_GRACE = 60.0  # seconds that a process may use in addition, to start and to end
 
 
 def main() -> int:
-    """Gives the exit code: 0, 1 after a failure, 2 for a mistake in the flags."""
+    """Returns the exit code: 0, 1 after a failure, 2 for wrong flags."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -74,7 +74,7 @@ def _all(flags: argparse.Namespace) -> int:
 
 
 def _one(name: str, flags: argparse.Namespace, guided: bool) -> tuple[int, float, str]:
-    """Runs, seconds, and what failed (empty: nothing)."""
+    """Number of runs, seconds, and the failure as text (empty: none)."""
     command = [sys.executable, __file__, "--child", name, "--runs", str(flags.runs)]
     command += ["--seconds", str(flags.seconds), "--seed", str(flags.seed)]
     command += ["--findings", str(flags.findings.absolute())]
@@ -108,14 +108,14 @@ class _Child:
     def __init__(self, flags: argparse.Namespace) -> None:
         self.flags = flags
         self.note = flags.findings / f"{_file_name(flags.child)}.json"
-        self.last = self.note.with_suffix(".last")  # what is being read, should the process end
+        self.last = self.note.with_suffix(".last")  # the current file, in case the process ends
         self.runs = 0
         self.end = time.monotonic() + flags.seconds
         logging.disable(logging.WARNING)
         warnings.simplefilter("ignore")
 
     def run(self) -> int:
-        """Gives the exit code."""
+        """Returns the exit code."""
         if self.flags.random:
             self._load()
             return self._at_random()
@@ -161,7 +161,7 @@ class _Child:
     def _one_input(self, data: bytes) -> None:
         if self.runs >= self.flags.runs or time.monotonic() > self.end:
             self._tell("")
-            os._exit(0)  # libFuzzer knows no other end than a failure
+            os._exit(0)  # libFuzzer can only be ended by a failure
         self.try_out(data)
 
     def damaged(self, data: bytes, generator: random.Random) -> bytes:
@@ -171,7 +171,7 @@ class _Child:
         return (self.damage.damaged_json if as_json else self.damage.damaged)(data, changes)
 
     def try_out(self, data: bytes) -> None:
-        """One file; ends the process where it fails."""
+        """Read one file; ends the process on a failure."""
         reader = self.reader
         self.last.write_bytes(data)
         size = reader.write(data)

@@ -1,10 +1,11 @@
-"""The ops on extreme scenes against the float64 twin, by hypothesis: see tests/ops/extremes.py.
+"""Compares the ops with the float64 reference on extreme scenes, by hypothesis: see extremes.py.
 
     python tests/nightly/fuzz_ops.py                              20,000 cases and some on emulation
     python tests/nightly/fuzz_ops.py --cases 1000 --isa avx2 --seed 7
 
-Each instruction set in a process of its own; of the kernels of a GPU one case in fifty. The exit
-code is 1 where anything does not hold; the smallest case is printed.
+The scenes are those of tests/ops/extremes.py. Each instruction set runs in its own process. One
+case in fifty also runs on the emulated GPU kernels. The exit code is 1 after a failure; the
+smallest failing case is printed.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
-#: Of a thousand cases; the rest goes to `check_project`.
+#: Cases out of a thousand; the others go to `check_project`.
 SHARES = {"rasterize": 350, "harm": 150, "neighbours": 100, "photometric": 98, "long images": 2}
 
 

@@ -1,10 +1,11 @@
-"""Kills `capture`, `train`, `make` and `convert` at random moments, and sees that nothing is lost.
+"""Kills `sfm`, `train`, `make` and `convert` at random times, and checks that nothing is lost.
 
     PYTHONPATH=src python tests/nightly/kill_anywhere.py --kills 200
 
-Each round begins with a new folder, kills the command (SIGKILL, with its children) one to five
-times in a row, opens after each kill all that has a final name, then lets the same command run to
-its end: see tests/kill/harness.py. Exit code 1, and the folder is kept, where a promise is broken.
+Each round starts with a new folder and kills the command (SIGKILL, with its children) one to five
+times in a row. After each kill it opens all files that have their final names. Then the same
+command runs to its end: see tests/kill/harness.py. If a guarantee is violated, the exit code is 1
+and the folder is kept.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 VERBS = ("capture", "train", "make", "convert")
-# Of all kills: those of a verb that takes long are fewer.
+# Shares of all kills; slow subcommands have fewer.
 _SHARES = {"capture": 0.2, "train": 0.35, "make": 0.15, "convert": 0.3}
 
 
 def jobs(folder: Path, verbs: list[str]) -> list[Job]:
-    """Those of the verbs, with small inputs in ``folder``."""
+    """The jobs of all subcommands, with small inputs in ``folder``."""
     found: list[Job] = []
     if "convert" in verbs:
         write_gaussians(folder / "in.ply", some_gaussians(4000, 1))

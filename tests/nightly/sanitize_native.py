@@ -1,10 +1,10 @@
-"""The kernels of the CPU under sanitizers: AddressSanitizer and UndefinedBehaviorSanitizer with the
-tests of the ops, on each instruction set that runs here, and ThreadSanitizer for the threads.
+"""Runs the CPU kernels under sanitizers: AddressSanitizer and UndefinedBehaviorSanitizer with the
+tests of the ops, on each instruction set of this machine, and ThreadSanitizer for the threads.
 
     python tests/nightly/sanitize_native.py              some minutes
     python tests/nightly/sanitize_native.py --isa avx2 --skip threads
 
-It needs g++ with its sanitizers. The exit code is 1 where anything is found.
+It needs g++ with its sanitizers. The exit code is 1 if anything is found.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ def main() -> int:
 
 
 def _sanitized_package() -> Path:
-    """The folder that holds the package with sanitized libraries."""
+    """A folder with a copy of the package whose libraries are sanitized."""
     sanitize = "-fsanitize=address,undefined -fno-sanitize-recover=undefined -g1"
     configure = ["cmake", "-G", "Ninja", "-S", ROOT, "-B", BUILD / "cmake", "--log-level=WARNING"]
-    # Without GPU kernels, which take a minute and run elsewhere.
+    # Without GPU kernels, which take a minute to build and are tested elsewhere.
     configure += ["-DCMAKE_CXX_COMPILER=g++", "-DCMAKE_DISABLE_FIND_PACKAGE_Python3=ON"]
     subprocess.run([*configure, f"-DCMAKE_CXX_FLAGS={sanitize}"], check=True)
     subprocess.run(["cmake", "--build", BUILD / "cmake", "--", "--quiet"], check=True)
@@ -67,7 +67,7 @@ def _preloaded() -> dict[str, str]:
     ]
     return os.environ | {
         "LD_PRELOAD": " ".join(path.strip() for path in libraries),
-        "ASAN_OPTIONS": "detect_leaks=0",  # Python's own
+        "ASAN_OPTIONS": "detect_leaks=0",  # Python itself has leaks
         "UBSAN_OPTIONS": "print_stacktrace=1",
     }
 
@@ -84,8 +84,8 @@ def _isas(package: Path) -> list[str]:
 def _tests(package: Path, isa: str) -> bool:
     started = time.monotonic()
     command = [sys.executable, "-m", "pytest", "tests/ops", "-m", "not emulated and not gpu"]
-    # Not those that measure a call, load libraries of their own making, or have NVRTC compile: it
-    # does not find its parts under a sanitizer.
+    # Without tests that measure times, load their own libraries, or compile with NVRTC, which does
+    # not find its own libraries under a sanitizer.
     for other in ("native", "emulation", "driver", "cuda_build"):
         command.append(f"--ignore=tests/ops/test_{other}.py")
     command += ["-o", f"pythonpath={package}"]
@@ -99,7 +99,7 @@ def _tests(package: Path, isa: str) -> bool:
 
 
 def _threads() -> bool:
-    """ThreadSanitizer knows nothing of torch's locks, so a program of our own calls the kernels."""
+    """ThreadSanitizer does not support torch's locks, so a separate program calls the kernels."""
     program = BUILD / "races"
     BUILD.mkdir(parents=True, exist_ok=True)
     command = ["g++", "-std=c++17", "-O1", "-g", "-fsanitize=thread", "-pthread", "-Wno-psabi"]

@@ -1,11 +1,11 @@
-"""Both servers for an hour, with visitors who come, look and go, some abruptly, some hostile.
+"""Runs both servers for an hour, with visitors that connect, look around and disconnect.
 
-A small real training with --view and a `view` of a scene run as processes of their own. Their
-memory, threads and file descriptors are taken down every few seconds. At the end each must be
-alive, memory must be flat (its slope over the last half, by least squares, below BOUND), threads
-and descriptors within LIMITS, the training have made steps all the time, and nothing have been
-written to the terminal that a user would not understand. Before that, a thousand connections must
-leave the training RATIO of its steps a second.
+A small real training with --view and a `view` of a scene run as separate processes. Some visitors
+disconnect abruptly, some are hostile. Memory, threads and file descriptors of the servers are
+recorded every few seconds. At the end each server must be running, memory must be flat (its
+least-squares slope over the last half below BOUND), threads and descriptors within LIMITS, the
+training must have made steps all the time, and the terminal must have no unexpected output. Before
+that, a thousand connections must leave the training RATIO of its steps per second.
 
     python tests/nightly/soak_servers.py CAPTURE --minutes 60
 """
@@ -45,8 +45,8 @@ from tests.viewer.clients import (  # noqa: E402
     status,
 )
 
-BOUND = 0.5  # MiB a minute
-RATIO = 0.7  # of the steps a second that a training makes alone
+BOUND = 0.5  # MiB per minute
+RATIO = 0.7  # of the steps per second that a training makes alone
 LIMITS = {"threads": 320, "descriptors": 400}
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"}
 
@@ -57,7 +57,7 @@ def _hear() -> None:
 
 @dataclass
 class Server:
-    """A process, and what it was measured to use."""
+    """A process, and its resource use over time."""
 
     name: str
     process: subprocess.Popen[str]
@@ -74,7 +74,7 @@ class Server:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            # What a shell runs in the background hears no Ctrl-C, nor do its children.
+            # A shell starts background processes with Ctrl-C ignored, also their children.
             preexec_fn=_hear,
         )
         server = cls(name, process)
@@ -92,13 +92,13 @@ class Server:
 
     @property
     def step(self) -> int:
-        """The last that was told of."""
+        """The last step that it reported."""
         told = [line for line in self.output[-50:] if line.startswith("step ")]
         return int(re.findall(r"\d+", told[-1].replace(",", ""))[0]) if told else 0
 
     def sample(self, seconds: float) -> None:
         folder = Path(f"/proc/{self.process.pid}")
-        # Not what is mapped from files, which comes and goes as the system likes.
+        # Without memory-mapped files, which the system loads and evicts.
         kilobytes = re.search(r"RssAnon:\s+(\d+)", (folder / "status").read_text())
         assert kilobytes is not None
         rss = int(kilobytes[1]) / 1024
@@ -111,7 +111,7 @@ class Server:
         return self.process.wait(120)
 
     def defects(self) -> list[str]:
-        """What is not as promised."""
+        """The violated guarantees."""
         table = np.array(self.samples)
         last = table[len(table) // 2 :]
         slope = 60.0 * np.polyfit(last[:, 0], last[:, 1], 1)[0]
@@ -135,9 +135,9 @@ class Server:
 
 
 def undisturbed(training: Server) -> float:
-    """Steps a second among a thousand connections, idle and hammering, relative to those without.
+    """Steps per second among a thousand connections, idle and active, relative to those without.
 
-    By turns, since on a machine that does other things no two minutes are alike.
+    Both are measured alternately, since the load of the machine varies.
     """
     rates: dict[bool, list[float]] = {False: [], True: []}
     clients = ROOT / "tests/viewer/clients.py"
@@ -165,7 +165,7 @@ def undisturbed(training: Server) -> float:
 
 
 class Crowd:
-    """Threads of visitors."""
+    """The threads of the visitors."""
 
     def __init__(self, training: Server, scene: Server, seed: int) -> None:
         self._training, self._scene = training, scene
@@ -197,7 +197,7 @@ class Crowd:
             self._over.wait(rng.uniform(0.0, 3.0))
 
     def _visit(self, rng: random.Random) -> str:
-        """Look around in the training."""
+        """Use the page of the training."""
         visitor = Visitor(self._training.url)
         size = rng.choice([(320, 240), (640, 480), (800, 200)])
         pictures = 0
@@ -222,7 +222,7 @@ class Crowd:
         return "visits that end abruptly"
 
     def _load(self, rng: random.Random) -> str:
-        """Load the static page, or the other one; or leave in the middle of it."""
+        """Load one of the pages, sometimes disconnecting during the download."""
         url = rng.choice([self._scene.url, self._scene.url, self._training.url])
         if rng.random() < 0.3:
             client = open_socket(url)
@@ -236,7 +236,7 @@ class Crowd:
         else:
             wanted, what = 200, "pages"
             answer = get(url)
-        # Among hundreds of others it may be turned away, but not be given another answer.
+        # The server may reject it because of the other connections, but the response must be valid.
         if status(answer) in (0, 503):
             return "turned away"
         if status(answer) != wanted:

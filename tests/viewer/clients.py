@@ -1,4 +1,4 @@
-"""Clients of both servers, on real sockets: those that behave like a browser, and others.
+"""Clients of both servers, on real sockets: well-behaved and hostile ones.
 
     with Visitor(url) as visitor:
         visitor.send_camera()
@@ -44,22 +44,22 @@ POSE = {
 
 
 def camera(**changes: object) -> bytes:
-    """What a page says of its camera."""
+    """The camera message of the page."""
     return msgspec.msgpack.encode({"type": "ViewerCameraMessage", **POSE, **changes})
 
 
 def update(uuid: str, value: object, name: str = "value") -> bytes:
-    """What a page says of a control."""
+    """The message of a changed control."""
     return msgspec.msgpack.encode(
         {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {name: value}}
     )
 
 
 class Visitor:
-    """A page, without the browser: says where it looks from, and takes what it is sent."""
+    """The page without a browser: sends its camera and receives images."""
 
     def __init__(self, url: str, **options: Any) -> None:
-        """``options``: as those of `websockets.sync.client.connect`."""
+        """``options``: those of `websockets.sync.client.connect`."""
         options = {"open_timeout": 20, "close_timeout": 2, **options}
         self.socket: ClientConnection = connect(
             url.replace("http://", "ws://").rstrip("/"),
@@ -76,11 +76,11 @@ class Visitor:
             self.socket.close()
 
     def send_camera(self, **changes: object) -> None:
-        """Say where it looks from."""
+        """Send the camera."""
         self.socket.send(camera(**changes))
 
     def pictures(self, seconds: float, most: int = 1 << 30) -> int:
-        """Take what comes in this time, or until there are ``most`` pictures; how many came."""
+        """Receive messages for this time, or until ``most`` images; returns their number."""
         before, end = self.shown, time.monotonic() + seconds
         while self.shown - before < most and (left := end - time.monotonic()) > 0:
             try:
@@ -92,7 +92,7 @@ class Visitor:
         return self.shown - before
 
     def press(self, label: str, value: object = True) -> None:
-        """Set a control that it was told of."""
+        """Set a control by its label."""
         self.socket.send(update(self.controls[label], value))
 
     def _take(self, data: bytes) -> None:
@@ -122,7 +122,7 @@ def open_socket(url: str, seconds: float = 10.0) -> socket.socket:
 
 
 def ask(url: str, request: bytes, seconds: float = 10.0) -> bytes:
-    """What is answered to these bytes, up to the end of the connection."""
+    """The response to these bytes, up to the end of the connection."""
     answer = b""
     with open_socket(url, seconds) as client, contextlib.suppress(ConnectionError):
         client.sendall(request)
@@ -132,7 +132,7 @@ def ask(url: str, request: bytes, seconds: float = 10.0) -> bytes:
 
 
 def get(url: str, target: str | None = None, *headers: str, method: str = "GET") -> bytes:
-    """A request as it stands, nothing encoded; the answer, head and body."""
+    """Send a request without encoding; returns head and body of the response."""
     host, port = place(url)
     lines = [f"{method} {path(url) if target is None else target} HTTP/1.1"]
     if not any(line.lower().startswith("host:") for line in headers):
@@ -142,12 +142,12 @@ def get(url: str, target: str | None = None, *headers: str, method: str = "GET")
 
 
 def status(answer: bytes) -> int:
-    """0: the connection was closed without a word."""
+    """The status code; 0 if the connection was closed without a response."""
     return int(answer.split(b" ", 2)[1]) if answer else 0
 
 
 def upgrade(url: str) -> socket.socket:
-    """A websocket whose frames are written by hand."""
+    """A WebSocket connection for hand-written frames."""
     client = open_socket(url)
     host, port = place(url)
     client.sendall(
@@ -168,26 +168,26 @@ def upgrade(url: str) -> socket.socket:
 
 
 def frame(payload: bytes, opcode: int = 2, fin: bool = True, length: int | None = None) -> bytes:
-    """A frame of a client. ``length``: that is said to be the payload's."""
-    said = len(payload) if length is None else length
+    """A frame of a client. ``length``: the declared length of the payload."""
+    size = len(payload) if length is None else length
     head = bytes([opcode | (0x80 if fin else 0)])
-    if said < 126:
-        head += bytes([0x80 | said])
-    elif said < 1 << 16:
-        head += b"\xfe" + struct.pack(">H", said)
+    if size < 126:
+        head += bytes([0x80 | size])
+    elif size < 1 << 16:
+        head += b"\xfe" + struct.pack(">H", size)
     else:
-        head += b"\xff" + struct.pack(">Q", said)
+        head += b"\xff" + struct.pack(">Q", size)
     return head + bytes(4) + payload  # a mask of zeros
 
 
 def reset(client: socket.socket) -> None:
-    """Leave without a goodbye."""
+    """Disconnect without a closing handshake."""
     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     client.close()
 
 
 def pour(client: socket.socket, data: bytes, seconds: float, read: bool = False) -> int:
-    """Send the same again and again, until that is over or the other end has had enough."""
+    """Send the same data repeatedly, for a time or until the server disconnects."""
     sent, end = 0, time.monotonic() + seconds
     client.settimeout(0.2)
     while time.monotonic() < end:
@@ -202,7 +202,7 @@ def pour(client: socket.socket, data: bytes, seconds: float, read: bool = False)
     return sent
 
 
-# Those that do not behave. Each takes an address and some seconds.
+# Hostile clients. Each takes an address and a duration in seconds.
 
 
 def _garbage(url: str, seconds: float) -> None:
@@ -210,7 +210,7 @@ def _garbage(url: str, seconds: float) -> None:
         for _ in range(200):
             client.sendall(frame(os.urandom(random.randrange(1, 300)), random.choice((1, 2))))
         client.sendall(frame(msgspec.msgpack.encode({"type": "NoSuchMessage"})))
-        client.sendall(frame(b"\x91" * 60_000))  # lists within lists
+        client.sendall(frame(b"\x91" * 60_000))  # nested lists
         client.sendall(frame(bytes(100), opcode=11))
 
 
@@ -250,7 +250,7 @@ def _pieces(url: str, seconds: float) -> None:
 
 
 def _forms(url: str, seconds: float) -> None:
-    """What viser would keep for ever."""
+    """Messages that viser would store forever."""
     with upgrade(url) as client:
         client.sendall(frame(camera()))
         for i in range(900):
@@ -270,7 +270,7 @@ def _never_reads(url: str, seconds: float) -> None:
 
 
 def _half_open(url: str, seconds: float) -> None:
-    """A request that comes a byte a second, many times."""
+    """Requests sent at one byte per second, many at once."""
     clients = []
     with contextlib.suppress(OSError):
         clients = [open_socket(url) for _ in range(100)]
@@ -294,7 +294,7 @@ def _long_head(url: str, seconds: float) -> None:
 
 
 def _strangers(url: str, seconds: float) -> None:
-    """Connections as fast as they come, each gone at once."""
+    """Connections as fast as possible, each closed at once."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         client = open_socket(url)
@@ -304,7 +304,7 @@ def _strangers(url: str, seconds: float) -> None:
 
 
 def _comers(url: str, seconds: float) -> None:
-    """Browsers that come and go at once."""
+    """Browsers that connect and disconnect at once."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         with contextlib.suppress(ConnectionError):
@@ -313,7 +313,7 @@ def _comers(url: str, seconds: float) -> None:
             reset(client)
 
 
-#: Of the network viewer.
+#: Against the live viewer.
 HOSTILE: dict[str, Callable[[str, float], None]] = {
     "garbage": _garbage,
     "wrong types": _wrong_types,
@@ -328,18 +328,18 @@ HOSTILE: dict[str, Callable[[str, float], None]] = {
     "strangers": _strangers,
     "comers": _comers,
 }
-#: Of any server.
+#: Against any server.
 HOSTILE_TO_ANY = ("half open", "long head", "strangers")
 
 
 def hostile(kind: str, url: str, seconds: float) -> None:
-    """Until it is over or the server has had enough of it."""
+    """Run for a time, or until the server disconnects."""
     with contextlib.suppress(OSError):
         HOSTILE[kind](url, seconds)
 
 
 def crowd(url: str, seconds: float, kinds: dict[str, int]) -> None:
-    """So many of each, at once."""
+    """Run this number of each kind, at once."""
     threads = [
         threading.Thread(target=hostile, args=(kind, url, seconds), daemon=True)
         for kind, count in kinds.items()
@@ -351,7 +351,7 @@ def crowd(url: str, seconds: float, kinds: dict[str, int]) -> None:
         thread.join(seconds + 30)
 
 
-if __name__ == "__main__":  # URL SECONDS KIND=COUNT …: as a process of its own
+if __name__ == "__main__":  # URL SECONDS KIND=COUNT …: in a separate process
     print("begun", flush=True)
     _kinds = dict(argument.split("=") for argument in sys.argv[3:])
     crowd(sys.argv[1], float(sys.argv[2]), {kind: int(n) for kind, n in _kinds.items()})

@@ -1,4 +1,4 @@
-"""Poses of browsers as cameras, and a photo's place in a window."""
+"""Camera poses of browsers, and the rectangle of a photo in a window."""
 
 import math
 
@@ -25,7 +25,7 @@ def test_the_camera_of_a_browser():
     assert 2 * math.atan(120 / camera.fy) == pytest.approx(1.0)
 
 
-def test_nearness_forgives_rounding_alone():
+def test_is_near_only_ignores_rounding():
     here = pose()
     same = Pose(-here.quat, here.position + 1e-6, here.fov, 10, 10)
     assert here.is_near(same)
@@ -36,7 +36,7 @@ def test_nearness_forgives_rounding_alone():
     assert not here.is_near(pose(fov=1.1))
 
 
-def test_fit_keeps_the_shape_and_never_enlarges():
+def test_fit_keeps_the_aspect_ratio_and_never_enlarges():
     assert fit(1920, 1080, 960) == (960, 540)
     assert fit(400, 300, 960) == (400, 300)
     assert fit(10_000, 3, 100) == (100, 1)
@@ -44,7 +44,7 @@ def test_fit_keeps_the_shape_and_never_enlarges():
 
 @pytest.mark.parametrize("window", [(640, 200), (200, 640), (300, 300)])
 def test_a_photo_in_a_window_has_its_own_camera(window):
-    """The same point is on the same place of the photo, wherever that lies in the window."""
+    """A point projects to the same position of the photo, for any rectangle."""
     identity = torch.eye(3, 4, dtype=torch.float64)
     camera = Camera(90, 60, 70.0, 72.0, 44.0, 31.0, identity)
     placed = Placed.within(camera, *window)

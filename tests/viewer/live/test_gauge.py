@@ -13,7 +13,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.viewer.live.gauge import Curve, Gauge
 
 
-def test_a_curve_stays_short_and_true():
+def test_a_curve_has_few_points_and_correct_means():
     curve = Curve()
     for step in range(1, 10_001):
         curve.add(step, 2.0 * step)
@@ -32,7 +32,7 @@ def dataset(tmp_path_factory):
     return load_dataset(write_toy_dataset(root, "colmap-bin", 6, 48, 36, n_points=200))
 
 
-def test_psnr_is_that_of_an_evaluation(dataset):
+def test_psnr_equals_an_evaluation(dataset):
     gaussians = Gaussians.from_points(dataset.points)
     black = torch.zeros(3)
     gauge = Gauge(dataset.train, black)
@@ -46,7 +46,7 @@ def test_psnr_is_that_of_an_evaluation(dataset):
     assert Gauge(dataset.train[:2], black).measure(gaussians) > 0
 
 
-def test_no_photos_no_figure(dataset, tmp_path):
+def test_without_photos_there_is_no_psnr(dataset, tmp_path):
     assert not Gauge([], torch.zeros(3)).can_measure
     root = write_toy_dataset(tmp_path / "capture", "colmap-bin", 2, 48, 36, n_points=50)
     views = load_dataset(root).train

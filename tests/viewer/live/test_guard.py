@@ -1,4 +1,4 @@
-"""The running of the network viewer: who comes in, and what those can do who should not."""
+"""Access control of the live viewer, and its limits for hostile clients."""
 
 import contextlib
 import gc
@@ -57,7 +57,7 @@ def local() -> Iterator[RunningServer]:
 
 @pytest.fixture
 def shared() -> Iterator[RunningServer]:
-    """For others too; its address is that for this machine."""
+    """A server for other machines, too; its address is the local one."""
     running = start_server("0.0.0.0", None, "a scene")
     running.open()
     yield running
@@ -86,21 +86,21 @@ def refused(url: str, **options: object) -> int:
     return error.value.response.status_code
 
 
-# Who comes in
+# Access
 
 
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:8080", "127.0.0.1.evil.example", "10.0.0.1", "", "a b"]
 )
-def test_foreign_hosts_are_refused(local, host):
-    """A name that somebody else owns may point here (DNS rebinding)."""
+def test_foreign_hosts_are_rejected(local, host):
+    """A foreign domain name may resolve to this machine (DNS rebinding)."""
     assert status(get(local.url, "/", f"Host: {host}")) == 421
     upgrading = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
     upgrading += [f"Sec-WebSocket-Key: {'A' * 22}==", f"Sec-WebSocket-Protocol: {PROTOCOL}"]
     assert status(get(local.url, "/", f"Host: {host}", *upgrading)) == 421
 
 
-def test_own_hosts_at_any_port(local):
+def test_own_hosts_with_any_port(local):
     for host in ("localhost:9000", "127.0.0.1", "[::1]:1"):
         assert status(get(local.url, "/", f"Host: {host}", f"Origin: http://{host}")) == 200
 
@@ -112,14 +112,14 @@ def test_own_hosts_at_any_port(local):
         *("http://127.0.0.1:{port}.evil.example", "file://", "http://localhost:{port}"),
     ],
 )
-def test_foreign_pages_are_refused(local, origin):
+def test_foreign_pages_are_rejected(local, origin):
     origin = origin.format(port=port(local), other=port(local) + 1)
     if origin:  # else the client sends none
         assert refused(local.url, origin=origin) == 403
     assert status(get(local.url, "/", f"Origin: {origin}")) == 403
 
 
-def test_the_page_itself_is_let_in(local, shared):
+def test_the_page_itself_is_accepted(local, shared):
     for running in (local, shared):
         parts = urlsplit(running.url)
         with Visitor(running.url, origin=f"http://{parts.netloc}") as visitor:
@@ -129,7 +129,7 @@ def test_the_page_itself_is_let_in(local, shared):
     assert local.url == f"http://127.0.0.1:{port(local)}"
 
 
-def test_others_need_the_address(shared):
+def test_other_machines_need_the_token(shared):
     token = shared.url.split("/")[3]
     assert len(token) >= 20
     assert shared.others == f"http://{socket.gethostname()}:{port(shared)}/{token}/"
@@ -142,21 +142,21 @@ def test_others_need_the_address(shared):
     for path in ("", "/" + token[:-1], f"/{token}x", f"/x/{token}", f"/{token.swapcase()}"):
         answer = get(root, (path or "/") + "/")
         assert status(answer) == 404, path
-        assert answer.endswith(b"\r\n\r\n"), path  # nothing is told
+        assert answer.endswith(b"\r\n\r\n"), path  # the response has no content
         assert refused(root + path) == 404, path
     assert refused(f"{root}/%2e/{token}") == 404
     other = start_server("0.0.0.0", None, "a scene")
-    assert status(get(other.url)) == 503  # nobody comes in before it is opened
+    assert status(get(other.url)) == 503  # rejected before it is opened
     stop_server(other.server)
     assert other.url.split("/")[3] != token
     with pytest.raises(ValueError, match="needs a token"):
         Guard("0.0.0.0", None)
 
 
-# What is given
+# Served files
 
 
-def test_nothing_but_the_page(local, shared):
+def test_only_the_page_is_served(local, shared):
     for running in (local, shared):
         root = urlsplit(running.url).path.rstrip("/")
         for path in (
@@ -177,7 +177,7 @@ def test_nothing_but_the_page(local, shared):
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE", "CONNECT", "get"])
-def test_only_reading(local, method):
+def test_only_get_and_head(local, method):
     assert status(get(local.url, "/", method=method)) in (0, 400, 405, 501)
 
 
@@ -199,14 +199,14 @@ def test_only_reading(local, method):
         ["Upgrade: h2c"],
     ],
 )
-def test_requests_that_could_be_two(local, headers):
+def test_ambiguous_requests_are_rejected(local, headers):
     answer = get(local.url, "/", *headers)
     assert status(answer) in (0, 400, 413, 431)
     assert answer.count(b"HTTP/1.1") <= 1
     assert status(get(local.url)) == 200
 
 
-def test_pages_may_not_be_framed_nor_read_by_others(local):
+def test_the_page_cannot_be_framed_or_read_by_other_pages(local):
     connection = http.client.HTTPConnection("127.0.0.1", port(local))
     connection.request("GET", "/")
     headers = connection.getresponse().headers
@@ -217,7 +217,7 @@ def test_pages_may_not_be_framed_nor_read_by_others(local):
     connection.close()
 
 
-# What may be said
+# Messages
 
 
 def test_messages():
@@ -229,12 +229,12 @@ def test_messages():
     assert is_valid_message(msgspec.msgpack.encode({**click, "modifier": None, "owner": ""}))
     for name in POSE:
         for bad in (float("nan"), "x", None, [], [1.0, 2.0], b"x", {}):
-            sane = name in ("near", "far") and isinstance(bad, float)  # not looked at
+            sane = name in ("near", "far") and isinstance(bad, float)  # not used
             assert is_valid_message(camera(**{name: bad})) is sane, (name, bad)
     for name in ("image_width", "image_height"):
         for size in (0, -1, 1 << 20, 1e300):
             assert not is_valid_message(camera(**{name: size}))
-    # viser sets whatever attribute is named.
+    # viser sets any attribute that is named.
     for name in ("removed", "sync_cb", "update_cb", "label", "order"):
         assert not is_valid_message(update("a", 5, name))
     assert not is_valid_message(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a"}))
@@ -247,16 +247,16 @@ def test_messages():
     assert not is_valid_message(camera().decode("latin-1"))
 
 
-def test_a_program_of_another_version_is_refused(local, capfd):
-    """viser would write into the terminal what such a one calls itself."""
+def test_a_client_of_another_version_is_rejected(local, capfd):
+    """viser would print the name of such a client to the terminal."""
     assert refused(local.url, subprotocols=["viser-v0.0.0"]) == 400
     assert refused(local.url, subprotocols=None) == 400
     assert refused(local.url, subprotocols=[PROTOCOL, "x"]) == 400
     assert capfd.readouterr() == ("", "")
 
 
-def test_who_says_what_no_page_says_is_not_heard(local, capfd, caplog):
-    """Not a word in the terminal, nothing kept, and the next one is served as ever."""
+def test_invalid_messages_are_ignored(local, capfd, caplog):
+    """There is no output, nothing is stored, and the next client is served."""
     logging.getLogger("websockets.server").filters.clear()  # viser's own, since its first request
     for garbage in (b"\x16\x03\x01\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n", b""):
         ask(local.url, garbage + b"\r\n")
@@ -284,7 +284,7 @@ def test_who_says_what_no_page_says_is_not_heard(local, capfd, caplog):
         visitor.send_camera()
         wait(lambda: len(local.server.get_clients()) == 1)
     assert capfd.readouterr() == ("", "")
-    gc.collect()  # asyncio tells of errors that nobody asked for
+    gc.collect()  # asyncio then reports exceptions that were never retrieved
     time.sleep(0.1)
     assert [each for each in caplog.records if each.levelno >= logging.WARNING] == []
 
@@ -304,27 +304,27 @@ def is_cut_off(client: socket.socket, seconds: float = 5.0) -> bool:
 @pytest.mark.parametrize(
     "data",
     [
-        frame(bytes(125), opcode=9) * 2000,  # pings, each of which would be answered
+        frame(bytes(125), opcode=9) * 2000,  # pings, which require responses
         frame(camera()) * 2000,
-        frame(b"x", fin=False) + frame(b"", opcode=0, fin=False) * 20,  # no end, and no rate
+        frame(b"x", fin=False) + frame(b"", opcode=0, fin=False) * 20,  # a message without an end
         frame(b"", length=1 << 62),
         frame(b"", length=1 << 17),
         frame(b"x", opcode=11),
     ],
 )
-def test_floods_are_cut_off(local, data):
+def test_floods_are_disconnected(local, data):
     with upgrade(local.url) as client:
         with contextlib.suppress(OSError):
             client.sendall(data)
         assert is_cut_off(client)
-    with upgrade(local.url) as client:  # what a page says, and more than a page does
+    with upgrade(local.url) as client:  # a valid message, but too often
         for _ in range(100):
             client.sendall(frame(camera()))
             time.sleep(0.002)
         assert not is_cut_off(client, 0.2)
 
 
-def test_nothing_of_it_is_kept(local):
+def test_hostile_messages_leave_no_memory(local):
     hostile("millions of messages", local.url, 0.3)
     before = megabytes()
     for kind in ("pings", "millions of messages", "pieces", "huge frame", "forms"):
@@ -333,8 +333,8 @@ def test_nothing_of_it_is_kept(local):
     assert len(local.server._websock_server._broadcast_buffer.message_from_id) < 100
 
 
-def test_who_does_not_read_is_not_listened_to(local):
-    """Pictures that are not fetched replace one another; what it says is left where it is."""
+def test_a_client_that_does_not_read_is_not_read_from(local):
+    """Images that are not received replace one another; its messages are not read."""
     heard = 0
 
     async def moved(_: object) -> None:
@@ -365,11 +365,11 @@ def test_who_does_not_read_is_not_listened_to(local):
         assert heard - said < 40
 
 
-# How many
+# Limits of connections
 
 
-def test_no_more_than_so_many(local):
-    """A thousand connections: the process keeps its descriptors and threads, the next is served."""
+def test_the_number_of_connections_is_limited(local):
+    """With a thousand connections, descriptors and threads are limited; the next is served."""
     threads = threading.active_count()
     descriptors = len(os.listdir("/proc/self/fd"))
     clients = []
@@ -393,7 +393,7 @@ def test_no_more_than_so_many(local):
     wait(lambda: len(os.listdir("/proc/self/fd")) <= descriptors + 2)
 
 
-def test_no_more_than_so_many_browsers(local):
+def test_the_number_of_browsers_is_limited(local):
     with contextlib.ExitStack() as stack:
         for _ in range(_BROWSERS):
             stack.enter_context(Visitor(local.url))
@@ -409,8 +409,8 @@ def test_no_more_than_so_many_browsers(local):
     wait(is_free)
 
 
-def test_pages_that_nobody_fetches_are_few(local):
-    """Each is as large as the page; a connection that does not take it costs that until its end."""
+def test_unread_page_downloads_are_limited(local):
+    """Each unread download uses as much memory as the page."""
     request = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port(local)}\r\n\r\n".encode()
     assert status(ask(local.url, request)) == 200
     clients = []

@@ -1,4 +1,4 @@
-"""A training among strangers: it goes on, as fast and to the same bit, whatever they do."""
+"""A training with hostile clients: it continues, nearly as fast, with a bit-identical result."""
 
 import dataclasses
 import os
@@ -32,7 +32,7 @@ STEPS = 1_000_000
 
 
 class Watched:
-    """A training with a page, its steps made by whoever calls."""
+    """A training with a page; the test makes its steps."""
 
     def __init__(self, dataset: Dataset) -> None:
         self.trainer = Trainer(dataset, TrainConfig(iterations=STEPS))
@@ -47,14 +47,14 @@ class Watched:
         self._training.after_step(self.trainer.step, STEPS, loss, self.trainer.gaussians)
 
     def run(self, seconds: float) -> float:
-        """For so long; steps a second."""
+        """Make steps for this time; returns the steps per second."""
         began, first = time.monotonic(), self.trainer.step
         while time.monotonic() - began < seconds:
             self.step()
         return (self.trainer.step - first) / (time.monotonic() - began)
 
     def server_seconds(self) -> float:
-        """That the server's thread has computed."""
+        """Processor time of the server's thread."""
         fields = self._stat.read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / TICKS
 
@@ -83,7 +83,7 @@ def _politely() -> None:
 
 
 def attack(url: str, seconds: float, **kinds: int) -> subprocess.Popen[str]:
-    """From another process, which has begun; politely, since it is this machine that it burns."""
+    """Start hostile clients in another process, at low priority."""
     words = [f"{kind.replace('_', ' ')}={count}" for kind, count in kinds.items()]
     command = [sys.executable, clients.__file__, url, str(seconds), *words]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=_politely)
@@ -91,8 +91,8 @@ def attack(url: str, seconds: float, **kinds: int) -> subprocess.Popen[str]:
     return process
 
 
-def test_it_goes_on_to_the_bit(watched, dataset, capfd):
-    """The server's thread has its share of a core and no more; the scene is that of nobody's."""
+def test_the_training_continues_bit_identically(watched, dataset, capfd):
+    """The server's thread uses at most its share; the scene is the same as without clients."""
     watched.run(0.5)
     seconds = 3.0
     for kinds in (
@@ -116,8 +116,8 @@ def test_it_goes_on_to_the_bit(watched, dataset, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_viser_is_changed_in_its_own_thread_alone(watched, monkeypatch):
-    """Its buffers are no good to two: a browser that came at that moment ended a training."""
+def test_viser_is_only_used_in_its_own_thread(watched, monkeypatch):
+    """Its buffers are not thread-safe: a connecting browser could end a training."""
     threads = set()
     push = AsyncMessageBuffer.push
 
@@ -140,8 +140,8 @@ def test_viser_is_changed_in_its_own_thread_alone(watched, monkeypatch):
     assert threads == {watched.viewer.server._websock_server._server_thread.name}
 
 
-def test_controls_take_what_is_there(watched):
-    """Sliders have ends, lists have entries; a browser may say otherwise."""
+def test_invalid_control_values_are_limited(watched):
+    """Browsers may send values outside of the range of a slider or list."""
     with Visitor(watched.viewer.url) as visitor:
         visitor.send_camera()
         while len(visitor.controls) < 20:
@@ -187,7 +187,7 @@ def test_controls_take_what_is_there(watched):
             visitor.pictures(0.02)
 
 
-def test_a_picture_that_cannot_be_made_costs_no_training(watched):
+def test_an_image_that_cannot_be_rendered_does_not_end_the_training(watched):
     with Visitor(watched.viewer.url) as visitor:
         visitor.send_camera()
         session = watched.viewer.session
@@ -198,7 +198,7 @@ def test_a_picture_that_cannot_be_made_costs_no_training(watched):
         time.sleep(0.3)  # it is still
         for _ in range(20):
             watched.step()
-        assert seen.shown_version == seen.version  # it is not tried again and again
+        assert seen.shown_version == seen.version  # it is not repeated
         session.change(seen, display=dataclasses.replace(seen.display, crop=None))
         shown = visitor.shown
         end = time.monotonic() + 20
@@ -208,7 +208,7 @@ def test_a_picture_that_cannot_be_made_costs_no_training(watched):
             visitor.pictures(0.02)
 
 
-def test_views_kept_and_downloads_are_bounded(watched):
+def test_stored_views_and_downloads_are_limited(watched):
     with Visitor(watched.viewer.url) as visitor:
         visitor.send_camera()
         while "Store this view" not in visitor.controls:
@@ -230,8 +230,8 @@ def test_views_kept_and_downloads_are_bounded(watched):
         assert status(clients.get(watched.viewer.url)) == 200
 
 
-def test_pictures_wait_for_one_another(watched, monkeypatch):
-    """Where the server's thread is held up, what it has to send does not pile up in memory."""
+def test_images_are_not_rendered_while_one_is_sent(watched, monkeypatch):
+    """If the server's thread is blocked, images do not accumulate in memory."""
     drawn = []
     draw = watched.viewer._draw
     monkeypatch.setattr(watched.viewer, "_draw", lambda *what: drawn.append(1) or draw(*what))

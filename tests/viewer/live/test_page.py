@@ -1,4 +1,4 @@
-"""The page in real Chromium, on a training that runs: what it shows, what its controls do."""
+"""The page in real Chromium during a training: its images and its controls."""
 
 import os
 import re
@@ -26,7 +26,7 @@ BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() 
 
 
 class Training:
-    """A training as a process of its own, with a page."""
+    """A training in a separate process, with a page."""
 
     def __init__(self, dataset: Path, out: Path) -> None:
         port = free_port("127.0.0.1", None)
@@ -45,7 +45,7 @@ class Training:
             self.lines.append(line)
 
     def interrupt(self) -> str:
-        """Ctrl-C; what is said after it."""
+        """Send Ctrl-C; returns the following output."""
         self.process.send_signal(signal.SIGINT)
         out, _ = self.process.communicate(timeout=60)
         return out
@@ -121,10 +121,10 @@ def settled(page: Page) -> np.ndarray:
         if differ(before, now) < 0.05:
             return now
         before = now
-    raise AssertionError("the picture does not come to rest")
+    raise AssertionError("the image did not become still")
 
 
-def test_it_shows_a_training_that_goes_on(training, page):
+def test_it_shows_a_running_training(training, page):
     lines = "".join(training.lines)
     assert f"watch it in a browser: {training.url}\n" in lines
     assert "ssh -L" in lines
@@ -140,7 +140,7 @@ def test_it_shows_a_training_that_goes_on(training, page):
     assert [url for url in outside if not url.startswith(("data:", "blob:"))] == []
 
 
-def test_pause_step_and_go_on(page):
+def test_pause_step_and_resume(page):
     press(page, "Pause")
     page.wait_for("document.body.innerText.includes(', paused')")
     paused = step_of(page)
@@ -149,14 +149,14 @@ def test_pause_step_and_go_on(page):
     assert step_of(page) == paused
     press(page, "One step")
     wait(lambda: step_of(page) == paused + 1)
-    # Where it is paused the camera can be moved all the same, and what is seen changes.
+    # While paused, the camera can still be moved.
     page.drag(200, 600, 320, 640)
     assert differ(settled(page), still) > 2
     press(page, "Resume")
     wait(lambda: step_of(page) > paused + 10)
 
 
-def test_what_is_shown_can_be_chosen(page):
+def test_display_modes(page):
     press(page, "Pause")
     page.wait_for("document.body.innerText.includes(', paused')")
     before, seen = "Colour", [settled(page)]
@@ -170,7 +170,7 @@ def test_what_is_shown_can_be_chosen(page):
     press(page, "Resume")
 
 
-def test_standing_at_a_photo(training, page):
+def test_the_view_at_a_photo(training, page):
     press(page, "Pause")
     page.wait_for("document.body.innerText.includes(', paused')")
     press(page, "Next")
@@ -179,7 +179,7 @@ def test_standing_at_a_photo(training, page):
     press(page, "Photo")
     wait(lambda: differ(scene(page), render) > 0.2)
     photo = settled(page)
-    assert differ(photo, render) < 30  # it is the same place
+    assert differ(photo, render) < 30  # it is the same pose
     press(page, "Next")
     page.wait_for("document.body.innerText.includes('At view_02.png')")
     wait(lambda: differ(scene(page), photo) > 1)
@@ -188,7 +188,7 @@ def test_standing_at_a_photo(training, page):
     press(page, "Resume")
 
 
-def test_views_are_kept_for_a_film(page, tmp_path):
+def test_views_are_stored_for_a_video(page, tmp_path):
     page.evaluate(
         "(() => { const make = URL.createObjectURL; URL.createObjectURL = "
         "blob => { if (blob.type.includes('json')) window.kept = blob; "
@@ -198,7 +198,7 @@ def test_views_are_kept_for_a_film(page, tmp_path):
     page.wait_for("document.body.textContent.includes('1 stored')")
     page.drag(200, 600, 320, 640)
     settled_after = time.monotonic() + 1.0
-    wait(lambda: time.monotonic() > settled_after)  # the browser has told where it is now
+    wait(lambda: time.monotonic() > settled_after)  # the browser has sent its pose
     press(page, "Store this view")
     page.wait_for("document.body.textContent.includes('2 stored')")
     press(page, "Download the views")
@@ -211,7 +211,7 @@ def test_views_are_kept_for_a_film(page, tmp_path):
     page.wait_for("document.body.textContent.includes('1 stored')")
 
 
-def test_two_pages_have_a_camera_each(training, browser, page):
+def test_two_pages_have_separate_cameras(training, browser, page):
     press(page, "Pause")
     page.wait_for("document.body.innerText.includes(', paused')")
     other = browser.open(training.url)
@@ -223,13 +223,13 @@ def test_two_pages_have_a_camera_each(training, browser, page):
     assert differ(settled(page), here) < 1
     choose(other, "Colour", "Depth")
     assert differ(settled(page), here) < 1
-    press(other, "Resume")  # the training is one
+    press(other, "Resume")  # the training is shared
     paused = step_of(page)
     wait(lambda: step_of(page) > paused)
     other.close()
 
 
-def test_a_page_that_closes_in_mid_stream_harms_nobody(training, browser, page):
+def test_a_page_that_closes_during_a_transfer(training, browser, page):
     first = step_of(page)
     for _ in range(3):
         other = browser.open(training.url)

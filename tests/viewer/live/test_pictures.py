@@ -1,4 +1,4 @@
-"""Every way to see Gaussians, on scenes whose pictures are known."""
+"""All display modes, on scenes with known images."""
 
 import math
 
@@ -31,7 +31,7 @@ def balls(*places, colors=(RED, GREEN), size=0.12, opacity=0.98) -> Gaussians:
     )
 
 
-LEFT, RIGHT = (-0.5, 0.0, 2.0), (1.0, 0.0, 4.0)  # on the picture at column 25 and 65, row 30
+LEFT, RIGHT = (-0.5, 0.0, 2.0), (1.0, 0.0, 4.0)  # in the image at column 25 and 65, row 30
 TWO = balls(LEFT, RIGHT)
 
 
@@ -64,7 +64,7 @@ def test_depth_grows_from_yellow_to_violet():
     assert places == sorted(places, reverse=True)
     assert places[0] > 240
     assert places[4] < 30
-    assert at(picture, 45, 2) == [0, 0, 0]  # nothing there
+    assert at(picture, 45, 2) == [0, 0, 0]  # empty
     assert not draw(balls((0.0, 0.0, -1.0)), CAMERA, DisplaySettings("depth")).any()
 
 
@@ -83,7 +83,7 @@ def test_normals_are_the_shortest_axes_towards_the_camera(sign):
     red, green, blue = at(draw(flat, CAMERA, DisplaySettings("normals")), 45)
     assert (red, green) == pytest.approx((128, 128), abs=4)
     assert blue > 250
-    # Turned about the vertical by 45° it faces right, or left.
+    # Rotated about the vertical axis by 45° it faces right or left.
     flat.quats = torch.tensor([[math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0]])
     red, green, blue = at(draw(flat, CAMERA, DisplaySettings("normals")), 45)
     assert red == pytest.approx(255 * (0.5 - 0.5 / math.sqrt(2)), abs=6)
@@ -158,7 +158,7 @@ def photo_of(picture: np.ndarray) -> Photo:
     return Photo(torch.from_numpy(picture[:, 10:80].copy()), placed)
 
 
-def test_no_error_where_photo_and_render_are_the_same():
+def test_the_error_of_equal_photo_and_render_is_zero():
     colors = draw(TWO, CAMERA, DisplaySettings())
     same = draw(TWO, CAMERA, DisplaySettings("error"), photo=photo_of(colors))
     assert not same[:, 10:80].any()
@@ -184,7 +184,7 @@ def test_a_photo_is_wiped_over_the_render():
     assert whole[:, :10].max() <= 0.36 * 255  # darker around it
 
 
-def test_nothing_at_all():
+def test_an_empty_scene():
     nothing = TWO.select(torch.zeros(0, dtype=torch.int64))
     for mode in ("color", "depth", "alpha", "normals", "points", "ellipsoids", "cost", "error"):
         assert not draw(nothing, CAMERA, DisplaySettings(mode)).any(), mode

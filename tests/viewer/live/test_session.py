@@ -1,4 +1,4 @@
-"""Which picture is due, what the training keeps of its time, pause and step."""
+"""The next image, the training's share of the time, pause and step."""
 
 import threading
 import time
@@ -34,7 +34,7 @@ def pose(x: float = 0.0) -> Pose:
 
 
 def serve(session: Session, clock: Clock, scene: int, seconds: float, training=True) -> str | None:
-    """Take ``seconds`` over the picture that is due; which kind that was."""
+    """Render the due image in ``seconds``; returns its kind."""
     due = session.next_due(scene, training)
     if due is None:
         return None
@@ -43,9 +43,9 @@ def serve(session: Session, clock: Clock, scene: int, seconds: float, training=T
     return due.kind
 
 
-def test_small_while_it_moves_then_full_then_as_the_scene_goes_on(session, clock):
+def test_small_while_moving_then_full_size_then_when_the_scene_changes(session, clock):
     visitor = session.enter(1)
-    assert session.next_due(0, training=False) is None  # from where it looks is not known
+    assert session.next_due(0, training=False) is None  # its pose is unknown
     session.move(visitor, pose())
     due = session.next_due(0, training=False)
     assert (due.kind, due.width, due.height) == ("moving", 640, 360)
@@ -60,12 +60,12 @@ def test_small_while_it_moves_then_full_then_as_the_scene_goes_on(session, clock
     assert session.next_due(1, training=False).kind == "idle"
 
 
-def test_pictures_of_a_moving_camera_are_as_large_as_is_quick(session, clock):
+def test_images_of_a_moving_camera_have_a_size_that_is_fast(session, clock):
     visitor = session.enter(1)
     for i in range(30):
         session.move(visitor, pose(i))
         due = session.next_due(0, training=False)
-        session.spent(due, 0, 1e-6 * due.width * due.height)  # a microsecond a pixel
+        session.spent(due, 0, 1e-6 * due.width * due.height)  # a microsecond per pixel
     assert due.width * due.height == pytest.approx(50_000, rel=0.1)
     for i in range(30):
         session.move(visitor, pose(i))
@@ -74,7 +74,7 @@ def test_pictures_of_a_moving_camera_are_as_large_as_is_quick(session, clock):
     assert (due.width, due.height) == (1280, 720)
 
 
-def test_every_change_makes_a_picture_due(session, clock):
+def test_every_change_needs_a_new_image(session, clock):
     visitor = session.enter(1)
     session.move(visitor, pose())
     clock.now += 1
@@ -87,8 +87,8 @@ def test_every_change_makes_a_picture_due(session, clock):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_the_share_while_it_moves(session, clock, share):
-    """A training of steps of 10 ms, a camera that never rests, pictures of 30 ms."""
+def test_the_share_while_a_camera_moves(session, clock, share):
+    """Steps of 10 ms, images of 30 ms, and a camera that always moves."""
     session.share = share
     visitor = session.enter(1)
     viewing, start = 0.0, clock.now
@@ -100,8 +100,8 @@ def test_the_share_while_it_moves(session, clock, share):
     assert viewing / (clock.now - start) == pytest.approx(share, rel=0.2)
 
 
-def test_one_picture_at_a_time_is_under_way(session, clock):
-    """They do not pile up where they cannot be sent as fast as they are made."""
+def test_one_image_at_a_time_is_being_sent(session, clock):
+    """Images do not accumulate if sending is slower than rendering."""
     visitor, other = session.enter(1), session.enter(2)
     session.move(visitor, pose())
     due = session.next_due(0, training=False)
@@ -111,13 +111,13 @@ def test_one_picture_at_a_time_is_under_way(session, clock):
     assert session.next_due(0, training=False).visitor is other
     session.leave(2)
     session.sent(due, 0.1)
-    assert session.next_due(0, training=True) is None  # what sending took is the training's too
+    assert session.next_due(0, training=True) is None  # sending counts as viewing time, too
     assert session.next_due(0, training=False).visitor is visitor
     clock.now += 0.11
     assert session.next_due(0, training=True).visitor is visitor
 
 
-def test_the_share_while_nobody_moves(session, clock):
+def test_the_share_while_no_camera_moves(session, clock):
     visitor = session.enter(1)
     session.move(visitor, pose())
     viewing, pictures, start = 0.0, 0, clock.now
@@ -130,7 +130,7 @@ def test_the_share_while_nobody_moves(session, clock):
     assert pictures > 50
 
 
-def test_who_moves_goes_first(session, clock):
+def test_a_moving_camera_is_served_first(session, clock):
     still, moving = session.enter(1), session.enter(2)
     session.move(still, pose())
     clock.now += 1
@@ -144,7 +144,7 @@ def test_who_moves_goes_first(session, clock):
     assert session.is_here(moving)
 
 
-def test_a_picture_that_was_changed_meanwhile_is_due_again(session, clock):
+def test_a_change_during_rendering_needs_a_new_image(session, clock):
     visitor = session.enter(1)
     session.move(visitor, pose())
     clock.now += 1
@@ -170,12 +170,12 @@ def test_pause_step_and_resume(session):
     session.resume()
     assert session.may_step()
     assert not session.busy
-    session.step()  # of a training that runs: it stops after the one that it is at
+    session.step()  # of a running training: it pauses after the current step
     assert not session.may_step()
     assert session.paused
 
 
-def test_waiting_ends_with_a_change():
+def test_wait_returns_after_a_change():
     session = Session()
     session.pause()
     threading.Timer(0.05, session.resume).start()
@@ -185,7 +185,7 @@ def test_waiting_ends_with_a_change():
     assert session.may_step()
 
 
-def test_busy_is_about_visitors(session):
+def test_busy_depends_on_visitors(session):
     session.enter(1)
     session.enter(2)
     assert session.busy
@@ -197,7 +197,7 @@ def test_busy_is_about_visitors(session):
     assert not session.busy
 
 
-# Standing at a photo
+# The view at a photo
 
 
 def test_moving_away_leaves_the_photo(session, clock):
@@ -207,7 +207,7 @@ def test_moving_away_leaves_the_photo(session, clock):
     photo_view = PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5))
     session.send(visitor, photo_view)
     clock.now += 0.1
-    session.move(visitor, pose(1))  # was under way already
+    session.move(visitor, pose(1))  # sent before the browser was moved
     assert visitor.photo_view is photo_view
     session.move(visitor, pose(5))
     assert visitor.photo_view is photo_view
@@ -215,7 +215,7 @@ def test_moving_away_leaves_the_photo(session, clock):
     assert visitor.photo_view is None
 
 
-def test_a_browser_that_never_arrives_does_not_stand_there(session, clock):
+def test_a_browser_that_never_arrives_leaves_the_photo(session, clock):
     visitor = session.enter(1)
     camera = Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(3, 4).double())
     session.send(visitor, PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5)))
