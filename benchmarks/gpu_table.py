@@ -150,7 +150,7 @@ def _sanitizer(findings: Findings, name: str) -> str:
 
 def _training(findings: Findings, name: str) -> str:
     rows = []
-    key = ("capture", "iterations", "seed")
+    key = ("dataset", "iterations", "seed")
     runs = {tuple(f[k] for k in key): {} for f in findings.of("training")}
     for found in findings.of("training"):
         runs[tuple(found[k] for k in key)][found["device"]] = found
@@ -171,7 +171,7 @@ def _training(findings: Findings, name: str) -> str:
         else:
             cells += ["—"] * 5
         rows.append(cells)
-    absent = sorted({found["capture"] for found in findings.of("absent")})
+    absent = sorted({found["dataset"] for found in findings.of("absent")})
     if not rows and not absent:
         return ""
     lines = [f"## Training on {name}, PSNR of held-out photos in dB", ""]
