@@ -57,6 +57,11 @@ def test_html_files_cannot_be_read(tmp_path):
         read_gaussians(tmp_path / "scene.html")
 
 
+def test_it_is_listed_among_the_formats_to_write(tmp_path):
+    with pytest.raises(UserError, match=r"use one of .*\.html"):
+        write_gaussians(tmp_path / "scene.obj", three_balls())
+
+
 def test_scenes_without_a_page(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="has no Gaussians"):
         write_gaussians(tmp_path / "scene.html", three_balls().select(torch.zeros(0).long()))
