@@ -78,7 +78,9 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         found["beside"].append(job("build the peer", ["peer-build"], 240))
     if {"stages", "peer"} & set(flags.only):
         found["beside"].append(job("make scenes", ["scenes", *SIZES, *folder], 120))
-    for path in sorted([*ROOT.glob("tests/ops/test_*.py"), ROOT / "tests" / "test_trainer_gpu.py"]):
+    for path in sorted(
+        [*ROOT.glob("tests/ops/test_*.py"), ROOT / "tests" / "training" / "test_trainer_gpu.py"]
+    ):
         name = str(path.relative_to(ROOT))
         part = ["tests", name, "--done", str(scratch / f"{path.stem}.done")]
         found["tests"].append(job(name, part, 120, **few))

@@ -491,8 +491,8 @@ def test_cpu_training_with_few_packages_installed(gpu_modules, tmp_path):
     )
     assert {outcome.state for outcome in outcomes.values()} == {"done"}, log
     absent, *runs = [one for name, one in found if name == "train"]
-    assert absent == {"kind": "absent", "capture": "none"}
-    assert [(f["capture"], f["seed"]) for f in runs] == [("lego400", 0), ("lego400", 3)]
+    assert absent == {"kind": "absent", "dataset": "none"}
+    assert [(f["dataset"], f["seed"]) for f in runs] == [("lego400", 0), ("lego400", 3)]
     for run in runs:
         assert (run["device"], run["iterations"]) == ("cpu", 30)
         assert 5 < run["psnr"] < 60
@@ -527,7 +527,7 @@ def test_the_page_of_a_gpu(gpu_modules):
         add("a", "failure", test=f"tests/a.py::t{i}", line="went wrong " + 300 * "x")
     add("memcheck", "sanitizer", tool="memcheck", errors=2, counted=True, lines=["Invalid write"],
         last="ops: 33", finished=False)  # fmt: skip
-    key = {"capture": "fox", "iterations": 3000, "seed": 0, "ssim": 0.9, "gaussians": 65_000}
+    key = {"dataset": "fox", "iterations": 3000, "seed": 0, "ssim": 0.9, "gaussians": 65_000}
     add("c", "training", device="cpu", psnr=32.0, seconds=30.0, peak=9e8, psnr_on_cpu=None, **key)
     add(
         "g", "training", device="cuda", psnr=32.25, seconds=6.0, peak=2e8, psnr_on_cpu=32.251, **key
@@ -584,7 +584,7 @@ def test_the_jobs_of_a_run(gpu_modules, tmp_path):
 
     (tmp_path / "garden_points.npz").touch()
     flags = argparse.Namespace(
-        datasets=tmp_path, only=list(gpu.GROUPS), seeds=[0, 1], peer=None, arch="9.0"
+        captures=tmp_path, only=list(gpu.GROUPS), seeds=[0, 1], peer=None, arch="9.0"
     )
     planned = gpu.jobs(flags, tmp_path)
     names = [job.name for job in planned]
