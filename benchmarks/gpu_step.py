@@ -197,7 +197,7 @@ def milliseconds(before: torch.cuda.Event, after: torch.cuda.Event) -> float:
 
 
 class Behind:
-    """Keeps the GPU busy until all work to be timed is queued, so that it does not wait for it.
+    """Keeps the GPU busy until all timed work is queued, so that the GPU never waits for the CPU.
 
         with behind:
             before = event(); work(); after = event()

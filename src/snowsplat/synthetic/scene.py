@@ -175,7 +175,7 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
 
 
 def _halved(texture: np.ndarray) -> np.ndarray:
-    """Half the size by a mean of 2 x 2 texels; odd sizes are resampled."""
+    """The texture at half the size: means of 2 x 2 texels; odd sizes are resampled."""
     height, width = (max(1, side // 2) for side in texture.shape[:2])
     if texture.shape[0] != 2 * height or texture.shape[1] != 2 * width:
         planes = [

@@ -104,7 +104,9 @@ def test_points_are_small_and_have_their_colours():
 
 def test_ellipsoids_are_opaque_discs_with_an_edge():
     picture = draw(balls((0.0, 0.0, 2.0), opacity=0.5), CAMERA, DisplaySettings("ellipsoids"))
-    radius = 1.5 * math.hypot(80 * 0.12 / 2, math.sqrt(0.3))  # of the splat, blurred as all are
+    radius = 1.5 * math.hypot(
+        80 * 0.12 / 2, math.sqrt(0.3)
+    )  # of the splat, with the low-pass filter of 0.3 pixels²
     assert shown(picture) == pytest.approx(math.pi * radius**2, rel=0.15)
     values = picture[30, :, 0]
     assert values.max() == pytest.approx(0.9 * 255, abs=6)

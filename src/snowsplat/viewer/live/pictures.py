@@ -211,7 +211,7 @@ def _error(image: Tensor, photo: Photo) -> Tensor:
 
 
 def _beside(picture: Tensor, photo: Photo, display: DisplaySettings) -> Tensor:
-    """The photo up to the wipe position, a line there, and a darker render around the photo."""
+    """Show the photo up to the wipe position, then a line and the render; darken the rest."""
     at = photo.placed
     rows, columns = slice(at.top, at.top + at.height), slice(at.left, at.left + at.width)
     inside = picture[rows, columns].clone()
