@@ -37,7 +37,16 @@ class Room:
     tests: tuple[str, ...]
 
 
-_OPS = ("adam_step", "neighbours", "photometric", "project", "rasterize", "statistic", "tiling")
+_OPS = (
+    "adam_step",
+    "fuzz",
+    "neighbours",
+    "photometric",
+    "project",
+    "rasterize",
+    "statistic",
+    "tiling",
+)
 ROOMS = {
     "density": Room(("training/density/*.py",), ("tests/training/density",)),
     "optim": Room(
@@ -53,7 +62,7 @@ ROOMS = {
     "scene": Room(("scene/*.py",), ("tests/scene",)),
     "trajectory": Room(("trajectory/*.py",), ("tests/trajectory",)),
     "reference": Room(("ops/reference.py",), tuple(f"tests/ops/test_{op}.py" for op in _OPS)),
-    "data": Room(("data/*.py",), ("tests/data",)),
+    "data": Room(("data/**/*.py",), ("tests/data",)),
     "formats": Room(("formats/*.py",), ("tests/formats",)),
 }
 
@@ -99,8 +108,11 @@ def main() -> int:
             chosen = random.Random(f"{flags.seed} {name}").sample(mutants, flags.sample)
         tallies[name] = Tally(len(mutants))
         started = time.monotonic()
-        for mutant, outcome in try_all(ROOMS[name], chosen, flags.jobs):
+        outcomes = try_all(ROOMS[name], chosen, flags.jobs)
+        for i, (mutant, outcome) in enumerate(outcomes, 1):
             tallies[name].counts[outcome.outcome] += 1
+            if i % 25 == 0:
+                print(f"{name}: {i} of {len(chosen)}", flush=True)
             if outcome.outcome == "survived":
                 print(f"SURVIVED {mutant.diff()}", flush=True)
         print(

@@ -16,9 +16,9 @@ from mutation.mutants import Mutant
 
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGE = ROOT / "src" / "snowsplat"
-#: What faults are not put into: linked into a copy of the package, not copied.
-_LINKED = ("_lib", "_viewer", "native")
+_COPIED = ("src", "tests", "pyproject.toml")
 _BASELINE_SECONDS = 1800
+_ON_THE_CPU = "not emulated and not gpu"
 
 
 class Broken(Exception):
@@ -65,25 +65,33 @@ class Coverage:
 
 
 class Runner:
-    """A copy of the package, and a process in whose forks the tests run on it."""
+    """A copy of the checkout, and a process in whose forks the tests run on it."""
 
     def __init__(self) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="snowsplat_mutation_"))
-        package = self._folder / "src" / "snowsplat"
-        ignored = shutil.ignore_patterns("__pycache__", *_LINKED)
-        shutil.copytree(PACKAGE, package, ignore=ignored)
-        for name in _LINKED:
-            if (PACKAGE / name).exists():
-                (package / name).symlink_to(PACKAGE / name)
-        self._package = package
+        self.root = self._folder / "checkout"
+        self.package = self.root / "src" / "snowsplat"
+        self.root.mkdir()
+        for path in ROOT.iterdir():
+            if path.name in _COPIED and path.is_dir():
+                ignored = shutil.ignore_patterns("__pycache__", "node_modules", "_viewer")
+                shutil.copytree(path, self.root / path.name, ignore=ignored)
+            elif path.name in _COPIED:
+                shutil.copy(path, self.root)
+            elif path.name not in ("build", ".git"):
+                (self.root / path.name).symlink_to(path)
+        (self.package / "_viewer").symlink_to(PACKAGE / "_viewer")
+        # Real scenes and datasets, beside the checkout: tests that find none are skipped.
+        if (ROOT.parent / "shared").exists():
+            (self._folder / "shared").symlink_to(ROOT.parent / "shared")
         environment = os.environ | {
-            "PYTHONPATH": str(package.parent),
+            "PYTHONPATH": str(self.package.parent),
             "OMP_NUM_THREADS": "1",
             "HYPOTHESIS_STORAGE_DIRECTORY": str(self._folder / "hypothesis"),
         }
         self._process = subprocess.Popen(
             [sys.executable, Path(__file__).with_name("zygote.py")],
-            cwd=ROOT,
+            cwd=self.root,
             env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -104,8 +112,9 @@ class Runner:
             Broken: a test fails.
         """
         path = self._folder / "coverage.json"
-        limits = {"cpu_seconds": _BASELINE_SECONDS, "seconds": _BASELINE_SECONDS}
-        outcome = self._run(tests=tests, order=None, coverage=str(path), **limits)
+        outcome = self.run(
+            tests, cpu_seconds=_BASELINE_SECONDS, seconds=_BASELINE_SECONDS, coverage=str(path)
+        )
         if outcome.noticed:
             raise Broken(f"{' '.join(tests)}: {outcome.outcome} without a fault: {outcome.by}")
         found = json.loads(path.read_text())
@@ -121,29 +130,58 @@ class Runner:
         if not order:
             return Outcome("survived", None, 0.0)
         expected = sum(coverage.seconds[test] for test in order)
-        path = self._package / mutant.file
+        path = self.package / mutant.file
         source = path.read_bytes()
         cached = path.parent.glob(f"__pycache__/{path.stem}.*")
         try:
             path.write_bytes(mutant.source)
             for file in cached:
                 file.unlink()
-            return self._run(
-                tests=sorted({test.partition("::")[0] for test in order}),
+            return self.run(
+                sorted({test.partition("::")[0] for test in order}),
                 order=order,
-                coverage=None,
                 cpu_seconds=int(3 * expected) + 15,
                 seconds=20 * expected + 120,
             )
         finally:
             path.write_bytes(source)
 
-    def _run(self, **run: object) -> Outcome:
+    def run(
+        self,
+        tests: Sequence[str],
+        *,
+        cpu_seconds: int,
+        seconds: float,
+        order: Sequence[str] | None = None,
+        marked: str = _ON_THE_CPU,
+        isa: str | None = None,
+        coverage: str | None = None,
+    ) -> Outcome:
+        """Runs tests until one fails: see zygote.py.
+
+        Args:
+            tests: files and folders.
+            cpu_seconds, seconds: the most time of the processor, and in all.
+            order: which of the tests, in this order; default: all.
+            marked: pytest's ``-m``.
+            isa: the instruction set; default: the best.
+            coverage: a file for what they execute; then all of them run.
+        """
         process = self._process
         assert process.stdin is not None
         assert process.stdout is not None
         temporary = self._folder / "temporary"
-        process.stdin.write(json.dumps(run | {"temporary": str(temporary)}) + "\n")
+        run = {
+            "tests": list(tests),
+            "order": order,
+            "marked": marked,
+            "isa": isa,
+            "cpu_seconds": cpu_seconds,
+            "seconds": seconds,
+            "temporary": str(temporary),
+            "coverage": coverage,
+        }
+        process.stdin.write(json.dumps(run) + "\n")
         process.stdin.flush()
         answer = json.loads(process.stdout.readline())
         shutil.rmtree(temporary, ignore_errors=True)

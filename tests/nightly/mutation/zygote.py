@@ -2,10 +2,11 @@
 
     python zygote.py      one line of JSON per run on stdin, one with its outcome on stdout
 
-A run is {"tests", "order", "cpu_seconds", "seconds", "temporary", "coverage"}: files and folders of
-tests; which of their tests to run, in this order (null: all); limits of the processor's time and of
-the time; a folder for temporary files; and a file for the coverage, or null. The package itself is
-imported after the fork, since it differs from run to run.
+A run is {"tests", "order", "marked", "isa", "cpu_seconds", "seconds", "temporary", "coverage"}:
+files and folders of tests; which of their tests to run, in this order (null: all); pytest's -m; the
+instruction set (null: the best); limits of the processor's time and of the time; a folder for
+temporary files; and a file for the coverage (null: stop at the first failure instead). The package
+itself is imported after the fork, since it differs from run to run.
 """
 
 from __future__ import annotations
@@ -101,6 +102,8 @@ def _child(run: dict, answer: int) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (run["cpu_seconds"], run["cpu_seconds"] + 1))
     resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if run["isa"]:
+        os.environ["SNOWSPLAT_ISA"] = run["isa"]
     null = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
         os.dup2(null, descriptor)
@@ -112,7 +115,7 @@ def _child(run: dict, answer: int) -> None:
         recorded.start()
     plugin = _Plugin(run["order"], recorded)
     options = ["-p", "no:cacheprovider", "--basetemp", run["temporary"]]
-    options += ["-o", f"pythonpath={os.environ['PYTHONPATH']}", "-m", "not emulated and not gpu"]
+    options += ["-m", run["marked"]]
     options += [] if run["coverage"] else ["-x"]
     code = pytest.main([*run["tests"], *options], plugins=[plugin])
     if recorded is not None:
