@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -77,11 +78,20 @@ def blend_slowly(
     return image, alpha, depth
 
 
+BACKGROUND = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float64)
+
+
+@functools.cache
+def blended_slowly(seed: int) -> tuple[Splats2D, tuple[Tensor, ...]]:
+    """Splats and their image, once for all variants."""
+    splats = random_splats(seed, 70, 19, 18, opacity=(0.3, 1.0))
+    return splats, tuple(blend_slowly(splats, 19, 18, BACKGROUND))
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_definition(variant: Variant, seed: int) -> None:
-    splats = random_splats(seed, 70, 19, 18, opacity=(0.3, 1.0))
-    background = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float64)
-    wanted = blend_slowly(splats, 19, 18, background)
+    splats, wanted = blended_slowly(seed)
+    background = BACKGROUND
     assert wanted[1].max() > 0.999  # some pixels stop early
     got = variant.ops.rasterize(
         leaf_splats(splats, variant.dtype), 19, 18, background.to(variant.dtype), with_depth=True
