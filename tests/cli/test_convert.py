@@ -40,6 +40,7 @@ def ply(tmp_path) -> Path:
     return tmp_path / "a.ply"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", WRITTEN)
 def test_every_format_into_every_other(run, ply, tmp_path, first):
     once = tmp_path / f"once{first}"

@@ -58,6 +58,7 @@ def imported_by(*arguments: object) -> set[str]:
     return modules & ({"torch", "numpy", "PIL"} | subcommands)
 
 
+@pytest.mark.slow
 def test_help_and_mistakes_import_neither_torch_nor_other_subcommands():
     assert imported_by("--help") == set()
     assert imported_by("trian") == set()
@@ -66,6 +67,7 @@ def test_help_and_mistakes_import_neither_torch_nor_other_subcommands():
         assert not {"torch", "numpy", "PIL"} & imported_by(*arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".ply", ".spz", ".sog", ".glb", ".splat"])
 def test_info_describes_a_scene_without_torch(tmp_path, suffix):
     path = tmp_path / f"scene{suffix}"
@@ -159,6 +161,7 @@ def test_no_memory_is_one_line_that_says_what_helps(replace_run, refused):
         module.main(["info", "x"])
 
 
+@pytest.mark.slow
 def test_a_training_whose_reader_has_gone_is_not_done(dataset, tmp_path):
     """As of `| head -1`: silent, but no success."""
     read, write = os.pipe()

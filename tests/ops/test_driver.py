@@ -307,6 +307,7 @@ def test_a_cubin_that_does_not_fit_is_followed_by_one_made_here(error, where, gp
     assert gpus.launches[0].function[0] == b"statistic for sm_86, 1"
 
 
+@pytest.mark.slow
 def test_nothing_of_the_driver_is_loaded_for_the_cpu():
     code = (
         "import torch, sys; before = set(sys.modules);"

@@ -192,12 +192,14 @@ def test_threads_come_from_the_environment_or_the_affinity(monkeypatch):
             native._default_threads()
 
 
+@pytest.mark.slow
 def test_environment_reaches_the_library():
     code = "from snowsplat.ops import native; print(native.isa(), native.get_num_threads())"
     result = run_python(code, SNOWSPLAT_THREADS="5", SNOWSPLAT_ISA="baseline")
     assert result.stdout == "baseline 5\n", result.stderr
 
 
+@pytest.mark.slow
 def test_importing_loads_no_library():
     code = "import snowsplat; from snowsplat.ops import native; print(native._library.cache_info())"
     assert "currsize=0" in run_python(code, SNOWSPLAT_ISA="nonsense").stdout

@@ -314,6 +314,7 @@ def test_native_is_the_twin_at_any_size(
     compare(native, random_splats(width + height, count, width, height), width, height)
 
 
+@pytest.mark.slow
 def test_native_is_the_twin_on_a_long_strip(native: Variant) -> None:
     """Pixel coordinates of five digits, where float32 leaves a thousandth of a pixel."""
     splats = random_splats(4, 400, 16384, 3, pixels=30.0)
@@ -404,6 +405,7 @@ def test_native_is_the_twin_for_needles(native: Variant) -> None:
     compare(native, splats, 40, 40)
 
 
+@pytest.mark.slow
 def test_native_is_the_twin_for_tens_of_thousands(native: Variant) -> None:
     """So many that they are sorted in parallel; some depths are equal."""
     count, width, height = 60_000, 128, 96

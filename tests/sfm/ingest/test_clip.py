@@ -11,6 +11,7 @@ from snowsplat.util.errors import UserError
 from ..pictures import HEIGHT, WIDTH, pan, write_video
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "codec"),
     [

@@ -161,6 +161,7 @@ def test_a_full_disk_is_not_reported_as_a_damaged_video(tmp_path, monkeypatch):
         extract(write_video(tmp_path / "a.mp4", [wall()] * 3), tmp_path / "f", 1)
 
 
+@pytest.mark.slow
 def test_a_real_video(tmp_path):
     if not REAL.is_file():
         pytest.skip("no real video at ../shared/captures/walkaround.mp4")
