@@ -12,6 +12,7 @@ from snowsplat.data import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import DECODERS
 from snowsplat.scene.camera import Camera
+from snowsplat.training.config import changed
 from snowsplat.training.memory_budget import (
     CPU,
     GPU,
@@ -79,6 +80,42 @@ def test_without_a_limit_a_million_gaussians_are_estimated() -> None:
     plan = plan_memory(dataset_of(9, 100, 100), config, DEVICE, available=10**10)
     assert plan.limit is None
     assert "for each million Gaussians" in str(plan)
+
+
+def test_photos_have_half_of_the_available_memory_and_masks_a_byte_per_pixel() -> None:
+    dataset, config = dataset_of(10, 1000, 500), recipe("default")
+    mask = dataset.train[0].image
+    masked = replace(dataset, train=[replace(dataset.train[0], mask=mask), *dataset.train[1:]])
+    assert plan_memory(masked, config, DEVICE, 10**10).photos == 10 * 3 * 500_000 + 500_000
+    assert plan_memory(masked, config, DEVICE, 10_000_000).photos == 5_000_000
+    limited = changed(config, image_memory=3_000_000)
+    assert plan_memory(masked, limited, DEVICE, 10_000_000).photos == 3_000_000
+
+
+def test_the_median_photo_limits_the_gaussians() -> None:
+    views = [view for width in (1000, 200, 400) for view in dataset_of(1, width, 100).train]
+    config = recipe("default")
+    plan = plan_memory(replace(dataset_of(1, 8, 8), train=views), config, DEVICE, 10**10)
+    assert plan.limit == round(400 * 100 * config.gaussians_per_pixel)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_the_least_budget(device: str) -> None:
+    """1000 Gaussians, renderings of the largest photo, and the six largest photos decoded."""
+    sides = [300, 100, 200, 500, 400, 350, 250, 450]
+    views = [view for side in sides for view in dataset_of(1, side, 100).train]
+    dataset = replace(dataset_of(1, 8, 8), train=views)
+    cost, threads = (CPU, DECODERS) if device == "cpu" else (GPU, 0)
+    parameters = 3 + 3 + 4 + 1 + 3 + 45
+    least = cost.fixed + cost.pixel * 50_000 + 18 * threads * 50_000
+    least += 3 * 100 * (500 + 450 + 400 + 350 + 300 + 250)
+    least += 1000 * (3 * 4 * parameters + cost.gaussian)
+    config, where = recipe("default"), torch.device(device)
+    plan = plan_memory(dataset, config, where, 10**10, least)
+    assert plan.total == least
+    assert plan.limit == 1000
+    with pytest.raises(SettingError, match="^memory: "):
+        plan_memory(dataset, config, where, 10**10, least - 1)
 
 
 def test_photos_are_reduced_before_gaussians() -> None:
