@@ -85,6 +85,23 @@ def test_every_sh_degree_is_accepted(degree):
     assert recipe("paper", sh_degree=degree).sh_degree_at(30_000) == degree
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("iterations", 1),
+        ("initial_points", 1),
+        ("densify_interval", 1),
+        *(("sh_degree", degree) for degree in range(4)),
+        ("lr_means", 1e-12),
+        ("lr_means_final", 1e-12),
+        ("lr_means_steps", 0),
+        ("densify_until", 0.0),
+    ],
+)
+def test_the_smallest_valid_values_are_accepted(name, value):
+    recipe("paper", **{name: value})
+
+
 def test_the_largest_seeds_are_accepted():
     for seed in (2**61 - 1, -(2**61)):
         torch.Generator().manual_seed(4 * recipe("paper", seed=seed).seed + 3)
@@ -116,3 +133,10 @@ def test_the_limit_follows_the_size_of_the_photos():
     assert recipe("paper").capped(1000).density.max_gaussians == 0
     assert recipe("default").capped(1).density.max_gaussians == 1
     assert replace(recipe("paper"), gaussians_per_pixel=0.5).capped(99).density.max_gaussians == 50
+
+
+@pytest.mark.parametrize(("limit", "expected"), [(1, 1), (249, 249), (250, 250), (251, 250)])
+def test_the_smaller_limit_counts(limit, expected):
+    config = recipe("paper", max_gaussians=limit, gaussians_per_pixel=0.25)
+    assert config.gaussians_per_pixel == 0.25
+    assert config.capped(1000).density.max_gaussians == expected
