@@ -288,6 +288,26 @@ def test_not_valid(variant: Variant) -> None:
         assert torch.equal(still, old), name
 
 
+@pytest.mark.parametrize("rest", [0, 15])
+def test_rows_that_are_not_finite_are_counted_and_skipped(variant: Variant, rest: int) -> None:
+    """A row counts once for each parameter in which a value is not finite."""
+    degree = 0 if rest == 0 else 3
+    state = Optimised(variant, random_scene(3, 40, sh_degree=degree, rest=rest))
+    for name, values in (("means", [1, 1, 7]), ("quats", [5]), ("opacity_logits", [2, 9, 30])):
+        p = state.params[name]
+        p.grad = torch.zeros_like(p)
+        for k, row in enumerate(values):
+            p.grad.view(len(p), -1)[row, k % p[0].numel()] = math.inf
+    before = state.copy()
+    counts = torch.full((6,), 10, dtype=torch.int32)
+    grad = packed_grads(0, len(state.visible()))
+    state.step(grad, nonfinite_rows=counts)
+    assert counts.tolist() == [12, 10, 11, 13, 10, 10]
+    assert torch.equal(state.params["means"][1, 0], before["means"][1, 0])
+    assert torch.equal(state.m["opacity_logits"][30], before["m of opacity_logits"][30])
+    assert all(bool(tensor.isfinite().all()) for tensor in state.tensors().values())
+
+
 def test_values_at_rest_stay(variant: Variant) -> None:
     """Zero moments and no gradient: 0 / √(0 + eps²) is 0, not NaN."""
     state = Optimised(variant, random_scene(6, 10), fresh=True)

@@ -231,6 +231,15 @@ def test_harmonics_of_degree_one_point_along_the_axes(variant: Variant) -> None:
     assert_close(splats.colors, expected, 1e-6)
 
 
+def test_the_reference_computes_in_the_precision_of_the_means() -> None:
+    """The pose is float64 for any precision."""
+    scene = random_scene(1, 20)
+    exact = scene.to(torch.float64).project(reference)
+    rounded = scene.to(torch.float32).project(reference)
+    assert rounded.packed.dtype == torch.float32
+    assert_close(rounded.packed, exact.packed, 1e-4)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_finite_differences(double: Variant, degree: int) -> None:
     scene = smooth_scene(degree, sh_degree=degree).to(torch.float64)
