@@ -31,7 +31,7 @@ from snowsplat.data.decode import ImageSource, load_image, load_mask
 from snowsplat.data.decode import read_header as read_image_header
 from snowsplat.data.points_ply import read_points, write_points
 from snowsplat.evaluation.lpips import Lpips
-from snowsplat.formats import GaussianArrays, read_gaussians, write_gaussians
+from snowsplat.formats import FORMATS, GaussianArrays, read_gaussians, write_gaussians
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import unpack
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
@@ -118,13 +118,12 @@ def make_scene(n: int, degree: int) -> Gaussians:
     return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
 
 
-def _scene(file: str, degree: int = 1, **more: Any) -> Reader:
+def _scene(file: str) -> Reader:
     return Reader(
         f"scene {file}",
         file,
-        lambda folder: write_gaussians(folder / file, make_scene(30, degree)),
+        lambda folder: write_gaussians(folder / file, make_scene(30, 1)),
         lambda folder: read_gaussians(folder / file),
-        **more,
     )
 
 
@@ -473,17 +472,13 @@ def _make_points(folder: Path) -> None:
 
 
 READERS: tuple[Reader, ...] = (
-    _scene("a.ply"),
+    *(_scene(f"a{format.suffixes[0]}") for format in FORMATS if format.read and format.write),
     Reader("scene a.ply, ASCII", "a.ply", _ascii_ply, _reads("a.ply")),
-    _scene("a.compressed.ply"),
-    _scene("a.splat", 0),
     *(_ksplat(level) for level in (0, 1, 2)),
     *(_spz(f"scene spz {version}", version) for version in (1, 2, 3, 4)),
     _spz("scene spz 3, in gzip", 3, gzip.compress),
-    _scene("a.sog"),
     *(_sog_part(member) for member in ("meta.json", "means_l.webp", "shN_centroids.webp")),
     Reader("scene sog, a folder", "meta.json", _sog_folder, _reads("meta.json"), json=True),
-    _scene("a.glb"),
     Reader("scene glb, its JSON", "a.glb", _make_glb_json, _reads("a.glb"), True, _glb_json),
     Reader("points a.ply", "a.ply", _make_points, lambda folder: read_points(folder / "a.ply")),
     *(_dataset("colmap-bin", f"sparse/0/{part}.bin") for part in ("cameras", "images", "points3D")),

@@ -24,7 +24,7 @@ from snowsplat.training.trainer import Trainer
 from snowsplat.util.errors import UserError
 
 from ..ops.engines import launcher
-from .test_trainer import BUSY, BUSY_MCMC, CALM, dataset
+from .test_trainer import BUSY, BUSY_MCMC, CALM, dataset, every_density_control
 from .test_trainer_gpu import with_capacity
 
 __all__ = ["dataset"]  # a fixture
@@ -129,7 +129,7 @@ def re_step(text: str) -> int:
     return int(re.match(r"step (\d+)[:,]", text)[1])
 
 
-@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@every_density_control
 def test_an_invisible_nonfinite_gaussian_is_found_by_the_refinement(dataset, config) -> None:
     """Adam of visible Gaussians only does not read it."""
     trainer = Trainer(dataset, config)

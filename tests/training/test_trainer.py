@@ -83,6 +83,10 @@ BUSY = TrainConfig(
 BUSY_MCMC = replace(
     BUSY, density=McmcDensity(densify_from=10, densify_interval=10, max_gaussians=50)
 )
+#: Runs a test with every density control. Add a new one here.
+every_density_control = pytest.mark.parametrize(
+    "config", [pytest.param(BUSY, id="adaptive"), pytest.param(BUSY_MCMC, id="mcmc")]
+)
 CALM = TrainConfig(
     iterations=300,
     sh_interval=100,
@@ -130,7 +134,7 @@ def test_it_learns_and_is_the_same_training_in_float64(dataset, monkeypatch):
 
 
 @pytest.mark.isa
-@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@every_density_control
 def test_the_number_of_threads_does_not_change_a_bit(dataset, config):
     torch_threads, ops_threads = torch.get_num_threads(), ops.get_num_threads()
     try:
@@ -144,7 +148,7 @@ def test_the_number_of_threads_does_not_change_a_bit(dataset, config):
         torch.set_num_threads(torch_threads)
         ops.set_num_threads(ops_threads)
     assert_identical(*scenes)
-    assert len(scenes[0]) > COUNT
+    assert len(scenes[0]) != COUNT  # density control did something
 
 
 def test_another_seed_gives_another_scene(dataset):
@@ -152,7 +156,7 @@ def test_another_seed_gives_another_scene(dataset):
     assert len(a) != len(b) or not torch.equal(a.means, b.means)
 
 
-@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@every_density_control
 @pytest.mark.parametrize("stop", [30, 37])
 def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
     """Before a step that densifies (30), and before one that does not."""
@@ -167,7 +171,7 @@ def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
     assert_identical(second.gaussians, uninterrupted)
 
 
-@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@every_density_control
 def test_a_stretched_training_completes_its_schedule_and_resumes_bitwise(dataset, config, tmp_path):
     """60 steps become 90 after step 20, and 45 after step 40."""
     rates = LearningRates(means_steps=1.0)
@@ -238,7 +242,7 @@ def test_refinement_waits_for_the_next_step(dataset):
     assert counts[20] > counts[19]
 
 
-@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adaptive", "mcmc"])
 @pytest.mark.parametrize("cap", [25, 46])
 def test_the_cap_is_never_exceeded(dataset, config, cap):
     counts = []

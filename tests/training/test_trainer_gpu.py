@@ -22,7 +22,7 @@ from snowsplat.training.finite import Diverged
 from snowsplat.training.trainer import Trainer
 
 from ..ops.engines import launcher
-from .test_trainer import BUSY, BUSY_MCMC, dataset
+from .test_trainer import BUSY, BUSY_MCMC, dataset, every_density_control
 
 __all__ = ["dataset"]  # a fixture
 
@@ -39,7 +39,7 @@ def with_capacity(trainer: Trainer, instances: int) -> Trainer:
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@every_density_control
 def test_the_kernels_of_a_gpu_train_as_those_of_the_cpu(
     dataset: Dataset, config: TrainConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -90,7 +90,7 @@ def backward_by_hand(loss: Tensor) -> None:
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
-@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@every_density_control
 def test_a_step_waits_for_nothing_and_mixes_no_devices(
     dataset: Dataset,
     config: TrainConfig,
@@ -140,7 +140,7 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU that torch can use")
-@pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adc", "mcmc"])
+@every_density_control
 def test_training_on_a_gpu(dataset: Dataset, config: TrainConfig) -> None:
     device = torch.device("cuda")
     config = replace(config, background="black")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, get_args
 
 import tyro
 
 from snowsplat.cli.config_flags import RECIPE, ConfigFlags
 from snowsplat.cli.flags import flag, switch
+from snowsplat.pipeline.checkpoint_meta import Recipe
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.train import TrainOptions
 from snowsplat.util.errors import UserError
@@ -25,8 +26,7 @@ class JobFlags:
     """Folder for the result; created if missing."""
 
     recipe: Annotated[
-        Literal["default", "paper", "mcmc"] | None,
-        flag("{default,paper,mcmc}", default="default"),
+        Recipe | None, flag(f"{{{','.join(get_args(Recipe))}}}", default="default")
     ] = None
     """The origin of all other settings. default: a few thousand quick steps; paper: the schedule
     of the paper, 30,000 steps; mcmc: 30,000 steps with a fixed number of Gaussians."""

@@ -13,6 +13,7 @@ from snowsplat.util.safe_json import from_json
 if TYPE_CHECKING:
     from snowsplat.training.checkpoint import Checkpoint
 
+#: Names of `training.recipes.RECIPES`, without importing torch.
 Recipe = Literal["default", "paper", "mcmc"]
 
 

@@ -36,7 +36,7 @@ class TrainOptions:
         TrainOptions(hold_out=8, settings={"iterations": 7000, "max_gaussians": 200_000})
 
     Attributes:
-        recipe: the origin of all settings: "default", "paper" or "mcmc".
+        recipe: the origin of all settings, by name.
         settings: changed settings by name, see `snowsplat.training.config.changed`.
         images: name of the folder of photos in the dataset; default: "images".
         resolution: 1, 2, 4 or 8 divide the size of the photos; any other number is a width in

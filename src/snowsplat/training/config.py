@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from snowsplat.training.density import AdaptiveDensity, DensityConfig, McmcDensity
+from snowsplat.training.density import DENSITY_CONTROLS, AdaptiveDensity, DensityConfig
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.util.errors import SettingError, UserError
@@ -37,7 +37,7 @@ class TrainConfig:
         initial_scale: of every Gaussian at initialisation, in units of the mean distance to its
             three nearest neighbours.
         learning_rates: see `LearningRates`.
-        density: settings of density control, `AdaptiveDensity` or `McmcDensity`.
+        density: settings of density control, one of `DENSITY_CONTROLS`.
         gaussians_per_pixel: limits the number of Gaussians by the size of the photos, in addition
             to ``density.max_gaussians``: small photos show no more. 0 is no limit.
         visible_only: the optimiser skips Gaussians that the view of a step does not see. In the
@@ -156,10 +156,9 @@ def config_from_json(values: dict[str, Any]) -> TrainConfig:
     Raises:
         UserError: written by another version of the program, or damaged.
     """
-    controls: dict[str, Any] = {kind.__name__: kind for kind in (AdaptiveDensity, McmcDensity)}
     try:
         values = dict(values)
-        density = from_json(controls[values.pop("density_control")], values.pop("density"))
+        density = from_json(DENSITY_CONTROLS[values.pop("density_control")], values.pop("density"))
         rates = from_json(LearningRates, values.pop("learning_rates"))
         config = from_json(TrainConfig, values)
         return replace(config, density=density, learning_rates=rates)

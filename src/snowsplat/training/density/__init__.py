@@ -20,7 +20,7 @@ from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.training.view_gradient import ViewGradient
 
-__all__ = ["AdaptiveDensity", "DensityConfig", "DensityControl", "McmcDensity"]
+__all__ = ["DENSITY_CONTROLS", "AdaptiveDensity", "DensityConfig", "DensityControl", "McmcDensity"]
 
 
 class DensityControl(Protocol):
@@ -98,3 +98,9 @@ class DensityConfig(Protocol):
             device: of the Gaussians; default: the CPU.
         """
         ...
+
+
+#: The settings of every method by the name of their class, which a stored configuration names.
+DENSITY_CONTROLS: dict[str, type[DensityConfig]] = {
+    settings.__name__: settings for settings in (AdaptiveDensity, McmcDensity)
+}
