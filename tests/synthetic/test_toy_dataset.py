@@ -1,5 +1,7 @@
 """The toy dataset: images, poses and points are consistent."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -17,8 +19,16 @@ def test_the_same_arguments_write_the_same_files(tmp_path):
     assert (a / "images/view_00.png").read_bytes() != (c / "images/view_00.png").read_bytes()
 
 
-def test_binary_and_text_have_the_same_content(pristine):
-    binary, text = load_dataset(pristine["colmap-bin"]), load_dataset(pristine["colmap-txt"])
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory) -> dict[str, Path]:
+    """The same scene in each format."""
+    root = tmp_path_factory.mktemp("datasets")
+    formats = ("colmap-bin", "colmap-txt", "blender")
+    return {f: write_toy_dataset(root / f, f, 9, 32, 24, n_points=60) for f in formats}
+
+
+def test_binary_and_text_have_the_same_content(datasets):
+    binary, text = load_dataset(datasets["colmap-bin"]), load_dataset(datasets["colmap-txt"])
     assert torch.equal(binary.points.xyz, text.points.xyz)
     assert torch.equal(binary.points.rgb, text.points.rgb)
     for a, b in zip(binary.train, text.train, strict=True):
@@ -42,17 +52,17 @@ def test_points_have_the_colours_of_their_pixels(tmp_path):
 
 
 @pytest.mark.parametrize("format", ["colmap-bin", "blender"])
-def test_images_have_content(pristine, format):
-    dataset = load_dataset(pristine[format])
+def test_images_have_content(datasets, format):
+    dataset = load_dataset(datasets[format])
     with ImageLoader(dataset.train, background=(1, 1, 1)) as loader:
         for view in dataset.train:
             assert loader.get(view).rgb.double().std() > 15
 
 
-def test_transforms_json_and_colmap_model_agree(pristine):
+def test_transforms_json_and_colmap_model_agree(datasets):
     """The readers convert the axes and intrinsics of both formats to the same cameras."""
-    colmap = load_dataset(pristine["colmap-bin"], hold_out=None)
-    blender = load_dataset(pristine["blender"], hold_out=None)
+    colmap = load_dataset(datasets["colmap-bin"], hold_out=None)
+    blender = load_dataset(datasets["blender"], hold_out=None)
     by_number = {view.name.split("_")[1].rjust(6, "0"): view.camera for view in blender.train}
     for view in colmap.train:
         other = by_number[view.name.split("_")[1]]
