@@ -184,12 +184,12 @@ def test_photos_of_another_scene_are_named(tmp_path, pictures):
 
 
 def test_two_scenes_yield_the_larger_one_after_a_second_attempt(tmp_path, pictures):
-    other = [scenes.photograph(scenes.boards(9), pose, i) for i, pose in enumerate(scenes.arc(5))]
-    photos = scenes.write(tmp_path, [*other, *pictures[:7]])
+    other = [scenes.photograph(scenes.boards(9), pose, i) for i, pose in enumerate(scenes.arc(4))]
+    photos = scenes.write(tmp_path, [*other, *pictures[:6]])
     result = estimate_poses(tmp_path, photos, DRAFT, silent)
-    assert result.registered == [f"{i:03}.png" for i in range(5, 12)]
-    assert result.sub_models == [7, 5]
-    assert "a separate group of 5 photos" in result.unregistered["000.png"]
+    assert result.registered == [f"{i:03}.png" for i in range(4, 10)]
+    assert result.sub_models == [6, 4]
+    assert "a separate group of 4 photos" in result.unregistered["000.png"]
     assert len(result.attempts) > 1
     assert "4096 features" in result.attempts[1]
     sparse = tmp_path / "distorted" / "sparse"
