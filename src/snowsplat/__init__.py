@@ -2,14 +2,19 @@
 
     import snowsplat
 
+    made = snowsplat.make("photos", "garden_scene")
+    snowsplat.render_video("garden_scene")
+
+or, to control each step of the training,
+
     dataset = snowsplat.load_dataset("path/to/dataset")
     trainer = snowsplat.Trainer(dataset, snowsplat.recipe("default", iterations=1000))
     trainer.run()
     snowsplat.write_gaussians("scene.ply", trainer.gaussians)
 
-The public names are below; each is imported when it is first used, so that `snowsplat --help` does
-not wait for torch. `render` is in `snowsplat.scene.render`, the numerical operations are in
-`snowsplat.ops`.
+The public names are listed below; each is imported when it is first used, so that importing the
+package does not import torch. `render` is in `snowsplat.scene.render`, the numerical operations are
+in `snowsplat.ops`.
 """
 
 from importlib import import_module
@@ -20,7 +25,18 @@ from snowsplat._version import __version__
 if TYPE_CHECKING:
     from snowsplat.data import Dataset, Points, View, load_dataset
     from snowsplat.evaluation.metrics import evaluate_views
-    from snowsplat.formats import read_gaussians, write_gaussians
+    from snowsplat.formats import read_gaussians
+    from snowsplat.pipeline.compute import Compute
+    from snowsplat.pipeline.convert import Edits, convert
+    from snowsplat.pipeline.evaluate import evaluate
+    from snowsplat.pipeline.make import MakeOptions, make
+    from snowsplat.pipeline.observer import Observer
+    from snowsplat.pipeline.render import render_images
+    from snowsplat.pipeline.scene_files import write_gaussians
+    from snowsplat.pipeline.scene_source import load_trained
+    from snowsplat.pipeline.train import TrainOptions, resume, train
+    from snowsplat.pipeline.training_run import TrainingStopped
+    from snowsplat.pipeline.videos import VideoOptions, render_video
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.config import TrainConfig
@@ -31,34 +47,64 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "Camera": "scene.camera",
+    "Compute": "pipeline.compute",
     "Dataset": "data",
+    "Edits": "pipeline.convert",
     "Gaussians": "scene.gaussians",
+    "MakeOptions": "pipeline.make",
+    "Observer": "pipeline.observer",
     "Points": "data",
     "TrainConfig": "training.config",
+    "TrainOptions": "pipeline.train",
     "Trainer": "training.trainer",
+    "TrainingStopped": "pipeline.training_run",
     "UserError": "util.errors",
+    "VideoOptions": "pipeline.videos",
     "View": "data",
+    "convert": "pipeline.convert",
+    "evaluate": "pipeline.evaluate",
     "evaluate_views": "evaluation.metrics",
     "load_dataset": "data",
+    "load_trained": "pipeline.scene_source",
+    "make": "pipeline.make",
     "read_gaussians": "formats",
     "recipe": "training.recipes",
+    "render_images": "pipeline.render",
+    "render_video": "pipeline.videos",
+    "resume": "pipeline.train",
+    "train": "pipeline.train",
     "write_gaussians": "pipeline.scene_files",
 }
 
 __all__ = [
     "Camera",
+    "Compute",
     "Dataset",
+    "Edits",
     "Gaussians",
+    "MakeOptions",
+    "Observer",
     "Points",
     "TrainConfig",
+    "TrainOptions",
     "Trainer",
+    "TrainingStopped",
     "UserError",
+    "VideoOptions",
     "View",
     "__version__",
+    "convert",
+    "evaluate",
     "evaluate_views",
     "load_dataset",
+    "load_trained",
+    "make",
     "read_gaussians",
     "recipe",
+    "render_images",
+    "render_video",
+    "resume",
+    "train",
     "write_gaussians",
 ]
 

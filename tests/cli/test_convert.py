@@ -10,13 +10,11 @@ import pytest
 import torch
 
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
-from snowsplat.pipeline.convert import gaussians_to_keep
 from snowsplat.scene import edit
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.util.errors import UserError
 
 WRITTEN = [f.suffixes[0] for f in FORMATS if f.write]
 READ_BACK = [f for f in FORMATS if f.write and f.read]
@@ -136,14 +134,6 @@ def test_mistakes(refused, ply, tmp_path):
     for wrong in ("some", "-3", "101%", "1.5", "%"):
         assert "--decimate" in refused("convert", ply, out, f"--decimate={wrong}")
     assert not out.exists()
-
-
-def test_how_many_to_keep():
-    assert [gaussians_to_keep(text, 400) for text in ("0", "17", "0%", "50%", "12.5%", "100%")] == [
-        *(0, 17, 0, 200, 50, 400)
-    ]
-    with pytest.raises(UserError):
-        gaussians_to_keep("¾", 400)
 
 
 @pytest.mark.parametrize("format", READ_BACK, ids=lambda format: format.name)

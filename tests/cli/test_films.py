@@ -8,10 +8,6 @@ import numpy as np
 import pytest
 
 from snowsplat.cli.main import main
-from snowsplat.pipeline.videos import VideoOptions, VideoSize
-from snowsplat.util.errors import UserError
-
-from ..trajectory.rigs import camera_at
 
 SHORT = ("--seconds", 1, "--fps", 10)
 
@@ -100,21 +96,3 @@ def test_refused(refused, trained, tmp_path):
     assert "name a camera path with --path" in refused("render", trained, "--size", "64x48")
     assert "no such folder" in refused("render", tmp_path / "absent", "--path", "ellipse")
     assert "--threads: 0 is too small" in refused(*film, "--threads", 0)
-
-
-def test_sizes_are_even():
-    camera = camera_at((0.0, 0.0, -3.0))  # 64×48
-    assert VideoSize.parse(None).of(camera) == (64, 48)
-    assert VideoSize.parse("127").of(camera) == (126, 94)
-    assert VideoSize.parse("33x21").of(camera) == (32, 20)
-    large = camera.scaled(4000, 3000)
-    assert VideoSize.parse(None).of(large) == (1920, 1440)
-    assert VideoSize.parse("8192").of(camera.scaled(1, 100_000)) == (8192, 8192)
-
-
-def test_number_of_frames():
-    assert VideoOptions(seconds=2.0, fps=12.5).frames == 25
-    assert VideoOptions(seconds=0.001, fps=1.0).frames == 1
-    for wrong in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(UserError, match="above 0"):
-            VideoOptions(seconds=wrong)

@@ -16,7 +16,7 @@ import pytest
 from snowsplat import synthetic
 from snowsplat.pipeline import make as making
 from snowsplat.pipeline.make import RECORD, STAGES
-from snowsplat.pipeline.quality import PRESETS, quality_within
+from snowsplat.pipeline.quality import PRESETS
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.util.stages import Stages
 
@@ -227,13 +227,3 @@ def test_a_stop_before_the_cameras_leaves_the_folder_ours(refused, dataset, tmp_
     for _ in range(2):  # and the same command comes as far again
         assert "only 2 usable pictures" in refused("make", two, "-o", out)
         assert files(out) == {RECORD}
-
-
-def test_the_effort_that_a_time_allows():
-    assert [quality_within(seconds, 50, 0, 2) for seconds in (30, 60, 300, 3600)] == [
-        *("draft", "draft", "normal", "best"),
-    ]
-    assert quality_within(300, 50, 0, 16) == "best"
-    assert quality_within(300, 1000, 0, 2) == "draft"
-    assert quality_within(120, 0, 1, 2) == "draft"
-    assert quality_within(240, 0, 1, 2) == "normal"

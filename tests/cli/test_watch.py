@@ -1,6 +1,5 @@
 """`snowsplat watch`, and `--view` of `train` and `make`: what is refused, what is said, Ctrl-C."""
 
-import shutil
 import signal
 import socket
 import urllib.error
@@ -8,12 +7,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-import torch
 
-from snowsplat.pipeline.output_folder import OutputFolder
-from snowsplat.pipeline.watch import NewestScene, watched_folder
-from snowsplat.training import checkpoint
-from snowsplat.util.errors import UserError
 from snowsplat.viewer.live.server import free_port
 
 
@@ -51,49 +45,6 @@ def test_watch_until_ctrl_c(start, trained):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
-
-
-def test_the_newest_is_shown_as_it_comes(trained, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(trained, out)
-    folder = OutputFolder(out)
-    scene = NewestScene(folder, None)()
-    assert scene.about[0] == "After 50 steps"
-    assert NewestScene(folder, 20)().about[0] == "After 20 steps"
-    with pytest.raises(UserError, match="no scene of iteration 7; there are 20, 50"):
-        NewestScene(folder, 7)()
-
-    shutil.rmtree(out / "point_cloud/iteration_50")
-    newest = NewestScene(folder, None)
-    of_checkpoint = newest()
-    assert of_checkpoint.about[0] == "After 40 steps"
-    tensors = checkpoint.latest(folder.checkpoints).tensors
-    assert of_checkpoint.gaussians.means.equal(tensors["gaussians.means"])
-    assert newest() is of_checkpoint  # not read again
-
-    # A newer one comes, first damaged, then whole.
-    path = folder.scene_path(50)
-    path.parent.mkdir()
-    path.write_bytes(b"ply\n")
-    assert newest() is of_checkpoint
-    shutil.copyfile(trained / "point_cloud/iteration_50/point_cloud.ply", path)
-    later = newest()
-    assert later.about[0] == "After 50 steps"
-    assert later.number != of_checkpoint.number
-    shutil.rmtree(out / "point_cloud")
-    shutil.rmtree(out / "checkpoints")
-    assert newest() is later  # replaced at this moment
-    assert NewestScene(folder, None)().gaussians is None
-    assert "--checkpoint-every" in " ".join(NewestScene(folder, None)().about)
-
-
-def test_a_checkpoint_of_something_else(trained, tmp_path):
-    out = OutputFolder(tmp_path / "out")
-    shutil.copytree(trained, out.path)
-    for tensors in ({"a": torch.zeros(3)}, {"gaussians.means": torch.zeros(3)}):
-        checkpoint.save(out.checkpoints, 5000, tensors, {})
-        with pytest.raises(UserError, match="not the checkpoint of a training"):
-            NewestScene(out, None)()
 
 
 def test_watch_refuses(refused, trained, tmp_path):
@@ -140,12 +91,6 @@ def test_the_page_of_a_training_stays_until_ctrl_c(start, run, dataset, tmp_path
     assert run("train", dataset, "-o", plain, "--iterations", 30).code == 0
     name = "point_cloud/iteration_30/point_cloud.ply"
     assert (viewed / name).read_bytes() == (plain / name).read_bytes()
-
-
-def test_the_folder_of_make_holds_that_of_a_training(trained, tmp_path):
-    shutil.copytree(trained, tmp_path / "made" / "scene")
-    assert watched_folder(tmp_path / "made").path == tmp_path / "made" / "scene"
-    assert watched_folder(trained).path == trained
 
 
 def test_other_computers_are_told_an_address_that_cannot_be_guessed(start, trained):

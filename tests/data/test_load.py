@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.data import ImageLoader, load_dataset
+from snowsplat.data import ImageLoader, load_dataset, read_files
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
@@ -34,6 +34,23 @@ def test_extent_is_computed_from_the_training_cameras(pristine):
     centres = torch.stack([view.camera.position for view in dataset.train])
     farthest = (centres - centres.mean(0)).norm(dim=1).max()
     assert dataset.extent == pytest.approx(1.1 * float(farthest))
+
+
+def test_files_that_are_read_once_give_the_dataset_at_any_resolution(pristine, tmp_path):
+    """Bit-identical to reading them again, also if the photos are smaller than their cameras."""
+    half = write_toy_dataset(tmp_path / "half", "colmap-bin", 9, 66, 50)
+    resize_folder(half / "images", half / "images", (33, 25))
+    for root in (pristine["colmap-bin"], half):
+        files = read_files(root)
+        files.dataset(None)
+        for width in (23, 30):
+            once, again = files.dataset(width), load_dataset(root, resolution=width)
+            assert [view.name for view in once.test] == [view.name for view in again.test]
+            for a, b in zip(once.train, again.train, strict=True):
+                assert a.image == b.image
+                for name in ("width", "height", "fx", "fy", "cx", "cy"):
+                    assert getattr(a.camera, name) == getattr(b.camera, name)
+                assert a.camera.cam_from_world.equal(b.camera.cam_from_world)
 
 
 def test_lists_of_test_images(pristine, tmp_path):

@@ -53,31 +53,84 @@ def load_dataset(
             image is missing, damaged, or does not have the size of its camera.
         SettingError: ``images`` is not the folder of the images, or ``resolution`` is invalid.
     """
+    return read_files(
+        path, images=images, resolution=resolution, hold_out=hold_out, test_list=test_list
+    ).dataset(resolution)
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetFiles:
+    """The files of a dataset, read and checked: they become a `Dataset` at any resolution.
+
+    Attributes:
+        images: each with the header of its file, and the result of `_file_sizes`.
+        test_names: names of the views to hold out.
+    """
+
+    root: Path
+    images: list[tuple[PosedImage, Header, tuple[int, int, bool]]]
+    points: Points | None
+    description: str
+    test_names: set[str]
+
+    def dataset(self, resolution: int | None) -> Dataset:
+        """The dataset at a resolution, see `load_dataset`; reads no file.
+
+        Raises:
+            SettingError: ``resolution`` is invalid.
+            UserError: all images are held out, or cameras are not finite.
+        """
+        views = sorted(
+            (_view(*image, resolution) for image in self.images), key=lambda view: view.name
+        )
+        train = [view for view in views if view.name not in self.test_names]
+        if not train:
+            raise UserError(
+                f"{self.root}: all {len(views)} images are held out for testing, so no image is "
+                "left for training; hold out fewer or none"
+            )
+        return Dataset(
+            train=train,
+            test=[view for view in views if view.name in self.test_names],
+            points=self.points,
+            extent=scene_extent([view.camera for view in train]),
+            description=self.description,
+        )
+
+
+def read_files(
+    path: Path | str,
+    *,
+    images: str = "images",
+    resolution: int | None = None,
+    hold_out: int | None = 8,
+    test_list: Path | str | Sequence[str] | None = None,
+) -> DatasetFiles:
+    """Read and check the files of a dataset, once for several resolutions.
+
+    Args:
+        resolution: 2, 4 or 8 selects the folder ``images_2`` …; any other value the full size.
+
+    The other arguments and the errors are those of `load_dataset`.
+    """
     root = Path(path)
     posed, points, description = _read(root, images)
     posed = _with_smaller_copies(posed, resolution)
     headers = [read_header(image.path) for image in posed]
     sizes = _file_sizes(posed, headers)
-    views = sorted(
-        (_view(*found, resolution) for found in zip(posed, headers, sizes, strict=True)),
-        key=lambda view: view.name,
-    )
-    if len({view.name for view in views}) < len(views):
-        repeated = next(name for name, n in Counter(view.name for view in views).items() if n > 1)
+    for image, header in zip(posed, headers, strict=True):
+        if image.mask is not None:
+            _check_mask(image, header, read_header(image.mask))
+    count = Counter(image.name for image in posed)
+    if len(count) < len(posed):
+        repeated = next(name for name, n in sorted(count.items()) if n > 1)
         raise UserError(f"{root}: has two images named {repeated}; remove one")
-    test_names = _test_names(posed, hold_out, test_list)
-    train = [view for view in views if view.name not in test_names]
-    if not train:
-        raise UserError(
-            f"{root}: all {len(views)} images are held out for testing, so no image is left for "
-            "training; hold out fewer or none"
-        )
-    return Dataset(
-        train=train,
-        test=[view for view in views if view.name in test_names],
-        points=points,
-        extent=scene_extent([view.camera for view in train]),
-        description=description,
+    return DatasetFiles(
+        root,
+        list(zip(posed, headers, sizes, strict=True)),
+        points,
+        description,
+        _test_names(posed, hold_out, test_list),
     )
 
 
@@ -194,7 +247,6 @@ def _view(
     mask = None
     if image.mask is not None:
         mask = ImageSource(image.mask, width, height, sideways)
-        _check_mask(image, header, read_header(image.mask))
     source = ImageSource(image.path, width, height, sideways, header.width * header.height)
     return View(image.name, image.camera.scaled(width, height), source, mask)
 

@@ -32,7 +32,7 @@ from snowsplat.util.files import is_temporary, remove_temporaries, write_json, w
 from snowsplat.util.safe_json import from_json, read_json
 
 if TYPE_CHECKING:
-    from snowsplat.data import Dataset
+    from snowsplat.data import Dataset, DatasetFiles
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.config import TrainConfig
@@ -67,9 +67,17 @@ class DatasetSettings:
         Raises:
             UserError: see `snowsplat.data.load_dataset`.
         """
-        from snowsplat.data import load_dataset
+        return self.read_files().dataset(self.resolution)
 
-        return load_dataset(
+    def read_files(self) -> DatasetFiles:
+        """Read the files of the dataset, to load it at several resolutions.
+
+        Raises:
+            UserError: see `snowsplat.data.load_dataset`.
+        """
+        from snowsplat.data import read_files
+
+        return read_files(
             self.path,
             images=self.images,
             resolution=self.resolution,

@@ -184,7 +184,8 @@ class _Job:
         settings = options.dataset_settings(path)
         name = options.recipe or "default"
         config = recipe(name, **options.settings)
-        dataset = settings.load()
+        files = settings.read_files()
+        dataset = files.dataset(settings.resolution)
         plan = None
         if budget is not None:
             plan = budget.plan(
@@ -199,7 +200,7 @@ class _Job:
             config = plan.config
             if plan.resolution is not None:
                 settings = replace(settings, resolution=plan.resolution)
-                dataset = settings.load()
+                dataset = files.dataset(plan.resolution)
         memory = self._memory(dataset, config)
         trainer = Trainer(dataset, memory.plan.config, device=self.device)
         self.out.begin(dataset, settings, memory.plan.config)

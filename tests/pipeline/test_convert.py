@@ -1,0 +1,50 @@
+"""`convert` and its edits from Python."""
+
+import pytest
+import torch
+
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.pipeline.convert import Edits, convert, gaussians_to_keep
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.errors import SettingError, UserError
+
+
+def test_how_many_to_keep():
+    assert [gaussians_to_keep(text, 400) for text in ("0", "17", "0%", "50%", "12.5%", "100%")] == [
+        *(0, 17, 0, 200, 50, 400)
+    ]
+    with pytest.raises(UserError):
+        gaussians_to_keep("¾", 400)
+
+
+def test_edits_that_cannot_be_applied():
+    for edits, setting in (
+        ({"sh_degree": 4}, "sh_degree"),
+        ({"scale": 0.0}, "scale"),
+        ({"crop": (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)}, "crop"),
+        ({"decimate": "101%"}, "decimate"),
+    ):
+        with pytest.raises(SettingError) as error:
+            Edits(**edits)
+        assert error.value.setting == setting
+
+
+def test_two_scenes_become_one(tmp_path):
+    zeros = torch.zeros(3, 1, 3)
+    one = Gaussians(
+        torch.arange(9.0).reshape(3, 3),
+        zeros[:, 0],
+        torch.ones(3, 4),
+        zeros[:, 0, 0],
+        zeros,
+        zeros[:, :0],
+    )
+    write_gaussians(tmp_path / "a.ply", one)
+    edits = Edits(translate=(1.0, 0.0, 0.0), decimate=5)
+    format = convert([tmp_path / "a.ply", tmp_path / "a.ply"], tmp_path / "b.ply", edits)
+    assert format.name == "PLY"
+    both = read_gaussians(tmp_path / "b.ply")
+    assert len(both) == 5
+    assert set(both.means[:, 0].tolist()) <= {1.0, 4.0, 7.0}
+    with pytest.raises(UserError, match="exists; use `overwrite`"):
+        convert(tmp_path / "a.ply", tmp_path / "b.ply")

@@ -1,0 +1,114 @@
+"""`train`, `resume`, `evaluate` and `render` from Python: results, observer, errors."""
+
+import json
+import os
+import signal
+
+import pytest
+
+from snowsplat.data import load
+from snowsplat.pipeline.evaluate import evaluate
+from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.render import render_images
+from snowsplat.pipeline.scene_source import load_trained
+from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.pipeline.training_run import TrainingStopped
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.util.errors import SettingError, UserError
+
+
+class Recorder(Observer):
+    """What a training reports, in order."""
+
+    def __init__(self, interrupt_at: int = 0) -> None:
+        self.events: list[str] = []
+        self.interrupt_at = interrupt_at
+
+    def note(self, line: str) -> None:
+        self.events.append("note")
+
+    def steps_begin(self, step: int, iterations: int) -> None:
+        self.events.append(f"begin {step}/{iterations}")
+
+    def step(self, progress) -> None:
+        self.events.append(f"step {progress.step}")
+        if progress.step == self.interrupt_at:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def steps_end(self) -> None:
+        self.events.append("end")
+
+    def trained(self, result) -> None:
+        self.events.append("trained")
+
+
+def options(steps: int, **changes) -> TrainOptions:
+    return TrainOptions(settings={"iterations": steps}, **changes)
+
+
+def test_from_a_dataset_to_figures_and_images_without_printing(dataset, tmp_path, capfd):
+    recorder, out = Recorder(), tmp_path / "out"
+    result = train(dataset, out, options(5, hold_out=8), observer=recorder)
+    assert recorder.events == [
+        *("note", "note", "begin 0/5"),
+        *(f"step {step}" for step in range(1, 6)),
+        *("end", "trained"),
+    ]
+    assert result.scene == out / "point_cloud/iteration_5/point_cloud.ply"
+    assert result.scene.is_file()
+    assert result.report.is_file()
+    assert (result.step, result.first_step, result.time) == (5, 0, None)
+    scene = load_trained(out)
+    assert (len(scene.gaussians), scene.iteration) == (result.gaussians, 5)
+    names = []
+    evaluation = evaluate(scene, on_view=lambda figures: names.append(figures.name))
+    assert names == ["view_00.png", "view_08.png"]
+    assert result.evaluation is not None
+    assert evaluation == result.evaluation[1]
+    assert render_images(scene, splits=["test"]) == {out / "test/ours_5/renders": 2}
+    assert capfd.readouterr() == ("", "")
+
+
+def test_ctrl_c_and_resume_give_the_same_scene(dataset, tmp_path):
+    whole = train(dataset, tmp_path / "whole", options(12))
+    with pytest.raises(TrainingStopped, match="^stopped after step 7: ") as stopped:
+        train(dataset, tmp_path / "out", options(12), observer=Recorder(interrupt_at=7))
+    assert stopped.value.scene == tmp_path / "out/point_cloud/iteration_7/point_cloud.ply"
+    recorder = Recorder()
+    result = resume(tmp_path / "out", observer=recorder)
+    assert "begin 7/12" in recorder.events
+    assert (result.step, result.first_step) == (12, 7)
+    assert result.scene.read_bytes() == whole.scene.read_bytes()
+    with pytest.raises(UserError, match="other settings"):
+        resume(tmp_path / "out", TrainOptions(settings={"seed": 3}))
+
+
+def test_options_that_contradict_each_other():
+    with pytest.raises(UserError, match="`minutes` and `iterations` exclude each other"):
+        options(5, minutes=1.0)
+    with pytest.raises(SettingError, match="^minutes: 0 is not"):
+        TrainOptions(minutes=0.0)
+
+
+def test_a_taken_folder_names_the_settings(dataset, tmp_path):
+    train(dataset, tmp_path / "out", options(2))
+    with pytest.raises(UserError, match="use `resume` to continue it, `overwrite` to replace it"):
+        train(dataset, tmp_path / "out", options(2))
+
+
+def test_a_time_budget_reads_the_dataset_once(tmp_path, monkeypatch):
+    """Photos become smaller, so there are two datasets; their files are read for the first one."""
+    dataset = write_toy_dataset(tmp_path / "dataset", "colmap-bin", 4, 480, 40, n_points=300)
+    calls, read = [], load._read
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return read(*arguments)
+
+    monkeypatch.setattr(load, "_read", counted)
+    result = train(dataset, tmp_path / "out", TrainOptions(minutes=0.02))
+    assert len(calls) == 1
+    assert result.time is not None
+    assert result.time[1] == pytest.approx(1.2)
+    settings = json.loads((tmp_path / "out/config.json").read_text())["capture"]
+    assert settings["resolution"] == 400

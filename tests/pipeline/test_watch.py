@@ -1,0 +1,71 @@
+"""The scene that `watch` shows."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.watch import NewestScene, watched_folder
+from snowsplat.training import checkpoint
+from snowsplat.util.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def trained(dataset, tmp_path_factory) -> Path:
+    """Checkpoints of step 20 and 40, scenes of 20 and 50."""
+    out = tmp_path_factory.mktemp("watch") / "out"
+    settings = {"iterations": 50, "checkpoint_every": 20}
+    train(dataset, out, TrainOptions(settings=settings, save_iterations=(20,)))
+    return out
+
+
+def test_the_newest_is_shown_as_it_comes(trained, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(trained, out)
+    folder = OutputFolder(out)
+    scene = NewestScene(folder, None)()
+    assert scene.about[0] == "After 50 steps"
+    assert NewestScene(folder, 20)().about[0] == "After 20 steps"
+    with pytest.raises(UserError, match="no scene of iteration 7; there are 20, 50"):
+        NewestScene(folder, 7)()
+
+    shutil.rmtree(out / "point_cloud/iteration_50")
+    newest = NewestScene(folder, None)
+    of_checkpoint = newest()
+    assert of_checkpoint.about[0] == "After 40 steps"
+    tensors = checkpoint.latest(folder.checkpoints).tensors
+    assert of_checkpoint.gaussians.means.equal(tensors["gaussians.means"])
+    assert newest() is of_checkpoint  # not read again
+
+    # A newer one comes, first damaged, then whole.
+    path = folder.scene_path(50)
+    path.parent.mkdir()
+    path.write_bytes(b"ply\n")
+    assert newest() is of_checkpoint
+    shutil.copyfile(trained / "point_cloud/iteration_50/point_cloud.ply", path)
+    later = newest()
+    assert later.about[0] == "After 50 steps"
+    assert later.number != of_checkpoint.number
+    shutil.rmtree(out / "point_cloud")
+    shutil.rmtree(out / "checkpoints")
+    assert newest() is later  # replaced at this moment
+    assert NewestScene(folder, None)().gaussians is None
+    assert "--checkpoint-every" in " ".join(NewestScene(folder, None)().about)
+
+
+def test_a_checkpoint_of_something_else(trained, tmp_path):
+    out = OutputFolder(tmp_path / "out")
+    shutil.copytree(trained, out.path)
+    for tensors in ({"a": torch.zeros(3)}, {"gaussians.means": torch.zeros(3)}):
+        checkpoint.save(out.checkpoints, 5000, tensors, {})
+        with pytest.raises(UserError, match="not the checkpoint of a training"):
+            NewestScene(out, None)()
+
+
+def test_the_folder_of_make_holds_that_of_a_training(trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "made" / "scene")
+    assert watched_folder(tmp_path / "made").path == tmp_path / "made" / "scene"
+    assert watched_folder(trained).path == trained
