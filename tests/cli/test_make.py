@@ -225,5 +225,5 @@ def test_a_stop_before_the_cameras_leaves_the_folder_ours(refused, dataset, tmp_
     for name in ("view_00.png", "view_01.png"):
         shutil.copy(dataset / "images" / name, two)
     for _ in range(2):  # and the same command comes as far again
-        assert "only 2 usable pictures" in refused("make", two, "-o", out)
+        assert "only 2 usable images" in refused("make", two, "-o", out)
         assert files(out) == {RECORD}

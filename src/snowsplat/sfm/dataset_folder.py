@@ -243,7 +243,8 @@ def _check_free(
         if before != [str(path.absolute()) for path in inputs] and not overwrite:
             what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
-                f"{folder}: holds a dataset made from {what}; name another folder, or set `overwrite`"
+                f"{folder}: holds a dataset made from {what}; name another folder, or set "
+                "`overwrite`"
             )
         return
     allowed = {".new"}  # left by a run that was killed in its first stage
