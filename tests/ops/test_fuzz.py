@@ -234,6 +234,7 @@ def test_a_splat_that_is_not_finite_draws_nothing(native: Variant, value: float)
 EXAMPLES = {"native": 25, "emulated": 3, "cuda": 25}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in CHECKS if name != "long images"])
 def test_whatever_hypothesis_finds(native: Variant, name: str) -> None:
     """Projecting with its gradient and the step of Adam, blending with its gradient and the

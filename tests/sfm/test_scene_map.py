@@ -133,7 +133,7 @@ def test_a_single_position_without_points(photos):
 
 
 def test_a_large_scene_is_drawn_fast_and_is_small():
-    start = time.perf_counter()
+    start = time.process_time()
     drawings = draw_scene(ring(1000), *cloud(300_000))
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
     assert sum(len(d.svg) for d in drawings) < 1_000_000

@@ -14,6 +14,8 @@ from snowsplat.synthetic.photographer import photograph, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
+pytestmark = pytest.mark.slow
+
 DISTORTIONS = [
     (0.0, 0.0, 0.0, 0.0),
     (-0.062, 0.021, 0.00015, -0.0001),

@@ -175,6 +175,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_kill_9_during_a_save(tmp_path):
     """Killed at different moments of a save of 16 MB: a file under its final name is complete."""
     cut = 0

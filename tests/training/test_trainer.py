@@ -107,6 +107,7 @@ def assert_identical(a: Gaussians, b: Gaussians) -> None:
         assert torch.equal(parameter, b.parameters()[name]), name
 
 
+@pytest.mark.slow
 def test_it_learns_and_is_the_same_training_in_float64(dataset, monkeypatch):
     """300 steps with the native ops and with the reference in double precision: the same losses."""
 

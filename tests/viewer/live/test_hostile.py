@@ -27,6 +27,8 @@ from snowsplat.viewer.live.viewer import NetworkViewer
 from .. import clients
 from ..clients import Visitor, camera, status
 
+pytestmark = pytest.mark.slow
+
 TICKS = os.sysconf("SC_CLK_TCK")
 STEPS = 1_000_000
 
