@@ -69,6 +69,14 @@ def test_the_newest_by_number_are_kept(tmp_path):
     assert newest.step == newest.tensors["a"] == 1_000_500
 
 
+def test_newer_checkpoints_are_kept(tmp_path):
+    for step in (1, 2, 3, 4):
+        checkpoint.save(tmp_path, step, {"a": torch.tensor(step)}, {}, keep=9)
+    (tmp_path / ".step_000005.safetensors.tmp").write_bytes(b"of a killed save")
+    checkpoint.remove_old(tmp_path, 3, keep=1)
+    assert sorted(path.name[:11] for path in tmp_path.iterdir()) == ["step_000003", "step_000004"]
+
+
 def test_no_checkpoint(tmp_path):
     assert checkpoint.latest(tmp_path / "absent") is None
     (tmp_path / "step_000500.safetensors.bak").write_bytes(b"")

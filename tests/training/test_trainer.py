@@ -243,6 +243,19 @@ def test_refinement_waits_for_the_next_step(dataset):
     assert counts[20] > counts[19]
 
 
+def test_every_step_is_followed_by_density_control(dataset, monkeypatch):
+    trainer = Trainer(dataset, BUSY)
+    after_step, steps = trainer._density.after_step, []
+
+    def recorded(step, gaussians, optimizer):
+        steps.append(step)
+        return after_step(step, gaussians, optimizer)
+
+    monkeypatch.setattr(trainer._density, "after_step", recorded)
+    trainer.run(until=5)
+    assert steps == [1, 2, 3, 4]
+
+
 @pytest.mark.parametrize("config", [BUSY, BUSY_MCMC], ids=["adaptive", "mcmc"])
 @pytest.mark.parametrize("cap", [25, 46])
 def test_the_cap_is_never_exceeded(dataset, config, cap):
