@@ -62,3 +62,26 @@ def test_points_determine_the_box_without_outliers():
 def test_no_cameras():
     with pytest.raises(ValueError, match="needs at least one camera"):
         scene_bounds([])
+
+
+def test_sizes_of_the_cubes_without_a_common_point():
+    """The extent is 1.1 times the distance of the outermost camera from the middle."""
+    low, high = scene_bounds(ring(1.0, (5.0, 5.0, 0.0), -1.0))
+    torch.testing.assert_close(high - low, torch.full((3,), 2 * 5 * 1.1))
+    # Parallel cameras: five extents in front of the middle, 90% of the field of view.
+    cameras = [camera([x, 0.0, 0.0], [x, 10.0, 0.0]) for x in (0.0, 1.0, 4.0)]
+    distance = 5 * 1.1 * (4 - 5 / 3)
+    low, high = scene_bounds(cameras)
+    torch.testing.assert_close((low + high) / 2, torch.tensor([5 / 3, distance, 0.0]))
+    torch.testing.assert_close(high - low, torch.full((3,), 2 * 0.9 * distance * 200 / 555.5))
+    alone = scene_bounds(cameras[:1])  # the extent of a single camera is 1.1
+    torch.testing.assert_close(alone.mean(0), torch.tensor([0.0, 5.5, 0.0]))
+
+
+def test_quantiles_need_a_hundred_points():
+    points = torch.zeros(100, 3)
+    points[:, 0] = torch.arange(100)
+    low, high = scene_bounds(ring(4.0, (0.0, 0.0, 0.0), 1.0), points)
+    assert (float(low[0]), float(high[0])) == pytest.approx((0.99, 98.01))
+    low, high = scene_bounds(ring(4.0, (0.0, 0.0, 0.0), 1.0), points[1:])
+    assert float(low[0]) == pytest.approx(-float(high[0]), abs=1e-4)

@@ -83,15 +83,19 @@ def rewrite_cameras(folder, model, params):
     ("model", "params"),
     [
         ("SIMPLE_PINHOLE", (30.0, 16.0, 12.0)),
+        ("PINHOLE", (30.0, 35.0, 16.0, 12.0)),
         ("SIMPLE_RADIAL", (30.0, 16.0, 12.0, 0.0)),
-        ("OPENCV", (30.0, 30.0, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0)),
+        ("RADIAL", (30.0, 16.0, 12.0, 0.0, 0.0)),
+        ("OPENCV", (30.0, 35.0, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0)),
+        ("FULL_OPENCV", (30.0, 35.0, 16.0, 12.0, *[0.0] * 8)),
     ],
 )
 def test_models_with_zero_distortion_are_pinhole_cameras(dataset_copy, model, params):
     folder = dataset_copy("colmap-bin")
     rewrite_cameras(folder, model, params)
     camera = load_dataset(folder).train[0].camera
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30.0, 30.0, 16.0, 12.0)
+    fy = params[1] if params[1] != 16.0 else 30.0
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30.0, fy, 16.0, 12.0)
 
 
 @pytest.mark.parametrize(
@@ -223,3 +227,50 @@ def test_an_image_with_an_unknown_camera(dataset_copy):
     write_model(folder / "sparse/0", {5: model.cameras[1]}, model.images, nothing, nothing)
     with pytest.raises(UserError, match="camera 1, which the model does not contain"):
         load_dataset(folder)
+
+
+def test_numbers_of_the_camera_models_in_binary_files(tmp_path):
+    """COLMAP's numbers, and how many parameters each model has."""
+    models = {
+        "SIMPLE_PINHOLE": (0, 3),
+        "PINHOLE": (1, 4),
+        "SIMPLE_RADIAL": (2, 4),
+        "RADIAL": (3, 5),
+        "OPENCV": (4, 8),
+        "OPENCV_FISHEYE": (5, 8),
+        "FULL_OPENCV": (6, 12),
+        "FOV": (7, 5),
+        "SIMPLE_RADIAL_FISHEYE": (8, 4),
+        "RADIAL_FISHEYE": (9, 5),
+        "THIN_PRISM_FISHEYE": (10, 12),
+    }
+    nothing = np.empty((0, 3))
+    for name, (number, count) in models.items():
+        params = tuple(float(i + 1) for i in range(count))
+        camera = ColmapCamera(name, 640, 480, params)
+        write_model(tmp_path, {3: camera}, [ColmapImage("a", 3, POSE)], nothing, nothing)
+        content = (tmp_path / "cameras.bin").read_bytes()
+        expected = struct.pack(f"<QIiQQ{count}d", 1, 3, number, 640, 480, *params)
+        assert content == expected
+        assert read_model(tmp_path).cameras == {3: camera}
+
+
+def test_two_images_of_the_same_name_are_rejected(dataset_copy):
+    folder = dataset_copy("colmap-txt")
+    path = folder / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace("view_03.png", "view_02.png"))
+    with pytest.raises(UserError, match="two images named view_02.png"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
+def test_points_far_away_are_named_with_their_file(dataset_copy, kind, caplog):
+    folder = dataset_copy(kind)
+    model = read_model(folder / "sparse/0")
+    xyz = np.array([[0.0, 0.0, 0.0], [2e18, 0.0, 0.0]])
+    rgb = np.array([[1, 2, 3], [4, 5, 6]], np.uint8)
+    write_model(folder / "sparse/0", model.cameras, model.images, xyz, rgb, text=model.text)
+    with caplog.at_level(logging.WARNING):
+        points = read_points(folder / "sparse/0")
+    assert points.rgb.tolist() == [[1, 2, 3]]
+    assert str(folder / "sparse/0" / f"points3D.{'txt' if model.text else 'bin'}") in caplog.text

@@ -1,5 +1,6 @@
 """`load_dataset`, independent of the format: sizes, smaller copies, splits, damaged images."""
 
+import dataclasses
 import logging
 import shutil
 
@@ -8,7 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.data import ImageLoader, load_dataset, read_files
+from snowsplat.data import ImageLoader, Points, load_dataset, read_files
+from snowsplat.data.bounds import scene_bounds
+from snowsplat.data.dataset import scene_extent
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
@@ -212,3 +215,33 @@ def test_paths_that_are_not_datasets(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(UserError, match="not a dataset"):
         load_dataset(tmp_path / "file")
+
+
+def test_the_extent_of_cameras_in_one_place_is_one(pristine):
+    cameras = [view.camera for view in load_dataset(pristine["colmap-bin"]).train]
+    assert scene_extent(cameras[:1]) == 1.0
+    # Half of the way: 1.1 times the distance from the middle, however small.
+    pose = cameras[0].cam_from_world.clone()
+    pose[0, 3] += 0.5
+    pair = [cameras[0], dataclasses.replace(cameras[0], cam_from_world=pose)]
+    assert scene_extent(pair) == pytest.approx(1.1 * 0.25)
+
+
+def test_bounds_of_a_dataset_are_those_of_its_points_or_training_cameras(pristine):
+    dataset = load_dataset(pristine["colmap-bin"])
+    cameras = [view.camera for view in dataset.train]
+    alone = dataclasses.replace(dataset, points=None)
+    assert torch.equal(alone.bounds, scene_bounds(cameras))
+    only_test = dataclasses.replace(alone, train=[], test=dataset.train)
+    assert torch.equal(only_test.bounds, scene_bounds(cameras))
+    xyz = torch.rand(200, 3)
+    dense = dataclasses.replace(dataset, points=Points(xyz, torch.zeros(200, 3)))
+    assert torch.equal(dense.bounds, scene_bounds(cameras, xyz))
+
+
+def test_points_move_together():
+    points = Points(torch.ones(2, 3), torch.full((2, 3), 7, dtype=torch.uint8))
+    moved = points.to(torch.device("meta"))
+    assert moved.xyz.device.type == moved.rgb.device.type == "meta"
+    assert moved.rgb.dtype == torch.uint8
+    assert len(points.to(torch.device("cpu"))) == 2

@@ -256,3 +256,26 @@ def test_the_same_image_twice(scene):
 def test_damaged_files_raise_one_line_errors(dataset_copy, count_rejected):
     folder = dataset_copy("blender")
     assert count_rejected(folder / "transforms_train.json", lambda: load_dataset(folder)) >= 20
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize(("deviation", "valid"), [(0.008, True), (0.03, False)])
+def test_matrices_may_deviate_from_a_rotation_by_one_percent(scene, scale, deviation, valid):
+    matrix = np.array(UPRIGHT)
+    matrix[0, 1] = 2 * deviation  # the nearest rotation is half of it away
+    matrix[:3, :3] *= scale
+    frame = {"transform_matrix": matrix.tolist()}
+    if valid:
+        rotation = camera_of({"fl_x": 50}, frame, scene).cam_from_world[:, :3]
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=F64))
+    else:
+        with pytest.raises(UserError, match="not a rotation"):
+            camera_of({"fl_x": 50}, frame, scene)
+
+
+def test_a_folder_of_smaller_copies_takes_the_place_of_images(scene):
+    folder = scene({"fl_x": 50}, [{}, {}])
+    (folder / "images").rename(folder / "photos")
+    dataset = load_dataset(folder, images="photos", hold_out=None)
+    assert [view.image.path.parent.name for view in dataset.train] == ["photos", "photos"]
+    assert len({view.image.path for view in dataset.train}) == 2

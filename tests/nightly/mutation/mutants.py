@@ -25,8 +25,13 @@ from mutmut.mutation import mutators
 #: Never mutated. Annotations and imports do nothing, or break the file at once. What a `raise`
 #: holds is the text of a message: a test checks that an error is raised, not how it reads.
 _SKIPPED = (cst.Annotation, cst.Decorator, cst.Import, cst.ImportFrom, cst.Raise, cst.Assert)
-#: Nor are these: names for `import *`, and `strict=True`, which is an assertion.
-_NEVER = m.Assign(targets=[m.AssignTarget(m.Name("__all__"))]) | m.Arg(keyword=m.Name("strict"))
+#: Nor are: names for `import *`; `strict=True`, which is an assertion; other texts of messages.
+_NEVER = (
+    m.Assign(targets=[m.AssignTarget(m.Name("__all__"))])
+    | m.Arg(keyword=m.Name("strict"))
+    | m.Call(m.Name(m.MatchRegex(r".*Error")))
+    | m.Call(m.Attribute(m.Name("logger")))
+)
 #: Blocks within each other that are expected.
 _DEEPEST = 8
 #: Calls whose arguments are not removed or replaced: each such call would fail.
