@@ -3,19 +3,42 @@
 import re
 import runpy
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from snowsplat.cli import main as cli
 from snowsplat.formats import read_gaussians
+from snowsplat.pipeline.quality import PRESETS
+from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
 
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+@pytest.mark.slow
+def test_photos_to_scene_from_python(tmp_path, monkeypatch, capsys):
+    assert len(EXAMPLES[0].split("\n\n")[1].splitlines()) == 5  # "in five lines"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=100))
+    write_synthetic_photos(tmp_path / "photos", n_views=20, width=320, height=240)
+    example, changes = re.subn("seconds=5", "seconds=0.1", EXAMPLES[0])
+    assert changes == 1
+    (tmp_path / "example.py").write_text(example)
+    runpy.run_path("example.py")
+    psnr, scene = capsys.readouterr().out.split()
+    assert float(psnr) > 12
+    assert scene == "garden_scene/photos.ply"
+    assert len(read_gaussians(tmp_path / "garden.spz")) == round(len(read_gaussians(scene)) / 2)
+    assert (tmp_path / "garden.mp4").stat().st_size > 1000
+
+
 def test_python_example_runs(tmp_path, monkeypatch, capsys):
-    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    example = EXAMPLES[1]
     assert len(example.split("\n\n")[1].splitlines()) == 5  # "in five lines"
     monkeypatch.chdir(tmp_path)
     write_toy_dataset(tmp_path / "garden", n_views=9, width=48, height=36, n_points=300)
