@@ -149,6 +149,37 @@ def test_nodes_place_the_splats(seed, tmp_path):
         assert_same(got, expected, atol=2e-5)
 
 
+def test_parts_of_different_degrees_get_the_highest(seed, tmp_path, make_scene):
+    """Rows of a lower degree get zeros."""
+    document, binary, scene = seed
+    low = make_scene(5, 0, seed=4)
+    write_gaussians(tmp_path / "low.glb", low)
+    other, more = parts(tmp_path / "low.glb")
+    shift = len(document["bufferViews"])
+    for view in other["bufferViews"]:
+        view["byteOffset"] = view.get("byteOffset", 0) + len(binary)
+    for accessor in other["accessors"]:
+        accessor["bufferView"] += shift
+    primitive(other)["attributes"] = {
+        name: number + len(document["accessors"])
+        for name, number in primitive(other)["attributes"].items()
+    }
+    document["bufferViews"] += other["bufferViews"]
+    document["accessors"] += other["accessors"]
+    document["meshes"][0]["primitives"].append(primitive(other))
+    document["buffers"][0]["byteLength"] += len(more)
+    read = read_gaussians(assemble(tmp_path / "b.glb", document, binary + more))
+    assert (len(read), read.sh_degree) == (35, 2)
+    assert_same(read.select(torch.arange(30)), scene)
+    assert_same(read.select(torch.arange(30, 35)), edit.with_sh_degree(low, 2))
+
+
+def test_the_kernel_is_an_ellipse_by_default(seed, tmp_path):
+    document, binary, scene = seed
+    del extension(document)["kernel"]
+    assert_same(read_gaussians(assemble(tmp_path / "b.glb", document, binary)), scene)
+
+
 def test_quantised_attributes(seed, tmp_path):
     """The types that the specification allows, interleaved."""
     document, _, scene = seed
