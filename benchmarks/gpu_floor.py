@@ -16,13 +16,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-TILE = 16
+from snowsplat.ops.layout import TILE
+
 GEOMETRY = 3 + 3 + 4 + 1  # numbers per Gaussian: mean, scales, rotation, opacity
 NUMBERS = GEOMETRY + 3 + 45  # and colours of SH degree 3
 ROW = 64  # bytes per splat: 16 numbers
 SECTOR = 32  # bytes of the smallest memory access
 
-#: Operations per blended pair (pixel, splat) in `native/cuda/blend.cu`, three colours.
+#: Operations per blended pair (pixel, splat) in `native/cuda/rasterize.cu`, three colours.
 BLEND = {
     "d": 2,
     "log₂α": 5,
@@ -103,14 +104,14 @@ def works(frame: Frame) -> dict[str, Work]:
         "tiles_count": Work(n * (4 + SECTOR + 16 + 8)),
         "tiles_fill": Work(_fill_bytes(frame)),
         # The splat of an instance and its part in the tile; tiles; rows once; four planes.
-        "blend_fwd": Work(
+        "rasterize_fwd": Work(
             instances * (4 + 1) + frame.tiles * 8 + seen * ROW + pixels * 16,
             frame.pairs * sum(FORWARD.values()),
         ),
         # Image and photo (8 bits); the gradient.
         "photometric_u8": Work(pixels * (12 + 3 + 12), pixels * 3 * SSIM),
         # The same lists, rows, image, its gradient and alpha; the sums, in rows or in slots.
-        "blend_bwd": Work(
+        "rasterize_bwd": Work(
             instances * (4 + 1)
             + frame.tiles * 8
             + seen * ROW
@@ -127,7 +128,7 @@ def works(frame: Frame) -> dict[str, Work]:
         # Slots and their positions per splat; part of its row; the gradient.
         reduce = Work(instances * ROW + n * (8 + ROW) + seen * SECTOR)
         names = list(found)
-        after = names.index("blend_bwd") + 1
+        after = names.index("rasterize_bwd") + 1
         found = {
             **{name: found[name] for name in names[:after]},
             "splats_reduce": reduce,

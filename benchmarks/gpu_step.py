@@ -22,8 +22,9 @@ from workloads import Workload
 from snowsplat import ops
 from snowsplat.data import Dataset, Points, View
 from snowsplat.data.decode import ImageSource, LoadedImage
-from snowsplat.ops.cuda.kernels import Argument, Kernel
-from snowsplat.ops.cuda.launches import launch_by
+from snowsplat.ops.cuda.kernels import Kernel
+from snowsplat.ops.cuda.launches import Execute, launch_by
+from snowsplat.ops.layout import Params
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.scene.render import project, render
 from snowsplat.training.config import TrainConfig
@@ -129,9 +130,6 @@ class Step:
         }
 
 
-Execute = Callable[[Kernel, str, int, Sequence[Argument]], None]
-
-
 class KernelClock:
     """Records events before and after every kernel that the ops launch.
 
@@ -152,13 +150,13 @@ class KernelClock:
         finally:
             LAUNCHERS[device] = before
 
-    def _launch(self, function: str, n: int, args: Sequence[Argument]) -> int:
-        def marked(kernel: Kernel, name: str, blocks: int, arguments: Sequence[Argument]) -> None:
+    def _launch(self, function: str, params: Params) -> int:
+        def marked(kernel: Kernel, name: str, blocks: int, kernel_params: Params) -> None:
             before = self._mark()
-            self._execute(kernel, name, blocks, arguments)
+            self._execute(kernel, name, blocks, kernel_params)
             self.laps.append((function, name, before, self._mark()))
 
-        return launch_by(marked, function, n, args)
+        return launch_by(marked, function, params)
 
 
 def kernel_times(

@@ -16,9 +16,9 @@ NAMES = {
     "splats_sort": "sort by depth",
     "tiles_count": "tiles: count",
     "tiles_fill": "tiles: fill, sort",
-    "blend_fwd": "blend forward",
+    "rasterize_fwd": "blend forward",
     "photometric_u8": "photometric",
-    "blend_bwd": "blend backward",
+    "rasterize_bwd": "blend backward",
     "splats_reduce": "reduce",
     "accumulate_screen_statistics": "density statistics",
     "adam_step": "Adam",
@@ -205,7 +205,7 @@ def _stages(findings: Findings, name: str, in_order: bool) -> str:
     names += sorted({n for c in columns.values() for n in c} - {*names, REST, TOTAL})
     names += [REST, TOTAL]
     if in_order:  # only the functions that differ
-        names = [n for n in names if n in ("tiles_fill", "blend_bwd", "splats_reduce", TOTAL)]
+        names = [n for n in names if n in ("tiles_fill", "rasterize_bwd", "splats_reduce", TOTAL)]
     rows = []
     for n in names:
         row = [NAMES.get(n, n)]

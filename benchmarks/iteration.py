@@ -31,9 +31,9 @@ STAGES = {
     "splats_sort": "sort",
     "tiles_count": "tiles: count",
     "tiles_fill": "tiles: fill",
-    "blend_fwd": "blend forward",
+    "rasterize_fwd": "blend forward",
     "photometric_u8": "photometric",
-    "blend_bwd": "blend backward",
+    "rasterize_bwd": "blend backward",
     "splats_reduce": "reduce",
     "accumulate_screen_statistics": "density statistics",
     "adam_step": "adam step",
@@ -43,11 +43,11 @@ REST = "rest (Python)"
 TOTAL = "total"
 #: Queries of sizes, which return at once: counted with the rest.
 QUERIES = (
-    "blend_sums_in_order",
+    "rasterize_sums_in_order",
     "splat_record_bytes",
     "tiles_parts",
     "tiles_workspace_bytes",
-    "blend_block_bytes",
+    "rasterize_block_bytes",
 )
 
 
@@ -70,11 +70,11 @@ class Stopwatch:
     def on_launches(self) -> Iterator[None]:
         """Time each `launch`: replaces that name in all op modules."""
 
-        def timed(name: str, n: int, *args: Any, **options: Any) -> int:
+        def timed(name: str, *args: Any, **options: Any) -> int:
             if name in QUERIES:
-                return native.launch(name, n, *args, **options)
+                return native.launch(name, *args, **options)
             with self.stage(STAGES.get(name, name)):
-                return native.launch(name, n, *args, **options)
+                return native.launch(name, *args, **options)
 
         holders = [
             module

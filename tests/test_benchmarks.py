@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from snowsplat import Gaussians, load_dataset, ops, write_gaussians
-from snowsplat.ops import native, rasterizer, reference
+from snowsplat.ops import native, reference
 from snowsplat.ops.cuda.launches import KERNELS, launch_by
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
@@ -299,24 +299,26 @@ def test_lower_bounds_computed_by_hand(gpu_modules):
     # Tiles in 8 bits: one pass over keys of 2 bytes and values of 4.
     fill = 1000 * 20 + 600 * 32 + 5000 * 6
     assert works["tiles_fill"].bytes == fill + 5000 * (2 + 12) + 5000 * 2 + 200 * 4
-    assert works["blend_fwd"].bytes == 5000 * 5 + 200 * 8 + 600 * 64 + pixels * 16
-    assert works["blend_fwd"].operations == 100_000 * 19
-    assert works["blend_bwd"].bytes == 5000 * 5 + 200 * 8 + 600 * 128 + pixels * 28
-    assert works["blend_bwd"].operations == 100_000 * 34
+    assert works["rasterize_fwd"].bytes == 5000 * 5 + 200 * 8 + 600 * 64 + pixels * 16
+    assert works["rasterize_fwd"].operations == 100_000 * 19
+    assert works["rasterize_bwd"].bytes == 5000 * 5 + 200 * 8 + 600 * 128 + pixels * 28
+    assert works["rasterize_bwd"].operations == 100_000 * 34
     assert works["photometric_u8"] == gpu_floor.Work(pixels * 27, pixels * 3 * 154)
     assert works["adam_step"].bytes == 1000 * (59 * 4 * 6 + 4) + 600 * 64
     assert "splats_reduce" not in works
     # From bytes: 1.42 MB at 1 TB/s; from operations if these take longer.
     adam = works["adam_step"]
     assert adam.seconds(1e12, 1e12) == pytest.approx(adam.bytes * 1e-12)
-    assert works["blend_fwd"].seconds(1e12, 1e11) == pytest.approx(100_000 * 19e-11)
-    assert works["blend_fwd"].seconds(1e12, None) == pytest.approx(works["blend_fwd"].bytes * 1e-12)
+    assert works["rasterize_fwd"].seconds(1e12, 1e11) == pytest.approx(100_000 * 19e-11)
+    assert works["rasterize_fwd"].seconds(1e12, None) == pytest.approx(
+        works["rasterize_fwd"].bytes * 1e-12
+    )
 
     in_order = gpu_floor.works(gpu_floor.Frame(1000, 600, 5000, 100_000, 320, 160, in_order=True))
     names = list(in_order)
-    assert names.index("splats_reduce") == names.index("blend_bwd") + 1
+    assert names.index("splats_reduce") == names.index("rasterize_bwd") + 1
     assert in_order["splats_reduce"].bytes == 5000 * 64 + 1000 * 72 + 600 * 32
-    more = in_order["blend_bwd"].bytes - works["blend_bwd"].bytes
+    more = in_order["rasterize_bwd"].bytes - works["rasterize_bwd"].bytes
     assert more == 5000 * 68 - 600 * 64
     # 1920×1080 are 8160 tiles, 13 bits: two passes. 2²⁰ tiles: keys of 4 bytes, three passes.
     full = gpu_floor.works(gpu_floor.Frame(0, 0, 1, 0, 1920, 1080))["tiles_fill"].bytes
@@ -337,9 +339,9 @@ def test_the_sanitizer_program_runs_every_op_and_kernel(gpu_modules, monkeypatch
 
     launched = set()
 
-    def execute(kernel, name, blocks, args):
+    def execute(kernel, name, blocks, params):
         launched.add(name)
-        emulation.execute(kernel, name, blocks, args)
+        emulation.execute(kernel, name, blocks, params)
 
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -369,7 +371,7 @@ def test_the_sanitizer_program_runs_every_op_and_kernel(gpu_modules, monkeypatch
         works = gpu_floor.works(gpu_floor.Frame(**counts, in_order=in_order))
         assert list(times) == list(works)
         assert times.keys() <= gpu_table.NAMES.keys()
-        assert times["blend_fwd"].keys() == {"blend_fwd"}
+        assert times["rasterize_fwd"].keys() == {"rasterize_fwd"}
         assert min(t for kernels in times.values() for t in kernels.values()) > 0
     assert not torch.are_deterministic_algorithms_enabled()
     torch.set_num_threads(before)
@@ -427,11 +429,11 @@ def test_parsing_the_sanitizer_output(gpu_modules, monkeypatch, tmp_path):
     text = """========= COMPUTE-SANITIZER
 ops: 33 Gaussians
 ========= Invalid __global__ write of size 4 bytes
-=========     at blend_bwd+0x1230
+=========     at rasterize_bwd+0x1230
 =========     by thread (1,0,0) in block (0,0,0)
 =========     Address 0x7f is out of bounds
 =========
-========= Error: Race reported between Write access at blend_fwd+0x10 and Read access at x
+========= Error: Race reported between Write access at rasterize_fwd+0x10 and Read access at x
 =========
 all ops ran
 ========= ERROR SUMMARY: 30 errors
@@ -440,8 +442,8 @@ all ops ran
     for line in text.splitlines(keepends=True):
         log.read(line)
     assert (log.errors, log.finished, log.last) == (30, True, "ops: 33 Gaussians")
-    assert log.first[0] == "Invalid __global__ write of size 4 bytes, at blend_bwd+0x1230"
-    assert log.first[1].startswith("Error: Race reported between Write access at blend_fwd")
+    assert log.first[0] == "Invalid __global__ write of size 4 bytes, at rasterize_bwd+0x1230"
+    assert log.first[1].startswith("Error: Race reported between Write access at rasterize_fwd")
     for summary in ("ERROR SUMMARY: 0 errors", "RACECHECK SUMMARY: 0 hazards displayed (0 errors)"):
         log = gpu_parts.SanitizerLog()
         for line in ("========= COMPUTE-SANITIZER\n", f"========= {summary}\n"):
@@ -680,7 +682,6 @@ def page_of(found):
 @pytest.mark.emulated
 def test_the_measuring_parts_run(fake_gpu, capsys, tmp_path):
     """From their output to the page."""
-    import gpu_floor
     import gpu_ops
     import gpu_parts
 
@@ -705,7 +706,6 @@ def test_the_measuring_parts_run(fake_gpu, capsys, tmp_path):
     for name in ("project: cull", "blend backward", "Adam", "whole step"):
         assert f"| {name} | " in page
     assert "| reduce | " in page
-    assert rasterizer.TILE == gpu_floor.TILE
 
 
 @pytest.mark.emulated

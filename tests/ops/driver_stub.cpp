@@ -10,6 +10,7 @@ uint64_t recorded_values[4];
 void *recorded_function, *recorded_stream, *recorded_context;
 char recorded_code[4], recorded_name[64];
 int pushed, fail_next;
+uint64_t layout;
 
 static char context, library, kernel, function;
 static void* current;
@@ -30,6 +31,13 @@ int cuLibraryGetKernel(void** found, void*, const char* name) {
   std::strncpy(recorded_name, name, sizeof recorded_name - 1);
   return *found = &kernel, 0;
 }
+int cuLibraryGetGlobal(void** found, size_t* size, void*, const char* name) {
+  *found = std::strstr(name, "_kernel_layout") ? &layout : nullptr;
+  return *size = sizeof layout, 0;
+}
+int cuMemcpyDtoH_v2(void* target, const void* source, size_t size) {
+  return std::memcpy(target, source, size), 0;
+}
 int cuKernelGetFunction(void** found, void* of) {
   return *found = of == &kernel ? &function : nullptr, 0;
 }
@@ -37,7 +45,7 @@ int cuLaunchKernel(void* f, unsigned gx, unsigned gy, unsigned gz, unsigned bx, 
                    unsigned bz, unsigned, void* stream, void** parameters, void**) {
   const unsigned size[6] = {gx, gy, gz, bx, by, bz};
   for (int i = 0; i < 6; i++) recorded_size[i] = int(size[i]);
-  for (int i = 0; i < 4; i++) std::memcpy(&recorded_values[i], parameters[i], 8);
+  std::memcpy(recorded_values, parameters[0], sizeof recorded_values);
   recorded_function = f == &function ? f : nullptr;
   recorded_stream = stream, recorded_context = current;
   return fail_next;
@@ -60,6 +68,8 @@ int cuGetProcAddress_v2(const char* name, void** found, int, uint64_t, int* stat
       {"cuCtxPopCurrent", (void*)cuCtxPopCurrent_v2},
       {"cuLibraryLoadData", (void*)cuLibraryLoadData},
       {"cuLibraryGetKernel", (void*)cuLibraryGetKernel},
+      {"cuLibraryGetGlobal", (void*)cuLibraryGetGlobal},
+      {"cuMemcpyDtoH", (void*)cuMemcpyDtoH_v2},
       {"cuKernelGetFunction", (void*)cuKernelGetFunction},
       {"cuLaunchKernel", (void*)cuLaunchKernel},
       {"cuGetErrorName", (void*)cuGetErrorName},

@@ -16,6 +16,8 @@ import pytest
 import snowsplat
 from snowsplat.ops.cuda import nvrtc
 from snowsplat.ops.cuda.launches import KERNELS, SEQUENCES
+from snowsplat.ops.layout import layout_of
+from snowsplat.ops.params import ENTRIES
 
 from ..cache import cached
 
@@ -108,6 +110,22 @@ def kernels_in(cubin: bytes) -> dict[str, Built]:
     return found
 
 
+def layouts_in(cubin: bytes) -> dict[str, int]:
+    """The value of the variable NAME_layout of each kernel."""
+    sections = elf_sections(cubin)
+    names = list(sections)
+    found = {}
+    for name, _, _, section, value, size in struct.iter_unpack("<IBBHQQ", sections[".symtab"]):
+        text = sections[".strtab"][name : sections[".strtab"].index(b"\0", name)].decode()
+        if text.endswith("_layout"):
+            assert size == 8
+            content = sections[names[section]]
+            found[text.removesuffix("_layout")] = int.from_bytes(
+                content[value : value + 8], "little"
+            )
+    return found
+
+
 def cubin_of(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> bytes:
     """What `make native` made, if it is of these sources, else made now."""
     source = nvrtc.path_of(file)
@@ -144,15 +162,18 @@ def test_compiles_without_a_warning(file, compiler):
 @pytest.mark.parametrize("file", FILES)
 def test_cubins_hold_what_is_launched(file, architecture, compiler):
     expected = {name: kernel for name, kernel in KERNELS.items() if kernel.file == file}
-    found = kernels_in(cubin_of(file, architecture, compiler))
+    cubin = cubin_of(file, architecture, compiler)
+    found = kernels_in(cubin)
     assert {name.removesuffix("_f64") for name in found} == set(expected)
     for name in expected:
         assert name in found
         if f"{name}_f64" in cpu_entries():
             assert f"{name}_f64" in found
     for name, built in found.items():
-        assert built.threads == expected[name.removesuffix("_f64")].threads
-        assert set(built.parameters) == {8}, "launch() passes 8 bytes each"
+        kernel = expected[name.removesuffix("_f64")]
+        assert built.threads == kernel.threads
+        assert built.parameters == [layout_of(kernel.params).size], "one struct, by value"
+        assert layouts_in(cubin)[name] == layout_of(kernel.params).hash
         if not name.endswith("_f64"):
             assert built.local_bytes <= LOCAL_BYTES, name
 
@@ -161,15 +182,16 @@ def test_a_cubin_says_its_local_memory(compiler, tmp_path):
     source = tmp_path / "spills.cu"
     source.write_text(
         '#include "cuda/device.h"\n'
-        "SNOW_KERNEL(spills, 96, (int64_t n, const int32_t* in, double x, int32_t* out)) {\n"
+        "struct Spills { int64_t n; const int32_t* in; int32_t* out; SNOW_FIELDS(n, in, out) };\n"
+        "SNOW_KERNEL(spills, 96, Spills) {\n"
         "  int32_t row[40];\n"
-        "  for (int i = 0; i < 40; i++) row[in[i]] = i;\n"
-        "  out[0] = row[n];\n"
+        "  for (int i = 0; i < 40; i++) row[p.in[i]] = i;\n"
+        "  p.out[0] = row[p.n];\n"
         "}\n"
     )
     for architecture in ARCHITECTURES:
         (built,) = kernels_in(compiler.compile(source, f"sm_{architecture}")[0]).values()
-        assert built == Built(96, [8, 8, 8, 8], 160)
+        assert built == Built(96, [24], 160)
 
 
 def cpu_entries() -> set[str]:
@@ -192,32 +214,38 @@ def called(names: tuple[str, ...]) -> set[str]:
 
 
 def test_every_function_is_on_both_kinds_of_device():
-    launched = called(("launch", "variant", "ask"))
-    assert {"project_cull", "blend_fwd", "adam_step", "tiles_parts", "neighbours"} <= launched
+    launched = called(("launch", "variant", "query"))
+    assert {"project_cull", "rasterize_fwd", "adam_step", "tiles_parts", "neighbours"} <= launched
     on_gpu = set(KERNELS) | set(SEQUENCES)
     assert launched - on_gpu == set()
     assert launched - cpu_entries() == set()
-    # Names that reach launch() in other ways: any text in the ops that the CPU knows.
-    constants = {
-        node.value
-        for path in (PACKAGE / "ops").glob("*.py")
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    }
+    assert set(ENTRIES) - on_gpu == set()
     about_the_cpu = {"built_isa", "best_isa", "set_num_threads", "get_num_threads"}
-    assert (constants & cpu_entries()) - about_the_cpu - on_gpu == set()
+    entries = {name for name in cpu_entries() - about_the_cpu if not name.endswith("_layout")}
+    assert {name.removesuffix("_f64") for name in entries} == set(ENTRIES)
+    assert {f"{name}_layout" for name in entries} <= cpu_entries()
+
+
+STATISTIC_SOURCES = [
+    "statistic.cu",
+    "device.h",
+    "statistic.h",
+    "params.h",
+    "layout.h",
+    "portable.h",
+]
 
 
 def test_sources_of_a_kernel_are_all_that_it_includes(tmp_path):
     found = nvrtc.sources(nvrtc.path_of("statistic"))
-    assert [path.name for path in found] == ["statistic.cu", "device.h", "portable.h"]
+    assert [path.name for path in found] == STATISTIC_SOURCES
     assert all(path.is_absolute() for path in found)
 
 
 def test_what_does_not_compile_says_why_and_where(compiler, tmp_path):
     source = tmp_path / "wrong.cu"
     source.write_text(
-        '#include "cuda/device.h"\nSNOW_KERNEL(wrong, 32, (int64_t n)) { nonsense(); }\n'
+        '#include "cuda/device.h"\nSNOW_KERNEL(wrong, 32, snow::SizeQueryParams) { nonsense(); }\n'
     )
     with pytest.raises(nvrtc.CompileError, match=r"wrong.cu does not compile for sm_90: (.|\n)*"):
         compiler.compile(source, "sm_90")
@@ -242,7 +270,7 @@ def test_the_script_needs_nothing_but_python(compiler, tmp_path):
     assert b".debug_line" in cubin.read_bytes()
     target, *names = Path(f"{cubin}.d").read_text().replace(r"\ ", "?").split()
     assert target == f"{cubin}:".replace(" ", "?")
-    assert [Path(name).name for name in names] == ["statistic.cu", "device.h", "portable.h"]
+    assert [Path(name).name for name in names] == STATISTIC_SOURCES
     # The same code every time, without the paths of this machine.
     once, again = (compiler.compile(source, "sm_86")[0] for _ in range(2))
     assert once == again

@@ -2,10 +2,12 @@
 
 import ctypes
 import os
+import struct
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,9 +18,38 @@ import snowsplat
 from snowsplat.ops import native
 from snowsplat.ops.cuda import cubins, driver, nvrtc
 from snowsplat.ops.cuda.kernels import Kernel
+from snowsplat.ops.layout import Params, layout_of
+from snowsplat.ops.params import BackgroundBackwardParams
 from snowsplat.util.errors import UserError
 
-KERNEL = Kernel("statistic", threads=128, items=64)
+
+@dataclass(slots=True, kw_only=True)
+class SomeParams(Params):
+    n: int = 1
+    missing: torch.Tensor | None = None
+    tensor: torch.Tensor
+    large: int = 0
+    real: float = 0.0
+
+
+@dataclass(slots=True, kw_only=True)
+class ManyParams(Params):
+    n: int
+    means: torch.Tensor
+    log_scales: torch.Tensor
+    quats: torch.Tensor
+    opacity_logits: torch.Tensor
+    sh_dc: torch.Tensor
+    sh_rest: torch.Tensor
+    rows: int
+    degree: int
+    grad: torch.Tensor
+    ids: torch.Tensor
+    width: float
+    height: float
+
+
+KERNEL = Kernel("statistic", SomeParams, threads=128, items=64)
 BUILT = (75, 80, 86, 89, 90, 100, 120)  # as in CMakeLists.txt
 
 
@@ -48,6 +79,7 @@ class FakeDriver:
         self.calls = []
         self.launches = []
         self.fails = {}  # function → error, or code → error
+        self.layout = layout_of(SomeParams).hash  # of every kernel's struct
         self._contexts = threading.local()
 
     def _call(self, name, *args):
@@ -92,17 +124,25 @@ class FakeDriver:
     def cuKernelGetFunction(self, kernel):
         return self._call("cuKernelGetFunction", kernel), (*kernel, self._stack()[-1])
 
+    def cuLibraryGetGlobal(self, library, name):
+        return self._call("cuLibraryGetGlobal", library, name), 4096, 8
+
+    def cuMemcpyDtoH(self, target, source, size):
+        assert (source, size) == (4096, 8)
+        target[:] = self.layout.to_bytes(8, sys.byteorder)
+        return (self._call("cuMemcpyDtoH"),)
+
     def cuLaunchKernel(self, function, *rest):
         gx, gy, gz, bx, by, bz, shared, stream, parameters, extra = rest
         assert (gy, gz, by, bz, shared, extra) == (1, 1, 1, 1, 0, 0)
-        pointers = (ctypes.c_void_p * 30).from_address(parameters)
+        struct = ctypes.c_void_p.from_address(parameters).value
         launch = SimpleNamespace(
             function=function,
             blocks=gx,
             threads=bx,
             stream=stream,
             context=self._stack()[-1],
-            values=[ctypes.string_at(pointer, 8) for pointer in pointers],
+            struct=ctypes.string_at(struct, layout_of(SomeParams).size),
         )
         self.launches.append(launch)
         return (self._call("cuLaunchKernel"),)
@@ -120,7 +160,7 @@ def built(tmp_path, monkeypatch) -> Path:
     folder = tmp_path / "built"
     for number in BUILT:
         (folder / f"sm_{number}").mkdir(parents=True)
-        for file in ("statistic", "blend"):
+        for file in ("statistic", "rasterize"):
             (folder / f"sm_{number}" / f"{file}.cubin").write_bytes(f"{file} {number}".encode())
     monkeypatch.setattr(cubins, "_BUILT", folder)
     return folder
@@ -163,36 +203,51 @@ def compiler(tmp_path, monkeypatch) -> FakeCompiler:
 # ---- launching
 
 
-def as_int(value: bytes) -> int:
-    return int.from_bytes(value, sys.byteorder, signed=True)
-
-
-def as_float(value: bytes) -> float:
-    return ctypes.c_double.from_buffer_copy(value).value
-
-
-def test_arguments_arrive_where_the_driver_reads_them(gpus):
+def test_the_struct_arrives_where_the_driver_reads_it(gpus):
     tensor = on_gpu(torch.zeros(5))
-    numbers = [-(2**40), 2**62, True, 0.1, -1e300]
-    driver.run(KERNEL, "some_kernel", 7, (3, tensor, None, *numbers))
+    driver.run(KERNEL, "some_kernel", 7, SomeParams(n=3, tensor=tensor, large=-(2**40), real=0.1))
     (launch,) = gpus.launches
     assert (launch.blocks, launch.threads, launch.stream) == (7, 128, 70)
-    values = launch.values
-    assert [as_int(value) for value in values[:6]] == [3, tensor.data_ptr(), 0, -(2**40), 2**62, 1]
-    assert [as_float(value) for value in values[6:8]] == [0.1, -1e300]
+    assert struct.unpack("=qQQqd", launch.struct) == (3, 0, tensor.data_ptr(), -(2**40), 0.1)
     assert launch.function == (b"statistic 86", b"some_kernel", 1000)
+
+
+@pytest.mark.parametrize(
+    ("function", "error"), [(None, 0), ("cuLibraryGetGlobal", 500), ("cuMemcpyDtoH", 1)]
+)
+def test_a_kernel_with_another_struct_is_refused(function, error, gpus):
+    """Before it is launched; and a kernel from before there were structs has no layout."""
+    if function is None:
+        gpus.layout += 1
+    gpus.fails[function] = error
+    line = (
+        "some_kernel: the built kernels do not match the Python files: rebuild them .make native."
+    )
+    if error == 1:
+        line = "some_kernel: CUDA_ERROR_1, in words; update the NVIDIA driver"
+    for _ in range(2):
+        with pytest.raises(UserError, match=f"^cuda:0: {line}"):
+            driver.run(KERNEL, "some_kernel", 1, SomeParams(tensor=on_gpu(torch.zeros(1))))
+    assert gpus.launches == []
+    assert gpus.cuCtxGetCurrent() == (0, 0)
+
+
+def test_the_struct_is_checked_once(gpus):
+    for _ in range(3):
+        driver.run(KERNEL, "one", 1, SomeParams(tensor=on_gpu(torch.zeros(1))))
+    assert gpus.count("cuMemcpyDtoH") == 1
 
 
 def test_code_is_loaded_once_for_each_file_and_device(gpus):
     first, second = on_gpu(torch.zeros(1)), on_gpu(torch.zeros(1), OnSecondGpu)
-    blend = Kernel("blend", threads=32, items=32)
+    rasterize = Kernel("rasterize", SomeParams, threads=32, items=32)
     for _ in range(3):
-        driver.run(KERNEL, "one", 1, (1, first))
-        driver.run(KERNEL, "one_f64", 1, (1, first))
-        driver.run(KERNEL, "one", 1, (1, None, second))
-        driver.run(blend, "two", 1, (1, second))
+        driver.run(KERNEL, "one", 1, SomeParams(tensor=first))
+        driver.run(KERNEL, "one_f64", 1, SomeParams(tensor=first))
+        driver.run(KERNEL, "one", 1, SomeParams(tensor=second))
+        driver.run(rasterize, "two", 1, SomeParams(tensor=second))
     loaded = [call[1] for call in gpus.calls if call[0] == "cuLibraryLoadData"]
-    assert loaded == [b"statistic 86", b"statistic 90", b"blend 90"]
+    assert loaded == [b"statistic 86", b"statistic 90", b"rasterize 90"]
     assert gpus.count("cuLibraryGetKernel") == 4
     assert gpus.count("cuDevicePrimaryCtxRetain") == 2
     assert [(x.context, x.stream) for x in gpus.launches[:4]] == [
@@ -205,54 +260,61 @@ def test_code_is_loaded_once_for_each_file_and_device(gpus):
 
 def test_the_context_is_that_of_the_device_and_left_as_it_was(gpus):
     first, second = on_gpu(torch.zeros(1)), on_gpu(torch.zeros(1), OnSecondGpu)
-    driver.run(KERNEL, "one", 1, (1, first))
-    driver.run(KERNEL, "one", 1, (1, second))
+    driver.run(KERNEL, "one", 1, SomeParams(tensor=first))
+    driver.run(KERNEL, "one", 1, SomeParams(tensor=second))
     assert gpus.cuCtxGetCurrent() == (0, 0)
     gpus.cuCtxPushCurrent(1000)
     pushes = gpus.count("cuCtxPushCurrent")
-    driver.run(KERNEL, "one", 1, (1, first))  # is current: nothing to do
+    driver.run(KERNEL, "one", 1, SomeParams(tensor=first))  # is current: nothing to do
     assert gpus.count("cuCtxPushCurrent") == pushes
-    driver.run(KERNEL, "one", 1, (1, second))
+    driver.run(KERNEL, "one", 1, SomeParams(tensor=second))
     assert gpus.cuCtxGetCurrent() == (0, 1000)
     assert [launch.context for launch in gpus.launches] == [1000, 1001, 1000, 1001]
 
 
 def test_threads_have_arguments_of_their_own(gpus):
     tensor = on_gpu(torch.zeros(1))
-    driver.run(KERNEL, "one", 1, (0, tensor))
+    driver.run(KERNEL, "one", 1, SomeParams(tensor=tensor))
     addresses, wrong = set(), []
     barrier = threading.Barrier(4)
 
     def many(number: int) -> None:
-        addresses.add(driver._parameters.address)
+        addresses.add(driver._buffer.address)
         barrier.wait()
         for i in range(200):
             value = number * 1000 + i
-            driver.run(KERNEL, "one", value, (value, tensor))
+            driver.run(KERNEL, "one", value, SomeParams(n=value, tensor=tensor))
 
     threads = [threading.Thread(target=many, args=(number,)) for number in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    wrong = [x for x in gpus.launches[1:] if as_int(x.values[0]) != x.blocks or x.context != 1000]
+    wrong = [
+        x
+        for x in gpus.launches[1:]
+        if struct.unpack_from("=q", x.struct) != (x.blocks,) or x.context != 1000
+    ]
     assert len(gpus.launches) == 801
     assert not wrong
     assert len(addresses) == 4
 
 
 def test_launching_costs_little(gpus):
-    """What Python does for 20 arguments; the driver's own time comes on top."""
-    tensors = [on_gpu(torch.zeros(1)), *(torch.zeros(1) for _ in range(11))]
-    args = (5, *tensors, None, *range(4), 0.5, 1.5)
-    driver.run(KERNEL, "one", 1, args)
+    """What Python does for a struct of eight tensors; the driver's own time comes on top."""
+    names = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest", "grad", "ids")
+    tensors = {name: on_gpu(torch.zeros(1)) for name in names}
+    params = ManyParams(**tensors, n=5, width=0.5, height=1.5, rows=4, degree=3)
+    kernel = Kernel("statistic", ManyParams, threads=128, items=64)
+    gpus.layout = layout_of(ManyParams).hash
+    driver.run(kernel, "one", 1, params)
     gpus.cuCtxPushCurrent(1000)
     gpus.cuLaunchKernel = lambda *args: (0,)
 
     def batch() -> float:
         start = time.thread_time()
         for _ in range(200):
-            driver.run(KERNEL, "one", 1, args)
+            driver.run(kernel, "one", 1, params)
         return (time.thread_time() - start) / 200
 
     assert min(batch() for _ in range(10)) < 30e-6  # 7 to 9 µs on a busy machine
@@ -267,7 +329,11 @@ def test_launching_costs_little(gpus):
             2,
             "close other programs that use the GPU, or make the scene smaller",
         ),
-        ("cuLibraryGetKernel", 500, "the built kernels are older .*: rebuild them .make native."),
+        (
+            "cuLibraryGetKernel",
+            500,
+            "the built kernels do not match the Python files: rebuild them .make native.",
+        ),
         ("cuKernelGetFunction", 3, "update the NVIDIA driver, or use device cpu"),
     ],
 )
@@ -276,22 +342,28 @@ def test_errors_of_the_driver_are_lines_for_the_user(function, error, do, gpus):
     line = f"^cuda:1: some_kernel: CUDA_ERROR_{error}, in words; {do}$"
     for _ in range(2):
         with pytest.raises(UserError, match=line):
-            driver.run(KERNEL, "some_kernel", 1, (1, on_gpu(torch.zeros(1), OnSecondGpu)))
+            driver.run(
+                KERNEL, "some_kernel", 1, SomeParams(tensor=on_gpu(torch.zeros(1), OnSecondGpu))
+            )
     assert gpus.cuCtxGetCurrent() == (0, 0)
     gpus.fails.clear()
-    driver.run(KERNEL, "some_kernel", 1, (1, on_gpu(torch.zeros(1), OnSecondGpu)))
+    driver.run(KERNEL, "some_kernel", 1, SomeParams(tensor=on_gpu(torch.zeros(1), OnSecondGpu)))
 
 
 def test_a_driver_that_does_not_start_is_a_line_too(gpus):
     gpus.fails["cuInit"] = 803
     with pytest.raises(UserError, match="^cuda:0: CUDA_ERROR_803, in words; update"):
-        driver.run(KERNEL, "one", 1, (1, on_gpu(torch.zeros(1))))
+        driver.run(KERNEL, "one", 1, SomeParams(tensor=on_gpu(torch.zeros(1))))
 
 
 def test_a_gpu_that_cannot_be_used_says_why(gpus, monkeypatch):
     monkeypatch.setattr(driver, "why_unusable", lambda index: "it is too old")
+    tensor = on_gpu(torch.zeros(1))
+    params = BackgroundBackwardParams(
+        n=1, width=1, channels=1, grad_image=tensor, alpha=tensor, rows=tensor
+    )
     with pytest.raises(UserError, match="^cuda:0: it is too old$"):
-        native.launch("accumulate_screen_statistics", 1, on_gpu(torch.zeros(1)))
+        native.launch("background_bwd", params)
 
 
 @pytest.mark.parametrize("error", [200, 209, 218, 222])
@@ -302,7 +374,7 @@ def test_a_cubin_that_does_not_fit_is_followed_by_one_made_here(error, where, gp
     else:
         plain = gpus.cuKernelGetFunction
         gpus.cuKernelGetFunction = lambda k: (error, None) if k[0][-2:] == b"86" else plain(k)
-    driver.run(KERNEL, "one", 1, (1, on_gpu(torch.zeros(1))))
+    driver.run(KERNEL, "one", 1, SomeParams(tensor=on_gpu(torch.zeros(1))))
     assert compiler.compiled == [("statistic", "sm_86")]
     assert gpus.launches[0].function[0] == b"statistic for sm_86, 1"
 
@@ -323,9 +395,12 @@ def test_nothing_of_the_driver_is_loaded_for_the_cpu():
 
 THROUGH_THE_BINDINGS = """
 import ctypes, sys, torch
+from dataclasses import dataclass
 from types import SimpleNamespace
 from snowsplat.ops.cuda import cubins, driver
 from snowsplat.ops.cuda.kernels import Kernel
+from snowsplat.ops.layout import Params, layout_of
+from snowsplat.ops.params import BackgroundBackwardParams
 
 stub = ctypes.CDLL("libcuda.so.1")
 driver.why_unusable = lambda index: None
@@ -336,8 +411,18 @@ cubins.candidates = lambda file, capability, major: [b"code", file, capability, 
 class OnGpu(torch.Tensor):
     device = torch.device("cuda", 0)
 
+@dataclass
+class SomeParams(Params):
+    n: int
+    tensor: torch.Tensor
+    missing: torch.Tensor | None
+    real: float
+
+kernel = Kernel("some", SomeParams, threads=96, items=96)
+stub_layout = ctypes.c_uint64.in_dll(stub, "layout")
+stub_layout.value = layout_of(SomeParams).hash
 tensor = torch.zeros(3).as_subclass(OnGpu)
-driver.run(Kernel("some", 96, 96), "some_kernel", 5, (-6, tensor, None, 0.5))
+driver.run(kernel, "some_kernel", 5, SomeParams(-6, tensor, None, 0.5))
 values = (ctypes.c_int64 * 4).in_dll(stub, "recorded_values")
 sizes = (ctypes.c_int * 6).in_dll(stub, "recorded_size")
 pointer = lambda name: ctypes.c_void_p.in_dll(stub, name).value
@@ -351,7 +436,12 @@ assert (ctypes.c_char * 64).in_dll(stub, "recorded_name").value == b"some_kernel
 assert ctypes.c_int.in_dll(stub, "pushed").value == 2  # to load, and to launch
 ctypes.c_int.in_dll(stub, "fail_next").value = 700
 try:
-    driver.run(Kernel("some", 96, 96), "some_kernel", 5, (-6, tensor, None, 0.5))
+    driver.run(kernel, "some_kernel", 5, SomeParams(-6, tensor, None, 0.5))
+except driver.UserError as error:
+    print(error)
+stub_layout.value += 1
+try:
+    driver.run(kernel, "other_kernel", 5, SomeParams(-6, tensor, None, 0.5))
 except driver.UserError as error:
     print(error)
 """
@@ -376,6 +466,8 @@ def test_the_way_through_the_real_bindings(tmp_path):
     assert result.stdout == (
         "cuda:0: some_kernel: CUDA_ERROR_ILLEGAL_ADDRESS, an illegal memory access; "
         "update the NVIDIA driver, or use device cpu\n"
+        "cuda:0: other_kernel: the built kernels do not match the Python files: "
+        "rebuild them (make native)\n"
     ), result.stderr
 
 
@@ -415,7 +507,7 @@ def test_a_card_of_another_major_version_has_its_code_made_here(built, compiler)
 
 def test_without_built_kernels_all_are_made_here(tmp_path, monkeypatch, compiler):
     monkeypatch.setattr(cubins, "_BUILT", tmp_path / "nothing")
-    assert list(cubins.candidates("blend", (8, 6), 12)) == [b"blend for sm_86, 1"]
+    assert list(cubins.candidates("rasterize", (8, 6), 12)) == [b"rasterize for sm_86, 1"]
 
 
 @pytest.mark.parametrize(("major", "package"), [(12, "nvrtc-cu12"), (13, "nvrtc")])
@@ -425,11 +517,11 @@ def test_without_nvrtc_the_line_names_the_package(major, package, built, monkeyp
         raise nvrtc.NotFound
 
     monkeypatch.setattr(nvrtc, "find", nothing)
-    assert next(cubins.candidates("blend", (8, 6), major)) == b"blend 86"
+    assert next(cubins.candidates("rasterize", (8, 6), major)) == b"rasterize 86"
     with pytest.raises(
         UserError, match=rf"capability 13.0, and .*: pip install nvidia-cuda-{package}$"
     ):
-        list(cubins.candidates("blend", (13, 0), major))
+        list(cubins.candidates("rasterize", (13, 0), major))
 
 
 # ---- the cache
@@ -481,10 +573,10 @@ def test_a_cache_that_cannot_be_written_is_no_error(built, compiler, tmp_path, m
 def test_the_cache_is_where_it_is_by_custom(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    expected = tmp_path / ".cache" / "snowsplat" / "kernels" / "blend-sm_90-key"
-    assert cubins._cache_path("blend", "sm_90", "key") == expected
+    expected = tmp_path / ".cache" / "snowsplat" / "kernels" / "rasterize-sm_90-key"
+    assert cubins._cache_path("rasterize", "sm_90", "key") == expected
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # is to be ignored
-    assert cubins._cache_path("blend", "sm_90", "key") == expected
+    assert cubins._cache_path("rasterize", "sm_90", "key") == expected
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "Local"))
     assert (

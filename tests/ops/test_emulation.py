@@ -3,12 +3,15 @@
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
 
 from snowsplat.ops.cuda.kernels import Kernel
+from snowsplat.ops.layout import Params
+from snowsplat.ops.params import SizeQueryParams
 
 from . import emulation
 
@@ -23,8 +26,26 @@ def _forward(monkeypatch):
     monkeypatch.delenv("SNOWSPLAT_ORDER", raising=False)
 
 
-def run(name: str, threads: int, n: int, *args: torch.Tensor, blocks: int = 1) -> None:
-    emulation.execute(Kernel("faults", threads, threads), name, blocks, (n, *args))
+@dataclass(slots=True, kw_only=True)
+class FaultParams(Params):
+    n: int
+    given: torch.Tensor | None
+    out: torch.Tensor
+    total: torch.Tensor | None
+
+
+def run(
+    name: str,
+    threads: int,
+    n: int,
+    *tensors: torch.Tensor,
+    total: torch.Tensor | None = None,
+    blocks: int = 1,
+) -> None:
+    """``tensors``: what the kernel writes, or what it reads and what it writes."""
+    *given, out = tensors
+    params = FaultParams(n=n, given=given[0] if given else None, out=out, total=total)
+    emulation.execute(Kernel("faults", FaultParams, threads, threads), name, blocks, params)
 
 
 def zeros(count: int) -> torch.Tensor:
@@ -193,7 +214,7 @@ def test_votes_of_a_block():
 def test_atomics_over_several_blocks(order, monkeypatch):
     monkeypatch.setenv("SNOWSPLAT_ORDER", order)
     out, total = torch.tensor([0, -5, 500, 0, 0, -1, 4], dtype=torch.int32), torch.zeros(1)
-    run("atomics", 64, 150, out, total, blocks=3)
+    run("atomics", 64, 150, out, total=total, blocks=3)
     assert out.tolist() == [150, 149, 0, 255, 1, 4, 9]
     assert total.item() == 75
 
@@ -206,15 +227,12 @@ def test_two_kernels_one_after_the_other():
     assert values.tolist() == expected
 
 
-def test_threads_and_arguments_are_checked():
+def test_threads_and_parameters_are_checked():
     with pytest.raises(AssertionError, match="double_all has 64 threads, its Kernel says 32"):
         run("double_all", 32, 1, zeros(1))
-    kernel = Kernel("faults", 64, 64)
-    for given, letters in (
-        ((1,), "i"),
-        ((1, 2.0), "id"),
-        ((1.0, None), "dp"),
-        ((1, None, 1), "ipi"),
-    ):
-        with pytest.raises(AssertionError, match=f"double_all takes ip, not {letters}$"):
-            emulation.execute(kernel, "double_all", 1, given)
+    other = Kernel("faults", SizeQueryParams, 64, 64)
+    with pytest.raises(AssertionError, match="double_all does not take SizeQueryParams"):
+        emulation.execute(other, "double_all", 1, SizeQueryParams())
+    kernel = Kernel("faults", FaultParams, 64, 64)
+    with pytest.raises(AssertionError, match="double_all takes FaultParams, got SizeQueryParams"):
+        emulation.execute(kernel, "double_all", 1, SizeQueryParams())

@@ -3,13 +3,16 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
 
 import snowsplat
-from snowsplat.ops import native
+from snowsplat.ops import layout, native
+from snowsplat.ops.layout import Params
+from snowsplat.ops.params import SizeQueryParams, SplatsReduceParams
 from snowsplat.util.errors import UserError
 
 SOURCES = Path(snowsplat.__file__).parents[1]
@@ -31,14 +34,33 @@ def fresh(monkeypatch):
     monkeypatch.setattr(native, "_functions", {})
 
 
+@dataclass(slots=True, kw_only=True)
+class Nested(Params):
+    a: float
+    b: int
+
+
+@dataclass(slots=True, kw_only=True)
+class RecordParams(Params):
+    n: int
+    out: torch.Tensor
+    nothing: torch.Tensor | None
+    first: Nested
+    second: Nested
+    whole: int
+    last: torch.Tensor
+
+
 @pytest.fixture(scope="module")
 def recorder(tmp_path_factory):
-    """A library that writes down how its arguments arrived."""
+    """A library that writes down the parameters that arrive."""
     folder = tmp_path_factory.mktemp("lib")
     source = Path(__file__).with_name("launch_abi.cpp")
     compiler = os.environ.get("CXX", "c++")
     library = folder / "libsnowsplat_recorder.so"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", str(source), "-o", library], check=True)
+    include = f"-I{Path(snowsplat.__file__).parent / 'native'}"
+    command = [compiler, "-std=c++17", "-shared", "-fPIC", "-O1", include, source, "-o", library]
+    subprocess.run(command, check=True)
     return library
 
 
@@ -46,51 +68,133 @@ def recorder(tmp_path_factory):
 def recording(fresh, recorder, monkeypatch):
     monkeypatch.setattr(native, "_LIBRARIES", recorder.parent)
     monkeypatch.setattr(native, "_choose", lambda: "recorder")
+    monkeypatch.setattr(native, "ENTRIES", {"record": RecordParams})
 
 
-SCALARS = [x for i in range(10) for x in (-(2**40) - i, i + 0.1)]
+def record_params(**changes) -> RecordParams:
+    params = RecordParams(
+        n=6,
+        out=torch.zeros(6, dtype=torch.float64),
+        nothing=None,
+        first=Nested(a=0.1, b=-(2**40)),
+        second=Nested(a=-1e300, b=2**62),
+        whole=True,
+        last=torch.tensor([7], dtype=torch.int32),
+    )
+    return replace(params, **changes)
 
 
-def test_arguments_arrive_in_order_and_at_full_width(recording):
-    out = torch.zeros(21, dtype=torch.float64)
-    last = torch.tensor([7], dtype=torch.int32)
-    result = native.launch("record", 21, out, None, *SCALARS, last)
-    assert result == 2**40 + 21
-    assert out.tolist() == [*SCALARS, 7.0]
+def test_parameters_arrive_in_order_and_at_full_width(recording):
+    params = record_params()
+    assert native.launch("record", params) == 2**40 + 6
+    assert params.out.tolist() == [0.1, -(2.0**40), -1e300, 2.0**62, 1.0, 7.0]
 
 
-def test_bools_parameters_and_n_zero(recording):
-    out = torch.nn.Parameter(torch.zeros(21, dtype=torch.float64))
-    last = torch.zeros(1, dtype=torch.int32)
-    assert native.launch("record", 0, out, None, *SCALARS, last) == 2**40
-    assert out.abs().max() == 0
-    native.launch("record", 2, out, None, True, *SCALARS[1:], last)
-    assert out[:2].tolist() == [1.0, 0.1]
+def test_torch_parameters_and_n_zero(recording):
+    params = record_params(out=torch.nn.Parameter(torch.zeros(6, dtype=torch.float64)), n=0)
+    assert native.launch("record", params) == 2**40
+    assert params.out.abs().max() == 0
 
 
 def test_launch_costs_little(recording):
-    out = torch.zeros(21, dtype=torch.float64)
-    last = torch.zeros(1, dtype=torch.int32)
+    params = record_params(n=0)
 
     def batch() -> float:
         start = time.thread_time()
         for _ in range(200):
-            native.launch("record", 0, out, None, *SCALARS, last)
+            native.launch("record", params)
         return (time.thread_time() - start) / 200
 
-    assert min(batch() for _ in range(10)) < 30e-6  # 8 µs on an idle machine
+    assert min(batch() for _ in range(10)) < 30e-6  # 3 µs on an idle machine
 
 
-def test_tensors_must_be_contiguous_on_one_device_and_on_the_cpu(recording):
+def test_tensors_must_be_contiguous_on_one_device_with_kernels(recording):
     x = torch.zeros(4, 4)
-    with pytest.raises(ValueError, match="record: argument 2 of shape .4, 4. is not contiguous"):
-        native.launch("record", 1, x, x.t())
+    with pytest.raises(ValueError, match="record: out of shape .4, 4. is not contiguous"):
+        native.launch("record", record_params(out=x.t()))
+    everywhere = record_params(out=x.to("meta"), last=x.to("meta"))
     with pytest.raises(UserError, match="no kernels for device meta; use device cpu"):
-        native.launch("record", 1, x.to("meta"))
-    with pytest.raises(ValueError, match="tensors on cpu and on meta"):
-        native.launch("record", 1, x, x.to("meta"))
-    with pytest.raises(TypeError, match="argument 2 is a str"):
-        native.launch("record", 1, x, "x")
+        native.launch("record", everywhere)
+    with pytest.raises(ValueError, match="record: last is on meta, other tensors are on cpu"):
+        native.launch("record", record_params(last=x.to("meta")))
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"out": "text"}, "record: out must be a tensor or None, got str"),
+        ({"nothing": 3}, "record: nothing must be a tensor or None, got int"),
+        ({"whole": 1.5}, "RecordParams: whole must be an int, got float"),
+        ({"first": Nested(a=None, b=1)}, "RecordParams: first.a must be a float, got NoneType"),
+        ({"whole": 2**64}, "RecordParams: an integer has more than 64 bits"),
+    ],
+)
+def test_fields_have_their_kinds(recording, changes, found):
+    with pytest.raises(TypeError, match=f"^{found}$"):
+        native.launch("record", record_params(**changes))
+
+
+def test_a_struct_of_another_function_is_refused(recording):
+    with pytest.raises(TypeError, match="record takes RecordParams, not Nested"):
+        native.launch("record", Nested(a=1.0, b=2))
+
+
+def test_every_field_has_to_be_given():
+    with pytest.raises(TypeError, match="missing 1 required keyword-only argument: 'last'"):
+        RecordParams(n=1, out=None, nothing=None, first=None, second=None, whole=1)
+
+
+# A field is missing, has another name, kind or place, or a constant is another.
+@dataclass(slots=True, kw_only=True)
+class Shorter(Params):
+    n: int
+    out: torch.Tensor
+    nothing: torch.Tensor | None
+    first: Nested
+    second: Nested
+    whole: int
+
+
+@dataclass(slots=True, kw_only=True)
+class Renamed(Shorter):
+    final: torch.Tensor
+
+
+@dataclass(slots=True, kw_only=True)
+class OtherKind(Shorter):
+    last: float
+
+
+OUTDATED = "the native library for recorder does not match the Python files"
+
+
+@pytest.mark.parametrize("params", [Shorter, Renamed, OtherKind, Nested])
+def test_another_layout_is_found_when_the_library_is_loaded(recording, monkeypatch, params):
+    monkeypatch.setattr(native, "ENTRIES", {"record": params})
+    with pytest.raises(UserError, match=rf"^{OUTDATED} \(record\); rebuild it: .*make native"):
+        native.isa()
+
+
+def test_fields_in_another_order_are_found(recording, monkeypatch):
+    monkeypatch.setattr(native, "ENTRIES", {"record_swapped": RecordParams})
+    with pytest.raises(UserError, match=rf"^{OUTDATED} \(record_swapped\); rebuild it"):
+        native.isa()
+
+
+def test_another_constant_is_found(recording, monkeypatch):
+    assert native.isa() == "recorder"
+    native._library.cache_clear()
+    monkeypatch.setitem(layout._CONSTANTS, "tile", 32)
+    monkeypatch.setattr(layout, "_layouts", {})
+    with pytest.raises(UserError, match=OUTDATED):
+        native.isa()
+
+
+def reduce_params(slots: torch.Tensor, grad_packed: torch.Tensor) -> SplatsReduceParams:
+    same = dict.fromkeys(("slot_range", "packed", "columns"), slots)
+    return SplatsReduceParams(
+        n=1, slots=slots, **same, stride=1, channels=1, add=False, grad_packed=grad_packed
+    )
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
@@ -103,17 +207,21 @@ def test_cuda_without_a_gpu_says_why():
 
     with FakeTensorMode():
         x = torch.empty(3, device="cuda")
-        with pytest.raises(ValueError, match="tensors on cuda:0 and on cpu; move them to one"):
-            native.launch("accumulate_screen_statistics", 1, x, torch.empty(3))
+        with pytest.raises(
+            ValueError, match="grad_packed is on cpu, other tensors are on cuda:0; move"
+        ):
+            native.launch("splats_reduce", reduce_params(x, torch.empty(3)))
     x = torch.empty(3).as_subclass(OnGpu)
     with pytest.raises(UserError, match="^cuda:0: (there is no NVIDIA|this PyTorch|PyTorch|the )"):
-        native.launch("accumulate_screen_statistics", 1, x)
+        native.launch("splats_reduce", reduce_params(x, x))
 
 
 @pytest.mark.isa
 def test_unknown_function_names_the_remedy(fresh):
-    with pytest.raises(UserError, match=r"no function nonsense.*make native"):
-        native.launch("nonsense", 1)
+    with pytest.raises(
+        UserError, match=r"does not match the Python files .nonsense.; .*make native"
+    ):
+        native.launch("nonsense", SizeQueryParams())
 
 
 def test_missing_library_names_the_remedy(fresh, tmp_path, monkeypatch):
@@ -142,7 +250,9 @@ def test_best_is_picked_and_every_available_one_can_be_forced(fresh, monkeypatch
 
 def test_unknown_isa_names_the_valid_ones(fresh, monkeypatch):
     monkeypatch.setenv("SNOWSPLAT_ISA", "sse9")
-    with pytest.raises(UserError, match="'sse9' is no instruction set; .* baseline, avx2, avx512"):
+    with pytest.raises(
+        UserError, match="'sse9' is not an instruction set; .* baseline, avx2, avx512"
+    ):
         native.isa()
 
 
@@ -188,7 +298,7 @@ def test_threads_come_from_the_environment_or_the_affinity(monkeypatch):
     assert native._default_threads() == len(affinity)
     for wrong in ("0", "-2", "many"):
         monkeypatch.setenv("SNOWSPLAT_THREADS", wrong)
-        with pytest.raises(UserError, match=f"'{wrong}' is no number of threads"):
+        with pytest.raises(UserError, match=f"'{wrong}' is not a number of threads"):
             native._default_threads()
 
 

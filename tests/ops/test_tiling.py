@@ -12,12 +12,22 @@ from torch import Tensor
 
 from snowsplat.ops import native as natives
 from snowsplat.ops.cuda import sorting
-from snowsplat.ops.cuda.kernels import Argument, Run
+from snowsplat.ops.cuda.kernels import Run
 from snowsplat.ops.cuda.launches import KERNELS
+from snowsplat.ops.layout import TILE, Params
+from snowsplat.ops.params import (
+    SizeQueryParams,
+    SplatsPrepareParams,
+    SplatsReduceParams,
+    SplatsSortParams,
+    TileBinning,
+    TilesCountParams,
+    TilesFillParams,
+)
 
 from . import emulation
 from .conftest import variants
-from .engines import execute_there
+from .engines import execute_on_gpu
 from .scenes import (
     CUDA_FLOAT32,
     EMULATED_FLOAT32,
@@ -30,7 +40,6 @@ from .scenes import (
 )
 
 BLOCK = 4096  # keys of a block of the sort
-TILE = 16
 CPU = natives.LAUNCHERS["cpu"]
 
 
@@ -40,11 +49,11 @@ def run(request: pytest.FixtureRequest) -> Run:
     variant: Variant = request.param
     if variant.engine == "cuda" and not torch.cuda.is_available():
         pytest.skip("needs a GPU that torch can use")
-    execute = emulation.execute if variant.engine == "emulated" else execute_there
+    execute = emulation.execute if variant.engine == "emulated" else execute_on_gpu
 
-    def queue(name: str, blocks: int, *args: Argument) -> None:
+    def queue(name: str, blocks: int, params: Params) -> None:
         if blocks > 0:
-            execute(KERNELS[name.removesuffix("_f64")], name, blocks, args)
+            execute(KERNELS[name.removesuffix("_f64")], name, blocks, params)
 
     return queue
 
@@ -186,30 +195,61 @@ def bin_splats(
         guarded.append((tensor, size))
         return tensor
 
-    def launch(name: str, n: int, *args: Tensor | int | float | None) -> int:
-        return natives.launch(name + suffix, n, *args)
+    def launch(name: str, params: Params) -> int:
+        return natives.launch(name + suffix, params)
 
     columns = torch.tensor([8, 9, 10, -1])
     key = torch.int32 if native.dtype == torch.float32 else torch.int64
     keys, keys2, order, order2 = empty(m, key), empty(m, key), empty(m), empty(m)
-    records = empty(m * launch("splat_record_bytes", 0), torch.uint8)
+    records = empty(m * launch("splat_record_bytes", SizeQueryParams()), torch.uint8)
     launch(
-        *("splats_prepare", m, packed, stride, float(width), float(height)),
-        *(columns, records, keys),
+        "splats_prepare",
+        SplatsPrepareParams(
+            n=m,
+            packed=packed,
+            stride=stride,
+            width=width,
+            height=height,
+            columns=columns,
+            records=records,
+            keys=keys,
+        ),
     )
-    launch("splats_sort", m, keys, keys2, order, order2)
+    launch("splats_sort", SplatsSortParams(n=m, keys=keys, keys2=keys2, order=order, order2=order2))
     assert sorted(order[:m].tolist()) == list(range(m))
-    parts = natives.launch("tiles_parts", m)
-    size = natives.launch("tiles_workspace_bytes", m, tiles, parts)
+    parts = natives.launch("tiles_parts", SizeQueryParams(n=m))
+    query = SizeQueryParams(n=m, tiles=tiles, parts=parts)
+    size = natives.launch("tiles_workspace_bytes", query)
     workspace, tile_start = torch.empty(size, dtype=torch.uint8), empty(tiles + 1)
     needed = torch.full((1,), -5)
-    binning = (m, order, packed, stride, records, tiles_x, tiles_y, parts, workspace, tile_start)
-    count = launch("tiles_count", *binning, capacity, needed)
+    binning = TileBinning(
+        order=order,
+        packed=packed,
+        stride=stride,
+        records=records,
+        tiles_x=tiles_x,
+        tiles_y=tiles_y,
+        parts=parts,
+        workspace=workspace,
+        tile_start=tile_start,
+    )
+    count = launch(
+        "tiles_count", TilesCountParams(n=m, binning=binning, capacity=capacity, required=needed)
+    )
     if native.engine != "native" and capacity >= 0:
         assert count == capacity
     instance_splat, instance_slot, slot_range = empty(count), empty(count), empty(2 * m)
-    slots = (instance_slot, slot_range) if with_slots else (None, None)
-    launch("tiles_fill", *binning, count, instance_splat, *slots)
+    launch(
+        "tiles_fill",
+        TilesFillParams(
+            n=m,
+            binning=binning,
+            capacity=count,
+            instance_splat=instance_splat,
+            instance_slot=instance_slot if with_slots else None,
+            slot_range=slot_range if with_slots else None,
+        ),
+    )
     for tensor, length in guarded:
         assert (tensor[length:] == 99).all()
     start = tile_start[: tiles + 1].tolist()
@@ -427,15 +467,17 @@ def test_reduce(native: Variant, count: int, channels: int, add: bool) -> None:
     grad[:count] = before if add else math.nan
     natives.launch(
         f"splats_reduce{suffix}",
-        count,
-        slots.to(dtype),
-        torch.stack([starts, ends], dim=1).int(),
-        packed,
-        stride,
-        channels,
-        columns,
-        add,
-        grad,
+        SplatsReduceParams(
+            n=count,
+            slots=slots.to(dtype),
+            slot_range=torch.stack([starts, ends], dim=1).int(),
+            packed=packed,
+            stride=stride,
+            channels=channels,
+            columns=columns,
+            add=add,
+            grad_packed=grad,
+        ),
     )
     assert (grad[count:] == 99).all()
     wanted = before if add else torch.zeros(count, stride, dtype=torch.float64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,8 +13,9 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from snowsplat import ops
 from snowsplat.data import Dataset
 from snowsplat.data.decode import LoadedImage
-from snowsplat.ops.cuda.kernels import Argument, Kernel
+from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import launch_by
+from snowsplat.ops.layout import Params, layout_of
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.finite import Diverged
@@ -100,13 +100,14 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
     """With fake tensors, which have a device but no values: reading one is an error."""
     seen: list[str] = []
 
-    def record(kernel: Kernel, name: str, blocks: int, args: Sequence[Argument]) -> None:
-        for arg in args:
-            assert not isinstance(arg, Tensor) or arg.device.type == "cuda", name
+    def record(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
+        layout = layout_of(kernel.params)
+        tensors = [layout.values(params)[i] for i in layout.pointers]
+        assert all(tensor.device.type == "cuda" for tensor in tensors if tensor is not None), name
         seen.append(name)
 
-    def launch(name: str, n: int, args: Sequence[Argument]) -> int:
-        return launch_by(record, name, n, args)
+    def launch(name: str, params: Params) -> int:
+        return launch_by(record, name, params)
 
     trainer = Trainer(dataset, config)
     _, camera, photo = trainer._next_view(1)
@@ -132,7 +133,7 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
             trainer._optimize(1, camera, photo, on_device(torch.zeros(3)))
         finally:
             torch.use_deterministic_algorithms(False)
-    order = ["project_fwd", "tiles_", "blend_fwd", "photometric", "blend_bwd", "adam_"]
+    order = ["project_fwd", "tiles_", "rasterize_fwd", "photometric", "rasterize_bwd", "adam_"]
     places = [min(i for i, name in enumerate(seen) if part in name) for part in order]
     assert places == sorted(places), seen
     assert ("splats_reduce" in seen) == deterministic

@@ -1,11 +1,21 @@
-// The vocabulary in which the maths headers are written, so that one text serves every `Real`:
-// plain float and double (CUDA), Simd<float, W> (CPU) and Simd<double, W> (checks). A branch on data
-// is a select(), because in lanes both sides exist.
+// The functions that the maths headers are written with, so that the same code serves every `Real`:
+// float and double (CUDA), Simd<float, W> (CPU) and Simd<double, W> (gradient checks). A branch that
+// depends on data is written as select(), because SIMD lanes may take different sides.
 #pragma once
 
-#if !defined(__CUDACC_RTC__)
+#if defined(__CUDACC_RTC__)  // NVRTC has no headers of the C library
+using int8_t = signed char;
+using uint8_t = unsigned char;
+using int16_t = short;
+using uint16_t = unsigned short;
+using int32_t = int;
+using uint32_t = unsigned int;
+using int64_t = long long;
+using uint64_t = unsigned long long;
+#else
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #endif
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
@@ -34,7 +44,7 @@ SNOW_INLINE double log2(double a) { return ::log2(a); }
 SNOW_INLINE double exp2_blend(double a) { return ::exp2(a); }
 SNOW_INLINE double fma(double a, double b, double c) { return ::fma(a, b, c); }
 
-// 1/a and 1/√a. The compiler for a GPU has instructions for those of float.
+// 1/a and 1/√a. A GPU has instructions for those of float.
 SNOW_INLINE double reciprocal(double a) { return 1.0 / a; }
 SNOW_INLINE double rsqrt(double a) { return 1.0 / ::sqrt(a); }
 SNOW_INLINE double reciprocal_estimate(double a) { return 1.0 / a; }
@@ -48,23 +58,38 @@ SNOW_INLINE float rsqrt(float a) { return 1.f / ::sqrtf(a); }
 SNOW_INLINE float reciprocal_estimate(float a) { return 1.f / a; }
 #endif
 
-// Neither infinite nor NaN: infinity minus itself is NaN, which every comparison refuses.
+// Neither infinite nor NaN: infinity minus itself is NaN, and comparisons with NaN are false.
 template <class Real>
 SNOW_INLINE auto is_finite(Real a) {
   return a - a >= Real(0.f);
 }
 
+// The bits of a number as an unsigned integer.
+#if defined(__CUDACC_RTC__)
+SNOW_INLINE uint32_t bits_of(float a) { return __float_as_uint(a); }
+SNOW_INLINE uint64_t bits_of(double a) { return uint64_t(__double_as_longlong(a)); }
+#else
+SNOW_INLINE uint32_t bits_of(float a) {
+  uint32_t bits;
+  std::memcpy(&bits, &a, sizeof bits);
+  return bits;
+}
+SNOW_INLINE uint64_t bits_of(double a) {
+  uint64_t bits;
+  std::memcpy(&bits, &a, sizeof bits);
+  return bits;
+}
+#endif
+
 constexpr double kLog2E = 1.4426950408889634;
 constexpr double kLn2 = 0.6931471805599453;
 constexpr double kLn255 = 5.541263545158426;
 
-// Blending constants of Kerbl et al. 2023, section 6 and appendix C.
+// Constants of Kerbl et al. 2023, section 6 and appendix C.
 constexpr double kMinAlpha = 1.0 / 255.0;             // fainter contributions are skipped
 constexpr double kMaxAlpha = 0.99;                    // keeps 1 - alpha away from 0
 constexpr double kMinTransmittance = 1e-4;            // a pixel this opaque is finished
 constexpr double kLog2MinAlpha = -7.994353436858858;  // log2(1/255)
 constexpr double kDilation = 0.3;  // low-pass added to the 2D covariance, pixels^2
-
-constexpr int kTile = 16;  // tile edge, pixels
 
 }  // namespace snow

@@ -9,47 +9,40 @@
 // formed.
 #pragma once
 
-#include "portable.h"
+#include "params.h"
+#include "rasterize.h"
 
 namespace snow {
 
-constexpr int kPackedHeader = 8;   // columns of Splats2D before the colours, see ops/splats.py
-constexpr int kPackedStride = 16;  // columns of Splats2D with 3 colours
-
-template <class T>
-struct GaussianTensors {  // (N, 3), (N, 3), (N, 4), (N,), (N, 1, 3), (N, K, 3)
-  const T *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;
-  int64_t sh_rest_rows;  // K as stored; `degree` says how many of them are active
-};
-
-// A pinhole camera. Pixel (i, j) has its centre at (i + 0.5, j + 0.5); z points forward.
+// What is derived from CameraParams once per call (CPU) or per thread (CUDA).
 template <class T>
 struct PinholeCamera {
   T rotation[9], translation[3];  // cam_from_world
   T position[3];                  // camera centre in the world, -Rᵀ t
   T fx, fy, cx, cy, width, height, near;
-  // J is evaluated with x/z and y/z clamped to 15% beyond the image, where the linearisation of the
-  // projection would otherwise blow up.
+  // J is evaluated with x/z and y/z clamped to 15% beyond the image: farther out the linearisation
+  // of the projection grows without bound.
   T min_tx, max_tx, min_ty, max_ty;
 
-  // Real: in what the limits are reckoned; double on a CPU, where one camera serves a call. On a GPU
-  // each thread makes its own.
+  // Real: the type in which the limits are computed. double on the CPU; T on a GPU, where every
+  // thread computes them.
   template <class Real>
-  SNOW_INLINE PinholeCamera(const T* cam_from_world, Real width_, Real height_, Real fx_, Real fy_,
-                            Real cx_, Real cy_, Real near_)
-      : fx(T(fx_)), fy(T(fy_)), cx(T(cx_)), cy(T(cy_)), width(T(width_)), height(T(height_)),
-        near(T(near_)) {
+  SNOW_INLINE PinholeCamera(const CameraParams<T>& c, Real)
+      : fx(T(c.fx)), fy(T(c.fy)), cx(T(c.cx)), cy(T(c.cy)), width(T(c.width)), height(T(c.height)),
+        near(T(c.near)) {
     for (int i = 0; i < 3; i++) {
-      for (int j = 0; j < 3; j++) rotation[3 * i + j] = cam_from_world[4 * i + j];
-      translation[i] = cam_from_world[4 * i + 3];
+      for (int j = 0; j < 3; j++) rotation[3 * i + j] = c.cam_from_world[4 * i + j];
+      translation[i] = c.cam_from_world[4 * i + 3];
     }
     for (int k = 0; k < 3; k++) {
       position[k] = -(rotation[k] * translation[0] + rotation[3 + k] * translation[1] +
                       rotation[6 + k] * translation[2]);
     }
-    const Real beyond_x = Real(0.15) * width_, beyond_y = Real(0.15) * height_;
-    min_tx = T(-(cx_ + beyond_x) / fx_), max_tx = T((width_ - cx_ + beyond_x) / fx_);
-    min_ty = T(-(cy_ + beyond_y) / fy_), max_ty = T((height_ - cy_ + beyond_y) / fy_);
+    const Real w(c.width), h(c.height), focal_x(c.fx), focal_y(c.fy), centre_x(c.cx),
+        centre_y(c.cy);
+    const Real beyond_x = Real(0.15) * w, beyond_y = Real(0.15) * h;
+    min_tx = T(-(centre_x + beyond_x) / focal_x), max_tx = T((w - centre_x + beyond_x) / focal_x);
+    min_ty = T(-(centre_y + beyond_y) / focal_y), max_ty = T((h - centre_y + beyond_y) / focal_y);
   }
 };
 
@@ -240,14 +233,8 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
   for (int k = 0; k < 4; k++) grad.quat[k] = (dq[k] - radial * p.quat[k]) * p.inv_quat_norm;
 }
 
-// Squared Mahalanobis radius at which the splat fades to alpha = 1/255: α = o exp(−k²/2).
-template <class Real>
-SNOW_INLINE Real squared_cutoff(Real opacity) {
-  return Real(2 * kLn2) * (log2(opacity) - Real(kLog2MinAlpha));
-}
-
-// Exactly: in front of the near plane, at least 1/255 opaque, and the box of the ellipse
-// {α ≥ 1/255} holds a pixel centre's range. Anything not finite fails a comparison.
+// In front of the near plane, at least 1/255 opaque, and the box of the ellipse {α ≥ 1/255} reaches
+// the range of the pixel centres. Values that are not finite fail a comparison.
 template <class Real, class T>
 SNOW_INLINE auto is_visible(const ProjectedGaussian<Real>& p, const PinholeCamera<T>& c) {
   Real k2 = squared_cutoff(p.opacity);

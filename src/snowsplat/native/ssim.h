@@ -8,6 +8,18 @@ namespace snow {
 
 constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
 constexpr int kSsimRadius = 5;  // 11×11 window, Gaussian with σ = 1.5
+constexpr int kSsimTaps = 2 * kSsimRadius + 1;
+
+// The separable window: exp(−x²/(2·1.5²)) / Σ for x = k − 5.
+SNOW_INLINE constexpr double ssim_tap(int k) {
+  const int x = k < kSsimRadius ? kSsimRadius - k : k - kSsimRadius;
+  return x == 0   ? 0.26601172486179436
+         : x == 1 ? 0.2130055377112537
+         : x == 2 ? 0.10936068950970002
+         : x == 3 ? 0.03600077212843083
+         : x == 4 ? 0.007598758135239185
+                  : 0.00102838008447911;
+}
 
 template <class Real>
 struct SsimDerivatives {

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.projection import camera_args, check_parameters
+from snowsplat.ops.params import AdamStepParams, AdamTensor
+from snowsplat.ops.projection import camera_params, check_parameters
 from snowsplat.ops.splats import packed_width
 
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
@@ -41,15 +42,15 @@ def adam_step(
 ) -> None:
     """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
 
-    The gradients of the parameters never reach memory, which halves the time of this part of a
-    training step. The arguments of the camera and `sh_degree` are those that `project` was given.
+    The gradients of the parameters are never written to memory, which halves the time of this part
+    of a training step. The camera arguments and `sh_degree` are those passed to `project`.
 
     params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, shaped as for `project`,
         contiguous. A `.grad` that is not None (of a regulariser) is added to the gradient.
     exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
-    ids, packed_grad: `splats.ids` (M,), which ascends, and `splats.packed.grad` (M, 16). On a GPU
-        as `project` gave them, with ids of -1, or without those rows.
-    lr: a rate for each name. step: counts from 1 (bias correction).
+    ids, packed_grad: `splats.ids` (M,), ascending, and `splats.packed.grad` (M, 16). On a GPU as
+        `project` returned them, with ids of -1, or without those rows.
+    lr: the learning rate of each parameter. step: counts from 1 (bias correction).
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
 
@@ -59,7 +60,7 @@ def adam_step(
         value that the step would make infinite or NaN keeps its value and moments, and the rows
         with such values are added to the counts. No non-finite gradient reaches the parameters.
 
-    Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
+    Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
     p −= lr · m̂ / √(v̂ + eps²) (Kingma & Ba 2015, with ε inside the root).
 
     Raises ValueError where shapes, dtypes or devices do not fit.
@@ -93,33 +94,39 @@ def adam_step(
             )
     if step < 1:
         raise ValueError(f"adam_step: step counts from 1, got {step}")
-    per_parameter: list[Tensor | float | None] = []
+    tensor_params = {}
     for name, value in zip(PARAMETERS, tensors, strict=True):
         m, v = exp_avg[name], exp_avg_sq[name]
         shape = tuple(value.shape)
         check_tensor("adam_step", f"exp_avg[{name!r}]", m, shape, value)
         check_tensor("adam_step", f"exp_avg_sq[{name!r}]", v, shape, value)
-        extra = None if value.grad is None else value.grad.contiguous()
-        per_parameter += [value.detach(), m, v, extra, float(lr[name])]
+        tensor_params[name] = AdamTensor(
+            value=value.detach(),
+            m=m,
+            v=v,
+            extra=None if value.grad is None else value.grad.contiguous(),
+            rate=float(lr[name]) / (1 - betas[0] ** step),
+        )
     pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
-    camera = camera_args("adam_step", pose, width, height, fx, fy, cx, cy)
     done = launch(
         variant("adam_step", means),
-        len(means),
-        len(ids),
-        ids,
-        packed_grad.contiguous(),
-        *camera,
-        tensors[5].shape[1],
-        sh_degree,
-        *per_parameter,
-        step,
-        float(betas[0]),
-        float(betas[1]),
-        float(eps),
-        visible_only,
-        valid,
-        nonfinite_rows,
+        AdamStepParams(
+            n=len(means),
+            splats=len(ids),
+            ids=ids,
+            grad_packed=packed_grad.contiguous(),
+            camera=camera_params("adam_step", pose, width, height, fx, fy, cx, cy),
+            sh_rest_rows=tensors[5].shape[1],
+            sh_degree=sh_degree,
+            **tensor_params,
+            beta1=float(betas[0]),
+            beta2=float(betas[1]),
+            inv_correction2=1 / (1 - betas[1] ** step),
+            eps2=float(eps) * float(eps),
+            visible_only=visible_only,
+            valid=valid,
+            nonfinite_rows=nonfinite_rows,
+        ),
     )
     if done < 0:
         raise ValueError(

@@ -1,9 +1,9 @@
 """Launches native functions, on the CPU or on a GPU: the only place where the device decides.
 
-The CPU has one shared library per instruction set in `snowsplat/_lib`. All have the same entries,
-plain C functions of `(int64 n, pointers, int64s, doubles) -> int64`. The best one that the machine
-runs is loaded at the first launch; the environment variable SNOWSPLAT_ISA (avx512, avx2 or
-baseline) forces one. A GPU has the same entries: see `ops/cuda`.
+The CPU has one shared library per instruction set in `snowsplat/_lib`. All have the same entries:
+C functions that take a pointer to a struct of parameters (`ops/params.py`) and return an int64. The
+best one that the machine runs is loaded at the first launch; the environment variable SNOWSPLAT_ISA
+(avx512, avx2 or baseline) forces one. A GPU has the same entries: see `ops/cuda`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ import ctypes
 import functools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from snowsplat.ops import cuda
-from snowsplat.ops.cuda.kernels import Argument
+from snowsplat.ops.layout import LARGEST_PARAMS, Params, layout_of
+from snowsplat.ops.params import ENTRIES
 from snowsplat.util.errors import UserError
 
 # Worst to best. The position of a name is the number that native/cpu/isa.cpp knows it by.
@@ -26,11 +28,9 @@ ISAS = ("baseline", "avx2", "avx512")
 
 _LIBRARIES = Path(__file__).resolve().parent.parent / "_lib"
 _lock = threading.RLock()
-_functions: dict[str, Callable[..., int]] = {}
-
+# The functions that have been launched, and the structs that they take.
+_functions: dict[str, tuple[Callable[[Any], int], type[Params]]] = {}
 _int = ctypes.c_int64
-_double = ctypes.c_double
-_pointer = ctypes.c_void_p
 
 
 def _open(isa: str) -> ctypes.CDLL:
@@ -63,7 +63,7 @@ def _choose() -> str:
         return available_isas()[-1]
     if forced not in ISAS:
         raise UserError(
-            f"SNOWSPLAT_ISA={forced!r} is no instruction set; use one of {', '.join(ISAS)}"
+            f"SNOWSPLAT_ISA={forced!r} is not an instruction set; use one of {', '.join(ISAS)}"
         )
     if forced not in available_isas():
         raise UserError(
@@ -78,8 +78,31 @@ def _library() -> tuple[str, ctypes.CDLL]:
     with _lock:
         isa = _choose()
         library = _open(isa)
+        _check_layouts(isa, library)
         library.set_num_threads(_int(_default_threads()))
         return isa, library
+
+
+def _check_layouts(isa: str, library: ctypes.CDLL) -> None:
+    """Raises UserError unless the structs of the library are those of `ops/params.py`."""
+    for entry, params in ENTRIES.items():
+        for name in (entry, entry + "_f64"):
+            try:
+                layout = getattr(library, name + "_layout")
+            except AttributeError:
+                if name != entry:
+                    continue  # has no variant for float64
+                raise _outdated(isa, name) from None
+            layout.restype = ctypes.c_uint64
+            if layout() != layout_of(params).hash:
+                raise _outdated(isa, name)
+
+
+def _outdated(isa: str, name: str) -> UserError:
+    return UserError(
+        f"the native library for {isa} does not match the Python files ({name}); "
+        "rebuild it: `make native` in a checkout, `pip install .` elsewhere"
+    )
 
 
 def isa() -> str:
@@ -94,91 +117,95 @@ def _default_threads() -> int:
             return len(os.sched_getaffinity(0))
         return os.cpu_count() or 1
     if not asked.isdecimal() or int(asked) < 1:
-        raise UserError(f"SNOWSPLAT_THREADS={asked!r} is no number of threads; use 1 or more")
+        raise UserError(f"SNOWSPLAT_THREADS={asked!r} is not a number of threads; use 1 or more")
     return int(asked)
 
 
 def set_num_threads(threads: int) -> None:
-    """Let the kernels use `threads` threads. The results do not depend on it, to the bit."""
+    """Sets the number of threads that the kernels use. Results are bit-identical for any number."""
     if threads < 1:
         raise UserError(f"the number of threads must be 1 or more, not {threads}")
     _library()[1].set_num_threads(_int(threads))
 
 
 def get_num_threads() -> int:
-    """How many threads the kernels use.
+    """The number of threads that the kernels use.
 
-    At first SNOWSPLAT_THREADS, or else as many as there are processors that this process may use.
+    Initially SNOWSPLAT_THREADS, or else the number of processors that this process may use.
     """
     return int(_library()[1].get_num_threads())
 
 
-def _function(name: str) -> Callable[..., int]:
+def _function(name: str) -> tuple[Callable[[Any], int], type[Params]]:
     isa, library = _library()
-    try:
-        function = getattr(library, name)
-    except AttributeError:
-        raise UserError(
-            f"the native library for {isa} has no function {name}; it is older than the Python "
-            "files: rebuild it (`make native`)"
-        ) from None
-    function.restype = _int
-    _functions[name] = function
-    return function
+    params = ENTRIES.get(name.removesuffix("_f64"))
+    function = getattr(library, name, None)
+    if params is None or function is None:
+        raise _outdated(isa, name)
+    function.restype, function.argtypes = _int, (ctypes.c_void_p,)
+    _functions[name] = function, params
+    return _functions[name]
 
 
-def launch(name: str, n: int, *args: Argument, device: torch.device | None = None) -> int:
-    """Call the native function `name(n, *args)` and return its int64 result.
+def launch(name: str, params: Params, *, device: torch.device | None = None) -> int:
+    """Calls the native function `name` with a struct of parameters; returns its int64 result.
 
-    Tensors go as data pointers, None as a null pointer, int and bool as int64, float as double. The
-    tensors must be contiguous and on one device, which decides where the function runs; `device`
-    names it where no tensor does. Element types are the caller's business: a function for float64
-    tensors has the suffix `_f64`. The interpreter lock is released during the call on the CPU; on
-    a GPU the call is queued on torch's current stream.
+    The tensors of the struct must be contiguous and on one device, which decides where the function
+    runs; `device` names it if there is no tensor. Element types are not checked here: the function
+    for float64 tensors has the suffix `_f64`. On the CPU the interpreter lock is released during
+    the call; on a GPU the call is queued on torch's current stream.
 
     Raises UserError for a device without kernels, ValueError for tensors that are not contiguous or
-    not on one device, TypeError for any other argument.
+    not on one device, TypeError for the struct of another function or a field of another type.
     """
-    for position, arg in enumerate(args, start=1):
-        if isinstance(arg, torch.Tensor):
-            if device is None:
-                device = arg.device
-            elif arg.device != device:
-                raise ValueError(
-                    f"{name}: tensors on {device} and on {arg.device}; move them to one device"
-                )
-            if not arg.is_contiguous():
-                raise ValueError(
-                    f"{name}: argument {position} of shape {tuple(arg.shape)} is not contiguous"
-                )
-        elif not (arg is None or isinstance(arg, (int, float))):
+    layout = layout_of(type(params))
+    values = layout.values(params)
+    for i in layout.pointers:
+        tensor = values[i]
+        if tensor is None:
+            continue
+        if not isinstance(tensor, torch.Tensor):
             raise TypeError(
-                f"{name}: argument {position} is a {type(arg).__name__}, "
-                "not a tensor, int, float or None"
+                f"{name}: {layout.names[i]} must be a tensor or None, got {type(tensor).__name__}"
+            )
+        if device is None:
+            device = tensor.device
+        elif tensor.device != device:
+            raise ValueError(
+                f"{name}: {layout.names[i]} is on {tensor.device}, other tensors are on {device}; "
+                "move them to one device"
+            )
+        if not tensor.is_contiguous():
+            raise ValueError(
+                f"{name}: {layout.names[i]} of shape {tuple(tensor.shape)} is not contiguous"
             )
     launcher = LAUNCHERS.get("cpu" if device is None else device.type)
     if launcher is None:
         raise UserError(f"there are no kernels for device {device}; use device cpu or cuda")
-    return launcher(name, n, args)
+    return launcher(name, params)
 
 
-def _launch_cpu(name: str, n: int, args: Sequence[Argument]) -> int:
-    function = _functions.get(name) or _function(name)
-    values: list[object] = [_int(n)]
-    for arg in args:
-        # Wrapped one by one rather than through argtypes: a bare int would be cut to 32 bits.
-        if isinstance(arg, torch.Tensor):
-            values.append(_pointer(arg.data_ptr()))
-        elif arg is None:
-            values.append(_pointer())
-        elif isinstance(arg, int):
-            values.append(_int(arg))
-        else:
-            values.append(_double(arg))
-    return function(*values)
+class _Buffer(threading.local):
+    """Memory for the struct of a launch; each thread has its own."""
+
+    def __init__(self) -> None:
+        self.bytes = ctypes.create_string_buffer(LARGEST_PARAMS)
+        self.address = ctypes.addressof(self.bytes)
 
 
-LAUNCHERS: dict[str, Callable[[str, int, Sequence[Argument]], int]] = {
+_buffer = _Buffer()
+
+
+def _launch_cpu(name: str, params: Params) -> int:
+    function, expected = _functions.get(name) or _function(name)
+    if type(params) is not expected:
+        raise TypeError(f"{name} takes {expected.__name__}, not {type(params).__name__}")
+    buffer = _buffer
+    layout_of(expected).pack_into(buffer.bytes, params)
+    return function(buffer.address)
+
+
+LAUNCHERS: dict[str, Callable[[str, Params], int]] = {
     "cpu": _launch_cpu,
     "cuda": cuda.launch,
 }

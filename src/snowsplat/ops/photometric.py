@@ -11,13 +11,14 @@ from torch.autograd.function import once_differentiable
 from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, variant
 from snowsplat.ops.native import launch
+from snowsplat.ops.params import PhotometricParams
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     """(1 − λ) · mean |a − b| + λ · (1 − SSIM), a scalar; λ is `ssim_weight` (the paper, eq. 7).
 
-    image (H, W, 3) float, target (H, W, 3) of the same dtype or uint8 (then divided by 255), both
-    best of planar storage: `planar.permute(1, 2, 0)`. The gradient flows to `image` alone; it is
+    image (H, W, 3) float, target (H, W, 3) of the same dtype or uint8 (then divided by 255). Planar
+    storage, `planar.permute(1, 2, 0)`, avoids a copy. The gradient flows only to `image`; it is
     computed together with the value, in one pass over the images.
 
     Raises ValueError where shapes, dtypes or devices do not fit.
@@ -62,27 +63,29 @@ class _Photometric(torch.autograd.Function):
         ssim_weight: float,
         op: str,
     ) -> Tensor:
-        planes, goal = _planar(op, image.detach(), target)
+        planes, target_planes = _planar(op, image.detach(), target)
         grad = None
         if ctx.needs_input_grad[0]:
             grad = scratch.empty(tuple(planes.shape), planes.dtype, planes.device)
         means = torch.empty(2, dtype=torch.float64, device=planes.device)
-        name = "photometric_u8" if goal.dtype == torch.uint8 else "photometric"
+        name = "photometric_u8" if target_planes.dtype == torch.uint8 else "photometric"
         channels, height, width = planes.shape
         launch(
             variant(name, planes),
-            channels,
-            width,
-            height,
-            planes,
-            goal,
-            l1_weight,
-            ssim_weight,
-            grad,
-            means,
+            PhotometricParams(
+                n=channels,
+                width=width,
+                height=height,
+                image=planes,
+                target=target_planes,
+                l1_weight=l1_weight,
+                ssim_weight=ssim_weight,
+                grad=grad,
+                means=means,
+            ),
         )
         ctx.grad = grad
-        l1, similarity = means  # tensors: on a GPU nobody waits for them
+        l1, similarity = means  # tensors: reading them would wait for a GPU
         return (l1_weight * l1 + ssim_weight * similarity).to(planes.dtype)
 
     @staticmethod
@@ -90,6 +93,6 @@ class _Photometric(torch.autograd.Function):
     def backward(ctx: Any, grad_value: Tensor) -> tuple[Tensor | None, ...]:
         if ctx.grad is None:
             return None, None, None, None, None
-        on_cpu = grad_value.device.type == "cpu"  # elsewhere looking at it means waiting for it
+        on_cpu = grad_value.device.type == "cpu"  # on a GPU, reading the value would wait
         grad = ctx.grad if on_cpu and float(grad_value) == 1.0 else ctx.grad * grad_value
         return grad.permute(1, 2, 0), None, None, None, None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,7 +12,17 @@ from torch.autograd.function import once_differentiable
 
 from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
+from snowsplat.ops.layout import POSE_SUMS
 from snowsplat.ops.native import launch
+from snowsplat.ops.params import (
+    CameraParams,
+    GaussianGradients,
+    GaussianTensors,
+    ProjectBackwardParams,
+    ProjectCullParams,
+    ProjectForwardParams,
+    SizeQueryParams,
+)
 from snowsplat.ops.splats import Splats2D, packed_width
 from snowsplat.ops.sums import sum_of_rows
 
@@ -34,9 +45,10 @@ def project(
     sh_degree: int,
     near: float = 0.2,
 ) -> Splats2D:
-    """The splats that N Gaussians leave on a camera's image plane; the invisible are left out.
+    """Projects N Gaussians to splats on a camera's image plane; invisible ones are left out.
 
-    On a GPU, where leaving out would mean waiting, their rows are empty: zeros, of the id -1.
+    On a GPU they are not left out, because that would require waiting: their rows are empty (zeros)
+    and have the id -1.
 
     means (N, 3) in world units, log_scales (N, 3), quats (N, 4) wxyz of any length (zero: no
     rotation), opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, K, 3), of which degree `sh_degree`
@@ -44,20 +56,21 @@ def project(
     pixels; near > 0 in world units. All tensors float32, or all float64.
 
     Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (Kerbl et al. 2023, eq. 5), the colour is max(0, ½ + Σ SH(direction)).
-    Visible is what lies beyond `near` and is at least 1/255 opaque, if the box around its ellipse
-    {α ≥ 1/255} reaches the pixel centres. Gradients flow to every tensor, the camera's pose too.
+    A Gaussian is visible if it lies beyond `near`, is at least 1/255 opaque, and the box of its
+    ellipse {α ≥ 1/255} reaches the pixel centres. Gradients flow to every tensor, including the
+    camera's pose.
 
     Raises ValueError where shapes, dtypes or devices do not fit.
     """
     pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
-    camera = camera_args("project", pose, width, height, fx, fy, cx, cy, near)
+    camera = camera_params("project", pose, width, height, fx, fy, cx, cy, near)
     check_parameters("project", means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_degree)
     parameters = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
-    packed, ids = _Project.apply(sh_degree, camera[1:], camera[0], *parameters)
+    packed, ids = _Project.apply(sh_degree, camera, camera.cam_from_world, *parameters)
     return Splats2D(packed, ids, 3)
 
 
-def camera_args(
+def camera_params(
     op: str,
     cam_from_world: Tensor,
     width: int,
@@ -67,8 +80,11 @@ def camera_args(
     cx: float,
     cy: float,
     near: float = 0.2,
-) -> tuple[Tensor, float, float, float, float, float, float, float]:
-    """The camera in the order in which the native functions take it, checked."""
+) -> CameraParams:
+    """The camera as the native functions take it.
+
+    Raises ValueError for an image without pixels, or a camera that is not finite or positive.
+    """
     check_size(op, width, height)
     if cam_from_world.shape != (3, 4):
         raise ValueError(f"{op}: cam_from_world must be (3, 4), got {tuple(cam_from_world.shape)}")
@@ -78,9 +94,16 @@ def camera_args(
         if not math.isfinite(value) or (positive and value <= 0):
             kind = "positive and finite" if positive else "finite"
             raise ValueError(f"{op}: {name} must be {kind}, got {value}")
-    sizes = (float(width), float(height))
-    rest = (float(fx), float(fy), float(cx), float(cy), float(near))
-    return (cam_from_world.contiguous(), *sizes, *rest)
+    return CameraParams(
+        cam_from_world=cam_from_world.contiguous(),
+        width=float(width),
+        height=float(height),
+        fx=float(fx),
+        fy=float(fy),
+        cx=float(cx),
+        cy=float(cy),
+        near=float(near),
+    )
 
 
 def check_parameters(
@@ -115,23 +138,29 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any,
         sh_degree: int,
-        intrinsics: tuple[float, ...],
+        camera: CameraParams,
         cam_from_world: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
         parameters = tuple(p.detach().contiguous() for p in parameters)
-        means, sh_rest = parameters[0], parameters[5]
-        camera: tuple[Tensor | float, ...] = (cam_from_world, *intrinsics)
+        gaussians = _gaussian_tensors(sh_degree, *parameters)
+        means = gaussians.means
         ids = scratch.empty((len(means),), torch.int32, means.device)
-        cull = variant("project_cull", means)
-        rows = launch(cull, len(means), *parameters[:4], *camera, ids, device=means.device)
+        rows = launch(
+            variant("project_cull", means),
+            ProjectCullParams(n=len(means), gaussians=gaussians, camera=camera, ids=ids),
+        )
         ids = ids[:rows]
         packed = scratch.empty((rows, packed_width(3)), means.dtype, means.device)
-        shape = (sh_rest.shape[1], sh_degree)
-        launch(variant("project_fwd", means), rows, ids, *parameters, *shape, *camera, packed)
+        launch(
+            variant("project_fwd", means),
+            ProjectForwardParams(
+                n=rows, ids=ids, gaussians=gaussians, camera=camera, packed=packed
+            ),
+        )
         ctx.mark_non_differentiable(ids)
         ctx.save_for_backward(ids, cam_from_world, *parameters)
-        ctx.sh_degree, ctx.intrinsics = sh_degree, intrinsics
+        ctx.sh_degree, ctx.camera = sh_degree, camera
         return packed, ids
 
     @staticmethod
@@ -141,22 +170,29 @@ class _Project(torch.autograd.Function):
         grads = [torch.zeros_like(p) for p in parameters]
         pose = None
         if ctx.needs_input_grad[2]:
-            blocks = launch("project_pose_blocks", len(ids), device=ids.device)
-            pose = torch.empty(blocks, 15, dtype=torch.float64, device=ids.device)
+            blocks = launch("project_pose_blocks", SizeQueryParams(n=len(ids)), device=ids.device)
+            pose = torch.empty(blocks, POSE_SUMS, dtype=torch.float64, device=ids.device)
         launch(
             variant("project_bwd", parameters[0]),
-            len(ids),
-            ids,
-            *parameters,
-            parameters[5].shape[1],
-            ctx.sh_degree,
-            cam_from_world,
-            *ctx.intrinsics,
-            grad_packed.contiguous(),
-            *grads,
-            pose,
+            ProjectBackwardParams(
+                n=len(ids),
+                ids=ids,
+                gaussians=_gaussian_tensors(ctx.sh_degree, *parameters),
+                camera=replace(ctx.camera, cam_from_world=cam_from_world),
+                grad_packed=grad_packed.contiguous(),
+                grads=GaussianGradients(**dict(zip(_NAMES, grads, strict=True))),
+                pose=pose,
+            ),
         )
         return None, None, _pose_grad(cam_from_world, pose), *grads
+
+
+_NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+
+
+def _gaussian_tensors(sh_degree: int, *parameters: Tensor) -> GaussianTensors:
+    tensors = dict(zip(_NAMES, parameters, strict=True))
+    return GaussianTensors(**tensors, sh_rest_rows=tensors["sh_rest"].shape[1], sh_degree=sh_degree)
 
 
 def _pose_grad(cam_from_world: Tensor, pose: Tensor | None) -> Tensor | None:

@@ -1,8 +1,9 @@
-"""`rasterize`: blends 2D splats into an image, front to back."""
+"""`rasterize`: composites 2D splats into an image, front to back."""
 
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,13 +13,25 @@ from torch.autograd.function import once_differentiable
 from snowsplat.ops import scratch
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
+from snowsplat.ops.layout import GROUP_CHANNELS, SLOT_WIDTH, TILE
 from snowsplat.ops.native import launch
+from snowsplat.ops.params import (
+    BackgroundBackwardParams,
+    FrameParams,
+    RasterizeBackwardParams,
+    RasterizeCountParams,
+    RasterizeForwardParams,
+    SizeQueryParams,
+    SplatsPrepareParams,
+    SplatsRecolorParams,
+    SplatsReduceParams,
+    SplatsSortParams,
+    TileBinning,
+    TilesCountParams,
+    TilesFillParams,
+)
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
 from snowsplat.ops.sums import sum_of_rows
-
-TILE = 16
-_GROUP = 4  # channels that one pass of blending carries
-_SLOT = 16  # numbers of the gradient of one splat in one tile
 
 
 def rasterize(
@@ -33,10 +46,10 @@ def rasterize(
     """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
 
     Returns image (H, W, C) of planar storage, alpha (H, W), and depth (H, W) or None. With T the
-    light that the splats in front let through and α = min(0.99, o exp(−½ dᵀ conic d)):
+    transmittance of the splats in front and α = min(0.99, o exp(−½ dᵀ conic d)):
     image = Σ T α c + T_end · background, alpha = 1 − T_end, depth = Σ T α z (not divided by alpha).
-    What is fainter than 1/255 is skipped; a pixel is finished when the next splat would leave less
-    than 1e-4 of the light (Kerbl et al. 2023, section 6). Gradients flow to every column of
+    Splats fainter than 1/255 are skipped; a pixel is finished when the next splat would leave
+    T < 1e-4 (Kerbl et al. 2023, section 6). Gradients flow to every column of
     `splats.packed` but the radii, and to `background`.
 
     With `capacity` the CPU does not wait for a GPU to count instances. On a GPU gradients are
@@ -59,112 +72,167 @@ def rasterize(
 
 @torch.no_grad()
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
-    """(H, W) how many splats `rasterize` blends into each pixel, which is what it costs.
+    """(H, W) the number of splats that `rasterize` composites into each pixel: its cost.
 
-    Not counted: those fainter than 1/255 there, and those behind where the pixel is finished.
+    Splats fainter than 1/255 there do not count, nor do those behind the point where the pixel is
+    finished.
 
     Raises ValueError where shapes or dtypes do not fit.
     """
     check_float("count_blended", "splats", splats.packed)
     check_size("count_blended", width, height)
     packed = splats.packed.detach().contiguous()
-    frame = _Frame(packed, width, height, _channel_groups(1, False, packed.device)[0][1], None)
+    columns = _channel_groups(1, False, packed.device)[0][1]
+    frame = _bin_splats(packed, width, height, columns, None)
     counts = scratch.empty((height, width), packed.dtype, packed.device)
-    launch(variant("blend_count", packed), frame.tiles, *frame.blend_args(), counts)
+    launch(
+        variant("rasterize_count", packed),
+        RasterizeCountParams(n=frame.tiles, frame=frame.params, counts=counts),
+    )
     return counts
 
 
+@dataclass
 class _Frame:
-    """The splats of a frame sorted into tiles: what blending needs, forward and backward."""
+    """The splats of a frame, sorted into tiles: what the forward and the backward pass read."""
 
-    def __init__(
-        self, packed: Tensor, width: int, height: int, columns: Tensor, capacity: Capacity | None
-    ) -> None:
-        count, stride = packed.shape
-        device = packed.device
-        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        self.size, self.tiles = (width, height), tiles_x * tiles_y
+    params: FrameParams
+    tiles: int
+    instances: int
+    """Instances that memory is allocated for."""
+    sums_in_order: bool
+    """Gradients are summed in slots, in a fixed order; else they are added atomically."""
+    instance_slot: Tensor | None
+    slot_range: Tensor | None
 
-        def empty(size: int, dtype: torch.dtype = torch.int32) -> Tensor:
-            return scratch.empty((size,), dtype, device)
 
-        def ask(name: str, *args: int) -> int:
-            return launch(name, *args, device=device)
+def _bin_splats(
+    packed: Tensor, width: int, height: int, columns: Tensor, capacity: Capacity | None
+) -> _Frame:
+    """Sorts the splats by depth, counts the tiles that each touches, and lists them by tile.
 
-        self.ordered_sums = ask("blend_sums_in_order", 0) == 1
-        key = torch.int32 if packed.dtype == torch.float32 else torch.int64
-        keys = empty(count, key)
-        record_bytes = ask(variant("splat_record_bytes", packed), 0)
-        self.splats = (packed, stride, columns, empty(count * record_bytes, torch.uint8))
-        launch(
-            variant("splats_prepare", packed),
-            count,
-            packed,
-            stride,
-            float(width),
-            float(height),
-            *self.splats[2:],
-            keys,
-        )
-        order = empty(count)
-        launch(variant("splats_sort", packed), count, keys, empty(count, key), order, empty(count))
-        parts = ask("tiles_parts", count)
-        workspace = empty(ask("tiles_workspace_bytes", count, self.tiles, parts), torch.uint8)
-        self.tile_start = empty(self.tiles + 1)
-        binning = (order, packed, stride, self.splats[3], tiles_x, tiles_y, parts, workspace)
-        capacity = capacity or Capacity(-1, torch.empty(1, dtype=torch.int64, device=device))
-        self.instances = launch(
-            variant("tiles_count", packed),
-            count,
-            *binning,
-            self.tile_start,
-            capacity.instances,
-            capacity.required,
-        )
-        self.instance_splat = empty(self.instances)
-        self.instance_slot = empty(self.instances) if self.ordered_sums else None
-        self.slot_range = empty(2 * count) if self.ordered_sums else None
-        launch(
-            variant("tiles_fill", packed),
-            count,
-            *binning,
-            self.tile_start,
-            self.instances,
-            self.instance_splat,
-            self.instance_slot,
-            self.slot_range,
-        )
-        block_bytes = ask(variant("blend_block_bytes", packed), 0)
-        self.instance_blocks = empty(self.instances * block_bytes, torch.uint8)
-        self.tile_end = empty(self.tiles)
+    columns: (4,) the columns of `packed` that are the channels at first; -1 for none.
+    """
+    n, stride = packed.shape
+    device = packed.device
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    tiles = tiles_x * tiles_y
 
-    def blend_args(self) -> tuple[int | Tensor, ...]:
-        return (
-            *self.size,
-            *self.splats,
-            self.tile_start,
-            self.tile_end,
-            self.instance_splat,
-            self.instance_blocks,
-        )
+    def empty(size: int, dtype: torch.dtype = torch.int32) -> Tensor:
+        return scratch.empty((size,), dtype, device)
 
-    def recolor(self, columns: Tensor) -> None:
-        """From now on blend these columns."""
-        packed, stride, _, records = self.splats
-        self.splats = (packed, stride, columns, records)
-        launch(variant("splats_recolor", packed), len(packed), *self.splats)
+    def query(name: str, n: int = 0, tiles: int = 0, parts: int = 0) -> int:
+        return launch(name, SizeQueryParams(n=n, tiles=tiles, parts=parts), device=device)
+
+    records = empty(n * query(variant("splat_record_bytes", packed)), torch.uint8)
+    order = _sort_by_depth(packed, width, height, columns, records)
+
+    parts = query("tiles_parts", n)
+    binning = TileBinning(
+        order=order,
+        packed=packed,
+        stride=stride,
+        records=records,
+        tiles_x=tiles_x,
+        tiles_y=tiles_y,
+        parts=parts,
+        workspace=empty(query("tiles_workspace_bytes", n, tiles, parts), torch.uint8),
+        tile_start=empty(tiles + 1),
+    )
+    capacity = capacity or Capacity(-1, torch.empty(1, dtype=torch.int64, device=device))
+    instances = launch(
+        variant("tiles_count", packed),
+        TilesCountParams(
+            n=n, binning=binning, capacity=capacity.instances, required=capacity.required
+        ),
+    )
+
+    sums_in_order = query("rasterize_sums_in_order") == 1
+    instance_splat = empty(instances)
+    instance_slot = empty(instances) if sums_in_order else None
+    slot_range = empty(2 * n) if sums_in_order else None
+    launch(
+        variant("tiles_fill", packed),
+        TilesFillParams(
+            n=n,
+            binning=binning,
+            capacity=instances,
+            instance_splat=instance_splat,
+            instance_slot=instance_slot,
+            slot_range=slot_range,
+        ),
+    )
+
+    block_bytes = query(variant("rasterize_block_bytes", packed))
+    params = FrameParams(
+        width=width,
+        height=height,
+        packed=packed,
+        stride=stride,
+        columns=columns,
+        records=records,
+        tile_start=binning.tile_start,
+        tile_end=empty(tiles),
+        instance_splat=instance_splat,
+        instance_blocks=empty(instances * block_bytes, torch.uint8),
+    )
+    return _Frame(params, tiles, instances, sums_in_order, instance_slot, slot_range)
+
+
+def _sort_by_depth(
+    packed: Tensor, width: int, height: int, columns: Tensor, records: Tensor
+) -> Tensor:
+    """(M,) the rows of `packed`, nearest first; fills `records` on the CPU."""
+    n, stride = packed.shape
+    dtype = torch.int32 if packed.dtype == torch.float32 else torch.int64
+    keys, keys2 = (scratch.empty((n,), dtype, packed.device) for _ in range(2))
+    order, order2 = (scratch.empty((n,), torch.int32, packed.device) for _ in range(2))
+    launch(
+        variant("splats_prepare", packed),
+        SplatsPrepareParams(
+            n=n,
+            packed=packed,
+            stride=stride,
+            width=width,
+            height=height,
+            columns=columns,
+            records=records,
+            keys=keys,
+        ),
+    )
+    launch(
+        variant("splats_sort", packed),
+        SplatsSortParams(n=n, keys=keys, keys2=keys2, order=order, order2=order2),
+    )
+    return order
+
+
+def _with_channels(frame: _Frame, columns: Tensor) -> FrameParams:
+    """The frame with other columns as its channels."""
+    params = frame.params = replace(frame.params, columns=columns)
+    launch(
+        variant("splats_recolor", params.packed),
+        SplatsRecolorParams(
+            n=len(params.packed),
+            packed=params.packed,
+            stride=params.stride,
+            columns=columns,
+            records=params.records,
+        ),
+    )
+    return params
 
 
 @functools.cache
 def _channel_groups(
     channels: int, with_depth: bool, device: torch.device
 ) -> list[tuple[int, Tensor]]:
-    """The packed columns that become image planes, up to four a pass, with their first plane."""
+    """The packed columns that become image planes, up to four per pass, with their first plane."""
     columns = [COLORS + c for c in range(channels)] + ([DEPTHS] if with_depth else [])
     groups = []
-    for first in range(0, len(columns), _GROUP):
-        group = columns[first : first + _GROUP]
-        group += [-1] * (_GROUP - len(group))
+    for first in range(0, len(columns), GROUP_CHANNELS):
+        group = columns[first : first + GROUP_CHANNELS]
+        group += [-1] * (GROUP_CHANNELS - len(group))
         groups.append((first, torch.tensor(group, dtype=torch.int64, device=device)))
     return groups
 
@@ -184,22 +252,21 @@ class _Rasterize(torch.autograd.Function):
         packed = packed.detach().contiguous()
         groups = _channel_groups(channels, with_depth, packed.device)
         count = channels + with_depth
-        behind = torch.cat([background.detach(), packed.new_zeros(1)])  # nothing is behind depth
+        background = torch.cat([background.detach(), packed.new_zeros(1)])  # of the depth: 0
         planes = scratch.empty((count, height, width), packed.dtype, packed.device)
         alpha = scratch.empty((height, width), packed.dtype, packed.device)
-        frame = _Frame(packed, width, height, groups[0][1], capacity)
+        frame = _bin_splats(packed, width, height, groups[0][1], capacity)
         for first, columns in groups:
-            if first > 0:
-                frame.recolor(columns)
-            carried = min(_GROUP, count - first)
             launch(
-                variant("blend_fwd", packed),
-                frame.tiles,
-                *frame.blend_args(),
-                carried,
-                behind[first:],
-                planes[first:],
-                alpha if first == 0 else None,
+                variant("rasterize_fwd", packed),
+                RasterizeForwardParams(
+                    n=frame.tiles,
+                    frame=frame.params if first == 0 else _with_channels(frame, columns),
+                    channels=min(GROUP_CHANNELS, count - first),
+                    background=background[first:],
+                    image=planes[first:],
+                    alpha=alpha if first == 0 else None,
+                ),
             )
         ctx.save_for_backward(planes, alpha)
         ctx.frame, ctx.groups, ctx.channels = frame, groups, channels
@@ -212,66 +279,81 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, grad_planes: Tensor | None, grad_alpha: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         planes, alpha = ctx.saved_tensors
-        frame, count = ctx.frame, len(planes)
-        packed, stride = frame.splats[:2]
         if grad_planes is None:
             grad_planes = torch.zeros_like(planes)
         grad_planes = grad_planes.contiguous()
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-        # Sums in a fixed order come from slots, one an instance; the others grow where they belong.
-        grad_packed = scratch.empty(tuple(packed.shape), packed.dtype, packed.device)
-        slots = None
-        if frame.ordered_sums:
-            slots = scratch.empty((frame.instances, _SLOT), packed.dtype, packed.device)
-        else:
-            grad_packed.zero_()
-        for first, columns in ctx.groups:
-            if len(ctx.groups) > 1:
-                frame.recolor(columns)
-            carried = min(_GROUP, count - first)
-            launch(
-                variant("blend_bwd", packed),
-                frame.tiles,
-                *frame.blend_args(),
-                carried,
-                frame.instance_slot,
-                planes[first:],
-                grad_planes[first:],
-                alpha,
-                grad_alpha if first == 0 else None,
-                slots,
-                grad_packed,
-            )
-            if slots is not None:
-                launch(
-                    variant("splats_reduce", packed),
-                    len(packed),
-                    slots,
-                    frame.slot_range,
-                    packed,
-                    stride,
-                    carried,
-                    columns,
-                    first > 0,
-                    grad_packed,
-                )
+        grad_packed = _grad_packed(ctx.frame, ctx.groups, planes, grad_planes, alpha, grad_alpha)
         grad_background = None
         if ctx.needs_input_grad[1]:
-            grad_background = _background_grad(grad_planes[: ctx.channels], alpha)
+            grad_background = _grad_background(grad_planes[: ctx.channels], alpha)
         return grad_packed, grad_background, None, None, None, None, None
 
 
-def _background_grad(grad_image: Tensor, alpha: Tensor) -> Tensor:
+def _grad_packed(
+    frame: _Frame,
+    groups: list[tuple[int, Tensor]],
+    planes: Tensor,
+    grad_planes: Tensor,
+    alpha: Tensor,
+    grad_alpha: Tensor | None,
+) -> Tensor:
+    """The gradient of the splats, of the shape of `packed`."""
+    packed, stride = frame.params.packed, frame.params.stride
+    grad_packed = scratch.empty(tuple(packed.shape), packed.dtype, packed.device)
+    slots = None  # the gradients of the instances, where they are summed in a fixed order
+    if frame.sums_in_order:
+        slots = scratch.empty((frame.instances, SLOT_WIDTH), packed.dtype, packed.device)
+    else:
+        grad_packed.zero_()
+    for first, columns in groups:
+        channels = min(GROUP_CHANNELS, len(planes) - first)
+        launch(
+            variant("rasterize_bwd", packed),
+            RasterizeBackwardParams(
+                n=frame.tiles,
+                frame=frame.params if len(groups) == 1 else _with_channels(frame, columns),
+                channels=channels,
+                instance_slot=frame.instance_slot,
+                image=planes[first:],
+                grad_image=grad_planes[first:],
+                alpha=alpha,
+                grad_alpha=grad_alpha if first == 0 else None,
+                slots=slots,
+                grad_packed=grad_packed,
+            ),
+        )
+        if slots is not None and frame.slot_range is not None:
+            launch(
+                variant("splats_reduce", packed),
+                SplatsReduceParams(
+                    n=len(packed),
+                    slots=slots,
+                    slot_range=frame.slot_range,
+                    packed=packed,
+                    stride=stride,
+                    channels=channels,
+                    columns=columns,
+                    add=first > 0,
+                    grad_packed=grad_packed,
+                ),
+            )
+    return grad_packed
+
+
+def _grad_background(grad_image: Tensor, alpha: Tensor) -> Tensor:
     """(C,): the sum over pixels of ∂L/∂image · (1 − alpha)."""
     channels, height, width = grad_image.shape
     rows = torch.empty(height, channels, dtype=torch.float64, device=alpha.device)
     launch(
         variant("background_bwd", alpha),
-        height,
-        width,
-        channels,
-        grad_image.contiguous(),
-        alpha,
-        rows,
+        BackgroundBackwardParams(
+            n=height,
+            width=width,
+            channels=channels,
+            grad_image=grad_image.contiguous(),
+            alpha=alpha,
+            rows=rows,
+        ),
     )
     return sum_of_rows(rows).to(alpha.dtype)

@@ -27,6 +27,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from snowsplat.ops.capacity import Capacity
+from snowsplat.ops.layout import TILE
 from snowsplat.ops.splats import Splats2D
 
 LOW_PASS = 0.3  # pixels²: every splat is blurred by it, so that none slips between pixel centres
@@ -35,7 +36,7 @@ ALPHA_MAX = 0.99  # keeps 1 − α, hence the transmittance and its gradient, aw
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished when less light than this would come through
 JACOBIAN_MARGIN = 0.15  # of the image size: how far outside of it J still follows the centre
 QUAT_EPS = 1e-12
-TILE = 16
+
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 
 # Real spherical harmonics, by degree; with the signs that the scene files of the field assume.

@@ -1,8 +1,8 @@
-"""`Splats2D`: the seam between projecting and blending.
+"""`Splats2D`: the interface between projection and rasterization.
 
-One packed tensor holds everything that blending needs, one row per splat, so that the gradient of
-blending is one tensor too and a row is one or two cache lines. `project` makes it from 3D
-Gaussians; 2D image fitting makes it directly with `Splats2D.pack`.
+One packed tensor contains everything that the rasterizer reads, one row per splat, so that its
+gradient is one tensor too and a row is one or two cache lines. `project` creates it from 3D
+Gaussians; fitting an image with 2D Gaussians creates it directly with `Splats2D.pack`.
 """
 
 from __future__ import annotations
@@ -12,19 +12,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Columns of a packed row. C colours follow at COLORS; zeros fill the row up to a multiple of ROW.
+from snowsplat.ops.layout import PACKED_HEADER, PACKED_STRIDE
+
+# Columns of a packed row. C colours follow at COLORS; zeros pad the row to a multiple of
+# PACKED_STRIDE.
 MEANS2D = slice(0, 2)
 CONICS = slice(2, 5)
 OPACITIES = 5
 DEPTHS = 6
 RADII = 7
-COLORS = 8
-ROW = 16
+COLORS = PACKED_HEADER
 
 
 def packed_width(channels: int) -> int:
     """Columns of a packed row that carries `channels` colour or feature channels."""
-    return -(-(COLORS + channels) // ROW) * ROW
+    return -(-(COLORS + channels) // PACKED_STRIDE) * PACKED_STRIDE
 
 
 @dataclass
@@ -35,13 +37,13 @@ class Splats2D:
               0:2 `means2d`   x, y
               2:5 `conics`    a, b, c of the inverse covariance [[a, b], [b, c]]
               5   `opacities` in [0, 1]
-              6   `depths`    camera z: the blending order, nearest first, equal depths by row
+              6   `depths`    camera z: the order, nearest first, equal depths by row
               7   `radii`     3 σ of the major axis (information only, never has a gradient)
               8:8+C `colors`; the rest is padding (zero)
-    ids:      (M,) int32: the Gaussian that each row came from; ascending, but for −1, which marks
-              an empty row that draws nothing. On a GPU `project` gives every Gaussian its row, so
-              that nobody waits to be told how many are visible; on the CPU none is empty.
-              None: the rows are the Gaussians themselves (2D fitting).
+    ids:      (M,) int32: the Gaussian that each row came from; ascending, except for −1, which
+              marks an empty row that draws nothing. On a GPU `project` returns a row for every
+              Gaussian, because counting the visible ones would require waiting; on the CPU no row
+              is empty. None: the rows are the Gaussians themselves (2D fitting).
     channels: C, at least 1.
 
     The properties are views of `packed`; autograd flows through them.
@@ -72,7 +74,7 @@ class Splats2D:
         return self.packed.shape[0]
 
     def without_empty_rows(self) -> Splats2D:
-        """The same splats, each row one that draws something; waits for a GPU."""
+        """The same splats without the empty rows; waits for a GPU."""
         if self.ids is None or self.packed.device.type == "cpu":
             return self
         rows = (self.ids >= 0).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""`accumulate_screen_statistics`: what density control has to know of the splats of a view."""
+"""`accumulate_screen_statistics`: the statistics of splats that density control uses."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
+from snowsplat.ops.params import ScreenStatisticsParams
 from snowsplat.ops.splats import Splats2D
 
 
@@ -20,14 +21,13 @@ def accumulate_screen_statistics(
     max_radii: Tensor | None = None,
     valid: Tensor | None = None,
 ) -> None:
-    """Adds one view to the statistics of the N Gaussians, at the rows that it sees, in place.
+    """Adds one view to the statistics of the N Gaussians, in place, at the rows that it sees.
 
     With the gradient in `splats.packed.grad` and distinct `splats.ids`:
     norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|, views (N,) += 1, and
     max_radii (N,) = max(max_radii, `splats.radii`) unless None. The factor states the gradient for
-    a screen that spans [-1, 1], as the paper's threshold is (section 5.2). Rows of id −1 are
-    passed over, as those of a gradient that is not finite, and where `valid` (1,) bool is False
-    all are.
+    a screen that spans [-1, 1], as the paper's threshold is (section 5.2). Rows of id −1 and rows
+    whose gradient is not finite are skipped; if `valid`, (1,) bool, is False, all rows are.
 
     Raises ValueError where there is no gradient, no ids, or shapes or dtypes do not fit.
     """
@@ -43,15 +43,17 @@ def accumulate_screen_statistics(
         check_tensor(op, "max_radii", max_radii, (len(norm_sum),), packed)
     launch(
         variant(op, packed),
-        len(packed),
-        ids,
-        packed.detach().contiguous(),
-        grad.contiguous(),
-        packed.shape[1],
-        float(width),
-        float(height),
-        norm_sum,
-        views,
-        max_radii,
-        valid,
+        ScreenStatisticsParams(
+            n=len(packed),
+            ids=ids,
+            packed=packed.detach().contiguous(),
+            grad_packed=grad.contiguous(),
+            stride=packed.shape[1],
+            width=float(width),
+            height=float(height),
+            norm_sum=norm_sum,
+            views=views,
+            max_radii=max_radii,
+            valid=valid,
+        ),
     )

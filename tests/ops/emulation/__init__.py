@@ -1,4 +1,4 @@
-"""Runs the CUDA kernels on the CPU: each `.cu` file compiled as C++, a fibre for each thread.
+"""Runs the CUDA kernels on the CPU: each `.cu` file is compiled as C++, with a fibre per thread.
 
 The environment variable SNOWSPLAT_EMULATION=sanitized compiles with AddressSanitizer and
 UndefinedBehaviorSanitizer (Python then needs LD_PRELOAD; `make sanitized` knows how), and
@@ -12,13 +12,11 @@ import fcntl
 import functools
 import os
 import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from snowsplat.ops.cuda import nvrtc
-from snowsplat.ops.cuda.kernels import Argument, Kernel
+from snowsplat.ops.cuda.kernels import Kernel
+from snowsplat.ops.layout import Params, layout_of
 
 _HERE = Path(__file__).parent
 _ROOT = _HERE.parents[2]
@@ -55,38 +53,27 @@ def library(file: str) -> ctypes.CDLL:
     return loaded
 
 
-def _letter(arg: Argument) -> str:
-    if arg is None or isinstance(arg, torch.Tensor):
-        return "p"
-    return "i" if isinstance(arg, int) else "d"
-
-
-def execute(kernel: Kernel, name: str, blocks: int, args: Sequence[Argument]) -> None:
-    """Runs a kernel on CPU tensors, to its end.
+def execute(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
+    """Runs a kernel on CPU tensors until it ends.
 
     Raises:
         RuntimeError: a divergent barrier, and what else the emulation finds.
-        AssertionError: threads or arguments are not those of the kernel.
+        AssertionError: threads or parameters are not those of the kernel.
     """
     loaded = library(kernel.file)
     built = getattr(loaded, f"{name}_threads")()
     assert built == kernel.threads, f"{name} has {built} threads, its Kernel says {kernel.threads}"
-    parameters = getattr(loaded, f"{name}_parameters")
-    parameters.restype = ctypes.c_char_p
-    taken, given = parameters().decode(), "".join(map(_letter, args))
-    assert given == taken, f"{name} takes {taken}, not {given}"
-    values: list[ctypes.c_void_p | ctypes.c_int64 | ctypes.c_double] = []
-    for arg in args:
-        if isinstance(arg, torch.Tensor):
-            assert arg.device.type == "cpu"
-            values.append(ctypes.c_void_p(arg.data_ptr()))
-        elif arg is None:
-            values.append(ctypes.c_void_p())
-        elif isinstance(arg, int):
-            values.append(ctypes.c_int64(arg))
-        else:
-            values.append(ctypes.c_double(arg))
-    pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
+    layout = layout_of(kernel.params)
+    find_layout = getattr(loaded, f"{name}_layout")
+    find_layout.restype = ctypes.c_uint64
+    assert find_layout() == layout.hash, f"{name} does not take {layout.name}"
+    assert type(params) is kernel.params, f"{name} takes {layout.name}, got {type(params).__name__}"
+    for i in layout.pointers:
+        tensor = layout.values(params)[i]
+        assert tensor is None or tensor.device.type == "cpu"
+    struct = ctypes.create_string_buffer(layout.size)
+    layout.pack_into(struct, params)
+    pointers = (ctypes.c_void_p * 1)(ctypes.addressof(struct))
     call = getattr(loaded, f"{name}_call")
     wrong = loaded.emulate(call, ctypes.c_int64(blocks), ctypes.c_int64(kernel.threads), pointers)
     if wrong is not None:

@@ -54,30 +54,6 @@ T* shared_array(Site) {
   return static_cast<T*>(shared(&site, int64_t(sizeof(T)) * kCount));
 }
 
-// Calls a kernel with pointers to its arguments, as the driver of a GPU does.
-template <class... A, size_t... I>
-void call(void (*kernel)(A...), void** args, std::index_sequence<I...>) {
-  kernel(*static_cast<std::remove_reference_t<A>*>(args[I])...);
-}
-template <class... A>
-void call(void (*kernel)(A...), void** args) {
-  call(kernel, args, std::index_sequence_for<A...>());
-}
-
-// What a kernel takes, a letter each: p(ointer), i(nteger), d(ouble), the three that launch() passes.
-template <class... A>
-const char* parameters(void (*)(A...)) {
-  static_assert(((std::is_pointer<A>::value || std::is_same<A, int64_t>::value ||
-                  std::is_same<A, double>::value) &&
-                 ...),
-                "pointers, int64_t and double alone");
-  static const char letters[] = {(std::is_pointer<A>::value        ? 'p'
-                                  : std::is_same<A, double>::value ? 'd'
-                                                                   : 'i')...,
-                                 0};
-  return letters;
-}
-
 template <class T>
 uint64_t to_bits(T value) {
   static_assert(sizeof(T) <= 8 && std::is_trivially_copyable<T>::value, "a lane's value");
@@ -102,13 +78,16 @@ inline int lane() { return int(thread_index.x % 32); }
 #define gridDim (emulation::grid_size)
 
 #define SNOW_EMULATION_EXPORT extern "C" __attribute__((visibility("default")))
-#define SNOW_KERNEL(NAME, THREADS, PARAMETERS)                                                   \
-  static void NAME PARAMETERS;                                                                   \
-  SNOW_EMULATION_EXPORT void NAME##_call(void** args) { emulation::call(&NAME, args); }          \
-  SNOW_EMULATION_EXPORT int NAME##_threads() { return THREADS; }                                 \
-  SNOW_EMULATION_EXPORT const char* NAME##_parameters() { return emulation::parameters(&NAME); } \
-  static void NAME PARAMETERS
-#define SNOW_KERNEL_OF(NAME, THREADS, BLOCKS, PARAMETERS) SNOW_KERNEL(NAME, THREADS, PARAMETERS)
+// A kernel is called with pointers to its parameters, as by the driver of a GPU; there is one.
+#define SNOW_KERNEL(NAME, THREADS, ...)                                                     \
+  static void NAME(const __VA_ARGS__& p);                                                   \
+  SNOW_EMULATION_EXPORT void NAME##_call(void** parameters) {                               \
+    NAME(*static_cast<const __VA_ARGS__*>(parameters[0]));                                  \
+  }                                                                                         \
+  SNOW_EMULATION_EXPORT int NAME##_threads() { return THREADS; }                            \
+  SNOW_EMULATION_EXPORT uint64_t NAME##_layout() { return snow::layout_of<__VA_ARGS__>(); } \
+  static void NAME([[maybe_unused]] const __VA_ARGS__& p)
+#define SNOW_KERNEL_OF(NAME, THREADS, BLOCKS, ...) SNOW_KERNEL(NAME, THREADS, __VA_ARGS__)
 #define SNOW_SHARED(TYPE, NAME, COUNT) \
   using NAME##_element = TYPE;         \
   NAME##_element* const NAME = emulation::shared_array<NAME##_element, (COUNT)>([] {})

@@ -1,16 +1,10 @@
-// adam_step: the gradient of the splats, carried through the projection and used up at once by Adam
-// (Kingma & Ba 2015), without ever writing the gradients of the parameters to memory.
-//
-//   m ← β₁ m + (1 − β₁) g,   v ← β₂ v + (1 − β₂) g²,   p ← p − lr m̂ / √(v̂ + ε²)
-//
-// ε is inside the root, where a fast reciprocal root applies; for the ε = 1e-15 of this field that
-// is the same number.
-//
-// A number that this would make infinite or NaN stays as it is, with its moments: no gradient, however
-// broken, gets into the parameters. Rows with such numbers are counted.
-#include <algorithm>
-#include <cmath>
+// adam_step: carries the gradient of the splats through the projection and applies Adam (adam.h)
+// immediately: the gradients of the parameters are never written to memory.
+#include "adam.h"
 
+#include <algorithm>
+
+#include "cpu/entry.h"
 #include "cpu/gaussian_rows.h"
 #include "cpu/pool.h"
 
@@ -18,28 +12,22 @@ namespace snow {
 namespace {
 
 constexpr int64_t kBlock = 2048;
-constexpr int kParameters = 6;  // means, log_scales, quats, opacity_logits, sh_dc, sh_rest
 
+// A parameter as a matrix with one row per Gaussian.
 template <class T>
-struct AdamTensor {
+struct AdamRows {
   T *value, *m, *v;
-  const T* extra;           // a gradient to add, of the whole tensor; or null
-  int64_t stride;           // columns as stored
+  const T* extra;           // a gradient to add; or null
   T rate;                   // lr / (1 − β₁ᵗ)
-  int32_t* held = nullptr;  // a count of rows with numbers that stayed as they were; or null
+  int64_t stride;           // columns as stored
+  int32_t* nonfinite_rows;  // a count of skipped rows; or null
 
-  void count_held(int rows) const {
-    if (held) __atomic_fetch_add(held, rows, __ATOMIC_RELAXED);
-  }
-};
+  AdamRows(const AdamTensor<T>& t, int64_t columns, int32_t* count)
+      : value(t.value), m(t.m), v(t.v), extra(t.extra), rate(T(t.rate)), stride(columns),
+        nonfinite_rows(count) {}
 
-template <class V>
-struct AdamRule {
-  V beta1, beta2, gain1, gain2, inv_correction2, eps2;
-  SNOW_INLINE void step(V g, V& m, V& v, V& p, V rate) const {
-    m = beta1 * m + gain1 * g;
-    v = beta2 * v + gain2 * g * g;
-    p -= rate * m * rsqrt(v * inv_correction2 + eps2);
+  void count_nonfinite(int rows) const {
+    if (nonfinite_rows) __atomic_fetch_add(nonfinite_rows, rows, __ATOMIC_RELAXED);
   }
 };
 
@@ -48,21 +36,21 @@ SNOW_INLINE bool all_finite(V a) {
   return __builtin_expect(V::bits(is_finite(a)) == V::bits(V::first(V::width)), 1);
 }
 
-// For lanes where a step comes to numbers that are not finite: the step for the others alone, and
-// the lanes of those. Rare, so it stays out of the way.
+// The step where it comes to finite numbers, and the lanes where it does not. Rare, so it is kept
+// out of line.
 template <class V>
 __attribute__((noinline, cold)) uint32_t step_where_finite(const AdamRule<V>& rule, const V& g,
                                                            V& m, V& v, V& p, const V& rate) {
   const V m0 = m, v0 = v, p0 = p;
   rule.step(g, m, v, p, rate);
-  const auto took = is_finite(v + p);  // v is finite only if g and m are
-  m = select(took, m, m0), v = select(took, v, v0), p = select(took, p, p0);
-  return ~V::bits(took);
+  const auto taken = rule.is_taken(v, p);
+  m = select(taken, m, m0), v = select(taken, v, v0), p = select(taken, p, p0);
+  return ~V::bits(taken);
 }
 
 template <class V, class T>
 __attribute__((noinline, cold)) void update_finite_lanes(const AdamRule<V>& rule,
-                                                         const AdamTensor<T>& t,
+                                                         const AdamRows<T>& t,
                                                          const RowIndex<V::width>& rows,
                                                          const V* g) {
   const int columns = int(t.stride);
@@ -70,18 +58,18 @@ __attribute__((noinline, cold)) void update_finite_lanes(const AdamRule<V>& rule
   gather_rows(t.value, t.stride, rows.row, columns, p);
   gather_rows(t.m, t.stride, rows.row, columns, m);
   gather_rows(t.v, t.stride, rows.row, columns, v);
-  uint32_t held = 0;
+  uint32_t nonfinite = 0;
   for (int k = 0; k < columns; k++)
-    held |= step_where_finite(rule, g[k], m[k], v[k], p[k], V(t.rate));
-  t.count_held(__builtin_popcount(held & V::bits(V::first(rows.count))));
+    nonfinite |= step_where_finite(rule, g[k], m[k], v[k], p[k], V(t.rate));
+  t.count_nonfinite(__builtin_popcount(nonfinite & V::bits(V::first(rows.count))));
   scatter_rows(t.value, t.stride, rows.row, rows.count, columns, p);
   scatter_rows(t.m, t.stride, rows.row, rows.count, columns, m);
   scatter_rows(t.v, t.stride, rows.row, rows.count, columns, v);
 }
 
-// A few columns (at most four) of W rows, in lanes.
+// At most four columns of W rows, one row per lane.
 template <class V, class T = typename V::Scalar>
-__attribute__((noinline)) void update_lanes(const AdamRule<V>& rule, const AdamTensor<T>& t,
+__attribute__((noinline)) void update_lanes(const AdamRule<V>& rule, const AdamRows<T>& t,
                                             const RowIndex<V::width>& rows, V* g) {
   const int columns = int(t.stride);
   V p[4], m[4], v[4], extra[4];
@@ -103,7 +91,7 @@ __attribute__((noinline)) void update_lanes(const AdamRule<V>& rule, const AdamT
   scatter_rows(t.v, t.stride, rows.row, rows.count, columns, v);
 }
 
-// The first n columns (all of V at most) from m, v and value on; the lanes that stayed as they were.
+// Up to a vector of columns, from m, v and value on; returns the lanes that were skipped.
 template <class V, class T = typename V::Scalar>
 __attribute__((noinline, cold)) uint32_t update_finite(const AdamRule<V>& rule, int n, T* value,
                                                        T* m, T* v, const T* g, const T* extra,
@@ -111,18 +99,18 @@ __attribute__((noinline, cold)) uint32_t update_finite(const AdamRule<V>& rule, 
   V gradient = g ? V::load_first(g, n) : V(0.f);
   if (extra) gradient += V::load_first(extra, n);
   V mc = V::load_first(m, n), vc = V::load_first(v, n), pc = V::load_first(value, n);
-  const uint32_t held = step_where_finite(rule, gradient, mc, vc, pc, V(rate));
+  const uint32_t nonfinite = step_where_finite(rule, gradient, mc, vc, pc, V(rate));
   mc.store_first(m, n), vc.store_first(v, n), pc.store_first(value, n);
-  return held & V::bits(V::first(n));
+  return nonfinite & V::bits(V::first(n));
 }
 
 // `columns` (many) of one row, contiguous; g may be null (zero gradient).
 template <class V, class T = typename V::Scalar>
-__attribute__((noinline)) void update_row(const AdamRule<V>& rule, const AdamTensor<T>& t,
+__attribute__((noinline)) void update_row(const AdamRule<V>& rule, const AdamRows<T>& t,
                                           int64_t row, int columns, const T* g) {
   T *value = t.value + row * t.stride, *m = t.m + row * t.stride, *v = t.v + row * t.stride;
   const T* extra = t.extra ? t.extra + row * t.stride : nullptr;
-  uint32_t held = 0;
+  uint32_t nonfinite = 0;
   for (int c = 0; c < columns; c += V::width) {
     const int n = columns - c;
     V gradient = g ? V::load(g + c) : V(0.f), mc, vc, pc;
@@ -143,28 +131,43 @@ __attribute__((noinline)) void update_row(const AdamRule<V>& rule, const AdamTen
         continue;
       }
     }
-    held |= update_finite(rule, n, value + c, m + c, v + c, g ? g + c : nullptr,
-                          extra ? extra + c : nullptr, t.rate);
+    nonfinite |= update_finite(rule, n, value + c, m + c, v + c, g ? g + c : nullptr,
+                               extra ? extra + c : nullptr, t.rate);
   }
-  if (held) t.count_held(1);
+  if (nonfinite) t.count_nonfinite(1);
 }
 
-// Visible rows have gaps between them that the hardware does not foresee.
+// Visible rows have gaps between them that the hardware prefetcher does not predict.
 template <class T>
-SNOW_INLINE void prefetch_row(int64_t row, const AdamTensor<T>* t, int rest_columns) {
-  for (int k = 0; k < kParameters; k++) {
+SNOW_INLINE void prefetch_row(int64_t row, const AdamRows<T>* t, int rest_columns) {
+  for (int k = 0; k < kAdamParameters; k++) {
     const int64_t at = row * t[k].stride;
     for (int c = 0; c < (k < 5 ? 1 : rest_columns); c += 16)
       prefetch(t[k].value + at + c), prefetch(t[k].m + at + c), prefetch(t[k].v + at + c);
   }
 }
 
+// Returns −1 where an id is negative: those are rows of a GPU. Nothing changes then.
 template <class V, class T = typename V::Scalar>
-void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, int degree,
-          const PinholeCamera<T>& cam, const T* grad_packed, const AdamTensor<T>* t,
-          const AdamRule<V>& rule, bool visible_only) {
+int64_t step(const AdamStepParams<T>& p) {
   constexpr int W = V::width;
-  const int rest_columns = sh_columns(degree);
+  const int64_t n = p.n, m = p.splats;
+  const int32_t* ids = p.ids;
+  if (p.valid && !*p.valid) return 0;
+  if (std::any_of(ids, ids + m, [](int32_t id) { return id < 0; })) return -1;
+
+  const PinholeCamera<T> cam(p.camera, double());
+  const GaussianTensors<T> tensors = {p.means.value,          p.log_scales.value, p.quats.value,
+                                      p.opacity_logits.value, p.sh_dc.value,      p.sh_rest.value,
+                                      p.sh_rest_rows,         p.sh_degree};
+  const auto count = [&](int k) { return p.nonfinite_rows ? p.nonfinite_rows + k : nullptr; };
+  const AdamRows<T> t[kAdamParameters] = {
+      {p.means, 3, count(0)}, {p.log_scales, 3, count(1)},
+      {p.quats, 4, count(2)}, {p.opacity_logits, 1, count(3)},
+      {p.sh_dc, 3, count(4)}, {p.sh_rest, 3 * p.sh_rest_rows, count(5)}};
+  const AdamRule<V> rule(p);
+  const bool visible_only = p.visible_only != 0;
+  const int degree = int(p.sh_degree), rest_columns = sh_columns(degree);
   // Tasks are ranges of Gaussians, each with the splats that came from it: ids ascend.
   const int64_t units = visible_only ? m : n;
   parallel_for((units + kBlock - 1) / kBlock, [&](int64_t block) {
@@ -178,9 +181,9 @@ void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& te
     for (int64_t i = first; i < last; i += W) {
       GaussianGroup<V> g;
       g.rows = RowIndex<W>::of(ids, i, last);
-      g.load(tensors, degree);
+      g.load(tensors);
       GaussianGroupGradient<V> d;
-      group_vjp<V>(g, cam, degree, grad_packed, i, last, d, nullptr, nullptr);
+      group_vjp<V>(g, cam, degree, p.grad_packed, i, last, d, nullptr, nullptr);
       V* small[5] = {d.shape.mean, d.shape.log_scale, d.shape.quat, &d.shape.opacity_logit, d.dc};
       for (int k = 0; k < 5; k++) update_lanes(rule, t[k], g.rows, small[k]);
       int64_t lane[W];
@@ -201,6 +204,7 @@ void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& te
       if (degree > 0) update_row(rule, t[5], row, rest_columns, (const T*)nullptr);
     }
   });
+  return 0;
 }
 
 }  // namespace
@@ -208,39 +212,5 @@ void step(int64_t n, int64_t m, const int32_t* ids, const GaussianTensors<T>& te
 
 using namespace snow;
 
-// Per parameter, in the order means, log_scales, quats, opacity_logits, sh_dc, sh_rest: value,
-// first and second moment, extra gradient or null, and learning rate. Where *valid is false nothing
-// changes. held: six counts of rows to add to, or null. −1 where an id is negative, which is a row of
-// a GPU: nothing changes then, either.
-#define SNOW_ADAM_ENTRY(NAME, V)                                                                   \
-  SNOW_EXPORT int64_t NAME(                                                                        \
-      int64_t n, int64_t m, const int32_t* ids, const V::Scalar* grad_packed,                      \
-      const V::Scalar* cam_from_world, double width, double height, double fx, double fy,          \
-      double cx, double cy, double near, int64_t sh_rest_rows, int64_t degree, V::Scalar* p0,      \
-      V::Scalar* m0, V::Scalar* v0, const V::Scalar* e0, double lr0, V::Scalar* p1, V::Scalar* m1, \
-      V::Scalar* v1, const V::Scalar* e1, double lr1, V::Scalar* p2, V::Scalar* m2, V::Scalar* v2, \
-      const V::Scalar* e2, double lr2, V::Scalar* p3, V::Scalar* m3, V::Scalar* v3,                \
-      const V::Scalar* e3, double lr3, V::Scalar* p4, V::Scalar* m4, V::Scalar* v4,                \
-      const V::Scalar* e4, double lr4, V::Scalar* p5, V::Scalar* m5, V::Scalar* v5,                \
-      const V::Scalar* e5, double lr5, int64_t adam_step, double beta1, double beta2, double eps,  \
-      int64_t visible_only, const bool* valid, int32_t* held) {                                    \
-    if (valid && !*valid) return 0;                                                                \
-    if (std::any_of(ids, ids + m, [](int32_t id) { return id < 0; })) return -1;                   \
-    using T = V::Scalar;                                                                           \
-    const double c1 = 1 - std::pow(beta1, double(adam_step));                                      \
-    const double c2 = 1 - std::pow(beta2, double(adam_step));                                      \
-    AdamTensor<T> tensors[kParameters] = {                                                         \
-        {p0, m0, v0, e0, 3, T(lr0 / c1)}, {p1, m1, v1, e1, 3, T(lr1 / c1)},                        \
-        {p2, m2, v2, e2, 4, T(lr2 / c1)}, {p3, m3, v3, e3, 1, T(lr3 / c1)},                        \
-        {p4, m4, v4, e4, 3, T(lr4 / c1)}, {p5, m5, v5, e5, 3 * sh_rest_rows, T(lr5 / c1)}};        \
-    for (int k = 0; k < kParameters; k++) tensors[k].held = held ? held + k : nullptr;             \
-    const AdamRule<V> rule = {V(beta1),     V(beta2),  V(1 - beta1),                               \
-                              V(1 - beta2), V(1 / c2), V(eps * eps)};                              \
-    step<V>(n, m, ids, {p0, p1, p2, p3, p4, p5, sh_rest_rows}, int(degree),                        \
-            {cam_from_world, width, height, fx, fy, cx, cy, near}, grad_packed, tensors, rule,     \
-            visible_only != 0);                                                                    \
-    return 0;                                                                                      \
-  }
-
-SNOW_ADAM_ENTRY(adam_step, VecF)
-SNOW_ADAM_ENTRY(adam_step_f64, VecD)
+SNOW_ENTRY(adam_step, AdamStepParams<float>) { return step<VecF>(p); }
+SNOW_ENTRY(adam_step_f64, AdamStepParams<double>) { return step<VecD>(p); }

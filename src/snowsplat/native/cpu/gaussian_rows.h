@@ -1,6 +1,6 @@
-// W Gaussians at a time, a Gaussian a lane: reading their parameters from row-major tensors, and
-// carrying the gradient of their splats back to those parameters. Shared by project_bwd (which
-// writes the gradients) and adam_step (which uses them up at once).
+// W Gaussians at a time, one per SIMD lane: reading their parameters from row-major tensors, and
+// carrying the gradient of their splats back to those parameters. Shared by project_bwd, which
+// writes the gradients, and adam_step, which applies them immediately.
 #pragma once
 
 #include "projection.h"
@@ -9,8 +9,7 @@
 
 namespace snow {
 
-// Rows of the W Gaussians of a group. A last, shorter group repeats its final row in the idle
-// lanes.
+// Rows of the W Gaussians of a group. A last, shorter group repeats its final row in the idle lanes.
 template <int W>
 struct RowIndex {
   int64_t row[W];
@@ -44,10 +43,10 @@ struct GaussianGroup {
     gather_rows(g.quats, 4, rows.row, 4, shape.quat);
     gather_rows(g.opacity_logits, 1, rows.row, 1, &shape.opacity_logit);
   }
-  SNOW_INLINE void load(const GaussianTensors<T>& g, int degree) {
+  SNOW_INLINE void load(const GaussianTensors<T>& g) {
     load_position(g), load_orientation(g);
     gather_rows(g.sh_dc, 3, rows.row, 3, dc);
-    gather_rows(g.sh_rest, 3 * g.sh_rest_rows, rows.row, sh_columns(degree), rest);
+    gather_rows(g.sh_rest, 3 * g.sh_rest_rows, rows.row, sh_columns(int(g.sh_degree)), rest);
   }
 };
 

@@ -8,7 +8,7 @@
 #include <cpuid.h>
 #endif
 
-#include "cpu/pool.h"
+#include "cpu/entry.h"
 
 namespace {
 

@@ -1,13 +1,14 @@
 // neighbours: the exact distances from each point to its k nearest others, by a k-d tree.
 //
 // The tree is implicit: the points are reordered so that each node is a range, cut at its middle
-// along its widest axis down to leaves of at most 16 points. Every query starts from the root and
+// along its widest axis, down to leaves of at most 16 points. Every query starts at the root and
 // prunes by the distance to the cutting planes.
 #include <algorithm>
 #include <cmath>
 #include <limits>
 #include <vector>
 
+#include "cpu/entry.h"
 #include "cpu/pool.h"
 
 namespace snow {
@@ -15,15 +16,14 @@ namespace {
 
 constexpr int64_t kLeaf = 16;
 constexpr int64_t kBlock = 1024;
-constexpr int kMaxNeighbours = 64;
 
 template <class T>
 class Tree {
  public:
   Tree(const T* points, int64_t n) : order_(size_t(n)), nodes_(size_t(node_count(n))) {
     for (int64_t i = 0; i < n; i++) order_[size_t(i)] = int32_t(i);
-    // The top of the tree serially until there is work for every thread, then subtrees side by
-    // side.
+    // The top of the tree is built serially until there is work for every thread, then the subtrees
+    // in parallel.
     std::vector<Job> jobs = {{0, 0, n}};
     while (!jobs.empty() && int64_t(jobs.size()) < 4 * pool_size()) {
       std::vector<Job> next;
@@ -142,11 +142,11 @@ class Tree {
 
 using namespace snow;
 
-#define SNOW_NEIGHBOURS_ENTRY(NAME, T)                                            \
-  SNOW_EXPORT int64_t NAME(int64_t n, const T* points, int64_t k, T* distances) { \
-    if (n > 0) Tree<T>(points, n).query_all(n, int(k), distances);                \
-    return 0;                                                                     \
-  }
+template <class T>
+static int64_t find(const NeighboursParams<T>& p) {
+  if (p.n > 0) Tree<T>(p.points, p.n).query_all(p.n, int(p.k), p.distances);
+  return 0;
+}
 
-SNOW_NEIGHBOURS_ENTRY(neighbours, float)
-SNOW_NEIGHBOURS_ENTRY(neighbours_f64, double)
+SNOW_ENTRY(neighbours, NeighboursParams<float>) { return find(p); }
+SNOW_ENTRY(neighbours_f64, NeighboursParams<double>) { return find(p); }

@@ -1,14 +1,15 @@
 // photometric: L1 and SSIM between two images and the gradient of their weighted sum, in one pass.
 //
-// Images are planar, (3, H, W). A task is one channel of a strip of columns over a segment of rows;
-// it slides down the rows and keeps the last 11 horizontally filtered rows in rings: first of the
-// window means, then of the derivatives, so that nothing but the images touches memory. The cut
-// into tasks depends on the image size alone, and partial sums are added in order.
-#include <cmath>
+// Images are planar, (3, H, W). A task is one channel of a strip of columns over a segment of rows.
+// It moves down the rows and keeps the last 11 horizontally filtered rows in ring buffers: first of
+// the window means, then of the derivatives. Only the images themselves are read from and written to
+// memory. The division into tasks depends only on the image size, and partial sums are added in
+// order.
 #include <cstring>
 #include <utility>
 #include <vector>
 
+#include "cpu/entry.h"
 #include "cpu/pool.h"
 #include "simd.h"
 #include "ssim.h"
@@ -16,7 +17,6 @@
 namespace snow {
 namespace {
 
-constexpr int kTaps = 2 * kSsimRadius + 1;
 constexpr int kStrip = 256;  // columns of a task at most
 constexpr int kMargin = 16;  // columns computed on each side for the second filter
 constexpr int kPad = 32;     // columns of buffer on each side
@@ -24,20 +24,6 @@ constexpr int kRow = kStrip + 2 * kPad;
 constexpr int kSegment = 540;  // rows of a task, about
 
 int64_t strip_count(int64_t width) { return (width + kStrip - 1) / kStrip; }
-
-struct Window {
-  double tap[kTaps];
-  Window() {
-    double sum = 0;
-    for (int k = 0; k < kTaps; k++) {
-      const double x = k - kSsimRadius;
-      tap[k] = std::exp(-x * x / (2 * 1.5 * 1.5));
-      sum += tap[k];
-    }
-    for (double& t : tap) t /= sum;
-  }
-};
-const Window window;
 
 // n pixels (n ≤ W) of either kind of image.
 template <class V>
@@ -84,12 +70,12 @@ struct Neighbourhood<Simd<float, 16>> {
 template <class V>
 struct Filter {
   using T = typename V::Scalar;
-  V tap[kTaps];
+  V tap[kSsimTaps];
   Filter() {
-    for (int k = 0; k < kTaps; k++) tap[k] = V(window.tap[k]);
+    for (int k = 0; k < kSsimTaps; k++) tap[k] = V(ssim_tap(k));
   }
   SNOW_INLINE V along(const T* row, int x) const {
-    return along(Neighbourhood<V>(row, x), std::make_integer_sequence<int, kTaps>());
+    return along(Neighbourhood<V>(row, x), std::make_integer_sequence<int, kSsimTaps>());
   }
   template <int... k>
   SNOW_INLINE V along(const Neighbourhood<V>& n, std::integer_sequence<int, k...>) const {
@@ -100,7 +86,7 @@ struct Filter {
   SNOW_INLINE V across(const T* const* rows, int offset) const {
     V sum(0.f);
 #pragma GCC unroll 11
-    for (int k = 0; k < kTaps; k++) sum += tap[k] * V::load(rows[k] + offset);
+    for (int k = 0; k < kSsimTaps; k++) sum += tap[k] * V::load(rows[k] + offset);
     return sum;
   }
 };
@@ -109,9 +95,9 @@ template <class V>
 struct Scratch {
   using T = typename V::Scalar;
   alignas(64) T a[kRow], b[kRow], squares[kRow], product[kRow];
-  alignas(64) T means[kTaps][4][kRow];  // of a, b, a² + b², ab
-  alignas(64) T derivatives[3][kRow];   // d.mean_a, d.mean_aa, d.mean_ab
-  alignas(64) T filtered[kTaps][3][kRow];
+  alignas(64) T means[kSsimTaps][4][kRow];  // of a, b, a² + b², ab
+  alignas(64) T derivatives[3][kRow];       // d.mean_a, d.mean_aa, d.mean_ab
+  alignas(64) T filtered[kSsimTaps][3][kRow];
 };
 
 template <class V, class Target>
@@ -137,7 +123,7 @@ struct Photometric {
     const int first = kPad - kMargin, last = end + kMargin;
 
     for (int64_t y = row_begin - 2 * kSsimRadius; y < row_end + 2 * kSsimRadius; y++) {
-      auto& means = s.means[(y + 2 * kTaps) % kTaps];
+      auto& means = s.means[(y + 2 * kSsimTaps) % kSsimTaps];
       if (y >= 0 && y < height) {
         const int64_t row = plane + y * width;
         for (int64_t x = from; x < to; x += W) {
@@ -158,12 +144,12 @@ struct Photometric {
 
       const int64_t ys = y - kSsimRadius;  // the row whose SSIM is complete now
       if (ys < row_begin - kSsimRadius) continue;
-      auto& filtered = s.filtered[(ys + 2 * kTaps) % kTaps];
+      auto& filtered = s.filtered[(ys + 2 * kSsimTaps) % kSsimTaps];
       if (ys >= 0 && ys < height) {
         const bool mine = ys >= row_begin && ys < row_end;
-        const T* rows[kTaps];
-        for (int k = 0; k < kTaps; k++)
-          rows[k] = s.means[(ys - kSsimRadius + k + 2 * kTaps) % kTaps][0];
+        const T* rows[kSsimTaps];
+        for (int k = 0; k < kSsimTaps; k++)
+          rows[k] = s.means[(ys - kSsimRadius + k + 2 * kSsimTaps) % kSsimTaps][0];
         V sum(0.f);
         for (int x = first; x < last; x += W) {
           SsimDerivatives<V> d;
@@ -192,9 +178,9 @@ struct Photometric {
 
       const int64_t yo = ys - kSsimRadius;  // the row whose gradient is complete now
       if (yo < row_begin) continue;
-      const T* rows[kTaps];
-      for (int k = 0; k < kTaps; k++)
-        rows[k] = s.filtered[(yo - kSsimRadius + k + 2 * kTaps) % kTaps][0];
+      const T* rows[kSsimTaps];
+      for (int k = 0; k < kSsimTaps; k++)
+        rows[k] = s.filtered[(yo - kSsimRadius + k + 2 * kSsimTaps) % kSsimTaps][0];
       const V up(l1_weight), down(-l1_weight), weight(ssim_weight), zero(0.f);
       V sum(0.f);
       for (int64_t x = x0; x < x1; x += W) {
@@ -217,25 +203,24 @@ struct Photometric {
 };
 
 template <class V, class Target>
-void photometric(int64_t channels, int64_t width, int64_t height, const typename V::Scalar* image,
-                 const Target* target, double l1_weight, double ssim_weight,
-                 typename V::Scalar* grad, double* means) {
-  const int64_t strips = strip_count(width);
-  const int64_t segments = (height + kSegment - 1) / kSegment;
-  const double count = double(channels * width * height);
-  const Photometric<V, Target> p = {
-      width, height, image, target, l1_weight / count, ssim_weight / count, grad};
-  const int64_t tasks = channels * strips * segments;
+int64_t photometric(const PhotometricParams<typename V::Scalar, Target>& p) {
+  const int64_t strips = strip_count(p.width);
+  const int64_t segments = (p.height + kSegment - 1) / kSegment;
+  const double count = double(p.n * p.width * p.height);
+  const Photometric<V, Target> images = {
+      p.width, p.height, p.image, p.target, p.l1_weight / count, p.ssim_weight / count, p.grad};
+  const int64_t tasks = p.n * strips * segments;
   std::vector<double> sums(size_t(2 * tasks), 0.0);
   parallel_for(tasks, [&](int64_t task) {
     const int64_t segment = task % segments, strip = task / segments % strips;
-    const Range rows = split_range(height, segments, segment);
-    p.run(int(task / segments / strips), strip, rows.begin, rows.end, &sums[size_t(2 * task)]);
+    const Range rows = split_range(p.height, segments, segment);
+    images.run(int(task / segments / strips), strip, rows.begin, rows.end, &sums[size_t(2 * task)]);
   });
-  means[0] = means[1] = 0;
+  p.means[0] = p.means[1] = 0;
   for (int64_t t = 0; t < tasks; t++)
-    means[0] += sums[size_t(2 * t)], means[1] += sums[size_t(2 * t + 1)];
-  means[0] /= count, means[1] /= count;
+    p.means[0] += sums[size_t(2 * t)], p.means[1] += sums[size_t(2 * t + 1)];
+  p.means[0] /= count, p.means[1] /= count;
+  return 0;
 }
 
 }  // namespace
@@ -243,15 +228,7 @@ void photometric(int64_t channels, int64_t width, int64_t height, const typename
 
 using namespace snow;
 
-#define SNOW_PHOTOMETRIC_ENTRY(NAME, V, TARGET)                                                  \
-  SNOW_EXPORT int64_t NAME(int64_t channels, int64_t width, int64_t height,                      \
-                           const V::Scalar* image, const TARGET* target, double l1_weight,       \
-                           double ssim_weight, V::Scalar* grad, double* means) {                 \
-    photometric<V>(channels, width, height, image, target, l1_weight, ssim_weight, grad, means); \
-    return 0;                                                                                    \
-  }
-
-SNOW_PHOTOMETRIC_ENTRY(photometric, VecF, float)
-SNOW_PHOTOMETRIC_ENTRY(photometric_u8, VecF, uint8_t)
-SNOW_PHOTOMETRIC_ENTRY(photometric_f64, VecD, double)
-SNOW_PHOTOMETRIC_ENTRY(photometric_u8_f64, VecD, uint8_t)
+SNOW_ENTRY(photometric, PhotometricParams<float, float>) { return photometric<VecF>(p); }
+SNOW_ENTRY(photometric_u8, PhotometricParams<float, uint8_t>) { return photometric<VecF>(p); }
+SNOW_ENTRY(photometric_f64, PhotometricParams<double, double>) { return photometric<VecD>(p); }
+SNOW_ENTRY(photometric_u8_f64, PhotometricParams<double, uint8_t>) { return photometric<VecD>(p); }

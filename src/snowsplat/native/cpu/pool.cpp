@@ -9,6 +9,7 @@
 #include <thread>
 #include <vector>
 
+#include "cpu/entry.h"
 #include "simd.h"
 
 namespace snow {

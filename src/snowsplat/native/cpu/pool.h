@@ -1,8 +1,8 @@
 // A small pool of threads shared by all kernels of this library.
 //
 // parallel_for(tasks, body) calls body(task) once for each task in [0, tasks), on any thread in any
-// order: a kernel must not let the result depend on either. Idle workers sleep after a short spin,
-// so that a busy machine is not slowed by waiting. Denormals are flushed inside, restored after.
+// order; the result of a kernel must not depend on either. Idle workers sleep after a short spin, so
+// that waiting does not slow a busy machine. Denormals are flushed inside and the mode is restored.
 #pragma once
 
 #include <cstdint>
@@ -28,5 +28,3 @@ inline Range split_range(int64_t n, int64_t parts, int64_t part, int64_t unit = 
 }
 
 }  // namespace snow
-
-#define SNOW_EXPORT extern "C" __attribute__((visibility("default")))

@@ -3,13 +3,14 @@
 #include <cstring>
 #include <vector>
 
+#include "cpu/entry.h"
 #include "cpu/gaussian_rows.h"
 #include "cpu/pool.h"
 
 namespace snow {
 namespace {
 
-constexpr int64_t kBlock = 2048;  // Gaussians a task; fixed, so that nothing depends on the threads
+constexpr int64_t kBlock = 2048;  // Gaussians per task: independent of the number of threads
 
 // Bound on the half extents of the splat from its largest scale alone: λmax(Σ) = s², so
 // Σ'xx ≤ |J_x|² s² + 0.3 with |J_x|² = (fx/z)² (1 + tx²). Cheap, and never too small.
@@ -33,9 +34,12 @@ SNOW_INLINE typename V::Mask may_touch_image(const GaussianShape<V>& g, const Pi
 }
 
 template <class V, class T = typename V::Scalar>
-int64_t cull(int64_t n, const GaussianTensors<T>& tensors, const PinholeCamera<T>& cam,
-             int32_t* ids) {
+int64_t cull(const ProjectCullParams<T>& p) {
   constexpr int W = V::width;
+  const int64_t n = p.n;
+  const GaussianTensors<T>& tensors = p.gaussians;
+  const PinholeCamera<T> cam(p.camera, double());
+  int32_t* ids = p.ids;
   const int64_t blocks = (n + kBlock - 1) / kBlock;
   std::vector<int32_t> found(size_t(blocks), 0);
   parallel_for(blocks, [&](int64_t block) {
@@ -63,50 +67,51 @@ int64_t cull(int64_t n, const GaussianTensors<T>& tensors, const PinholeCamera<T
 }
 
 template <class V, class T = typename V::Scalar>
-void forward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, int degree,
-             const PinholeCamera<T>& cam, T* packed) {
+int64_t forward(const ProjectForwardParams<T>& p) {
   constexpr int W = V::width;
-  parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
-    const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
+  const int64_t n = p.n;
+  const int degree = int(p.gaussians.sh_degree);
+  const PinholeCamera<T> cam(p.camera, double());
+  parallel_for((n + kBlock - 1) / kBlock, [&](int64_t block) {
+    const int64_t begin = block * kBlock, end = begin + kBlock < n ? begin + kBlock : n;
     for (int64_t i = begin; i < end; i += W) {
       GaussianGroup<V> g;
-      g.rows = RowIndex<W>::of(ids, i, end);
-      g.load(tensors, degree);
-      ProjectedGaussian<V> p;
-      project_gaussian(g.shape, cam, p);
+      g.rows = RowIndex<W>::of(p.ids, i, end);
+      g.load(p.gaussians);
+      ProjectedGaussian<V> projected;
+      project_gaussian(g.shape, cam, projected);
       V column[kPackedStride], *color = column + kPackedHeader;
       sh_color(degree, view_direction(g.shape.mean, cam.position), g.dc, g.rest, color);
-      splat_header(p, column);
+      splat_header(projected, column);
       for (int k = 0; k < 3; k++) color[k] = max(color[k], V(0.f));
       for (int k = kPackedHeader + 3; k < kPackedStride; k++) column[k] = V(0.f);
       const auto splats = RowIndex<W>::contiguous(i, end);
-      scatter_rows(packed, kPackedStride, splats.row, splats.count, kPackedStride, column);
+      scatter_rows(p.packed, kPackedStride, splats.row, splats.count, kPackedStride, column);
     }
   });
+  return 0;
 }
 
-template <class T>
-struct GaussianGradients {
-  T *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;
-};
-
-// pose: per block 9 (rotation) + 3 (translation) + 3 (camera position) sums, or null.
 template <class V, class T = typename V::Scalar>
-void backward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, int degree,
-              const PinholeCamera<T>& cam, const T* grad_packed, const GaussianGradients<T>& grads,
-              double* pose) {
+int64_t backward(const ProjectBackwardParams<T>& p) {
   constexpr int W = V::width;
-  parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
-    const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
-    double sums[15] = {0};
+  const int64_t n = p.n;
+  const GaussianTensors<T>& tensors = p.gaussians;
+  const GaussianGradients<T>& grads = p.grads;
+  const int degree = int(tensors.sh_degree);
+  const PinholeCamera<T> cam(p.camera, double());
+  double* pose = p.pose;
+  parallel_for((n + kBlock - 1) / kBlock, [&](int64_t block) {
+    const int64_t begin = block * kBlock, end = begin + kBlock < n ? begin + kBlock : n;
+    double sums[kPoseSums] = {0};
     for (int64_t i = begin; i < end; i += W) {
       GaussianGroup<V> g;
-      g.rows = RowIndex<W>::of(ids, i, end);
-      g.load(tensors, degree);
+      g.rows = RowIndex<W>::of(p.ids, i, end);
+      g.load(tensors);
       GaussianGroupGradient<V> d;
       PoseGradient<V> dpose;
       V dposition[3];
-      group_vjp(g, cam, degree, grad_packed, i, end, d, pose ? &dpose : nullptr,
+      group_vjp(g, cam, degree, p.grad_packed, i, end, d, pose ? &dpose : nullptr,
                 pose ? dposition : nullptr);
       const int64_t* row = g.rows.row;
       const int count = g.rows.count;
@@ -124,8 +129,9 @@ void backward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, 
         }
       }
     }
-    if (pose) std::memcpy(pose + 15 * block, sums, sizeof sums);
+    if (pose) std::memcpy(pose + kPoseSums * block, sums, sizeof sums);
   });
+  return 0;
 }
 
 }  // namespace
@@ -133,40 +139,12 @@ void backward(int64_t m, const int32_t* ids, const GaussianTensors<T>& tensors, 
 
 using namespace snow;
 
-#define SNOW_PROJECT_ENTRIES(SUFFIX, V)                                                           \
-  SNOW_EXPORT int64_t project_cull##SUFFIX(                                                       \
-      int64_t n, const V::Scalar* means, const V::Scalar* log_scales, const V::Scalar* quats,     \
-      const V::Scalar* opacity_logits, const V::Scalar* cam_from_world, double width,             \
-      double height, double fx, double fy, double cx, double cy, double near, int32_t* ids) {     \
-    return cull<V>(n, {means, log_scales, quats, opacity_logits, nullptr, nullptr, 0},            \
-                   {cam_from_world, width, height, fx, fy, cx, cy, near}, ids);                   \
-  }                                                                                               \
-  SNOW_EXPORT int64_t project_fwd##SUFFIX(                                                        \
-      int64_t m, const int32_t* ids, const V::Scalar* means, const V::Scalar* log_scales,         \
-      const V::Scalar* quats, const V::Scalar* opacity_logits, const V::Scalar* sh_dc,            \
-      const V::Scalar* sh_rest, int64_t sh_rest_rows, int64_t degree,                             \
-      const V::Scalar* cam_from_world, double width, double height, double fx, double fy,         \
-      double cx, double cy, double near, V::Scalar* packed) {                                     \
-    forward<V>(m, ids, {means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_rest_rows},  \
-               int(degree), {cam_from_world, width, height, fx, fy, cx, cy, near}, packed);       \
-    return 0;                                                                                     \
-  }                                                                                               \
-  SNOW_EXPORT int64_t project_bwd##SUFFIX(                                                        \
-      int64_t m, const int32_t* ids, const V::Scalar* means, const V::Scalar* log_scales,         \
-      const V::Scalar* quats, const V::Scalar* opacity_logits, const V::Scalar* sh_dc,            \
-      const V::Scalar* sh_rest, int64_t sh_rest_rows, int64_t degree,                             \
-      const V::Scalar* cam_from_world, double width, double height, double fx, double fy,         \
-      double cx, double cy, double near, const V::Scalar* grad_packed, V::Scalar* d_means,        \
-      V::Scalar* d_log_scales, V::Scalar* d_quats, V::Scalar* d_opacity_logits,                   \
-      V::Scalar* d_sh_dc, V::Scalar* d_sh_rest, double* pose) {                                   \
-    backward<V>(m, ids, {means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_rest_rows}, \
-                int(degree), {cam_from_world, width, height, fx, fy, cx, cy, near}, grad_packed,  \
-                {d_means, d_log_scales, d_quats, d_opacity_logits, d_sh_dc, d_sh_rest}, pose);    \
-    return 0;                                                                                     \
-  }
+SNOW_ENTRY(project_cull, ProjectCullParams<float>) { return cull<VecF>(p); }
+SNOW_ENTRY(project_cull_f64, ProjectCullParams<double>) { return cull<VecD>(p); }
+SNOW_ENTRY(project_fwd, ProjectForwardParams<float>) { return forward<VecF>(p); }
+SNOW_ENTRY(project_fwd_f64, ProjectForwardParams<double>) { return forward<VecD>(p); }
+SNOW_ENTRY(project_bwd, ProjectBackwardParams<float>) { return backward<VecF>(p); }
+SNOW_ENTRY(project_bwd_f64, ProjectBackwardParams<double>) { return backward<VecD>(p); }
 
-SNOW_PROJECT_ENTRIES(, VecF)
-SNOW_PROJECT_ENTRIES(_f64, VecD)
-
-// Rows of the `pose` scratch that project_bwd fills for m splats: 15 doubles each.
-SNOW_EXPORT int64_t project_pose_blocks(int64_t m) { return (m + kBlock - 1) / kBlock; }
+// Rows of `pose` that project_bwd fills for n splats.
+SNOW_ENTRY(project_pose_blocks, SizeQueryParams) { return (p.n + kBlock - 1) / kBlock; }

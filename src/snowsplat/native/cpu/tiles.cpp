@@ -3,13 +3,14 @@
 //   splats_sort      radix sort of the depth keys (stable, so equal depths keep row order)
 //   tiles_count      exactly which tiles each splat touches; counts per tile
 //   tiles_fill       a stable counting scatter by tile, in depth order
-// and back: splats_reduce sums the gradients of a splat's tiles. The result of each is the same for
-// any number of threads.
+// and back: splats_reduce sums the gradients of a splat's tiles. No result depends on the number of
+// threads.
 #include <cstring>
 #include <vector>
 
+#include "cpu/entry.h"
 #include "cpu/pool.h"
-#include "cpu/records.h"
+#include "cpu/splat_record.h"
 #include "simd.h"
 
 namespace snow {
@@ -20,38 +21,19 @@ constexpr int64_t kSerialBelow = 8000;  // splats; under this one part is faster
 
 int64_t part_count(int64_t m) { return m < kSerialBelow ? 1 : pool_size(); }
 
-inline uint32_t ordered_bits(float x) {  // unsigned integers in the order of the floats
-  uint32_t b;
-  std::memcpy(&b, &x, 4);
-  return b & 0x80000000u ? ~b : b | 0x80000000u;
-}
-inline uint64_t ordered_bits(double x) {
-  uint64_t b;
-  std::memcpy(&b, &x, 8);
-  return b >> 63 ? ~b : b | 0x8000000000000000ull;
-}
-template <class T>
-struct KeyOf;
-template <>
-struct KeyOf<float> {
-  using type = uint32_t;
-};
-template <>
-struct KeyOf<double> {
-  using type = uint64_t;
-};
-
 template <class T>
 SNOW_INLINE void set_colors(SplatRecord<T>& r, const T* row, const int64_t* columns) {
   for (int k = 0; k < kGroupChannels; k++) r.color[k] = columns[k] < 0 ? T(0) : row[columns[k]];
 }
 
 template <class V, class T = typename V::Scalar>
-void prepare(int64_t m, const T* packed, int64_t stride, double width, double height,
-             const int64_t* columns, SplatRecord<T>* records, typename KeyOf<T>::type* keys) {
+int64_t prepare(const SplatsPrepareParams<T>& p) {
   constexpr int W = V::width;
-  parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
-    const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
+  const int64_t n = p.n, stride = p.stride;
+  const T* packed = p.packed;
+  SplatRecord<T>* records = p.records;
+  parallel_for((n + kBlock - 1) / kBlock, [&](int64_t block) {
+    const int64_t begin = block * kBlock, end = begin + kBlock < n ? begin + kBlock : n;
     for (int64_t i = begin; i < end; i += W) {
       const int count = end - i < W ? int(end - i) : W;
       int64_t row[W];
@@ -59,39 +41,39 @@ void prepare(int64_t m, const T* packed, int64_t stride, double width, double he
       V c[8];
       gather_rows(packed, stride, row, 7, c);
       c[7] = V(0.f);
-      const V det = c[2] * c[4] - c[3] * c[3];
-      const V k2 = V(2 * kLn2) * (log2(c[5]) - V(kLog2MinAlpha));
-      const V reach = max(k2, V(0.f)) / det;
-      const V ex = sqrt(reach * c[4]), ey = sqrt(reach * c[2]);
-      const V half(0.5f), right(width - 1), bottom(height - 1);
-      const V x0 = max(c[0] - ex - half, V(0.f)), x1 = min(c[0] + ex - half, right);
-      const V y0 = max(c[1] - ey - half, V(0.f)), y1 = min(c[1] + ey - half, bottom);
-      const uint32_t seen =
-          V::bits((k2 >= V(0.f)) & (det > V(0.f)) & (c[2] > V(0.f)) & (x1 >= x0) & (y1 >= y0));
+      const PixelExtent<V> extent(c[0], c[1], c + 2, c[5], V(double(p.width - 1)),
+                                  V(double(p.height - 1)));
+      const uint32_t visible = V::bits(extent.visible);
       const SplatTerms<V> t = splat_terms(c[0], c[1], c + 2, c[5]);
       V terms[8] = {t.mean_x, t.mean_y, t.A, t.B, t.C, t.log2_opacity, t.slope_x, t.slope_y};
       constexpr int64_t record = sizeof(SplatRecord<T>) / sizeof(T);
       scatter_rows((T*)records, record, row, count, 8, terms);
       alignas(64) T rect[4][W];
-      x0.store(rect[0]), y0.store(rect[1]), x1.store(rect[2]), y1.store(rect[3]);
+      extent.x0.store(rect[0]), extent.y0.store(rect[1]);
+      extent.x1.store(rect[2]), extent.y1.store(rect[3]);
       for (int l = 0; l < count; l++) {
         SplatRecord<T>& r = records[i + l];
-        set_colors(r, packed + (i + l) * stride, columns);
-        const bool on = seen >> l & 1;
+        set_colors(r, packed + (i + l) * stride, p.columns);
+        const bool on = visible >> l & 1;
         r.tile_x0 = on ? uint16_t(int(rect[0][l]) / kTile) : 1;
         r.tile_y0 = on ? uint16_t(int(rect[1][l]) / kTile) : 1;
         r.tile_x1 = on ? uint16_t(int(rect[2][l]) / kTile) : 0;
         r.tile_y1 = on ? uint16_t(int(rect[3][l]) / kTile) : 0;
-        keys[i + l] = ordered_bits(packed[(i + l) * stride + 6]);
+        p.keys[i + l] = ordered_bits(packed[(i + l) * stride + 6]);
       }
     }
   });
+  return 0;
 }
 
-// Least significant digit first, 11 bits a pass, over only as many bits as the keys differ in.
-template <class Key>
-void radix_sort(int64_t m, Key* keys, Key* keys2, uint32_t* order, uint32_t* order2) {
+// Least significant digit first, 11 bits per pass, over as many bits as the keys differ in.
+template <class T>
+int64_t radix_sort(const SplatsSortParams<T>& p) {
+  using Key = DepthKey<T>;
   constexpr int kBits = 11, kBins = 1 << kBits;
+  const int64_t m = p.n;
+  Key *keys = p.keys, *keys2 = p.keys2;
+  uint32_t *order = p.order, *order2 = p.order2;
   const int64_t parts = part_count(m);
   std::vector<Key> lows(static_cast<size_t>(parts), ~Key(0)), highs(static_cast<size_t>(parts), 0);
   parallel_for(parts, [&](int64_t part) {
@@ -114,7 +96,7 @@ void radix_sort(int64_t m, Key* keys, Key* keys2, uint32_t* order, uint32_t* ord
     passes++;
   if (passes == 0) {
     for (int64_t i = 0; i < m; i++) order[i] = uint32_t(i);
-    return;
+    return 0;
   }
   std::vector<uint32_t> histogram(size_t(parts * kBins));
   for (int pass = 0; pass < passes; pass++) {
@@ -148,17 +130,18 @@ void radix_sort(int64_t m, Key* keys, Key* keys2, uint32_t* order, uint32_t* ord
       }
     });
   }
+  return 0;
 }
 
 // The tiles of one splat: a rectangle, and for small ones (≤ 16 tiles) the exact subset as bits,
-// row-major in a rectangle `width` tiles wide. Large ones are walked again with the same test.
+// row-major in a rectangle `width` tiles wide. Large ones are tested again in fill_tiles.
 struct TileSpan {
   uint16_t x0, y0, bits;
   uint8_t width, large;
 };
 static_assert(sizeof(TileSpan) == 8, "layout of the scratch tensor");
 
-// Which of 16 tiles touch the splat: tile k of the 16 is at (k % width, k / width) from (x, y).
+// Which of 16 tiles the splat touches: tile k of the 16 is at (k % width, k / width) from (x, y).
 template <class V, class T = typename V::Scalar>
 struct TileTest {
   alignas(64) T column[kTile + 1][16], row[kTile + 1][16];
@@ -199,8 +182,8 @@ SNOW_INLINE void for_each_tile_of_large(const SplatRecord<T>& r, int64_t tiles_x
     }
 }
 
-// What tiles_count leaves for tiles_fill, carved from one block of memory: the tiles of every
-// splat, the first slot of every part, and per part a count of every tile.
+// What tiles_count hands to tiles_fill, in one block of memory: the tiles of every splat, the first
+// slot of every part, and per part a count for every tile.
 struct TileWork {
   TileSpan* spans;
   uint32_t* part_slots;
@@ -222,11 +205,17 @@ struct SmallOffsets {  // tile offset of bit k in a span `width` wide
   }
 };
 
+// Returns the number of instances, in *required too. On the CPU memory is allocated after this.
 template <class V, class T = typename V::Scalar>
-int64_t count_tiles(int64_t m, const uint32_t* order, const SplatRecord<T>* records,
-                    int64_t tiles_x, int64_t tiles_y, int64_t parts, uint32_t* counts,
-                    uint32_t* tile_start, TileSpan* spans, uint32_t* part_slots) {
-  const int64_t tiles = tiles_x * tiles_y;
+int64_t count_tiles(const TilesCountParams<T>& p) {
+  const int64_t m = p.n, tiles_x = p.binning.tiles_x, parts = p.binning.parts;
+  const int64_t tiles = tiles_x * p.binning.tiles_y;
+  const uint32_t* order = p.binning.order;
+  const SplatRecord<T>* records = p.binning.records;
+  uint32_t* tile_start = p.binning.tile_start;
+  const TileWork work(p.binning.workspace, m, parts);
+  TileSpan* spans = work.spans;
+  uint32_t *part_slots = work.part_slots, *counts = work.counts;
   const SmallOffsets offsets(tiles_x);
   parallel_for(parts, [&](int64_t part) {
     uint32_t* count = counts + part * tiles;
@@ -269,15 +258,20 @@ int64_t count_tiles(int64_t m, const uint32_t* order, const SplatRecord<T>* reco
     const uint32_t n = part_slots[part];
     part_slots[part] = slots, slots += n;
   }
-  return sum;
+  return *p.required = sum;
 }
 
 template <class V, class T = typename V::Scalar>
-void fill_tiles(int64_t m, const uint32_t* order, const SplatRecord<T>* records, int64_t tiles_x,
-                int64_t tiles_y, int64_t parts, uint32_t* counts, const TileSpan* spans,
-                const uint32_t* part_slots, uint32_t* instance_splat, uint32_t* instance_slot,
-                uint32_t* slot_range) {
-  const int64_t tiles = tiles_x * tiles_y;
+int64_t fill_tiles(const TilesFillParams<T>& p) {
+  const int64_t m = p.n, tiles_x = p.binning.tiles_x, parts = p.binning.parts;
+  const int64_t tiles = tiles_x * p.binning.tiles_y;
+  const uint32_t* order = p.binning.order;
+  const SplatRecord<T>* records = p.binning.records;
+  uint32_t *instance_splat = p.instance_splat, *instance_slot = p.instance_slot;
+  uint32_t* slot_range = p.slot_range;
+  const TileWork work(p.binning.workspace, m, parts);
+  TileSpan* spans = work.spans;
+  uint32_t *part_slots = work.part_slots, *counts = work.counts;
   const SmallOffsets offsets(tiles_x);
   parallel_for(parts, [&](int64_t part) {
     uint32_t *next = counts + part * tiles, slot = part_slots[part];
@@ -300,13 +294,17 @@ void fill_tiles(int64_t m, const uint32_t* order, const SplatRecord<T>* records,
       slot_range[2 * splat] = first_slot, slot_range[2 * splat + 1] = slot;
     }
   });
+  return 0;
 }
 
-// Sums each splat's slots in slot order and writes (or, for further channel groups, adds) its row
-// of the packed gradient. `channels` colours of the group went to `columns`.
+// Sums each splat's slots in slot order and writes (or, for further groups of channels, adds) its
+// row of the packed gradient.
 template <class V, class T = typename V::Scalar>
-void reduce(int64_t m, const T* slots, const uint32_t* slot_range, const T* packed, int64_t stride,
-            int64_t channels, const int64_t* columns, bool add, T* grad) {
+int64_t reduce(const SplatsReduceParams<T>& p) {
+  const int64_t m = p.n, stride = p.stride, channels = p.channels;
+  const T* slots = p.slots;
+  const uint32_t* slot_range = p.slot_range;
+  const bool add = p.add != 0;
   constexpr int W = V::width, kVectors = kSlotWidth / W;
   const int base = channels <= 3 ? 3 : 4;
   parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
@@ -322,8 +320,8 @@ void reduce(int64_t m, const T* slots, const uint32_t* slot_range, const T* pack
         for (int k = 0; k < kVectors; k++) sum[k] += V::load(slots + s * kSlotWidth + k * W);
       alignas(64) T total[kSlotWidth];
       for (int k = 0; k < kVectors; k++) sum[k].store(total + k * W);
-      const T *row = packed + i * stride, *q = total + base;
-      T* g = grad + i * stride;
+      const T *row = p.packed + i * stride, *q = total + base;
+      T* g = p.grad_packed + i * stride;
       if (!add)
         for (int64_t k = 0; k < stride; k += W) V(0.f).store(g + k);
       if (slot_range[2 * i] == slot_range[2 * i + 1]) continue;
@@ -333,15 +331,16 @@ void reduce(int64_t m, const T* slots, const uint32_t* slot_range, const T* pack
       g[0] += d_mean[0], g[1] += d_mean[1];
       g[2] += d_conic[0], g[3] += d_conic[1], g[4] += d_conic[2];
       g[5] += d_opacity;
-      for (int k = 0; k < channels; k++) g[columns[k]] += total[k];
+      for (int k = 0; k < channels; k++) g[p.columns[k]] += total[k];
     }
   });
+  return 0;
 }
 
 template <class T>
-void recolor(int64_t m, const T* packed, int64_t stride, const int64_t* columns,
-             SplatRecord<T>* records) {
-  for (int64_t i = 0; i < m; i++) set_colors(records[i], packed + i * stride, columns);
+int64_t recolor(const SplatsRecolorParams<T>& p) {
+  for (int64_t i = 0; i < p.n; i++) set_colors(p.records[i], p.packed + i * p.stride, p.columns);
+  return 0;
 }
 
 }  // namespace
@@ -349,61 +348,25 @@ void recolor(int64_t m, const T* packed, int64_t stride, const int64_t* columns,
 
 using namespace snow;
 
-#define SNOW_TILE_ENTRIES(SUFFIX, V)                                                             \
-  SNOW_EXPORT int64_t splats_prepare##SUFFIX(                                                    \
-      int64_t m, const V::Scalar* packed, int64_t stride, double width, double height,           \
-      const int64_t* columns, SplatRecord<V::Scalar>* records, KeyOf<V::Scalar>::type* keys) {   \
-    prepare<V>(m, packed, stride, width, height, columns, records, keys);                        \
-    return 0;                                                                                    \
-  }                                                                                              \
-  SNOW_EXPORT int64_t splats_recolor##SUFFIX(int64_t m, const V::Scalar* packed, int64_t stride, \
-                                             const int64_t* columns,                             \
-                                             SplatRecord<V::Scalar>* records) {                  \
-    recolor(m, packed, stride, columns, records);                                                \
-    return 0;                                                                                    \
-  }                                                                                              \
-  SNOW_EXPORT int64_t splats_sort##SUFFIX(int64_t m, KeyOf<V::Scalar>::type* keys,               \
-                                          KeyOf<V::Scalar>::type* keys2, uint32_t* order,        \
-                                          uint32_t* order2) {                                    \
-    radix_sort(m, keys, keys2, order, order2);                                                   \
-    return 0;                                                                                    \
-  }                                                                                              \
-  /* Gives the number of instances, in *needed too. A GPU makes room for `capacity` instead. */  \
-  SNOW_EXPORT int64_t tiles_count##SUFFIX(                                                       \
-      int64_t m, const uint32_t* order, const V::Scalar*, int64_t,                               \
-      const SplatRecord<V::Scalar>* records, int64_t tiles_x, int64_t tiles_y, int64_t parts,    \
-      void* workspace, uint32_t* tile_start, int64_t /* capacity */, int64_t* needed) {          \
-    const TileWork w(workspace, m, parts);                                                       \
-    *needed = count_tiles<V>(m, order, records, tiles_x, tiles_y, parts, w.counts, tile_start,   \
-                             w.spans, w.part_slots);                                             \
-    return *needed;                                                                              \
-  }                                                                                              \
-  SNOW_EXPORT int64_t tiles_fill##SUFFIX(                                                        \
-      int64_t m, const uint32_t* order, const V::Scalar*, int64_t,                               \
-      const SplatRecord<V::Scalar>* records, int64_t tiles_x, int64_t tiles_y, int64_t parts,    \
-      void* workspace, uint32_t*, int64_t /* capacity */, uint32_t* instance_splat,              \
-      uint32_t* instance_slot, uint32_t* slot_range) {                                           \
-    const TileWork w(workspace, m, parts);                                                       \
-    fill_tiles<V>(m, order, records, tiles_x, tiles_y, parts, w.counts, w.spans, w.part_slots,   \
-                  instance_splat, instance_slot, slot_range);                                    \
-    return 0;                                                                                    \
-  }                                                                                              \
-  SNOW_EXPORT int64_t splat_record_bytes##SUFFIX(int64_t) {                                      \
-    return sizeof(SplatRecord<V::Scalar>);                                                       \
-  }                                                                                              \
-  SNOW_EXPORT int64_t splats_reduce##SUFFIX(                                                     \
-      int64_t m, const V::Scalar* slots, const uint32_t* slot_range, const V::Scalar* packed,    \
-      int64_t stride, int64_t channels, const int64_t* columns, int64_t add, V::Scalar* grad) {  \
-    reduce<V>(m, slots, slot_range, packed, stride, channels, columns, add != 0, grad);          \
-    return 0;                                                                                    \
-  }
+SNOW_ENTRY(splats_prepare, SplatsPrepareParams<float>) { return prepare<VecF>(p); }
+SNOW_ENTRY(splats_prepare_f64, SplatsPrepareParams<double>) { return prepare<VecD>(p); }
+SNOW_ENTRY(splats_recolor, SplatsRecolorParams<float>) { return recolor(p); }
+SNOW_ENTRY(splats_recolor_f64, SplatsRecolorParams<double>) { return recolor(p); }
+SNOW_ENTRY(splats_sort, SplatsSortParams<float>) { return radix_sort(p); }
+SNOW_ENTRY(splats_sort_f64, SplatsSortParams<double>) { return radix_sort(p); }
+SNOW_ENTRY(tiles_count, TilesCountParams<float>) { return count_tiles<VecF>(p); }
+SNOW_ENTRY(tiles_count_f64, TilesCountParams<double>) { return count_tiles<VecD>(p); }
+SNOW_ENTRY(tiles_fill, TilesFillParams<float>) { return fill_tiles<VecF>(p); }
+SNOW_ENTRY(tiles_fill_f64, TilesFillParams<double>) { return fill_tiles<VecD>(p); }
+SNOW_ENTRY(splats_reduce, SplatsReduceParams<float>) { return reduce<VecF>(p); }
+SNOW_ENTRY(splats_reduce_f64, SplatsReduceParams<double>) { return reduce<VecD>(p); }
 
-SNOW_TILE_ENTRIES(, VecF)
-SNOW_TILE_ENTRIES(_f64, VecD)
-
-// How many parts tiles_count and tiles_fill should be given for m splats.
-SNOW_EXPORT int64_t tiles_parts(int64_t m) { return part_count(m); }
+// Bytes of a record.
+SNOW_ENTRY(splat_record_bytes, SizeQueryParams) { return (void)p, sizeof(SplatRecord<float>); }
+SNOW_ENTRY(splat_record_bytes_f64, SizeQueryParams) { return (void)p, sizeof(SplatRecord<double>); }
+// The number of parts into which tiles_count and tiles_fill divide n splats.
+SNOW_ENTRY(tiles_parts, SizeQueryParams) { return part_count(p.n); }
 // Bytes of their workspace.
-SNOW_EXPORT int64_t tiles_workspace_bytes(int64_t m, int64_t tiles, int64_t parts) {
-  return TileWork::bytes(m, tiles, parts);
+SNOW_ENTRY(tiles_workspace_bytes, SizeQueryParams) {
+  return TileWork::bytes(p.n, p.tiles, p.parts);
 }

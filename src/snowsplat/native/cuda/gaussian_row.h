@@ -1,7 +1,8 @@
-// Rows of parameters in a block of threads, which does as many Gaussians as it has threads. Maths is
-// a thread a Gaussian. Memory is all threads together along the rows, which lie one behind the other
-// in a tensor: neighbouring threads at neighbouring numbers. Between the two, rows lie in a tile in
-// shared memory, of a stride that is odd: threads in one column of it are then in different banks.
+// Rows of parameters in a block of threads, which processes as many Gaussians as it has threads. One
+// thread computes one Gaussian; loads and stores are cooperative: all threads go along the rows,
+// which are contiguous in a tensor, so that neighbouring threads access neighbouring addresses. In
+// between, the rows are in a tile in shared memory whose stride is odd, so that the threads that
+// access one column of it use different banks.
 #pragma once
 
 #include "cuda/device.h"
@@ -21,8 +22,8 @@ constexpr int kLogitColumn = kQuatColumn + 4;
 constexpr int kDcColumn = kLogitColumn + 1;
 constexpr int kRowColumns = kDcColumn + 3;
 
-// Goes through `columns` (> 0) columns of the block's rows: f(row, column), with arrays of kBatch
-// each, as loads that do not wait for each other. Row kRowThreads stands for none.
+// Calls f(row, column) for `columns` (> 0) columns of the block's rows, with arrays of kBatch each, so
+// that loads do not wait for each other. Row kRowThreads means none.
 template <int kBatch, class F>
 SNOW_INLINE void for_each_number(int columns, const F& f) {
   const int rows_a_step = kRowThreads / columns, columns_a_step = kRowThreads % columns;
@@ -40,7 +41,8 @@ SNOW_INLINE void for_each_number(int columns, const F& f) {
 
 constexpr int kRestBatch = 8;  // of sh_rest
 
-// Calls f(constant of the degree): what is unrolled by it stays in registers.
+// Calls f with the degree as a constant: arrays that are indexed by unrolled loops then stay in
+// registers.
 template <int kValue>
 struct Constant {
   static constexpr int value = kValue;
@@ -57,8 +59,8 @@ SNOW_INLINE void with_degree(int degree, const F& f) {
 
 // The active columns of sh_rest of the Gaussians `ids` (kRowThreads + 1 of them, −1: none).
 template <int kStride, class T>
-SNOW_INLINE void load_rest(const GaussianTensors<T>& tensors, int degree, const int32_t* ids,
-                           T* tile) {
+SNOW_INLINE void load_rest(const GaussianTensors<T>& tensors, const int32_t* ids, T* tile) {
+  const int degree = int(tensors.sh_degree);
   if (degree == 0) return;
   const int64_t stride = 3 * tensors.sh_rest_rows;
   for_each_number<kRestBatch>(sh_columns(degree), [&](const int* row, const int* column) {
@@ -80,12 +82,11 @@ SNOW_INLINE void load_shape(const GaussianTensors<T>& tensors, int64_t id, Gauss
   g.opacity_logit = tensors.opacity_logits[id];
 }
 
-// The gradient of a splat, a row of 16, → those of the parameters of its Gaussian, into its row of a
-// tile, which holds sh_rest until then. `position` is the gradient of the camera's centre.
+// The gradient of a splat, a row of 16, → the gradients of the parameters of its Gaussian, in its row
+// of a tile, which holds sh_rest before. `position` is the gradient of the camera's position.
 template <class T>
-SNOW_INLINE void row_vjp(const GaussianTensors<T>& tensors, int64_t id, int degree,
-                         const PinholeCamera<T>& cam, const T* grad_splat, T* row,
-                         PoseGradient<T>& pose, T* position) {
+SNOW_INLINE void row_vjp(const GaussianTensors<T>& tensors, int64_t id, const PinholeCamera<T>& cam,
+                         const T* grad_splat, T* row, PoseGradient<T>& pose, T* position) {
   GaussianShape<T> g, d;
   load_shape(tensors, id, g);
   const SplatGradient<T> d_splat = {{grad_splat[0], grad_splat[1]},
@@ -95,7 +96,7 @@ SNOW_INLINE void row_vjp(const GaussianTensors<T>& tensors, int64_t id, int degr
   T dc[3], d_color[3], d_mean[3];
   for (int k = 0; k < 3; k++) dc[k] = tensors.sh_dc[3 * id + k];
   for (int k = 0; k < 3; k++) d_color[k] = grad_splat[kPackedHeader + k];
-  with_degree(degree, [&](auto constant) {
+  with_degree(int(tensors.sh_degree), [&](auto constant) {
     sh_color_vjp(constant.value, view_direction(g.mean, cam.position), dc, row, d_color,
                  row + kDcColumn, row, d_mean);
   });

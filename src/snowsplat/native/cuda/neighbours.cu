@@ -1,15 +1,15 @@
 // neighbours: the exact distances from each point to its k nearest others.
 //
 //   neighbours_codes    the place of each point on a space-filling curve (Morton 1966), 21 bits an axis
-//   (a sort)            so that points that follow each other are near each other
+//   (a sort)            so that consecutive points are near each other
 //   neighbours_chunks   the points in that order; the box of each chunk of 32
 //   neighbours_groups   the box of each group of 32 chunks
-//   neighbours_of_*     the search: a warp a chunk of queries, a lane a query
+//   neighbours_of_*     the search: one warp per chunk of queries, one lane per query
 //
-// A warp begins with its own chunk and those beside it on the curve, which bounds what its lanes look
-// for. Then it goes through all groups, and visits each chunk whose box is nearer to one of its
-// lanes than the worst of that lane's best. So the order decides on the time alone: the result
-// is exact, also where all points fall into one cell of the curve.
+// A warp begins with its own chunk and the adjacent ones on the curve, which bounds the distances that
+// its lanes search for. It then goes through all groups and visits each chunk whose box is nearer to
+// one of its queries than the worst of the k best found so far. The order only affects the time: the
+// result is exact, even where all points fall into one cell of the curve.
 #include "cuda/device.h"
 
 namespace snow {
@@ -35,6 +35,46 @@ struct alignas(16) Box {
 };
 
 template <class T>
+struct NeighboursCodesParams {
+  int64_t n;        // points
+  const T* points;  // (n, 3)
+  const T* low;     // (3,) corner of the box of all points
+  const T* high;    // (3,)
+  uint64_t* codes;  // out, (n,)
+  SNOW_FIELDS(n, points, low, high, codes)
+};
+
+template <class T>
+struct NeighboursChunksParams {
+  int64_t n;             // points
+  const T* points;       // (n, 3)
+  const int32_t* order;  // (n,) by their codes
+  T* ordered;            // out, (n, 3) points in that order
+  Box<T>* boxes;         // out, one per chunk of 32
+  SNOW_FIELDS(n, points, order, ordered, boxes)
+};
+
+template <class T>
+struct NeighboursGroupsParams {
+  int64_t n;                  // chunks
+  const Box<T>* chunk_boxes;  // (n,)
+  Box<T>* boxes;              // out, one per group of 32
+  SNOW_FIELDS(n, chunk_boxes, boxes)
+};
+
+template <class T>
+struct NeighboursSearchParams {
+  int64_t n;                  // points
+  const T* points;            // (n, 3) in the order of their codes
+  const int32_t* order;       // (n,)
+  const Box<T>* chunk_boxes;  // one per chunk
+  const Box<T>* group_boxes;  // one per group
+  int64_t k;                  // neighbours of each point
+  T* distances;               // out, (n, k)
+  SNOW_FIELDS(n, points, order, chunk_boxes, group_boxes, k, distances)
+};
+
+template <class T>
 SNOW_INLINE T gap(T below, T above) {
   return max(max(below, above), T(0));
 }
@@ -42,8 +82,8 @@ template <class T>
 SNOW_INLINE T squared(T x, T y, T z) {
   return x * x + y * y + z * z;
 }
-// Squared distances, by the same operations for all, so that rounding does not put a point nearer
-// than its box.
+// Squared distances, all by the same operations, so that rounding never makes a point nearer than its
+// box.
 template <class T>
 SNOW_INLINE T away(const Point<T>& a, const Point<T>& b) {
   return squared(a.x - b.x, a.y - b.y, a.z - b.z);
@@ -71,7 +111,7 @@ template <class T>
 SNOW_INLINE T warp_max(T value) {
   return -warp_min(-value);
 }
-// The box around those of the lanes.
+// The box around the boxes of all lanes.
 template <class T>
 SNOW_INLINE Box<T> warp_box(const Box<T>& b) {
   return {{warp_min(b.low.x), warp_min(b.low.y), warp_min(b.low.z), T(0)},
@@ -108,7 +148,7 @@ SNOW_INLINE void codes(int n, const T* points, const T* low, const T* high, uint
   out[i] = code;
 }
 
-// A warp a chunk. order: the points by their codes.
+// One warp per chunk. order: the points by their codes.
 template <class T>
 SNOW_INLINE void chunks(int n, const T* points, const int32_t* order, T* ordered, Box<T>* boxes) {
   const int64_t i = thread_index();
@@ -123,7 +163,7 @@ SNOW_INLINE void chunks(int n, const T* points, const int32_t* order, T* ordered
   if (lane_id() == 0 && i < n) boxes[i / kWarp] = box;
 }
 
-// A warp a group.
+// One warp per group.
 template <class T>
 SNOW_INLINE void groups(int chunk_count, const Box<T>* chunk_boxes, Box<T>* boxes) {
   const int64_t i = thread_index();
@@ -134,8 +174,8 @@ SNOW_INLINE void groups(int chunk_count, const Box<T>* chunk_boxes, Box<T>* boxe
   if (lane_id() == 0 && i < chunk_count) boxes[i / kWarp] = box;
 }
 
-// The kBest smallest squared distances so far, ascending. For k < kBest the first ones are taken from
-// the beginning, by a distance below all; in a lane without a query all are.
+// The kBest smallest squared distances so far, ascending. For k < kBest the first ones are occupied from
+// the beginning by a distance below all others; in a lane without a query all are.
 template <class T, int kBest>
 struct Best {
   T distances[kBest];
@@ -154,14 +194,15 @@ struct Best {
 };
 
 template <int kBest, class T>
-SNOW_INLINE void search(int n, const T* points, const int32_t* order, const Box<T>* chunk_boxes,
-                        const Box<T>* group_boxes, int k, T* distances) {
+SNOW_INLINE void search(int n, const T* __restrict__ points, const int32_t* __restrict__ order,
+                        const Box<T>* __restrict__ chunk_boxes,
+                        const Box<T>* __restrict__ group_boxes, int k, T* __restrict__ distances) {
   SNOW_SHARED(Point<T>, shared, kThreads);
   Point<T>* const chunk_points = shared + warp_id() * kWarp;
   const int chunk_count = (n + kWarp - 1) / kWarp;
   const int group_count = (chunk_count + kWarp - 1) / kWarp;
   const int own = int(blockIdx.x) * kWarps + warp_id();
-  if (own >= chunk_count) return;  // the whole warp; no barrier of the block follows
+  if (own >= chunk_count) return;  // the complete warp; no barrier of the block follows
   const T inf = infinity<T>();
 
   // Beyond the last point: infinitely far from every query.
@@ -219,32 +260,27 @@ SNOW_INLINE void search(int n, const T* points, const int32_t* order, const Box<
 }  // namespace
 }  // namespace snow
 
-#define SNOW_NEIGHBOURS_SEARCH(BEST, SUFFIX, T)                                                    \
-  SNOW_KERNEL(                                                                                     \
-      neighbours_of_##BEST##SUFFIX, 128,                                                           \
-      (int64_t n, const T* __restrict__ points, const int32_t* __restrict__ order,                 \
-       const snow::Box<T>* __restrict__ chunk_boxes, const snow::Box<T>* __restrict__ group_boxes, \
-       int64_t k, T* __restrict__ distances)) {                                                    \
-    snow::search<BEST>(int(n), points, order, chunk_boxes, group_boxes, int(k), distances);        \
+using namespace snow;
+
+#define SNOW_NEIGHBOURS_SEARCH(BEST, SUFFIX, T)                                       \
+  SNOW_KERNEL(neighbours_of_##BEST##SUFFIX, kThreads, NeighboursSearchParams<T>) {    \
+    search<BEST>(int(p.n), p.points, p.order, p.chunk_boxes, p.group_boxes, int(p.k), \
+                 p.distances);                                                        \
   }
 
-#define SNOW_NEIGHBOURS_KERNELS(SUFFIX, T)                                                   \
-  SNOW_KERNEL(neighbours_codes##SUFFIX, 128,                                                 \
-              (int64_t n, const T* points, const T* low, const T* high, uint64_t* codes)) {  \
-    snow::codes(int(n), points, low, high, codes);                                           \
-  }                                                                                          \
-  SNOW_KERNEL(                                                                               \
-      neighbours_chunks##SUFFIX, 128,                                                        \
-      (int64_t n, const T* points, const int32_t* order, T* ordered, snow::Box<T>* boxes)) { \
-    snow::chunks(int(n), points, order, ordered, boxes);                                     \
-  }                                                                                          \
-  SNOW_KERNEL(neighbours_groups##SUFFIX, 128,                                                \
-              (int64_t chunks, const snow::Box<T>* chunk_boxes, snow::Box<T>* boxes)) {      \
-    snow::groups(int(chunks), chunk_boxes, boxes);                                           \
-  }                                                                                          \
-  SNOW_NEIGHBOURS_SEARCH(1, SUFFIX, T)                                                       \
-  SNOW_NEIGHBOURS_SEARCH(3, SUFFIX, T)                                                       \
-  SNOW_NEIGHBOURS_SEARCH(8, SUFFIX, T)                                                       \
+#define SNOW_NEIGHBOURS_KERNELS(SUFFIX, T)                                      \
+  SNOW_KERNEL(neighbours_codes##SUFFIX, kThreads, NeighboursCodesParams<T>) {   \
+    codes(int(p.n), p.points, p.low, p.high, p.codes);                          \
+  }                                                                             \
+  SNOW_KERNEL(neighbours_chunks##SUFFIX, kThreads, NeighboursChunksParams<T>) { \
+    chunks(int(p.n), p.points, p.order, p.ordered, p.boxes);                    \
+  }                                                                             \
+  SNOW_KERNEL(neighbours_groups##SUFFIX, kThreads, NeighboursGroupsParams<T>) { \
+    groups(int(p.n), p.chunk_boxes, p.boxes);                                   \
+  }                                                                             \
+  SNOW_NEIGHBOURS_SEARCH(1, SUFFIX, T)                                          \
+  SNOW_NEIGHBOURS_SEARCH(3, SUFFIX, T)                                          \
+  SNOW_NEIGHBOURS_SEARCH(8, SUFFIX, T)                                          \
   SNOW_NEIGHBOURS_SEARCH(64, SUFFIX, T)
 
 SNOW_NEIGHBOURS_KERNELS(, float)

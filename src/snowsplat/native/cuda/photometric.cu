@@ -1,18 +1,19 @@
 // photometric: L1 and SSIM between two images, and the gradient of their weighted sum.
 //
-// Images are planar, (channels, H, W), each plane of fewer than 2³¹ pixels. A block does a tile of one
-// channel, 32 columns wide: it loads the tile with a margin of 5, filters the rows into shared
-// memory, then the columns from there. The Gaussian window is separable and symmetric, and sees
-// zeros outside of the image, so the same two passes, over the maps of derivatives, are its adjoint.
+// Images are planar, (channels, H, W), each plane of fewer than 2³¹ pixels. A block processes a tile of
+// one channel, 32 columns wide: it loads the tile with a margin of 5, filters the rows into shared
+// memory, then the columns from there. The Gaussian window is separable and symmetric, and the image
+// is padded with zeros, so the same two passes over the maps of derivatives are its adjoint.
 //
-//   photometric_similarity   SSIM a pixel; sums a block; the three derivatives of SSIM, as maps
-//   photometric_gradient     the filtered maps make the gradient, L1 is added
-//   photometric_means        adds the sums of the blocks, in order: the same bits in every run
+//   photometric_similarity   SSIM per pixel, sums per block, the three derivatives of SSIM as maps
+//   photometric_gradient     the gradient from the filtered maps, plus that of L1
+//   photometric_means        adds the sums of the blocks in order: bit-identical in every run
 //
-// The maps go through memory. To do without them, a block would load its tile with a margin of 10
-// and filter all of it: by count half as much arithmetic again, and more shared memory than a block
-// may have without asking (48 kB). Instead photometric.py takes few channels at a time where images
-// are large (one of 1920×1080: maps of 25 MB), and the caches of larger GPUs hold most of that.
+// The maps go through global memory. Without them, a block would have to load its tile with a margin
+// of 10 and filter all of it: about half as much arithmetic again, and more than the 48 kB of shared
+// memory that a block has by default. Instead photometric.py processes few channels at a time if
+// images are large (for one of 1920×1080 the maps have 25 MB), which the caches of larger GPUs mostly
+// hold.
 #include "cuda/device.h"
 #include "ssim.h"
 
@@ -20,17 +21,16 @@ namespace snow {
 namespace {
 
 constexpr int kThreads = 192, kWarps = kThreads / kWarp;
-constexpr int kTaps = 2 * kSsimRadius + 1;
 
-constexpr int kColumns = kWarp;                           // of a tile: a lane a column
+constexpr int kColumns = kWarp;                           // of a tile: one lane per column
 constexpr int kWideColumns = kColumns + 2 * kSsimRadius;  // with its margins
 // Odd, so that the lanes of a warp, in 8 rows × every 8th column, use different banks.
 constexpr int kWidePitch = kWideColumns + 1, kPitch = kColumns + 1;
 constexpr int kRun = 8;  // neighbouring pixels of a row that a thread filters together
 constexpr int kRuns = kColumns / kRun;
 
-// Rows of a tile: in float as many as leave room for two blocks on the smallest of the GPUs, in
-// double as many as fit. photometric.py knows them too.
+// Rows of a tile: in float as many as allow two blocks per multiprocessor on the smallest GPUs, in
+// double as many as fit. photometric.py computes the number of blocks from the same size.
 template <class T>
 struct Tile {
   static constexpr int kOwnRows = sizeof(T) == 4 ? 4 : 2;  // of a thread, in the second pass
@@ -47,16 +47,37 @@ struct Tile {
   }
 };
 
-// exp(−x²/(2·1.5²)) / Σ for x = k − 5. Everything that calls it is unrolled: a constant.
-SNOW_INLINE double window_tap(int k) {
-  const int x = k < kSsimRadius ? kSsimRadius - k : k - kSsimRadius;
-  return x == 0   ? 0.26601172486179436
-         : x == 1 ? 0.2130055377112537
-         : x == 2 ? 0.10936068950970002
-         : x == 3 ? 0.03600077212843083
-         : x == 4 ? 0.007598758135239185
-                  : 0.00102838008447911;
-}
+template <class T, class Target>
+struct PhotometricSimilarityParams {
+  int64_t n;              // channels
+  int64_t width, height;  // pixels
+  const T* image;         // (n, height, width)
+  const Target* target;   // (n, height, width)
+  T* maps;       // out, (n, 3, height, width), or null: the derivatives of SSIM with respect
+                 // to the windowed means of a, of a² + b² and of ab
+  double* sums;  // out, (blocks, 2) of |a − b| and of SSIM
+  SNOW_FIELDS(n, width, height, image, target, maps, sums)
+};
+
+template <class T, class Target>
+struct PhotometricGradientParams {
+  int64_t n;                      // channels
+  int64_t width, height;          // pixels
+  const T* image;                 // (n, height, width)
+  const Target* target;           // (n, height, width)
+  const T* maps;                  // (n, 3, height, width)
+  double l1_weight, ssim_weight;  // divided by the number of values
+  T* grad;                        // out, (n, height, width)
+  SNOW_FIELDS(n, width, height, image, target, maps, l1_weight, ssim_weight, grad)
+};
+
+struct PhotometricMeansParams {
+  int64_t n;           // blocks
+  const double* sums;  // (n, 2)
+  int64_t values;      // of the images
+  double* means;       // out, (2,)
+  SNOW_FIELDS(n, sums, values, means)
+};
 
 template <class T>
 SNOW_INLINE T pixel(const T* p, int at) {
@@ -82,10 +103,10 @@ SNOW_INLINE void load_tile(const Tile<T>& tile, int width, int height, Load load
   }
 }
 
-// Filters the rows of a wide tile: from what values(place in it, kMaps values) gives to `rows`.
+// Filters the rows of a wide tile: from what values(place in it, kMaps values) returns into `rows`.
 template <int kMaps, class T, class Values>
 SNOW_INLINE void filter_rows(T* rows, Values values) {
-  static_assert(Tile<T>::kWideRows * kRuns <= kThreads, "a thread does one run at most");
+  static_assert(Tile<T>::kWideRows * kRuns <= kThreads, "at most one run per thread");
   const int run = int(threadIdx.x);
   if (run < Tile<T>::kWideRows * kRuns) {
     const int row = run / kRuns, x = run % kRuns * kRun;
@@ -97,9 +118,9 @@ SNOW_INLINE void filter_rows(T* rows, Values values) {
 #pragma unroll
       for (int i = 0; i < kRun; i++) {
         const int k = j - i;
-        if (k < 0 || k >= kTaps) continue;
+        if (k < 0 || k >= kSsimTaps) continue;
 #pragma unroll
-        for (int m = 0; m < kMaps; m++) sums[m][i] += T(window_tap(k)) * value[m];
+        for (int m = 0; m < kMaps; m++) sums[m][i] += T(ssim_tap(k)) * value[m];
       }
     }
 #pragma unroll
@@ -121,12 +142,12 @@ SNOW_INLINE void filter_column(const T* rows, int first, T (&sums)[kMaps][Tile<T
       const T value = rows[m * Tile<T>::kCount + (first + j) * kPitch + lane_id()];
 #pragma unroll
       for (int i = 0; i < Tile<T>::kOwnRows; i++)
-        if (j - i >= 0 && j - i < kTaps) sums[m][i] += T(window_tap(j - i)) * value;
+        if (j - i >= 0 && j - i < kSsimTaps) sums[m][i] += T(ssim_tap(j - i)) * value;
     }
   }
 }
 
-// Over the lanes of a warp; all have it.
+// The sum over the lanes of a warp, in all of them.
 template <class T>
 SNOW_INLINE T warp_sum(T value) {
 #pragma unroll
@@ -134,11 +155,10 @@ SNOW_INLINE T warp_sum(T value) {
   return value;
 }
 
-// maps: (channels, 3, H, W), the derivatives by the mean of a, of a² + b² and of ab; may be null.
-// sums: (blocks, 2), of |a − b| and of SSIM.
 template <class T, class Target>
-SNOW_INLINE void similarity(int width, int height, const T* image, const Target* target, T* maps,
-                            double* sums) {
+SNOW_INLINE void similarity(int width, int height, const T* __restrict__ image,
+                            const Target* __restrict__ target, T* __restrict__ maps,
+                            double* __restrict__ sums) {
   SNOW_SHARED(T, a, Tile<T>::kWideCount);
   SNOW_SHARED(T, b, Tile<T>::kWideCount);
   SNOW_SHARED(T, rows, 4 * Tile<T>::kCount);
@@ -188,13 +208,13 @@ SNOW_INLINE void similarity(int width, int height, const T* image, const Target*
   }
 }
 
-// The weights are already divided by the number of values.
 template <class T, class Target>
-SNOW_INLINE void gradient(int width, int height, const T* image, const Target* target,
-                          const T* maps, double l1_weight, double ssim_weight, T* grad) {
+SNOW_INLINE void gradient(int width, int height, const T* __restrict__ image,
+                          const Target* __restrict__ target, const T* __restrict__ maps,
+                          double l1_weight, double ssim_weight, T* __restrict__ grad) {
   SNOW_SHARED(T, derivatives, 3 * Tile<T>::kWideCount);
   SNOW_SHARED(T, rows, 3 * Tile<T>::kCount);
-  // Converted once a block: GPUs for graphics are slow at anything with double.
+  // Converted once per block: consumer GPUs are slow at double.
   SNOW_SHARED(T, weights, 2);
   if (threadIdx.x == 0) weights[0] = T(l1_weight), weights[1] = T(ssim_weight);
   const Tile<T> tile(width, height);
@@ -203,7 +223,7 @@ SNOW_INLINE void gradient(int width, int height, const T* image, const Target* t
   maps += 3 * tile.channel * plane;
   const T* const map[3] = {maps, maps + plane, maps + 2 * plane};
 
-  // Windows are centred on pixels of the image only: outside of it the derivatives are 0.
+  // Windows are centred only on pixels of the image: outside of it the derivatives are 0.
   load_tile(tile, width, height, [&](int place, int at) {
 #pragma unroll
     for (int m = 0; m < 3; m++)
@@ -235,18 +255,15 @@ SNOW_INLINE void gradient(int width, int height, const T* image, const Target* t
 }  // namespace
 }  // namespace snow
 
-#define SNOW_PHOTOMETRIC_KERNELS(SUFFIX, T, TARGET)                                                \
-  SNOW_KERNEL(                                                                                     \
-      photometric_similarity##SUFFIX, 192,                                                         \
-      (int64_t, int64_t width, int64_t height, const T* __restrict__ image,                        \
-       const TARGET* __restrict__ target, T* __restrict__ maps, double* __restrict__ sums)) {      \
-    snow::similarity<T>(int(width), int(height), image, target, maps, sums);                       \
-  }                                                                                                \
-  SNOW_KERNEL(photometric_gradient##SUFFIX, 192,                                                   \
-              (int64_t, int64_t width, int64_t height, const T* __restrict__ image,                \
-               const TARGET* __restrict__ target, const T* __restrict__ maps, double l1_weight,    \
-               double ssim_weight, T* __restrict__ grad)) {                                        \
-    snow::gradient<T>(int(width), int(height), image, target, maps, l1_weight, ssim_weight, grad); \
+using namespace snow;
+
+#define SNOW_PHOTOMETRIC_KERNELS(SUFFIX, T, TARGET)                                               \
+  SNOW_KERNEL(photometric_similarity##SUFFIX, kThreads, PhotometricSimilarityParams<T, TARGET>) { \
+    similarity(int(p.width), int(p.height), p.image, p.target, p.maps, p.sums);                   \
+  }                                                                                               \
+  SNOW_KERNEL(photometric_gradient##SUFFIX, kThreads, PhotometricGradientParams<T, TARGET>) {     \
+    gradient(int(p.width), int(p.height), p.image, p.target, p.maps, p.l1_weight, p.ssim_weight,  \
+             p.grad);                                                                             \
   }
 
 SNOW_PHOTOMETRIC_KERNELS(, float, float)
@@ -255,17 +272,16 @@ SNOW_PHOTOMETRIC_KERNELS(_f64, double, double)
 SNOW_PHOTOMETRIC_KERNELS(_u8_f64, double, uint8_t)
 
 // One block: means[0] = Σ |a − b| / values, means[1] = Σ SSIM / values.
-SNOW_KERNEL(photometric_means, 256,
-            (int64_t n, const double* __restrict__ sums, int64_t values, double* means)) {
+SNOW_KERNEL(photometric_means, 256, PhotometricMeansParams) {
   SNOW_SHARED(double, partial, 256 * 2);
   const int t = int(threadIdx.x);
   double l1 = 0, ssim = 0;
-  for (int64_t i = t; i < n; i += 256) l1 += sums[2 * i], ssim += sums[2 * i + 1];
+  for (int64_t i = t; i < p.n; i += 256) l1 += p.sums[2 * i], ssim += p.sums[2 * i + 1];
   partial[t] = l1, partial[256 + t] = ssim;
   __syncthreads();
   for (int half = 128; half > 0; half /= 2) {
     if (t < half) partial[t] += partial[t + half], partial[256 + t] += partial[256 + t + half];
     __syncthreads();
   }
-  if (t < 2) means[t] = partial[256 * t] / double(values);
+  if (t < 2) p.means[t] = partial[256 * t] / double(p.values);
 }

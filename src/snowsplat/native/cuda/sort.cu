@@ -1,5 +1,5 @@
-// Prefix sums and a radix sort of any length, for the other parts of the engine. No block waits for
-// another: what needs the results of all blocks is a kernel of its own (see ops/cuda/sorting.py).
+// Prefix sums and a radix sort of any length, for the other kernels. No block waits for another: what
+// needs the results of all blocks is a separate kernel (see ops/cuda/sorting.py).
 //
 //   scan_sums, scan_of_sums, scan_apply   an exclusive prefix sum
 //   sort_count, sort_offsets, sort_scatter   one pass of the sort, by one digit of at most 8 bits
@@ -12,9 +12,43 @@ namespace {
 
 constexpr int kThreads = 256;
 
+// An exclusive prefix sum. scan_of_sums has as many items as scan_sums has blocks.
+struct ScanParams {
+  int64_t n;               // items
+  const uint32_t* values;  // (n,)
+  uint64_t* sums;          // one per block of 1024 values; then the sum of the blocks before
+  uint32_t* out;           // (n,) may be `values`
+  int64_t* total;          // out, (1,)
+  SNOW_FIELDS(n, values, sums, out, total)
+};
+
+// One pass of the sort, by `bits` bits (at most 8) from bit `shift` on.
+template <class Key>
+struct SortPassParams {
+  int64_t n;               // pairs that memory is allocated for
+  const Key* keys;         // (n,)
+  const uint32_t* values;  // (n,), or null: 0, 1, …
+  Key* keys_out;           // out, (n,)
+  uint32_t* values_out;    // out, (n,)
+  int64_t shift, bits;
+  int64_t blocks;          // of sort_count and sort_scatter
+  uint32_t* counts;        // (2^bits, blocks)
+  const uint32_t* totals;  // (2^bits,); `counts` if there is one block
+  const int64_t* count;    // (1,) the number of pairs, or null: n
+  SNOW_FIELDS(n, keys, values, keys_out, values_out, shift, bits, blocks, counts, totals, count)
+};
+
+// Between them: the sums of the counts of the blocks before.
+struct SortOffsetsParams {
+  int64_t n;         // blocks
+  uint32_t* counts;  // (digits, n)
+  uint32_t* totals;  // out, (digits,)
+  SNOW_FIELDS(n, counts, totals)
+};
+
 // ---- Prefix sum ---------------------------------------------------------------------------------
 
-constexpr int kScanItems = 4;  // of a thread, one after the other
+constexpr int kScanItems = 4;  // consecutive items of a thread
 
 struct ScanItems {
   uint32_t value[kScanItems];
@@ -38,7 +72,7 @@ SNOW_INLINE void sum_blocks(int64_t n, const uint32_t* values, uint64_t* sums) {
   if (threadIdx.x == 0) sums[blockIdx.x] = scan.total;
 }
 
-// One block. Replaces the sums by those of the blocks before.
+// One block. Replaces each sum by the sum of those before it.
 SNOW_INLINE void scan_blocks(int64_t n, uint64_t* sums, int64_t* total) {
   uint64_t carry = 0;
   for (int64_t first = 0; first < n; first += kThreads) {
@@ -50,8 +84,8 @@ SNOW_INLINE void scan_blocks(int64_t n, uint64_t* sums, int64_t* total) {
   if (threadIdx.x == 0) *total = int64_t(carry);
 }
 
-// `out` may be `values`. What does not fit into 32 bits becomes the largest number that does, and
-// is then beyond whatever memory there is.
+// Sums that do not fit into 32 bits become the largest number that does, which is beyond any
+// allocated memory.
 SNOW_INLINE void apply_scan(int64_t n, const uint32_t* values, const uint64_t* sums,
                             uint32_t* out) {
   const ScanItems items = load_scan_items(n, values);
@@ -87,13 +121,13 @@ SNOW_INLINE Digit digit_at(int64_t shift, int64_t bits) {
   return {int(shift), (1u << int(bits)) - 1};
 }
 
-// How many of n items there are: the number may be known on the GPU only.
+// How many of the n items there are: the number may be known only on the GPU.
 SNOW_INLINE int64_t valid_items(int64_t n, const int64_t* count) {
   return count && *count < n ? *count : n;
 }
 
-// The lanes that have the same digit. A vote for each of its bits: unlike the instruction that
-// compares whole values, it takes as long for many digits as for few.
+// The lanes that have the same digit. One vote per bit: unlike the instruction that compares complete
+// values, the time does not depend on the number of different digits.
 SNOW_INLINE uint32_t lanes_with(int digit) {
   uint32_t same = kAllLanes;
 #pragma unroll
@@ -105,17 +139,15 @@ SNOW_INLINE uint32_t lanes_with(int digit) {
   return same;
 }
 
-SNOW_INLINE uint32_t lanes_below() { return (1u << lane_id()) - 1; }
-
 // counts[digit · blocks + block]: how often the digit is in the keys of a block.
 template <class Key>
-SNOW_INLINE void count_digits(int64_t n, const Key* keys, Digit digit_of, int64_t blocks,
-                              uint32_t* counts, const int64_t* count) {
+SNOW_INLINE void count_digits(const SortPassParams<Key>& p) {
   constexpr int kItems = kSortItems<Key>;
+  const Digit digit_of = digit_at(p.shift, p.bits);
   SNOW_SHARED(uint32_t, histogram, kDigits);
   histogram[threadIdx.x] = 0;
   __syncthreads();
-  const int64_t valid = valid_items(n, count);
+  const int64_t valid = valid_items(p.n, p.count);
   const int64_t first = int64_t(blockIdx.x) * (kThreads * kItems);
   if (first < valid) {
     const int64_t left = valid - first;
@@ -123,18 +155,19 @@ SNOW_INLINE void count_digits(int64_t n, const Key* keys, Digit digit_of, int64_
     for (int k = 0; k < kItems; k++) {
       const int at = k * kThreads + int(threadIdx.x);
       const bool is_valid = at < left;
-      const int digit = is_valid ? digit_of(keys[first + at]) : 0;
-      // One lane adds for all that have its digit, because often most of them do.
+      const int digit = is_valid ? digit_of(p.keys[first + at]) : 0;
+      // One lane adds for all lanes with its digit: often most of them have the same.
       const uint32_t same = lanes_with(digit) & __ballot_sync(kAllLanes, is_valid);
       if (is_valid && (same & lanes_below()) == 0) atomicAdd(&histogram[digit], __popc(same));
     }
   }
   __syncthreads();
   if (threadIdx.x <= digit_of.mask)
-    counts[int64_t(threadIdx.x) * blocks + blockIdx.x] = histogram[threadIdx.x];
+    p.counts[int64_t(threadIdx.x) * p.blocks + blockIdx.x] = histogram[threadIdx.x];
 }
 
-// A block a digit: its counts become the sums of those of the blocks before, totals[digit] of all.
+// One block per digit: its counts become the sums of the counts of the blocks before, and
+// totals[digit] the sum of all.
 SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals) {
   uint32_t* row = counts + int64_t(blockIdx.x) * blocks;
   uint32_t carry = 0;
@@ -158,13 +191,12 @@ SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals)
   if (threadIdx.x == 0) totals[blockIdx.x] = carry;
 }
 
-// Each warp has kItems × 32 keys in a row. It goes through them 32 at a time and ranks them among
-// those of its own with the same digit; from the tallies of all warps follows the place of a key in
-// the block's keys in the order of their digits. In this order they go to shared memory and from
-// there out, so that neighbouring threads write to neighbouring addresses; the values follow. What
-// is not valid is at the end and has the last digit, so that it stays at the end.
-// One block alone has no others to add, so that sort_offsets may be left out: its counts are the
-// totals.
+// Each warp has kItems × 32 consecutive keys. It ranks them, 32 at a time, among its own keys with the
+// same digit; the tallies of all warps then give the place of a key in the block's keys sorted by
+// digit. In this order the keys go to shared memory and from there out, so that neighbouring threads
+// write to neighbouring addresses; the values follow. Invalid items are at the end and have the last
+// digit, so they stay at the end.
+// A single block has no others to add: sort_offsets may be skipped, and its counts are the totals.
 template <class Key>
 SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const uint32_t* values,
                                Key* keys_out, uint32_t* values_out, Digit digit_of, int64_t blocks,
@@ -213,7 +245,8 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
       tally[w * kDigits + thread] = uint16_t(sum);
       sum += c;
     }
-    // Two scans in one: of the digits of this block, and above them of those of all.
+    // Two scans in one: the digits of this block in the low half, those of all blocks in the high
+    // half.
     const uint64_t both = uint64_t(is_digit ? totals[thread] : 0) << 32 | sum;
     const uint64_t before = block_scan<kThreads>(both).before;
     const uint32_t here = uint32_t(before);
@@ -257,14 +290,12 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
 }
 
 template <class Key>
-SNOW_INLINE void scatter(int64_t n, const Key* keys, const uint32_t* values, Key* keys_out,
-                         uint32_t* values_out, Digit digit_of, int64_t blocks,
-                         const uint32_t* counts, const uint32_t* totals, const int64_t* count) {
+SNOW_INLINE void scatter(const SortPassParams<Key>& p) {
   constexpr int kAll = kThreads * kSortItems<Key>;
-  const int64_t first = int64_t(blockIdx.x) * kAll, left = valid_items(n, count) - first;
+  const int64_t first = int64_t(blockIdx.x) * kAll, left = valid_items(p.n, p.count) - first;
   if (left > 0)
-    scatter_block(first, left < kAll ? int(left) : kAll, keys, values, keys_out, values_out,
-                  digit_of, blocks, counts, totals);
+    scatter_block(first, left < kAll ? int(left) : kAll, p.keys, p.values, p.keys_out, p.values_out,
+                  digit_at(p.shift, p.bits), p.blocks, p.counts, p.totals);
 }
 
 }  // namespace
@@ -272,35 +303,14 @@ SNOW_INLINE void scatter(int64_t n, const Key* keys, const uint32_t* values, Key
 
 using namespace snow;
 
-SNOW_KERNEL(scan_sums, 256, (int64_t n, const uint32_t* values, uint64_t* sums)) {
-  sum_blocks(n, values, sums);
-}
-SNOW_KERNEL(scan_of_sums, 256, (int64_t n, uint64_t* sums, int64_t* total)) {
-  scan_blocks(n, sums, total);
-}
-SNOW_KERNEL(scan_apply, 256,
-            (int64_t n, const uint32_t* values, const uint64_t* sums, uint32_t* out)) {
-  apply_scan(n, values, sums, out);
-}
-SNOW_KERNEL(sort_offsets, 256, (int64_t blocks, uint32_t* counts, uint32_t* totals)) {
-  scan_counts(blocks, counts, totals);
-}
+SNOW_KERNEL(scan_sums, kThreads, ScanParams) { sum_blocks(p.n, p.values, p.sums); }
+SNOW_KERNEL(scan_of_sums, kThreads, ScanParams) { scan_blocks(p.n, p.sums, p.total); }
+SNOW_KERNEL(scan_apply, kThreads, ScanParams) { apply_scan(p.n, p.values, p.sums, p.out); }
 
-// `count` (how many of the n there are) and `values` (the rows' numbers then) may be null.
-#define SNOW_SORT_KERNELS(SUFFIX, KEY)                                                            \
-  SNOW_KERNEL(sort_count_##SUFFIX, 256,                                                           \
-              (int64_t n, const KEY* keys, int64_t shift, int64_t bits, int64_t blocks,           \
-               uint32_t* counts, const int64_t* count)) {                                         \
-    count_digits(n, keys, digit_at(shift, bits), blocks, counts, count);                          \
-  }                                                                                               \
-  SNOW_KERNEL(sort_scatter_##SUFFIX, 256,                                                         \
-              (int64_t n, const KEY* keys, const uint32_t* values, KEY* keys_out,                 \
-               uint32_t* values_out, int64_t shift, int64_t bits, int64_t blocks,                 \
-               const uint32_t* counts, const uint32_t* totals, const int64_t* count)) {           \
-    scatter(n, keys, values, keys_out, values_out, digit_at(shift, bits), blocks, counts, totals, \
-            count);                                                                               \
-  }
-
-SNOW_SORT_KERNELS(u16, uint16_t)
-SNOW_SORT_KERNELS(u32, uint32_t)
-SNOW_SORT_KERNELS(u64, uint64_t)
+SNOW_KERNEL(sort_count_u16, kThreads, SortPassParams<uint16_t>) { count_digits(p); }
+SNOW_KERNEL(sort_count_u32, kThreads, SortPassParams<uint32_t>) { count_digits(p); }
+SNOW_KERNEL(sort_count_u64, kThreads, SortPassParams<uint64_t>) { count_digits(p); }
+SNOW_KERNEL(sort_offsets, kThreads, SortOffsetsParams) { scan_counts(p.n, p.counts, p.totals); }
+SNOW_KERNEL(sort_scatter_u16, kThreads, SortPassParams<uint16_t>) { scatter(p); }
+SNOW_KERNEL(sort_scatter_u32, kThreads, SortPassParams<uint32_t>) { scatter(p); }
+SNOW_KERNEL(sort_scatter_u64, kThreads, SortPassParams<uint64_t>) { scatter(p); }

@@ -4,33 +4,75 @@
 //   tiles_fill       the instances, pairs of a tile and a splat, in that order; then sorted by tile
 //   tiles_start      where the instances of each tile begin
 //   splats_reduce    sums the gradients of a splat's tiles in a fixed order
-// A splat touches the same tiles as on the CPU (native/cpu/tiles.cpp), but that the image counts as
-// whole tiles. Where it may touch many, a warp looks at them side by side.
+// A splat touches the same tiles as on the CPU (native/cpu/tiles.cpp), except that the image is
+// extended to a multiple of the tile size. A splat that may touch many tiles is tested by a warp.
 #include "cuda/device.h"
-// (the first, because it has the integer types)
-#include "blend.h"
 #include "cuda/scan.h"
+#include "rasterize.h"
 
 namespace snow {
 namespace {
 
 constexpr int kThreads = 256, kWarps = kThreads / kWarp;
-constexpr int kSmall = 32;      // tiles of a rectangle that one thread looks at, a bit each
-constexpr int kColumns = 8;     // of a packed row: mean, conic, opacity, depth, radius
-constexpr int kRow = 9;         // what lies between two rows in shared memory: an odd number
-constexpr int kSlotWidth = 16;  // scalars of one (tile, splat) gradient: ≤ 4 colours, 6 moments
+constexpr int kSmall = 32;               // tiles of a rectangle that one thread tests, one bit each
+constexpr int kColumns = kPackedHeader;  // of a packed row: mean, conic, opacity, depth, radius
+constexpr int kRow = kColumns + 1;       // stride of the rows in shared memory: odd
 
-SNOW_INLINE uint32_t ordered_bits(float x) {  // unsigned integers in the order of the floats
-  const uint32_t b = __float_as_uint(x);
-  return b >> 31 ? ~b : b | 0x80000000u;
-}
-SNOW_INLINE uint64_t ordered_bits(double x) {
-  const uint64_t b = uint64_t(__double_as_longlong(x));
-  return b >> 63 ? ~b : b | 0x8000000000000000ull;
-}
+// tiles_count: for each splat, in the order of depth, its rectangle of tiles as pairs of 16 bits, how
+// many of them it touches, and which (as bits; for more than 32 tiles their number again).
+template <class T>
+struct TilesCountKernelParams {
+  int64_t n;                                   // splats
+  const uint32_t* order;                       // (n,)
+  const T* packed;                             // (n, stride)
+  int64_t stride;                              // columns
+  int64_t tiles_x, tiles_y;                    // tiles of the image
+  uint32_t *corners, *sizes, *tiles, *counts;  // out, (n,) each
+  SNOW_FIELDS(n, order, packed, stride, tiles_x, tiles_y, corners, sizes, tiles, counts)
+};
 
-// Brings the first columns of the rows of a warp's lanes (< 0: none) to shared memory, 8 lanes a
-// row, and gives that of this lane.
+// tiles_fill: the instances, as a tile and a splat each. One of tiles_16 and tiles_32 is null.
+template <class T>
+struct TilesFillKernelParams {
+  int64_t n;                                // splats
+  const uint32_t* order;                    // (n,)
+  const T* packed;                          // (n, stride)
+  int64_t stride;                           // columns
+  int64_t tiles_x, tiles_y;                 // tiles of the image
+  const uint32_t *corners, *sizes, *tiles;  // (n,) each, from tiles_count
+  const uint32_t* first_slots;              // (n,) sums of the counts of the splats before
+  uint16_t* tiles_16;                       // out, (capacity,)
+  uint32_t* tiles_32;                       // out, (capacity,)
+  uint32_t* splats;                         // out, (capacity,)
+  int64_t capacity;                         // instances that memory is allocated for
+  uint32_t* slot_range;                     // out, (n, 2), or null
+  SNOW_FIELDS(n, order, packed, stride, tiles_x, tiles_y, corners, sizes, tiles, first_slots,
+              tiles_16, tiles_32, splats, capacity, slot_range)
+};
+
+// tiles_start: the first instance of each tile, in the sorted list of their tiles.
+template <class Key>
+struct TilesStartParams {
+  int64_t n;                // tiles + 1
+  const Key* keys;          // (capacity,)
+  const int64_t* required;  // (1,) instances
+  int64_t capacity;         // instances that memory is allocated for
+  uint32_t* tile_start;     // out, (n,)
+  SNOW_FIELDS(n, keys, required, capacity, tile_start)
+};
+
+// tiles_gather: instance_splat[i] = slot_splat[instance_slot[i]] for the instances that there are.
+struct TilesGatherParams {
+  int64_t n;                      // instances that memory is allocated for
+  const uint32_t* slot_splat;     // (n,)
+  const uint32_t* instance_slot;  // (n,)
+  const int64_t* required;        // (1,) instances
+  uint32_t* instance_splat;       // out, (n,)
+  SNOW_FIELDS(n, slot_splat, instance_slot, required, instance_splat)
+};
+
+// Copies the first columns of the rows of a warp's lanes (< 0: none) to shared memory, 8 lanes per
+// row, and returns that of this lane.
 template <class T>
 SNOW_INLINE const T* stage_rows(const T* packed, int64_t stride, int row, T* stage) {
   const int column = lane_id() % kColumns;
@@ -53,22 +95,14 @@ struct TileRectangle {
 template <class T>
 SNOW_INLINE TileRectangle tile_rectangle(const T* row, int tiles_x, int tiles_y) {
   const T right = T(tiles_x * kTile - 1), bottom = T(tiles_y * kTile - 1);
-  const T x = row[0], y = row[1], a = row[2], b = row[3], c = row[4];
-  const T zero(0), half(0.5);
-  const T det = a * c - b * b;
-  const T k2 = T(2 * kLn2) * (log2(row[5]) - T(kLog2MinAlpha));
-  const T reach = max(k2, zero) / det;
-  const T ex = sqrt(reach * c), ey = sqrt(reach * a);
-  const T x0 = max(x - ex - half, zero), x1 = min(x + ex - half, right);
-  const T y0 = max(y - ey - half, zero), y1 = min(y + ey - half, bottom);
-  const bool finite = (x - x) + (y - y) == zero;
-  if (!(finite && k2 >= zero && det > zero && a > zero && x1 >= x0 && y1 >= y0))
-    return {0, 0, 0, 0};
-  const int first_x = int(x0) / kTile, first_y = int(y0) / kTile;
-  return {first_x, first_y, int(x1) / kTile - first_x + 1, int(y1) / kTile - first_y + 1};
+  const PixelExtent<T> extent(row[0], row[1], row + 2, row[5], right, bottom);
+  if (!extent.visible || !is_finite(row[0]) || !is_finite(row[1])) return {0, 0, 0, 0};
+  const int first_x = int(extent.x0) / kTile, first_y = int(extent.y0) / kTile;
+  return {first_x, first_y, int(extent.x1) / kTile - first_x + 1,
+          int(extent.y1) / kTile - first_y + 1};
 }
 
-// Whether a splat reaches 1/255 somewhere between the pixel centres at the corners of a tile.
+// Whether a splat reaches α = 1/255 somewhere between the pixel centres at the corners of a tile.
 template <class T>
 struct TileTest {
   SplatTerms<T> terms;
@@ -86,7 +120,7 @@ struct TileTest {
 };
 
 // A warp goes row by row through the tiles of a rectangle, 32 at a time, and calls f(whether this
-// lane's tile is touched, x, y). All lanes come to each call.
+// lane's tile is touched, x, y). All lanes take part in each call.
 template <class T, class F>
 SNOW_INLINE void for_each_32_tiles(const TileRectangle& r, const TileTest<T>& touches, F&& f) {
   const int area = r.width * r.height;
@@ -99,33 +133,28 @@ SNOW_INLINE void for_each_32_tiles(const TileRectangle& r, const TileTest<T>& to
   }
 }
 
-SNOW_INLINE uint32_t lanes_below() { return (1u << lane_id()) - 1; }
-
 SNOW_INLINE uint32_t pair_of_16_bits(int low, int high) {
   return uint32_t(low) | uint32_t(high) << 16;
 }
 
-template <class T, class Key>
-SNOW_INLINE void prepare(int64_t m, const T* packed, int64_t stride, int tiles_x, int tiles_y,
-                         Key* keys) {
-  SNOW_SHARED(T, stage, kThreads * kRow);
-  const int64_t i = thread_index();
-  const T* row = stage_rows(packed, stride, i < m ? int(i) : -1, stage + warp_id() * kWarp * kRow);
-  if (i >= m) return;
-  // What is nowhere comes last, out of the way of what is.
-  const bool seen = tile_rectangle(row, tiles_x, tiles_y).width > 0;
-  keys[i] = seen ? ordered_bits(row[6]) : ~Key(0);
-}
-
-// What tiles_count finds, for each splat in the order of depth: its rectangle, as pairs of 16 bits,
-// how many of the tiles in there it touches, and which (of up to 32; else their number again).
-struct Footprints {
-  uint32_t *corners, *sizes, *tiles, *counts;
-};
+SNOW_INLINE int tiles_along(int64_t pixels) { return int((pixels + kTile - 1) / kTile); }
 
 template <class T>
-SNOW_INLINE void count_tiles(int64_t m, const uint32_t* order, const T* packed, int64_t stride,
-                             int tiles_x, int tiles_y, const Footprints& out) {
+SNOW_INLINE void prepare(const SplatsPrepareParams<T>& p) {
+  SNOW_SHARED(T, stage, kThreads * kRow);
+  const int64_t i = thread_index();
+  const T* row =
+      stage_rows(p.packed, p.stride, i < p.n ? int(i) : -1, stage + warp_id() * kWarp * kRow);
+  if (i >= p.n) return;
+  // Splats that are not visible are sorted behind all others.
+  const bool visible = tile_rectangle(row, tiles_along(p.width), tiles_along(p.height)).width > 0;
+  p.keys[i] = visible ? ordered_bits(row[6]) : ~DepthKey<T>(0);
+}
+
+template <class T>
+SNOW_INLINE void count_tiles(const TilesCountKernelParams<T>& out) {
+  const int64_t m = out.n;
+  const int tiles_x = int(out.tiles_x), tiles_y = int(out.tiles_y);
   SNOW_SHARED(T, stage, kThreads * kRow);
   SNOW_SHARED(int, large, kThreads);  // the threads whose splats wait for a warp
   SNOW_SHARED(int, large_count, 1);
@@ -133,8 +162,8 @@ SNOW_INLINE void count_tiles(int64_t m, const uint32_t* order, const T* packed, 
   __syncthreads();
 
   const int64_t i = thread_index();
-  const T* row =
-      stage_rows(packed, stride, i < m ? int(order[i]) : -1, stage + warp_id() * kWarp * kRow);
+  const T* row = stage_rows(out.packed, out.stride, i < m ? int(out.order[i]) : -1,
+                            stage + warp_id() * kWarp * kRow);
   if (i < m) {
     const TileRectangle r = tile_rectangle(row, tiles_x, tiles_y);
     const int area = r.width * r.height;
@@ -143,7 +172,7 @@ SNOW_INLINE void count_tiles(int64_t m, const uint32_t* order, const T* packed, 
     if (area > kSmall) {
       large[atomicAdd(large_count, 1)] = int(threadIdx.x);
     } else {
-      uint32_t tiles = uint32_t(area);  // of a single tile nothing is asked
+      uint32_t tiles = uint32_t(area);  // a single tile needs no test
       if (area > 1) {
         const TileTest<T> touches(row);
         tiles = 0;
@@ -172,54 +201,46 @@ SNOW_INLINE void count_tiles(int64_t m, const uint32_t* order, const T* packed, 
   }
 }
 
-// Where instances go: their tiles into one of two arrays, the other is null.
-struct Instances {
-  uint16_t* tiles_16;
-  uint32_t* tiles_32;
-  uint32_t* splats;
-  int64_t capacity;
-
-  SNOW_INLINE void set(int64_t at, int tile, uint32_t splat) const {
-    if (at >= capacity) return;
-    if (tiles_16)
-      tiles_16[at] = uint16_t(tile);
-    else
-      tiles_32[at] = uint32_t(tile);
-    splats[at] = splat;
-  }
-};
+// Writes an instance, if there is memory for it.
+template <class T>
+SNOW_INLINE void set_instance(const TilesFillKernelParams<T>& p, int64_t at, int tile,
+                              uint32_t splat) {
+  if (at >= p.capacity) return;
+  if (p.tiles_16)
+    p.tiles_16[at] = uint16_t(tile);
+  else
+    p.tiles_32[at] = uint32_t(tile);
+  p.splats[at] = splat;
+}
 
 SNOW_INLINE uint32_t clamped(int64_t slot, int64_t capacity) {
   return uint32_t(slot < capacity ? slot : capacity);
 }
 
-// `first_slots` are the sums of the counts of the splats before. Writes as many instances of a
-// splat as were counted, whatever else happens.
+// Writes exactly as many instances of a splat as were counted.
 template <class T>
-SNOW_INLINE void fill_tiles(int64_t m, const uint32_t* order, const T* packed, int64_t stride,
-                            int tiles_x, int tiles_y, const Footprints& found,
-                            const uint32_t* first_slots, const Instances& out,
-                            uint32_t* slot_range) {
+SNOW_INLINE void fill_tiles(const TilesFillKernelParams<T>& p) {
+  const int tiles_x = int(p.tiles_x), tiles_y = int(p.tiles_y);
   SNOW_SHARED(int, large, kThreads);
   SNOW_SHARED(int, large_count, 1);
   if (threadIdx.x == 0) *large_count = 0;
   __syncthreads();
 
-  // A thread a splat first, then a lane a tile of the warp's small splats, so that neighbouring
-  // lanes write to neighbouring addresses.
+  // First one thread per splat, then one lane per tile of the warp's small splats, so that
+  // neighbouring lanes write to neighbouring addresses.
   const int64_t i = thread_index();
   uint32_t splat = 0, corner = 0, tiles = 0, first_slot = 0;
   int width = 1, area = 0;
-  if (i < m) {
-    const uint32_t size = found.sizes[i];
-    splat = order[i], corner = found.corners[i], tiles = found.tiles[i];
-    first_slot = first_slots[i];
+  if (i < p.n) {
+    const uint32_t size = p.sizes[i];
+    splat = p.order[i], corner = p.corners[i], tiles = p.tiles[i];
+    first_slot = p.first_slots[i];
     width = int(size & 0xffff), area = width * int(size >> 16);
     const bool is_large = area > kSmall;
-    if (slot_range) {
+    if (p.slot_range) {
       const int64_t slots = is_large ? tiles : uint32_t(__popc(tiles));
-      slot_range[2 * int64_t(splat)] = clamped(first_slot, out.capacity);
-      slot_range[2 * int64_t(splat) + 1] = clamped(first_slot + slots, out.capacity);
+      p.slot_range[2 * int64_t(splat)] = clamped(first_slot, p.capacity);
+      p.slot_range[2 * int64_t(splat) + 1] = clamped(first_slot + slots, p.capacity);
     }
     if (is_large) {
       large[atomicAdd(large_count, 1)] = int(threadIdx.x);
@@ -243,61 +264,62 @@ SNOW_INLINE void fill_tiles(int64_t m, const uint32_t* order, const T* packed, i
       const int x = int(its_corner & 0xffff) + k % its_width;
       const int y = int(its_corner >> 16) + k / its_width;
       const int before = __popc(its_tiles & ((1u << k) - 1));
-      out.set(int64_t(its_slot) + before, y * tiles_x + x, its_splat);
+      set_instance(p, int64_t(its_slot) + before, y * tiles_x + x, its_splat);
     }
   }
   __syncthreads();
 
   for (int e = warp_id(); e < *large_count; e += kWarps) {
     const int64_t at = int64_t(blockIdx.x) * kThreads + large[e];
-    const uint32_t its_corner = found.corners[at], its_size = found.sizes[at];
-    const uint32_t its_splat = order[at], count = found.tiles[at];
-    const int64_t its_slot = first_slots[at];
+    const uint32_t its_corner = p.corners[at], its_size = p.sizes[at];
+    const uint32_t its_splat = p.order[at], count = p.tiles[at];
+    const int64_t its_slot = p.first_slots[at];
     const TileRectangle r = {int(its_corner & 0xffff), int(its_corner >> 16),
                              int(its_size & 0xffff), int(its_size >> 16)};
     uint32_t done = 0;
-    for_each_32_tiles(r, TileTest<T>(packed + its_splat * stride), [&](bool touched, int x, int y) {
-      const uint32_t votes = __ballot_sync(kAllLanes, touched);
-      const uint32_t k = done + uint32_t(__popc(votes & lanes_below()));
-      if (touched && k < count) out.set(its_slot + k, y * tiles_x + x, its_splat);
-      done += uint32_t(__popc(votes));
-    });
-    // Should the test come out otherwise than in tiles_count, by rounding where nothing is to be
-    // seen, then what is left over goes to no tile.
+    for_each_32_tiles(r, TileTest<T>(p.packed + its_splat * p.stride),
+                      [&](bool touched, int x, int y) {
+                        const uint32_t votes = __ballot_sync(kAllLanes, touched);
+                        const uint32_t k = done + uint32_t(__popc(votes & lanes_below()));
+                        if (touched && k < count)
+                          set_instance(p, its_slot + k, y * tiles_x + x, its_splat);
+                        done += uint32_t(__popc(votes));
+                      });
+    // If rounding makes the test differ from that of tiles_count, at tiles where the splat is not
+    // visible, the remaining instances are assigned to no tile.
     for (uint32_t k = done + uint32_t(lane_id()); k < count; k += kWarp)
-      out.set(its_slot + k, tiles_x * tiles_y, its_splat);
+      set_instance(p, its_slot + k, tiles_x * tiles_y, its_splat);
   }
 }
 
-// tile_start[tile]: how many of the sorted instances belong to tiles before. n: tiles + 1.
 template <class Key>
-SNOW_INLINE void start_tiles(int64_t n, const Key* keys, const int64_t* needed, int64_t capacity,
-                             uint32_t* tile_start) {
+SNOW_INLINE void start_tiles(const TilesStartParams<Key>& p) {
   const int64_t tile = thread_index();
-  if (tile >= n) return;
-  int64_t low = 0, high = *needed < capacity ? *needed : capacity;
+  if (tile >= p.n) return;
+  int64_t low = 0, high = *p.required < p.capacity ? *p.required : p.capacity;
   while (low < high) {
     const int64_t middle = (low + high) / 2;
-    if (keys[middle] < uint32_t(tile))
+    if (p.keys[middle] < uint32_t(tile))
       low = middle + 1;
     else
       high = middle;
   }
-  tile_start[tile] = uint32_t(low);
+  p.tile_start[tile] = uint32_t(low);
 }
 
-// Sums each splat's slots in slot order, 16 lanes a splat, and writes (or, for further channel
-// groups, adds) its row of the packed gradient. `channels` colours of the group went to `columns`.
+// Sums each splat's slots in slot order, 16 lanes per splat, and writes (or, for further groups of
+// channels, adds) its row of the packed gradient.
 template <class T>
-SNOW_INLINE void reduce(int64_t m, const T* slots, const uint32_t* slot_range, const T* packed,
-                        int64_t stride, int channels, const int64_t* columns, bool add, T* grad) {
+SNOW_INLINE void reduce(const SplatsReduceParams<T>& p) {
+  const int channels = int(p.channels);
+  const bool add = p.add != 0;
   const int64_t i = thread_index() / kSlotWidth;
   const int lane = int(threadIdx.x) % kSlotWidth;
   uint32_t begin = 0, end = 0;
-  if (i < m) begin = slot_range[2 * i], end = slot_range[2 * i + 1];
+  if (i < p.n) begin = p.slot_range[2 * i], end = p.slot_range[2 * i + 1];
   T sum(0);
 #pragma unroll 4
-  for (uint32_t s = begin; s < end; s++) sum += slots[int64_t(s) * kSlotWidth + lane];
+  for (uint32_t s = begin; s < end; s++) sum += p.slots[int64_t(s) * kSlotWidth + lane];
 
   T moment[6], color[4];
   const int base = channels <= 3 ? 3 : 4;
@@ -305,25 +327,25 @@ SNOW_INLINE void reduce(int64_t m, const T* slots, const uint32_t* slot_range, c
   for (int k = 0; k < 6; k++) moment[k] = __shfl_sync(kAllLanes, sum, base + k, kSlotWidth);
 #pragma unroll
   for (int k = 0; k < 4; k++) color[k] = __shfl_sync(kAllLanes, sum, k, kSlotWidth);
-  if (i >= m || (add && begin == end)) return;
+  if (i >= p.n || (add && begin == end)) return;
 
   T d_mean[2] = {T(0), T(0)}, d_conic[3] = {T(0), T(0), T(0)}, d_opacity(0);
   if (begin < end) {
-    const T* row = packed + i * stride;
+    const T* row = p.packed + i * p.stride;
     splat_terms_vjp<T>(row + 2, row[5],
                        {moment[0], moment[1], moment[2], moment[3], moment[4], moment[5]}, d_mean,
                        d_conic, d_opacity);
   }
   const T geometry[6] = {d_mean[0], d_mean[1], d_conic[0], d_conic[1], d_conic[2], d_opacity};
-  T* g = grad + i * stride;
-  for (int column = lane; column < int(stride); column += kSlotWidth) {
+  T* g = p.grad_packed + i * p.stride;
+  for (int column = lane; column < int(p.stride); column += kSlotWidth) {
     T value = add ? g[column] : T(0);
 #pragma unroll
     for (int k = 0; k < 6; k++)
       if (column == k) value += geometry[k];
 #pragma unroll
     for (int k = 0; k < 4; k++)
-      if (k < channels && column == int(columns[k])) value += color[k];
+      if (k < channels && column == int(p.columns[k])) value += color[k];
     g[column] = value;
   }
 }
@@ -333,52 +355,18 @@ SNOW_INLINE void reduce(int64_t m, const T* slots, const uint32_t* slot_range, c
 
 using namespace snow;
 
-#define SNOW_TILE_KERNELS(SUFFIX, T, KEY)                                                          \
-  SNOW_KERNEL(                                                                                     \
-      splats_prepare##SUFFIX, 256,                                                                 \
-      (int64_t m, const T* packed, int64_t stride, int64_t tiles_x, int64_t tiles_y, KEY* keys)) { \
-    prepare(m, packed, stride, int(tiles_x), int(tiles_y), keys);                                  \
-  }                                                                                                \
-  SNOW_KERNEL(                                                                                     \
-      tiles_count##SUFFIX, 256,                                                                    \
-      (int64_t m, const uint32_t* order, const T* packed, int64_t stride, int64_t tiles_x,         \
-       int64_t tiles_y, uint32_t* corners, uint32_t* sizes, uint32_t* tiles, uint32_t* counts)) {  \
-    count_tiles(m, order, packed, stride, int(tiles_x), int(tiles_y),                              \
-                {corners, sizes, tiles, counts});                                                  \
-  }                                                                                                \
-  SNOW_KERNEL(tiles_fill##SUFFIX, 256,                                                             \
-              (int64_t m, const uint32_t* order, const T* packed, int64_t stride, int64_t tiles_x, \
-               int64_t tiles_y, uint32_t* corners, uint32_t* sizes, uint32_t* tiles,               \
-               const uint32_t* first_slots, uint16_t* tiles_16, uint32_t* tiles_32,                \
-               uint32_t* splats, int64_t capacity, uint32_t* slot_range)) {                        \
-    fill_tiles(m, order, packed, stride, int(tiles_x), int(tiles_y),                               \
-               {corners, sizes, tiles, nullptr}, first_slots,                                      \
-               {tiles_16, tiles_32, splats, capacity}, slot_range);                                \
-  }                                                                                                \
-  SNOW_KERNEL(splats_reduce##SUFFIX, 256,                                                          \
-              (int64_t m, const T* slots, const uint32_t* slot_range, const T* packed,             \
-               int64_t stride, int64_t channels, const int64_t* columns, int64_t add, T* grad)) {  \
-    reduce(m, slots, slot_range, packed, stride, int(channels), columns, add != 0, grad);          \
-  }
+SNOW_KERNEL(splats_prepare, kThreads, SplatsPrepareParams<float>) { prepare(p); }
+SNOW_KERNEL(splats_prepare_f64, kThreads, SplatsPrepareParams<double>) { prepare(p); }
+SNOW_KERNEL(tiles_count, kThreads, TilesCountKernelParams<float>) { count_tiles(p); }
+SNOW_KERNEL(tiles_count_f64, kThreads, TilesCountKernelParams<double>) { count_tiles(p); }
+SNOW_KERNEL(tiles_fill, kThreads, TilesFillKernelParams<float>) { fill_tiles(p); }
+SNOW_KERNEL(tiles_fill_f64, kThreads, TilesFillKernelParams<double>) { fill_tiles(p); }
+SNOW_KERNEL(tiles_start_u16, kThreads, TilesStartParams<uint16_t>) { start_tiles(p); }
+SNOW_KERNEL(tiles_start_u32, kThreads, TilesStartParams<uint32_t>) { start_tiles(p); }
+SNOW_KERNEL(splats_reduce, kThreads, SplatsReduceParams<float>) { reduce(p); }
+SNOW_KERNEL(splats_reduce_f64, kThreads, SplatsReduceParams<double>) { reduce(p); }
 
-SNOW_TILE_KERNELS(, float, uint32_t)
-SNOW_TILE_KERNELS(_f64, double, uint64_t)
-
-SNOW_KERNEL(tiles_start_u16, 256,
-            (int64_t n, const uint16_t* keys, const int64_t* needed, int64_t capacity,
-             uint32_t* tile_start)) {
-  start_tiles(n, keys, needed, capacity, tile_start);
-}
-SNOW_KERNEL(tiles_start_u32, 256,
-            (int64_t n, const uint32_t* keys, const int64_t* needed, int64_t capacity,
-             uint32_t* tile_start)) {
-  start_tiles(n, keys, needed, capacity, tile_start);
-}
-
-// instance_splat[i] = slot_splat[instance_slot[i]], for as many as there are of n.
-SNOW_KERNEL(tiles_gather, 256,
-            (int64_t n, const uint32_t* slot_splat, const uint32_t* instance_slot,
-             const int64_t* needed, uint32_t* instance_splat)) {
+SNOW_KERNEL(tiles_gather, kThreads, TilesGatherParams) {
   const int64_t i = thread_index();
-  if (i < n && i < *needed) instance_splat[i] = slot_splat[instance_slot[i]];
+  if (i < p.n && i < *p.required) p.instance_splat[i] = p.slot_splat[p.instance_slot[i]];
 }

@@ -1,6 +1,6 @@
-"""Runs kernels on a GPU, through its driver: torch has the memory and the streams, we the kernels.
+"""Runs kernels on a GPU through its driver; memory and streams are torch's.
 
-Launching costs microseconds of Python and waits for nothing.
+A launch costs a few microseconds of Python and does not wait for the GPU.
 """
 
 from __future__ import annotations
@@ -9,71 +9,59 @@ import contextlib
 import ctypes
 import functools
 import importlib
-import struct
+import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 
 from snowsplat.ops.cuda import cubins
 from snowsplat.ops.cuda.availability import why_unusable
-from snowsplat.ops.cuda.kernels import Argument, Kernel
+from snowsplat.ops.cuda.kernels import Kernel
+from snowsplat.ops.layout import LARGEST_PARAMS, Params, layout_of
 from snowsplat.util.errors import UserError
 
-# Of the driver. What is no code for this card may be followed by what is.
+# Errors of the driver. After code that is not for this card, other code may be.
 _OUT_OF_MEMORY = 2
 _NOT_FOUND = 500
 _NO_CODE_FOR_IT = (200, 209, 218, 222)  # invalid image, no binary, invalid PTX, too new a PTX
+_OUTDATED = "the built kernels do not match the Python files: rebuild them (make native)"
 
-_MOST_PARAMETERS = 128
 
-
-class _Parameters(threading.local):
-    """Where the driver reads a launch's arguments, each in 8 bytes; it is done when it returns."""
+class _Buffer(threading.local):
+    """Where the driver reads the struct of a launch, which it copies before it returns."""
 
     def __init__(self) -> None:
-        self.values = ctypes.create_string_buffer(8 * _MOST_PARAMETERS)
-        first = ctypes.addressof(self.values)
-        self._pointers = (ctypes.c_void_p * _MOST_PARAMETERS)(
-            *range(first, first + 8 * _MOST_PARAMETERS, 8)
-        )
-        self.address = ctypes.addressof(self._pointers)
+        self.struct = ctypes.create_string_buffer(LARGEST_PARAMS)
+        self._pointer = ctypes.c_void_p(ctypes.addressof(self.struct))
+        #: Of an array of pointers to the parameters, of which there is one.
+        self.address = ctypes.addressof(self._pointer)
 
 
-_parameters = _Parameters()
+_buffer = _Buffer()
 _gpus: dict[int, _Gpu] = {}
 _lock = threading.Lock()
 
 
-def run(kernel: Kernel, name: str, blocks: int, args: Sequence[Argument]) -> None:
-    """Queue a kernel on torch's current stream of the device that has the tensors.
+def run(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
+    """Queues a kernel on torch's current stream of the device that has the tensors.
 
     Raises:
-        UserError: the GPU cannot be used, or the driver refuses.
+        UserError: the GPU cannot be used, the kernels are outdated, or the driver reports an error.
     """
-    index, kinds = -1, "="
-    values: list[int | float] = []
-    for arg in args:
-        if isinstance(arg, torch.Tensor):
-            kinds += "Q"
-            values.append(arg.data_ptr())
-            if index < 0:
-                index = arg.device.index
-        elif arg is None:
-            kinds += "Q"
-            values.append(0)
-        else:
-            kinds += "q" if isinstance(arg, int) else "d"
-            values.append(arg)
+    layout = layout_of(kernel.params)
+    values = layout.values(params)
+    tensor = next(values[i] for i in layout.pointers if values[i] is not None)
+    index = tensor.device.index
     gpu = _gpus.get(index) or _gpu(index)
     function = gpu.functions.get(name) or gpu.load(kernel, name)
-    parameters = _parameters
-    struct.pack_into(kinds, parameters.values, 0, *values)
+    buffer = _buffer
+    layout.pack_into(buffer.struct, params)
     stream = torch.cuda.current_stream(index).cuda_stream
     cuda = gpu.cuda
-    launch = (function, blocks, 1, 1, kernel.threads, 1, 1, 0, stream, parameters.address, 0)
-    # Threads that torch makes, for backward passes, begin without a context.
+    launch = (function, blocks, 1, 1, kernel.threads, 1, 1, 0, stream, buffer.address, 0)
+    # The threads that torch creates for backward passes have no context at first.
     if int(cuda.cuCtxGetCurrent()[1]) == gpu.context:
         (error,) = cuda.cuLaunchKernel(*launch)
     else:
@@ -92,7 +80,7 @@ def _gpu(index: int) -> _Gpu:
 
 @functools.cache
 def _bindings() -> Any:
-    # Only now: who computes on a CPU need not have it.
+    # Imported when needed: on a CPU it may be missing.
     return importlib.import_module("cuda.bindings.driver")
 
 
@@ -126,7 +114,7 @@ class _Gpu:
             self._check(self.cuda.cuCtxPopCurrent())
 
     def load(self, kernel: Kernel, name: str) -> Any:
-        """The function `name` on this device, to be had from `functions` from now on."""
+        """Loads the function `name` on this device and stores it in `functions`."""
         with self._loading, self.current():
             if name not in self.functions:
                 if kernel.file in self._libraries:
@@ -135,8 +123,21 @@ class _Gpu:
                     error, function = self._first_function(kernel.file, name)
                 if error != 0:
                     self.fail(error, name)
+                self._check_layout(kernel, name)
                 self.functions[name] = function
             return self.functions[name]
+
+    def _check_layout(self, kernel: Kernel, name: str) -> None:
+        """Raises UserError unless the kernel takes the struct that `run` passes."""
+        found = bytearray(8)
+        library = self._libraries[kernel.file]
+        error, address, _ = self.cuda.cuLibraryGetGlobal(library, f"{name}_layout".encode())
+        if error == 0:
+            (error,) = self.cuda.cuMemcpyDtoH(found, address, len(found))
+        if error not in (0, _NOT_FOUND):
+            self.fail(error, name)
+        if error or int.from_bytes(found, sys.byteorder) != layout_of(kernel.params).hash:
+            raise UserError(f"cuda:{self._index}: {name}: {_OUTDATED}")
 
     def _first_function(self, file: str, name: str) -> tuple[int, Any]:
         error, function = 0, None
@@ -164,12 +165,12 @@ class _Gpu:
         return result[1] if len(result) > 1 else None
 
     def fail(self, error: Any, name: str) -> None:
-        """Raises: UserError: always; a line about an error of the driver."""
+        """Raises UserError: the driver's error in one line."""
         said, what = self.cuda.cuGetErrorName(error), self.cuda.cuGetErrorString(error)
         known = said[0] == 0 and what[0] == 0
         text = f"{said[1].decode()}, {what[1].decode()}" if known else f"error {int(error)}"
         if error == _NOT_FOUND:
-            do = "the built kernels are older than the Python files: rebuild them (make native)"
+            do = _OUTDATED
         elif error == _OUT_OF_MEMORY:
             do = "close other programs that use the GPU, or make the scene smaller"
         else:

@@ -1,33 +1,33 @@
-"""`Kernel`: what launching one has to know of it."""
+"""`Kernel`: what is needed to launch one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol
 
-import torch
-
-Argument = torch.Tensor | int | float | None
+from snowsplat.ops.layout import Params
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel in `native/cuda/<file>.cu`; with the suffix `_f64`, its twin for float64.
+    """A kernel in `native/cuda/<file>.cu`; the one for float64 has the suffix `_f64`.
 
+    params: its struct of parameters.
     threads: of a block, as in its SNOW_KERNEL.
-    items: how many of the n things to do a block does.
+    items: of the n items, how many a block processes.
     """
 
     file: str
+    params: type[Params]
     threads: int
     items: int
 
     def blocks(self, n: int) -> int:
-        """Blocks that do n things."""
+        """The number of blocks for n items."""
         return -(-n // self.items)
 
 
 class Run(Protocol):
-    """Queues a kernel behind those before it: its full name, blocks (0: nothing), arguments."""
+    """Queues a kernel behind those before it: its full name, blocks (0: none), parameters."""
 
-    def __call__(self, name: str, blocks: int, *args: Argument) -> None: ...
+    def __call__(self, name: str, blocks: int, params: Params) -> None: ...

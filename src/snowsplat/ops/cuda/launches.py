@@ -1,16 +1,17 @@
-"""The native functions on a GPU: which kernels each is made of.
+"""The native functions on a GPU: the kernels that each consists of.
 
-Most are one kernel of the same name and arguments; a few are a sequence of them. Each part of the
-engine (`projection`, `tiling`, …) says so of its own:
+Most are one kernel of the same name and parameters; a few are a sequence of kernels. Each module
+(`projection`, `tiling`, …) declares its own:
 
-KERNELS    name → `Kernel`: the file it is in, its threads a block, how much of `n` a block does.
-SEQUENCES  name → a function `(run, suffix, n, *args) -> int` that runs kernels one after the other;
-           `suffix` is "" or "_f64", for those that come in both.
+KERNELS    name → `Kernel`: its file, struct of parameters, and block size.
+SEQUENCES  name → a function `(run, suffix, params) -> int` that runs kernels one after the other;
+           `suffix` is "" or "_f64", for those that exist in both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from typing import Any
 
 from snowsplat.ops.cuda import (
     adam,
@@ -22,7 +23,8 @@ from snowsplat.ops.cuda import (
     sorting,
     tiling,
 )
-from snowsplat.ops.cuda.kernels import Argument, Kernel
+from snowsplat.ops.cuda.kernels import Kernel
+from snowsplat.ops.layout import Params
 
 _PARTS = (projection, adam, sorting, tiling, rasterizer, photometric, nearest_neighbours)
 KERNELS: dict[str, Kernel] = {n: k for part in _PARTS for n, k in part.KERNELS.items()}
@@ -30,32 +32,30 @@ SEQUENCES: dict[str, Callable[..., int]] = {
     name: sequence for part in _PARTS for name, sequence in part.SEQUENCES.items()
 }
 
+Execute = Callable[[Kernel, str, int, Params], None]
+"""Runs a kernel: the kernel, its full name, blocks, parameters."""
 
-def launch(name: str, n: int, args: Sequence[Argument]) -> int:
-    """What `native.launch` does with tensors on a GPU: queues it on torch's current stream.
+
+def launch(name: str, params: Params) -> int:
+    """`native.launch` for tensors on a GPU: queues the kernels on torch's current stream.
 
     Raises:
-        UserError: the GPU cannot be used; the line says why.
+        UserError: the GPU cannot be used; the message says why.
     """
-    return launch_by(driver.run, name, n, args)
+    return launch_by(driver.run, name, params)
 
 
-def launch_by(
-    execute: Callable[[Kernel, str, int, Sequence[Argument]], None],
-    name: str,
-    n: int,
-    args: Sequence[Argument],
-) -> int:
-    """The same by `execute(kernel, its name, blocks, arguments)`: a GPU's driver, or a test."""
+def launch_by(execute: Execute, name: str, params: Any) -> int:
+    """The same with `execute` in place of the GPU's driver."""
 
-    def run(kernel_name: str, blocks: int, *arguments: Argument) -> None:
+    def run(kernel_name: str, blocks: int, kernel_params: Params) -> None:
         if blocks > 0:
             kernel = KERNELS[kernel_name.removesuffix("_f64")]
-            execute(kernel, kernel_name, blocks, arguments)
+            execute(kernel, kernel_name, blocks, kernel_params)
 
     base = name.removesuffix("_f64")
     suffix = name[len(base) :]
     if base in SEQUENCES:
-        return SEQUENCES[base](run, suffix, n, *args)
-    run(name, KERNELS[base].blocks(n), n, *args)
+        return SEQUENCES[base](run, suffix, params)
+    run(name, KERNELS[base].blocks(params.n), params)
     return 0

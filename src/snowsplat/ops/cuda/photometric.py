@@ -1,62 +1,117 @@
-"""photometric on a GPU."""
+"""`photometric_loss` and `ssim` on a GPU."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import torch
 from torch import Tensor
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
+from snowsplat.ops.layout import Params
+from snowsplat.ops.params import PhotometricParams
+
+
+@dataclass(slots=True, kw_only=True)
+class PhotometricSimilarityParams(Params):
+    n: int
+    width: int
+    height: int
+    image: Tensor
+    target: Tensor
+    maps: Tensor | None
+    sums: Tensor
+
+
+@dataclass(slots=True, kw_only=True)
+class PhotometricGradientParams(Params):
+    n: int
+    width: int
+    height: int
+    image: Tensor
+    target: Tensor
+    maps: Tensor
+    l1_weight: float
+    ssim_weight: float
+    grad: Tensor
+
+
+@dataclass(slots=True, kw_only=True)
+class PhotometricMeansParams(Params):
+    n: int
+    sums: Tensor
+    values: int
+    means: Tensor
+
 
 KERNELS: dict[str, Kernel] = {
-    "photometric_similarity": Kernel("photometric", threads=192, items=1),
-    "photometric_similarity_u8": Kernel("photometric", threads=192, items=1),
-    "photometric_gradient": Kernel("photometric", threads=192, items=1),
-    "photometric_gradient_u8": Kernel("photometric", threads=192, items=1),
-    "photometric_means": Kernel("photometric", threads=256, items=256),
+    **{
+        f"photometric_similarity{target}": Kernel(
+            "photometric", PhotometricSimilarityParams, threads=192, items=1
+        )
+        for target in ("", "_u8")
+    },
+    **{
+        f"photometric_gradient{target}": Kernel(
+            "photometric", PhotometricGradientParams, threads=192, items=1
+        )
+        for target in ("", "_u8")
+    },
+    "photometric_means": Kernel("photometric", PhotometricMeansParams, threads=256, items=256),
 }
 
 _TILE_WIDTH = 32
 _TILE_HEIGHT = {"": 24, "_f64": 12}
-_MAPS_BYTES = 32 << 20  # of derivatives at a time, or those of one channel
+_MAPS_BYTES = 32 << 20  # of derivatives at a time; more if those of one channel need it
 
 
-def _photometric(
-    target_suffix: str,
-    run: Run,
-    suffix: str,
-    channels: int,
-    width: int,
-    height: int,
-    image: Tensor,
-    target: Tensor,
-    l1_weight: float,
-    ssim_weight: float,
-    grad: Tensor | None,
-    means: Tensor,
-) -> int:
+def _photometric(target_suffix: str, run: Run, suffix: str, p: PhotometricParams) -> int:
+    channels, width, height = p.n, p.width, p.height
     tiles = -(-width // _TILE_WIDTH) * -(-height // _TILE_HEIGHT[suffix])  # of a channel
-    sums = torch.empty(channels * tiles, 2, dtype=torch.float64, device=image.device)
+    device, dtype = p.image.device, p.image.dtype
+    sums = torch.empty(channels * tiles, 2, dtype=torch.float64, device=device)
     values = channels * width * height
-    some, maps = channels, None
-    if grad is not None:
-        size = 3 * width * height * image.element_size()
-        some = max(1, min(channels, _MAPS_BYTES // size))
-        maps = torch.empty(some * 3 * width * height, dtype=image.dtype, device=image.device)
-    for first in range(0, channels, some):
-        last = min(first + some, channels)
-        shape = last - first, width, height
-        images = image[first:last], target[first:last]
+    at_once = channels
+    if p.grad is not None:
+        size = 3 * width * height * p.image.element_size()
+        at_once = max(1, min(channels, _MAPS_BYTES // size))
+        maps = torch.empty(at_once * 3 * width * height, dtype=dtype, device=device)
+    for first in range(0, channels, at_once):
+        last = min(first + at_once, channels)
         blocks = (last - first) * tiles
-        name = f"photometric_similarity{target_suffix}{suffix}"
-        run(name, blocks, *shape, *images, maps, sums[first * tiles :])
-        if grad is not None:
-            name = f"photometric_gradient{target_suffix}{suffix}"
-            weights = l1_weight / values, ssim_weight / values
-            run(name, blocks, *shape, *images, maps, *weights, grad[first:last])
-    run("photometric_means", 1, channels * tiles, sums, values, means)
+        run(
+            f"photometric_similarity{target_suffix}{suffix}",
+            blocks,
+            PhotometricSimilarityParams(
+                n=last - first,
+                width=width,
+                height=height,
+                image=p.image[first:last],
+                target=p.target[first:last],
+                maps=None if p.grad is None else maps,
+                sums=sums[first * tiles :],
+            ),
+        )
+        if p.grad is not None:
+            run(
+                f"photometric_gradient{target_suffix}{suffix}",
+                blocks,
+                PhotometricGradientParams(
+                    n=last - first,
+                    width=width,
+                    height=height,
+                    image=p.image[first:last],
+                    target=p.target[first:last],
+                    maps=maps,
+                    l1_weight=p.l1_weight / values,
+                    ssim_weight=p.ssim_weight / values,
+                    grad=p.grad[first:last],
+                ),
+            )
+    means = PhotometricMeansParams(n=channels * tiles, sums=sums, values=values, means=p.means)
+    run("photometric_means", 1, means)
     return 0
 
 

@@ -3,41 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
+from snowsplat.ops.layout import POSE_SUMS, Params
+from snowsplat.ops.params import (
+    ProjectBackwardParams,
+    ProjectCullParams,
+    ProjectForwardParams,
+    ScreenStatisticsParams,
+    SizeQueryParams,
+)
+
+
+@dataclass(slots=True, kw_only=True)
+class PoseSumParams(Params):
+    n: int
+    sums: Tensor
+    pose: Tensor
+
 
 KERNELS: dict[str, Kernel] = {
-    "project_cull": Kernel("project", threads=256, items=256),
-    "project_fwd": Kernel("project", threads=64, items=64),
-    "project_bwd": Kernel("project", threads=64, items=64),
-    "project_pose_sum": Kernel("project", threads=512, items=512),
-    "accumulate_screen_statistics": Kernel("statistic", threads=256, items=256),
+    "project_cull": Kernel("project", ProjectCullParams, threads=256, items=256),
+    "project_fwd": Kernel("project", ProjectForwardParams, threads=64, items=64),
+    "project_bwd": Kernel("project", ProjectBackwardParams, threads=64, items=64),
+    "project_pose_sum": Kernel("project", PoseSumParams, threads=512, items=512),
+    "accumulate_screen_statistics": Kernel(
+        "statistic", ScreenStatisticsParams, threads=256, items=256
+    ),
 }
 
 
-def project_cull(run: Run, suffix: str, n: int, *args: Any) -> int:
-    """All rows stay: who is not seen has the id −1."""
-    run("project_cull" + suffix, KERNELS["project_cull"].blocks(n), n, *args)
-    return n
+def project_cull(run: Run, suffix: str, p: ProjectCullParams) -> int:
+    """Keeps all rows: the id of a Gaussian that is not visible is −1."""
+    run("project_cull" + suffix, KERNELS["project_cull"].blocks(p.n), p)
+    return p.n
 
 
-def project_pose_blocks(run: Run, suffix: str, m: int) -> int:
-    return min(m, 1)
+def project_pose_blocks(run: Run, suffix: str, query: SizeQueryParams) -> int:
+    return min(query.n, 1)
 
 
-def project_bwd(run: Run, suffix: str, m: int, ids: Tensor, *args: Any) -> int:
-    *rest, pose = args
-    blocks = KERNELS["project_bwd"].blocks(m)
-    sums = None
-    if pose is not None:
-        sums = torch.empty(blocks, 15, dtype=torch.float64, device=ids.device)
-    run("project_bwd" + suffix, blocks, m, ids, *rest, sums)
-    if sums is not None:
-        run("project_pose_sum", min(blocks, 1), blocks, sums, pose)
+def project_bwd(run: Run, suffix: str, p: ProjectBackwardParams) -> int:
+    blocks = KERNELS["project_bwd"].blocks(p.n)
+    if p.pose is None:
+        run("project_bwd" + suffix, blocks, p)
+        return 0
+    sums = torch.empty(blocks, POSE_SUMS, dtype=torch.float64, device=p.ids.device)
+    run("project_bwd" + suffix, blocks, replace(p, pose=sums))
+    run("project_pose_sum", min(blocks, 1), PoseSumParams(n=blocks, sums=sums, pose=p.pose))
     return 0
 
 

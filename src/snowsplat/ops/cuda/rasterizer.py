@@ -1,4 +1,4 @@
-"""blending on a GPU."""
+"""Rasterization on a GPU."""
 
 from __future__ import annotations
 
@@ -7,26 +7,33 @@ from collections.abc import Callable
 import torch
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
+from snowsplat.ops.params import (
+    BackgroundBackwardParams,
+    RasterizeBackwardParams,
+    RasterizeCountParams,
+    RasterizeForwardParams,
+    SizeQueryParams,
+)
 
 KERNELS: dict[str, Kernel] = {
-    "blend_fwd": Kernel("blend", threads=256, items=1),
-    "blend_count": Kernel("blend", threads=256, items=1),
-    "blend_bwd": Kernel("blend", threads=256, items=1),
-    "background_bwd": Kernel("blend", threads=128, items=1),
+    "rasterize_fwd": Kernel("rasterize", RasterizeForwardParams, threads=256, items=1),
+    "rasterize_count": Kernel("rasterize", RasterizeCountParams, threads=256, items=1),
+    "rasterize_bwd": Kernel("rasterize", RasterizeBackwardParams, threads=256, items=1),
+    "background_bwd": Kernel("rasterize", BackgroundBackwardParams, threads=128, items=1),
 }
 
 
-def _sums_in_order(run: Run, suffix: str, n: int) -> int:
-    """Sums in a fixed order cost memory and time, so those who want them ask torch for them."""
+def _sums_in_order(run: Run, suffix: str, query: SizeQueryParams) -> int:
+    """Sums in a fixed order take memory and time; torch's setting requests them."""
     return int(torch.are_deterministic_algorithms_enabled())
 
 
-def _block_bytes(run: Run, suffix: str, n: int) -> int:
-    """A bit for each of the eight warps of a tile."""
+def _block_bytes(run: Run, suffix: str, query: SizeQueryParams) -> int:
+    """One bit for each of the eight warps of a tile."""
     return 1
 
 
 SEQUENCES: dict[str, Callable[..., int]] = {
-    "blend_block_bytes": _block_bytes,
-    "blend_sums_in_order": _sums_in_order,
+    "rasterize_block_bytes": _block_bytes,
+    "rasterize_sums_in_order": _sums_in_order,
 }

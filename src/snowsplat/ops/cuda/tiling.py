@@ -1,161 +1,219 @@
-"""Splats sorted into tiles, on a GPU.
+"""Sorting splats into tiles, on a GPU.
 
 The instances, pairs of a tile and a splat that touches it, are listed splat by splat in the order
 of depth; the number of an instance in this list is its slot. A stable sort by tile then gives each
-tile its splats, nearest first. Nothing waits for the GPU, unless the number of instances is asked.
+tile its splats, nearest first. Nothing waits for the GPU, unless the number of instances is
+requested.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
 from snowsplat.ops.cuda.sorting import exclusive_scan, sort_pairs, sort_passes
+from snowsplat.ops.layout import SLOT_WIDTH, Params
+from snowsplat.ops.params import (
+    SizeQueryParams,
+    SplatsPrepareParams,
+    SplatsReduceParams,
+    SplatsSortParams,
+    TilesCountParams,
+    TilesFillParams,
+)
+
+
+@dataclass(slots=True, kw_only=True)
+class TilesCountKernelParams(Params):
+    n: int
+    order: Tensor
+    packed: Tensor
+    stride: int
+    tiles_x: int
+    tiles_y: int
+    corners: Tensor
+    sizes: Tensor
+    tiles: Tensor
+    counts: Tensor
+
+
+@dataclass(slots=True, kw_only=True)
+class TilesFillKernelParams(Params):
+    n: int
+    order: Tensor
+    packed: Tensor
+    stride: int
+    tiles_x: int
+    tiles_y: int
+    corners: Tensor
+    sizes: Tensor
+    tiles: Tensor
+    first_slots: Tensor
+    tiles_16: Tensor | None
+    tiles_32: Tensor | None
+    splats: Tensor
+    capacity: int
+    slot_range: Tensor | None
+
+
+@dataclass(slots=True, kw_only=True)
+class TilesStartParams(Params):
+    n: int
+    keys: Tensor
+    required: Tensor
+    capacity: int
+    tile_start: Tensor
+
+
+@dataclass(slots=True, kw_only=True)
+class TilesGatherParams(Params):
+    n: int
+    slot_splat: Tensor
+    instance_slot: Tensor
+    required: Tensor
+    instance_splat: Tensor
+
 
 KERNELS: dict[str, Kernel] = {
-    "splats_prepare": Kernel("tiles", threads=256, items=256),
-    "tiles_count": Kernel("tiles", threads=256, items=256),
-    "tiles_fill": Kernel("tiles", threads=256, items=256),
-    "tiles_start_u16": Kernel("tiles", threads=256, items=256),
-    "tiles_start_u32": Kernel("tiles", threads=256, items=256),
-    "tiles_gather": Kernel("tiles", threads=256, items=256),
-    "splats_reduce": Kernel("tiles", threads=256, items=16),
+    "splats_prepare": Kernel("tiles", SplatsPrepareParams, threads=256, items=256),
+    "tiles_count": Kernel("tiles", TilesCountKernelParams, threads=256, items=256),
+    "tiles_fill": Kernel("tiles", TilesFillKernelParams, threads=256, items=256),
+    "tiles_start_u16": Kernel("tiles", TilesStartParams, threads=256, items=256),
+    "tiles_start_u32": Kernel("tiles", TilesStartParams, threads=256, items=256),
+    "tiles_gather": Kernel("tiles", TilesGatherParams, threads=256, items=256),
+    "splats_reduce": Kernel("tiles", SplatsReduceParams, threads=256, items=256 // SLOT_WIDTH),
 }
 
-_TILE = 16  # pixels
 _HEAD = 16  # bytes of a workspace before its arrays: the number of instances
 _ARRAYS = 4
 
 
-def _nothing(run: Run, suffix: str, n: int, *args: object) -> int:
+def _zero(run: Run, suffix: str, params: Params) -> int:
     return 0
 
 
-def _workspace_bytes(run: Run, suffix: str, m: int, tiles: int, parts: int) -> int:
-    return _HEAD + 4 * _ARRAYS * m
+def _workspace_bytes(run: Run, suffix: str, query: SizeQueryParams) -> int:
+    return _HEAD + 4 * _ARRAYS * query.n
 
 
-def _open_workspace(workspace: Tensor, m: int) -> tuple[Tensor, ...]:
-    """What tiles_count leaves for tiles_fill.
+def _open_workspace(workspace: Tensor, n: int) -> tuple[Tensor, ...]:
+    """What tiles_count hands to tiles_fill.
 
     The number of instances (1,) int64, and of each splat, nearest first, the corner and the size of
-    its rectangle of tiles, which of these it touches, and its first slot.
+    its rectangle of tiles, the tiles of it that the splat touches, and its first slot.
     """
-    needed = workspace[: _HEAD // 2].view(torch.int64)
-    return needed, *workspace[_HEAD:].view(torch.int32).view(_ARRAYS, m)
+    required = workspace[: _HEAD // 2].view(torch.int64)
+    return required, *workspace[_HEAD:].view(torch.int32).view(_ARRAYS, n)
 
 
-def _splats_prepare(
-    run: Run,
-    suffix: str,
-    m: int,
-    packed: Tensor,
-    stride: int,
-    width: float,
-    height: float,
-    columns: Tensor,
-    records: Tensor,
-    keys: Tensor,
-) -> int:
-    blocks = KERNELS["splats_prepare"].blocks(m)
-    tiles = -(-int(width) // _TILE), -(-int(height) // _TILE)
-    run(f"splats_prepare{suffix}", blocks, m, packed, stride, *tiles, keys)
+def _splats_sort(run: Run, suffix: str, p: SplatsSortParams) -> int:
+    bits = 8 * p.keys.element_size()  # an even number of passes, so they end in `order`
+    sort_pairs(run, p.n, p.keys, p.keys2, p.order, p.order2, (0, bits), rows=True)
     return 0
 
 
-def _splats_sort(
-    run: Run, suffix: str, m: int, keys: Tensor, keys2: Tensor, order: Tensor, order2: Tensor
-) -> int:
-    bits = 8 * keys.element_size()  # an even number of passes, so they end in `order`
-    sort_pairs(run, m, keys, keys2, order, order2, (0, bits), rows=True)
-    return 0
+def _tiles_count(run: Run, suffix: str, p: TilesCountParams) -> int:
+    binning = p.binning
+    total, corners, sizes, tiles, slots = _open_workspace(binning.workspace, p.n)
+    run(
+        f"tiles_count{suffix}",
+        KERNELS["tiles_count"].blocks(p.n),
+        TilesCountKernelParams(
+            n=p.n,
+            order=binning.order,
+            packed=binning.packed,
+            stride=binning.stride,
+            tiles_x=binning.tiles_x,
+            tiles_y=binning.tiles_y,
+            corners=corners,
+            sizes=sizes,
+            tiles=tiles,
+            counts=slots,
+        ),
+    )
+    exclusive_scan(run, p.n, slots, slots, total)
+    p.required.copy_(total)
+    return int(p.required.item()) if p.capacity < 0 else p.capacity
 
 
-def _tiles_count(
-    run: Run,
-    suffix: str,
-    m: int,
-    order: Tensor,
-    packed: Tensor,
-    stride: int,
-    records: Tensor,
-    tiles_x: int,
-    tiles_y: int,
-    parts: int,
-    workspace: Tensor,
-    tile_start: Tensor,
-    capacity: int,
-    needed: Tensor,
-) -> int:
-    total, corners, sizes, tiles, slots = _open_workspace(workspace, m)
-    blocks = KERNELS["tiles_count"].blocks(m)
-    splats = (m, order, packed, stride, tiles_x, tiles_y)
-    run(f"tiles_count{suffix}", blocks, *splats, corners, sizes, tiles, slots)
-    exclusive_scan(run, m, slots, slots, total)
-    needed.copy_(total)
-    return int(needed.item()) if capacity < 0 else capacity
-
-
-def _tiles_fill(
-    run: Run,
-    suffix: str,
-    m: int,
-    order: Tensor,
-    packed: Tensor,
-    stride: int,
-    records: Tensor,
-    tiles_x: int,
-    tiles_y: int,
-    parts: int,
-    workspace: Tensor,
-    tile_start: Tensor,
-    capacity: int,
-    instance_splat: Tensor,
-    instance_slot: Tensor | None,
-    slot_range: Tensor | None,
-) -> int:
-    needed, corners, sizes, touched, slots = _open_workspace(workspace, m)
-    tiles = tiles_x * tiles_y  # and this is the tile of what is in none
+def _tiles_fill(run: Run, suffix: str, p: TilesFillParams) -> int:
+    binning, capacity = p.binning, p.capacity
+    required, corners, sizes, touched, slots = _open_workspace(binning.workspace, p.n)
+    tiles = binning.tiles_x * binning.tiles_y  # also the key of instances that are in no tile
     bits = tiles.bit_length()
     narrow = bits <= 16
 
     def empty(dtype: torch.dtype) -> Tensor:
-        return torch.empty(capacity, dtype=dtype, device=packed.device)
+        return torch.empty(capacity, dtype=dtype, device=binning.packed.device)
 
     key = torch.int16 if narrow else torch.int32
     keys, keys2, spare = empty(key), empty(key), empty(torch.int32)
-    # What the sort carries: the splats, or where slots are wanted these, and their splats follow.
-    carried = instance_splat if instance_slot is None else instance_slot
+    # The sort carries the splats; if slots are required it carries the slots, and the splats are
+    # looked up afterwards.
+    in_slots = p.instance_slot is not None
+    carried = p.instance_splat if p.instance_slot is None else p.instance_slot
     pair = (carried, spare) if sort_passes(bits) % 2 == 0 else (spare, carried)
-    slot_splat = pair[0] if instance_slot is None else empty(torch.int32)
+    slot_splat = empty(torch.int32) if in_slots else pair[0]
     run(
         f"tiles_fill{suffix}",
-        KERNELS["tiles_fill"].blocks(m),
-        *(m, order, packed, stride, tiles_x, tiles_y, corners, sizes, touched, slots),
-        *((keys, None) if narrow else (None, keys)),
-        slot_splat,
-        capacity,
-        slot_range,
+        KERNELS["tiles_fill"].blocks(p.n),
+        TilesFillKernelParams(
+            n=p.n,
+            order=binning.order,
+            packed=binning.packed,
+            stride=binning.stride,
+            tiles_x=binning.tiles_x,
+            tiles_y=binning.tiles_y,
+            corners=corners,
+            sizes=sizes,
+            tiles=touched,
+            first_slots=slots,
+            tiles_16=keys if narrow else None,
+            tiles_32=None if narrow else keys,
+            splats=slot_splat,
+            capacity=capacity,
+            slot_range=p.slot_range,
+        ),
     )
-    rows = instance_slot is not None
-    keys, _ = sort_pairs(run, capacity, keys, keys2, *pair, (0, bits), count=needed, rows=rows)
-    if instance_slot is not None:
-        blocks = KERNELS["tiles_gather"].blocks(capacity)
-        run("tiles_gather", blocks, capacity, slot_splat, instance_slot, needed, instance_splat)
+    keys, _ = sort_pairs(
+        run, capacity, keys, keys2, *pair, (0, bits), count=required, rows=in_slots
+    )
+    if p.instance_slot is not None:
+        run(
+            "tiles_gather",
+            KERNELS["tiles_gather"].blocks(capacity),
+            TilesGatherParams(
+                n=capacity,
+                slot_splat=slot_splat,
+                instance_slot=p.instance_slot,
+                required=required,
+                instance_splat=p.instance_splat,
+            ),
+        )
     start = "tiles_start_u16" if narrow else "tiles_start_u32"
-    run(start, KERNELS[start].blocks(tiles + 1), tiles + 1, keys, needed, capacity, tile_start)
+    run(
+        start,
+        KERNELS[start].blocks(tiles + 1),
+        TilesStartParams(
+            n=tiles + 1,
+            keys=keys,
+            required=required,
+            capacity=capacity,
+            tile_start=binning.tile_start,
+        ),
+    )
     return 0
 
 
 SEQUENCES: dict[str, Callable[..., int]] = {
-    "splat_record_bytes": _nothing,  # blending reads the packed rows themselves
-    "splats_recolor": _nothing,
-    "tiles_parts": _nothing,
+    "splat_record_bytes": _zero,  # the GPU reads the packed rows themselves
+    "splats_recolor": _zero,
+    "tiles_parts": _zero,
     "tiles_workspace_bytes": _workspace_bytes,
-    "splats_prepare": _splats_prepare,
     "splats_sort": _splats_sort,
     "tiles_count": _tiles_count,
     "tiles_fill": _tiles_fill,

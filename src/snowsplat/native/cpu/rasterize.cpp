@@ -1,4 +1,4 @@
-// Blending: the splats of each 16×16 tile, front to back, and the gradient of that.
+// Rasterization: composites the splats of each 16×16 tile front to back; and its gradient.
 //
 // Pixels are in SIMD lanes: a block is W neighbouring pixels of one row (a whole row at W = 16), a
 // tile has 256/W blocks, numbered column-major: block = (x / W) · 16 + y. One vector test per
@@ -12,8 +12,9 @@
 //           to log α is w·(g·c) − α S/(1 − α): no division by T, no last index per pixel. A splat's
 //           sums stay in lanes over its blocks and are folded once, into a slot of its own: no
 //           atomics, so the result is the same for any number of threads.
+#include "cpu/entry.h"
 #include "cpu/pool.h"
-#include "cpu/records.h"
+#include "cpu/splat_record.h"
 #include "simd.h"
 
 namespace snow {
@@ -157,8 +158,14 @@ struct Frame {
   int64_t width, height, tiles_x;
   const SplatRecord<T>* records;
   const uint32_t *tile_start, *instance_splat;
-  uint32_t* tile_end;  // where the forward pass stopped, every pixel opaque
+  uint32_t* tile_end;
   typename Tile<V>::Bits* instance_blocks;
+
+  explicit Frame(const FrameParams<T>& p)
+      : width(p.width), height(p.height), tiles_x((p.width + kTile - 1) / kTile),
+        records(p.records), tile_start(p.tile_start), instance_splat(p.instance_splat),
+        tile_end(p.tile_end),
+        instance_blocks(static_cast<typename Tile<V>::Bits*>(p.instance_blocks)) {}
 };
 
 // With `Count`, the image is the number of splats that were blended.
@@ -183,7 +190,6 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
     for (int k = 0; k < C; k++) block[b].color[k] = V(0.f);
     if (n) live |= Bits(1) << b;
   }
-  const V threshold(kLog2MinAlpha), max_alpha(kMaxAlpha), min_t(kMinTransmittance);
   const uint32_t end = f.tile_start[index + 1];
   uint32_t i = f.tile_start[index];
   RowTerms<V> rows[kChunk];
@@ -215,9 +221,9 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
         list &= list - 1;
         const SplatRecord<T>& r = *splat[j];
         const V power = (V(r.terms.A) * X + V(rows[j].p1[row])) * X + V(rows[j].p0[row]);
-        const V a = zero_unless(power >= threshold, min(exp2_blend(power), max_alpha));
+        const V a = zero_unless(is_blended(power), capped_alpha(exp2_blend(power)));
         V weight = a * transmittance, next = transmittance - weight;
-        const auto open = next >= min_t;
+        const auto open = is_open(next);
         if (__builtin_expect(V::bits(open) != still, 0)) {
           // Some lanes would fall below the least transmittance: they stop here, before this splat.
           const auto stops = V::from_bits(still & ~V::bits(open));
@@ -231,7 +237,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
         }
         transmittance = next;
         if constexpr (Count)
-          color[0] += zero_unless((power >= threshold) & open, V(1.f));
+          color[0] += zero_unless(is_blended(power) & open, V(1.f));
         else
           for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
       }
@@ -255,7 +261,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
   }
 }
 
-// grad_alpha may be null. image and grad_image are the group's planes.
+// grad_alpha may be null. image and grad_image are the planes of the group of channels.
 template <class V, int C, class T = typename V::Scalar>
 void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_t* instance_slot,
                    const T* image, const T* grad_image, const T* alpha, const T* grad_alpha,
@@ -292,7 +298,7 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
     }
     block[b].behind = behind;
   }
-  const V threshold(kLog2MinAlpha), max_alpha(kMaxAlpha), min_t(kMinTransmittance), one(1.f);
+  const V max_alpha(kMaxAlpha);
   const uint32_t end = f.tile_end[index];
   uint32_t i = f.tile_start[index];
   RowTerms<V> rows;
@@ -321,9 +327,9 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
         Block& s = block[b];
         const V power = (A * X + V(rows.p1[row])) * X + V(rows.p0[row]);
         const V e = exp2_blend(power);
-        const V a = zero_unless(power >= threshold, min(e, max_alpha));
+        const V a = zero_unless(is_blended(power), capped_alpha(e));
         V weight = a * s.transmittance, next = s.transmittance - weight;
-        const auto open = next >= min_t;
+        const auto open = is_open(next);
         if (__builtin_expect(V::bits(open) != alive[b], 0)) {
           alive[b] = V::bits(open);
           weight = zero_unless(open, weight), next = zero_unless(open, next);
@@ -336,8 +342,7 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
         }
         const V ahead = weight * seen, behind = s.behind - ahead;
         s.behind = behind;
-        const V q =
-            zero_unless(open & (e < max_alpha), ahead - a * behind * reciprocal_estimate(one - a));
+        const V q = zero_unless(open & (e < max_alpha), log_alpha_gradient(ahead, a, behind));
         const V dy(rows.dy[row]);
         q0 += q;
         qy += q * dy;
@@ -355,27 +360,63 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
   }
 }
 
-// Sum over pixels of grad_image · (1 − alpha), a row at a time: the gradient of the background.
+// Sum over pixels of grad_image · (1 − alpha), per row: the gradient of the background.
 template <class T>
-void background_rows(int64_t height, int64_t width, int64_t channels, const T* grad_image,
-                     const T* alpha, double* rows) {
-  parallel_for(height, [&](int64_t y) {
-    for (int64_t k = 0; k < channels; k++) {
+int64_t background_rows(const BackgroundBackwardParams<T>& p) {
+  parallel_for(p.n, [&](int64_t y) {
+    const T* alpha = p.alpha + y * p.width;
+    for (int64_t k = 0; k < p.channels; k++) {
+      const T* grad = p.grad_image + (k * p.n + y) * p.width;
       double sum = 0;
-      for (int64_t x = 0; x < width; x++)
-        sum +=
-            double(grad_image[(k * height + y) * width + x]) * (1.0 - double(alpha[y * width + x]));
-      rows[y * channels + k] = sum;
+      for (int64_t x = 0; x < p.width; x++) sum += double(grad[x]) * (1.0 - double(alpha[x]));
+      p.rows[y * p.channels + k] = sum;
     }
   });
+  return 0;
 }
 
 template <class F>
 void for_tiles(int64_t tiles, F&& body) {
-  constexpr int64_t kTogether = 4;  // tiles a task: neighbours share splats in the cache
+  constexpr int64_t kTogether = 4;  // tiles per task: neighbours share splats in the cache
   parallel_for((tiles + kTogether - 1) / kTogether, [&](int64_t task) {
     for (int64_t t = task * kTogether; t < tiles && t < (task + 1) * kTogether; t++) body(t);
   });
+}
+
+template <class V, class T = typename V::Scalar>
+int64_t forward(const RasterizeForwardParams<T>& p) {
+  const Frame<V> f(p.frame);
+  for_tiles(p.n, [&](int64_t t) {
+    if (p.channels <= 3)
+      forward_tile<V, 3>(f, t, int(p.channels), p.background, p.image, p.alpha);
+    else
+      forward_tile<V, 4>(f, t, int(p.channels), p.background, p.image, p.alpha);
+  });
+  return 0;
+}
+
+template <class V, class T = typename V::Scalar>
+int64_t count(const RasterizeCountParams<T>& p) {
+  const Frame<V> f(p.frame);
+  const T nothing_behind = 0;
+  for_tiles(p.n, [&](int64_t t) {
+    forward_tile<V, 1, true, T>(f, t, 1, &nothing_behind, p.counts, nullptr);
+  });
+  return 0;
+}
+
+template <class V, class T = typename V::Scalar>
+int64_t backward(const RasterizeBackwardParams<T>& p) {
+  const Frame<V> f(p.frame);
+  for_tiles(p.n, [&](int64_t t) {
+    if (p.channels <= 3)
+      backward_tile<V, 3>(f, t, int(p.channels), p.instance_slot, p.image, p.grad_image, p.alpha,
+                          p.grad_alpha, p.slots);
+    else
+      backward_tile<V, 4>(f, t, int(p.channels), p.instance_slot, p.image, p.grad_image, p.alpha,
+                          p.grad_alpha, p.slots);
+  });
+  return 0;
 }
 
 }  // namespace
@@ -383,66 +424,17 @@ void for_tiles(int64_t tiles, F&& body) {
 
 using namespace snow;
 
-#define SNOW_BLEND_ENTRIES(SUFFIX, V)                                                             \
-  SNOW_EXPORT int64_t blend_fwd##SUFFIX(                                                          \
-      int64_t tiles, int64_t width, int64_t height, const V::Scalar*, int64_t, const int64_t*,    \
-      const SplatRecord<V::Scalar>* records, const uint32_t* tile_start, uint32_t* tile_end,      \
-      const uint32_t* instance_splat, Tile<V>::Bits* instance_blocks, int64_t channels,           \
-      const V::Scalar* background, V::Scalar* image, V::Scalar* alpha) {                          \
-    const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
-                        records,  tile_start,     instance_splat,                                 \
-                        tile_end, instance_blocks};                                               \
-    for_tiles(tiles, [&](int64_t t) {                                                             \
-      if (channels <= 3)                                                                          \
-        forward_tile<V, 3>(f, t, int(channels), background, image, alpha);                        \
-      else                                                                                        \
-        forward_tile<V, 4>(f, t, int(channels), background, image, alpha);                        \
-    });                                                                                           \
-    return 0;                                                                                     \
-  }                                                                                               \
-  SNOW_EXPORT int64_t blend_count##SUFFIX(                                                        \
-      int64_t tiles, int64_t width, int64_t height, const V::Scalar*, int64_t, const int64_t*,    \
-      const SplatRecord<V::Scalar>* records, const uint32_t* tile_start, uint32_t* tile_end,      \
-      const uint32_t* instance_splat, Tile<V>::Bits* instance_blocks, V::Scalar* counts) {        \
-    const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
-                        records,  tile_start,     instance_splat,                                 \
-                        tile_end, instance_blocks};                                               \
-    const V::Scalar nothing_behind = 0;                                                           \
-    for_tiles(tiles, [&](int64_t t) {                                                             \
-      forward_tile<V, 1, true, V::Scalar>(f, t, 1, &nothing_behind, counts, nullptr);             \
-    });                                                                                           \
-    return 0;                                                                                     \
-  }                                                                                               \
-  SNOW_EXPORT int64_t blend_bwd##SUFFIX(                                                          \
-      int64_t tiles, int64_t width, int64_t height, const V::Scalar*, int64_t, const int64_t*,    \
-      const SplatRecord<V::Scalar>* records, const uint32_t* tile_start, uint32_t* tile_end,      \
-      const uint32_t* instance_splat, Tile<V>::Bits* instance_blocks, int64_t channels,           \
-      const uint32_t* instance_slot, const V::Scalar* image, const V::Scalar* grad_image,         \
-      const V::Scalar* alpha, const V::Scalar* grad_alpha, V::Scalar* slots, V::Scalar*) {        \
-    const Frame<V> f = {width,    height,         (width + kTile - 1) / kTile,                    \
-                        records,  tile_start,     instance_splat,                                 \
-                        tile_end, instance_blocks};                                               \
-    for_tiles(tiles, [&](int64_t t) {                                                             \
-      if (channels <= 3)                                                                          \
-        backward_tile<V, 3>(f, t, int(channels), instance_slot, image, grad_image, alpha,         \
-                            grad_alpha, slots);                                                   \
-      else                                                                                        \
-        backward_tile<V, 4>(f, t, int(channels), instance_slot, image, grad_image, alpha,         \
-                            grad_alpha, slots);                                                   \
-    });                                                                                           \
-    return 0;                                                                                     \
-  }                                                                                               \
-  SNOW_EXPORT int64_t background_bwd##SUFFIX(int64_t height, int64_t width, int64_t channels,     \
-                                             const V::Scalar* grad_image, const V::Scalar* alpha, \
-                                             double* rows) {                                      \
-    background_rows(height, width, channels, grad_image, alpha, rows);                            \
-    return 0;                                                                                     \
-  }                                                                                               \
-  /* Bytes of instance_blocks per (tile, splat) instance. */                                      \
-  SNOW_EXPORT int64_t blend_block_bytes##SUFFIX(int64_t) { return sizeof(Tile<V>::Bits); }
+SNOW_ENTRY(rasterize_fwd, RasterizeForwardParams<float>) { return forward<VecF>(p); }
+SNOW_ENTRY(rasterize_fwd_f64, RasterizeForwardParams<double>) { return forward<VecD>(p); }
+SNOW_ENTRY(rasterize_count, RasterizeCountParams<float>) { return count<VecF>(p); }
+SNOW_ENTRY(rasterize_count_f64, RasterizeCountParams<double>) { return count<VecD>(p); }
+SNOW_ENTRY(rasterize_bwd, RasterizeBackwardParams<float>) { return backward<VecF>(p); }
+SNOW_ENTRY(rasterize_bwd_f64, RasterizeBackwardParams<double>) { return backward<VecD>(p); }
+SNOW_ENTRY(background_bwd, BackgroundBackwardParams<float>) { return background_rows(p); }
+SNOW_ENTRY(background_bwd_f64, BackgroundBackwardParams<double>) { return background_rows(p); }
 
-SNOW_BLEND_ENTRIES(, VecF)
-SNOW_BLEND_ENTRIES(_f64, VecD)
-
-// 1 where gradients are summed in slots, in order; 0 where they are added up where they belong.
-SNOW_EXPORT int64_t blend_sums_in_order(int64_t) { return 1; }
+// Bytes of instance_blocks per instance.
+SNOW_ENTRY(rasterize_block_bytes, SizeQueryParams) { return (void)p, sizeof(Tile<VecF>::Bits); }
+SNOW_ENTRY(rasterize_block_bytes_f64, SizeQueryParams) { return (void)p, sizeof(Tile<VecD>::Bits); }
+// 1 where gradients are summed in slots, in a fixed order; 0 where they are added atomically.
+SNOW_ENTRY(rasterize_sums_in_order, SizeQueryParams) { return (void)p, 1; }

@@ -1,0 +1,125 @@
+// The layout of a struct of parameters as one number. Python fills these structs (ops/params.py) and
+// computes the same number; when it loads a library it compares the two.
+//
+//   struct ExampleParams {
+//     int64_t n;
+//     const float* values;
+//     SNOW_FIELDS(n, values)  // every member, in order
+//   };
+//
+// layout_of<ExampleParams>() is a hash of the text "n:i@0;values:p@8;#16": of every field the name,
+// the kind (p pointer, i int64_t, d double, or {…} for a nested struct) and the offset in bytes,
+// then the size of the struct. The text begins with the constants that Python and C++ share.
+#pragma once
+
+#include "portable.h"
+
+namespace snow {
+
+constexpr int kTile = 16;           // edge of a tile in pixels
+constexpr int kGroupChannels = 4;   // channels that one rasterization pass carries at most
+constexpr int kSlotWidth = 16;      // scalars of a (tile, splat) gradient: ≤ 4 colours, 6 moments
+constexpr int kPackedHeader = 8;    // columns of Splats2D before the colours
+constexpr int kPackedStride = 16;   // columns of Splats2D with three colours
+constexpr int kPoseSums = 15;       // 9 of the rotation, 3 of the translation, 3 of the position
+constexpr int kMaxNeighbours = 64;  // largest k of `neighbours`
+
+class LayoutHash {
+ public:
+  constexpr void text(const char* characters) {
+    for (; *characters; characters++)
+      value = (value ^ uint64_t(*characters)) * 1099511628211ull;  // FNV-1a
+  }
+  constexpr void number(int64_t n) {
+    if (n >= 10) number(n / 10);
+    const char digit[2] = {char('0' + n % 10), 0};
+    text(digit);
+  }
+  constexpr void constant(const char* name, int n) { text(name), text("="), number(n), text(";"); }
+
+  uint64_t value = 14695981039346656037ull;
+};
+
+// A nested struct; the specialisations are the kinds of single fields.
+template <class Field>
+struct FieldKind {
+  static constexpr void describe(LayoutHash& hash) {
+    hash.text("{"), Field::template describe<Field>(hash), hash.text("}");
+  }
+};
+template <class Pointee>
+struct FieldKind<Pointee*> {
+  static constexpr void describe(LayoutHash& hash) { hash.text("p"); }
+};
+template <>
+struct FieldKind<int64_t> {
+  static constexpr void describe(LayoutHash& hash) { hash.text("i"); }
+};
+template <>
+struct FieldKind<double> {
+  static constexpr void describe(LayoutHash& hash) { hash.text("d"); }
+};
+
+template <class Params>
+constexpr uint64_t layout_of() {
+  LayoutHash hash;
+  hash.constant("tile", kTile);
+  hash.constant("group_channels", kGroupChannels);
+  hash.constant("slot_width", kSlotWidth);
+  hash.constant("packed_header", kPackedHeader);
+  hash.constant("packed_stride", kPackedStride);
+  hash.constant("pose_sums", kPoseSums);
+  hash.constant("max_neighbours", kMaxNeighbours);
+  Params::template describe<Params>(hash);
+  return hash.value;
+}
+
+}  // namespace snow
+
+#if defined(__CUDACC_RTC__)  // has neither <cstddef> nor the builtin
+#define SNOW_OFFSET_OF(STRUCT, NAME) __INTADDR__(&(static_cast<STRUCT*>(0)->NAME))
+#else
+#define SNOW_OFFSET_OF(STRUCT, NAME) __builtin_offsetof(STRUCT, NAME)
+#endif
+
+// Within a struct: its members, in order.
+#define SNOW_FIELDS(...)                                   \
+  template <class Self>                                    \
+  static constexpr void describe(snow::LayoutHash& hash) { \
+    SNOW_FOR_EACH(SNOW_DESCRIBE_FIELD, __VA_ARGS__)        \
+    hash.text("#"), hash.number(int64_t(sizeof(Self)));    \
+  }
+#define SNOW_DESCRIBE_FIELD(NAME)                        \
+  hash.text(#NAME), hash.text(":");                      \
+  snow::FieldKind<decltype(Self::NAME)>::describe(hash); \
+  hash.text("@"), hash.number(int64_t(SNOW_OFFSET_OF(Self, NAME))), hash.text(";");
+
+// MACRO(a) MACRO(b) … for up to 20 arguments.
+#define SNOW_FOR_EACH(MACRO, ...)                                                                 \
+  SNOW_TWENTY_FIRST(__VA_ARGS__, SNOW_EACH_20, SNOW_EACH_19, SNOW_EACH_18, SNOW_EACH_17,          \
+                    SNOW_EACH_16, SNOW_EACH_15, SNOW_EACH_14, SNOW_EACH_13, SNOW_EACH_12,         \
+                    SNOW_EACH_11, SNOW_EACH_10, SNOW_EACH_9, SNOW_EACH_8, SNOW_EACH_7,            \
+                    SNOW_EACH_6, SNOW_EACH_5, SNOW_EACH_4, SNOW_EACH_3, SNOW_EACH_2, SNOW_EACH_1) \
+  (MACRO, __VA_ARGS__)
+#define SNOW_TWENTY_FIRST(A, B, C, D, E, F, G, H, I, J, K, L, M, N, O, P, Q, R, S, T, FOUND, ...) \
+  FOUND
+#define SNOW_EACH_1(MACRO, FIRST) MACRO(FIRST)
+#define SNOW_EACH_2(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_1(MACRO, __VA_ARGS__)
+#define SNOW_EACH_3(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_2(MACRO, __VA_ARGS__)
+#define SNOW_EACH_4(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_3(MACRO, __VA_ARGS__)
+#define SNOW_EACH_5(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_4(MACRO, __VA_ARGS__)
+#define SNOW_EACH_6(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_5(MACRO, __VA_ARGS__)
+#define SNOW_EACH_7(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_6(MACRO, __VA_ARGS__)
+#define SNOW_EACH_8(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_7(MACRO, __VA_ARGS__)
+#define SNOW_EACH_9(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_8(MACRO, __VA_ARGS__)
+#define SNOW_EACH_10(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_9(MACRO, __VA_ARGS__)
+#define SNOW_EACH_11(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_10(MACRO, __VA_ARGS__)
+#define SNOW_EACH_12(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_11(MACRO, __VA_ARGS__)
+#define SNOW_EACH_13(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_12(MACRO, __VA_ARGS__)
+#define SNOW_EACH_14(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_13(MACRO, __VA_ARGS__)
+#define SNOW_EACH_15(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_14(MACRO, __VA_ARGS__)
+#define SNOW_EACH_16(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_15(MACRO, __VA_ARGS__)
+#define SNOW_EACH_17(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_16(MACRO, __VA_ARGS__)
+#define SNOW_EACH_18(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_17(MACRO, __VA_ARGS__)
+#define SNOW_EACH_19(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_18(MACRO, __VA_ARGS__)
+#define SNOW_EACH_20(MACRO, FIRST, ...) MACRO(FIRST) SNOW_EACH_19(MACRO, __VA_ARGS__)

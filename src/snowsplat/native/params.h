@@ -1,0 +1,337 @@
+// The parameters of every operation: one struct each, passed across the boundary between Python and
+// the kernels. A CPU entry takes a pointer to the struct, a CUDA kernel takes it by value. The
+// Python side fills them by name (ops/params.py); layout.h says how the two are kept equal.
+//
+// Every field has 8 bytes. `n` comes first: how many items the operation processes. T is float or
+// double. Pointers marked "or null" are optional. Shapes are row-major.
+#pragma once
+
+#include "layout.h"
+
+namespace snow {
+
+template <class T>
+struct SplatRecord;  // cpu/splat_record.h
+
+template <class T>
+struct DepthKeyOf;
+template <>
+struct DepthKeyOf<float> {
+  using type = uint32_t;
+};
+template <>
+struct DepthKeyOf<double> {
+  using type = uint64_t;
+};
+template <class T>
+using DepthKey = typename DepthKeyOf<T>::type;
+
+// ---- Parts of the structs below -----------------------------------------------------------------
+
+// A pinhole camera. Pixel (i, j) has its centre at (i + 0.5, j + 0.5); z points forward.
+template <class T>
+struct CameraParams {
+  const T* cam_from_world;  // (3, 4): rotation and translation
+  double width, height;     // pixels
+  double fx, fy, cx, cy;    // pixels
+  double near;              // world units; what is nearer is not seen
+  SNOW_FIELDS(cam_from_world, width, height, fx, fy, cx, cy, near)
+};
+
+// The parameters of N Gaussians.
+template <class T>
+struct GaussianTensors {
+  const T* means;           // (N, 3) world units
+  const T* log_scales;      // (N, 3)
+  const T* quats;           // (N, 4) wxyz, of any length
+  const T* opacity_logits;  // (N,)
+  const T* sh_dc;           // (N, 1, 3)
+  const T* sh_rest;         // (N, sh_rest_rows, 3)
+  int64_t sh_rest_rows;     // rows of sh_rest as stored
+  int64_t sh_degree;        // 0 to 3: uses the first (sh_degree + 1)² − 1 of them
+  SNOW_FIELDS(means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_rest_rows, sh_degree)
+};
+
+// Their gradients, of the same shapes.
+template <class T>
+struct GaussianGradients {
+  T *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;
+  SNOW_FIELDS(means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
+};
+
+// ---- project ------------------------------------------------------------------------------------
+
+// project_cull: which Gaussians the camera sees.
+template <class T>
+struct ProjectCullParams {
+  int64_t n;  // Gaussians
+  GaussianTensors<T> gaussians;
+  CameraParams<T> camera;
+  int32_t* ids;  // out, (n,). CPU: the visible ones, compacted; returns their number. CUDA: i or −1
+  SNOW_FIELDS(n, gaussians, camera, ids)
+};
+
+// project_fwd: the splats of the visible Gaussians.
+template <class T>
+struct ProjectForwardParams {
+  int64_t n;           // splats
+  const int32_t* ids;  // (n,) the Gaussian of each splat; CUDA: −1 for an empty row
+  GaussianTensors<T> gaussians;
+  CameraParams<T> camera;
+  T* packed;  // out, (n, 16)
+  SNOW_FIELDS(n, ids, gaussians, camera, packed)
+};
+
+// project_bwd: the gradient of the splats carried to the Gaussians and the pose.
+template <class T>
+struct ProjectBackwardParams {
+  int64_t n;           // splats
+  const int32_t* ids;  // (n,) as for project_fwd
+  GaussianTensors<T> gaussians;
+  CameraParams<T> camera;
+  const T* grad_packed;        // (n, 16)
+  GaussianGradients<T> grads;  // out; rows that no splat came from are not written
+  double* pose;                // out, or null: (project_pose_blocks, 15) sums, to be added up
+  SNOW_FIELDS(n, ids, gaussians, camera, grad_packed, grads, pose)
+};
+
+// ---- adam_step ----------------------------------------------------------------------------------
+
+// A parameter of the Gaussians, its moments and what changes it.
+template <class T>
+struct AdamTensor {
+  T *value, *m, *v;
+  const T* extra;  // a gradient to add, of the shape of `value`; or null
+  double rate;     // lr / (1 − β₁ᵗ)
+  SNOW_FIELDS(value, m, v, extra, rate)
+};
+
+template <class T>
+struct AdamStepParams {
+  int64_t n;             // Gaussians
+  int64_t splats;        // rows of grad_packed
+  const int32_t* ids;    // CPU: (splats,) ascending rows of Gaussians. CUDA: (n,) the splat or −1
+  const T* grad_packed;  // (splats, 16)
+  CameraParams<T> camera;
+  int64_t sh_rest_rows, sh_degree;  // as in GaussianTensors
+  AdamTensor<T> means, log_scales, quats, opacity_logits, sh_dc, sh_rest;
+  double beta1, beta2;
+  double inv_correction2;   // 1 / (1 − β₂ᵗ)
+  double eps2;              // ε²
+  int64_t visible_only;     // 1: Gaussians without a splat keep their values and moments
+  const bool* valid;        // (1,), or null; false: nothing changes
+  int32_t* nonfinite_rows;  // (6,), or null: counts to which skipped rows are added
+  SNOW_FIELDS(n, splats, ids, grad_packed, camera, sh_rest_rows, sh_degree, means, log_scales,
+              quats, opacity_logits, sh_dc, sh_rest, beta1, beta2, inv_correction2, eps2,
+              visible_only, valid, nonfinite_rows)
+};
+
+// ---- accumulate_screen_statistics ---------------------------------------------------------------
+
+template <class T>
+struct ScreenStatisticsParams {
+  int64_t n;             // splats
+  const int32_t* ids;    // (n,) distinct Gaussians; negative: an empty row
+  const T* packed;       // (n, stride)
+  const T* grad_packed;  // (n, stride)
+  int64_t stride;        // columns
+  double width, height;  // pixels
+  T* norm_sum;           // (N,) the norm of the gradient of the mean is added
+  T* views;              // (N,) 1 is added
+  T* max_radii;          // (N,), or null: becomes the maximum with the radius
+  const bool* valid;     // (1,), or null; false: nothing changes
+  SNOW_FIELDS(n, ids, packed, grad_packed, stride, width, height, norm_sum, views, max_radii, valid)
+};
+
+// ---- rasterize: splats → tiles ------------------------------------------------------------------
+
+// splats_prepare: depth keys, and on the CPU the records that the later stages read.
+template <class T>
+struct SplatsPrepareParams {
+  int64_t n;                // splats
+  const T* packed;          // (n, stride)
+  int64_t stride;           // columns
+  int64_t width, height;    // pixels
+  const int64_t* columns;   // (4,) the columns that become channels; −1: zero
+  SplatRecord<T>* records;  // out, (n,); CPU only
+  DepthKey<T>* keys;        // out, (n,)
+  SNOW_FIELDS(n, packed, stride, width, height, columns, records, keys)
+};
+
+// splats_recolor: the records take other channels. CPU only.
+template <class T>
+struct SplatsRecolorParams {
+  int64_t n;
+  const T* packed;
+  int64_t stride;
+  const int64_t* columns;
+  SplatRecord<T>* records;
+  SNOW_FIELDS(n, packed, stride, columns, records)
+};
+
+// splats_sort: a stable sort by key.
+template <class T>
+struct SplatsSortParams {
+  int64_t n;
+  DepthKey<T>* keys;   // (n,) overwritten
+  DepthKey<T>* keys2;  // (n,) scratch
+  uint32_t* order;     // out, (n,) splats, nearest first
+  uint32_t* order2;    // (n,) scratch
+  SNOW_FIELDS(n, keys, keys2, order, order2)
+};
+
+// What tiles_count and tiles_fill share.
+template <class T>
+struct TileBinning {
+  const uint32_t* order;          // (splats,) from splats_sort
+  const T* packed;                // (splats, stride); CUDA only
+  int64_t stride;                 // columns
+  const SplatRecord<T>* records;  // (splats,); CPU only
+  int64_t tiles_x, tiles_y;       // tiles of the image
+  int64_t parts;                  // of the work, from tiles_parts; CPU only
+  void* workspace;                // tiles_workspace_bytes, carried from tiles_count to tiles_fill
+  uint32_t* tile_start;           // out, (tiles + 1,) first instance of each tile
+  SNOW_FIELDS(order, packed, stride, records, tiles_x, tiles_y, parts, workspace, tile_start)
+};
+
+// tiles_count: how many instances, pairs of a splat and a tile it touches, there are.
+template <class T>
+struct TilesCountParams {
+  int64_t n;  // splats
+  TileBinning<T> binning;
+  int64_t capacity;   // CUDA: instances that memory is allocated for, or −1 to wait for the count
+  int64_t* required;  // out, (1,) instances
+  SNOW_FIELDS(n, binning, capacity, required)
+};
+
+// tiles_fill: the splats of each tile, nearest first.
+template <class T>
+struct TilesFillParams {
+  int64_t n;  // splats
+  TileBinning<T> binning;
+  int64_t capacity;          // instances that the arrays have room for
+  uint32_t* instance_splat;  // out, (capacity,) sorted by tile
+  uint32_t* instance_slot;   // out, (capacity,) its number splat by splat; CUDA: or null
+  uint32_t* slot_range;  // out, (n, 2) first slot of a splat and the one after its last; or null
+  SNOW_FIELDS(n, binning, capacity, instance_splat, instance_slot, slot_range)
+};
+
+// ---- rasterize: tiles → image and back ----------------------------------------------------------
+
+// The splats of a frame, sorted into tiles.
+template <class T>
+struct FrameParams {
+  int64_t width, height;           // pixels
+  const T* packed;                 // (splats, stride)
+  int64_t stride;                  // columns
+  const int64_t* columns;          // (4,) the columns that are the channels; −1: zero
+  const SplatRecord<T>* records;   // (splats,); CPU only
+  const uint32_t* tile_start;      // (tiles + 1,)
+  uint32_t* tile_end;              // (tiles,) where the forward pass stopped, every pixel opaque
+  const uint32_t* instance_splat;  // (instances,)
+  void* instance_blocks;           // (instances,) bits of the pixel blocks that a splat touches
+  SNOW_FIELDS(width, height, packed, stride, columns, records, tile_start, tile_end, instance_splat,
+              instance_blocks)
+};
+
+template <class T>
+struct RasterizeForwardParams {
+  int64_t n;  // tiles
+  FrameParams<T> frame;
+  int64_t channels;     // 1 to 4
+  const T* background;  // (channels,)
+  T* image;             // out, (channels, height, width)
+  T* alpha;             // out, (height, width), or null
+  SNOW_FIELDS(n, frame, channels, background, image, alpha)
+};
+
+// rasterize_count: how many splats each pixel blends.
+template <class T>
+struct RasterizeCountParams {
+  int64_t n;  // tiles
+  FrameParams<T> frame;
+  T* counts;  // out, (height, width)
+  SNOW_FIELDS(n, frame, counts)
+};
+
+template <class T>
+struct RasterizeBackwardParams {
+  int64_t n;  // tiles
+  FrameParams<T> frame;
+  int64_t channels;               // 1 to 4
+  const uint32_t* instance_slot;  // (instances,), or null where slots is
+  const T* image;                 // (channels, height, width) as the forward pass left it
+  const T* grad_image;            // the same shape
+  const T* alpha;                 // (height, width)
+  const T* grad_alpha;            // (height, width), or null
+  T* slots;                       // out, (instances, 16) gradients, to be added by splats_reduce;
+                                  // null: they are added to grad_packed atomically (CUDA)
+  T* grad_packed;                 // (splats, stride)
+  SNOW_FIELDS(n, frame, channels, instance_slot, image, grad_image, alpha, grad_alpha, slots,
+              grad_packed)
+};
+
+// splats_reduce: the gradient of a splat from those of its instances.
+template <class T>
+struct SplatsReduceParams {
+  int64_t n;                   // splats
+  const T* slots;              // (instances, 16)
+  const uint32_t* slot_range;  // (n, 2)
+  const T* packed;             // (n, stride)
+  int64_t stride;              // columns
+  int64_t channels;            // 1 to 4
+  const int64_t* columns;      // (4,) where the gradients of the channels go
+  int64_t add;                 // 1: add to grad_packed; 0: write every column
+  T* grad_packed;              // (n, stride)
+  SNOW_FIELDS(n, slots, slot_range, packed, stride, channels, columns, add, grad_packed)
+};
+
+// background_bwd: the sum of grad_image · (1 − alpha) over each row of pixels.
+template <class T>
+struct BackgroundBackwardParams {
+  int64_t n;            // rows: the height of the image
+  int64_t width;        // pixels
+  int64_t channels;     // any number
+  const T* grad_image;  // (channels, n, width)
+  const T* alpha;       // (n, width)
+  double* rows;         // out, (n, channels)
+  SNOW_FIELDS(n, width, channels, grad_image, alpha, rows)
+};
+
+// ---- photometric --------------------------------------------------------------------------------
+
+// L1 and SSIM between two images. Target is T, or uint8_t with 255 for 1.
+template <class T, class Target>
+struct PhotometricParams {
+  int64_t n;                      // channels
+  int64_t width, height;          // pixels
+  const T* image;                 // (n, height, width)
+  const Target* target;           // (n, height, width)
+  double l1_weight, ssim_weight;  // of the two in the gradient
+  T* grad;                        // out, of the weighted sum, or null
+  double* means;                  // out, (2,) mean |a − b| and mean SSIM
+  SNOW_FIELDS(n, width, height, image, target, l1_weight, ssim_weight, grad, means)
+};
+
+// ---- neighbours ---------------------------------------------------------------------------------
+
+template <class T>
+struct NeighboursParams {
+  int64_t n;        // points
+  const T* points;  // (n, 3)
+  int64_t k;        // 1 to 64
+  T* distances;     // out, (n, k) ascending; infinity where there are fewer others
+  SNOW_FIELDS(n, points, k, distances)
+};
+
+// ---- sizes --------------------------------------------------------------------------------------
+
+// The question how large a scratch tensor has to be; the entry returns the answer.
+struct SizeQueryParams {
+  int64_t n;      // items
+  int64_t tiles;  // tiles_workspace_bytes only
+  int64_t parts;  // tiles_workspace_bytes only
+  SNOW_FIELDS(n, tiles, parts)
+};
+
+}  // namespace snow

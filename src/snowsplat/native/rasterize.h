@@ -1,0 +1,143 @@
+// The opacity of one splat at one pixel, the pixels where it is visible, and how splats are
+// composited.
+//
+// With d = pixel − mean, α(d) = o exp(−½ dᵀ K d) (Kerbl et al. 2023, eq. 3 and appendix). Kernels
+// use the base-2 logarithm, in which the opacity is a summand and the test α ≥ 1/255 one
+// comparison:
+//
+//   log₂ α = A dx² + B dx dy + C dy² + log₂ o,
+//   A = −½ log₂e · a,  B = −log₂e · b,  C = −½ log₂e · c
+//
+// Along a row of pixels x = X + x₀ this is a quadratic in X whose coefficients depend only on the
+// row.
+#pragma once
+
+#include "layout.h"
+
+namespace snow {
+
+// ---- Where a splat is visible -------------------------------------------------------------------
+
+// Squared Mahalanobis radius at which the splat fades to α = 1/255: α = o exp(−k²/2).
+template <class Real>
+SNOW_INLINE Real squared_cutoff(Real opacity) {
+  return Real(2 * kLn2) * (log2(opacity) - Real(kLog2MinAlpha));
+}
+
+// The pixels that the box of a splat's ellipse {α ≥ 1/255} covers, clamped to an image whose last
+// pixel is (right, bottom). `visible` is false where the box misses the image or the splat is no
+// ellipse.
+template <class Real>
+struct PixelExtent {
+  Real x0, y0, x1, y1;
+  decltype(Real(0.f) >= Real(0.f)) visible;
+
+  SNOW_INLINE PixelExtent(Real x, Real y, const Real* conic, Real opacity, Real right,
+                          Real bottom) {
+    const Real a = conic[0], b = conic[1], c = conic[2], zero(0.f), half(0.5f);
+    const Real det = a * c - b * b;
+    const Real k2 = squared_cutoff(opacity);
+    const Real reach = max(k2, zero) / det;
+    const Real ex = sqrt(reach * c), ey = sqrt(reach * a);
+    x0 = max(x - ex - half, zero), x1 = min(x + ex - half, right);
+    y0 = max(y - ey - half, zero), y1 = min(y + ey - half, bottom);
+    visible = (k2 >= zero) & (det > zero) & (a > zero) & (x1 >= x0) & (y1 >= y0);
+  }
+};
+
+// Unsigned integers in the order of the floats: the keys by which splats are sorted by depth.
+SNOW_INLINE uint32_t ordered_bits(float x) {
+  const uint32_t b = bits_of(x);
+  return b >> 31 ? ~b : b | 0x80000000u;
+}
+SNOW_INLINE uint64_t ordered_bits(double x) {
+  const uint64_t b = bits_of(x);
+  return b >> 63 ? ~b : b | 0x8000000000000000ull;
+}
+
+template <class Real>
+struct SplatTerms {
+  Real mean_x, mean_y, A, B, C, log2_opacity;
+  // −B/2A, −B/2C: log₂α peaks along a row at x = slope_x · dy, along a column at y = slope_y · dx.
+  Real slope_x, slope_y;
+};
+
+template <class Real>
+SNOW_INLINE SplatTerms<Real> splat_terms(Real mean_x, Real mean_y, const Real* conic,
+                                         Real opacity) {
+  SplatTerms<Real> s;
+  s.mean_x = mean_x, s.mean_y = mean_y;
+  s.A = Real(-0.5 * kLog2E) * conic[0];
+  s.B = Real(-kLog2E) * conic[1];
+  s.C = Real(-0.5 * kLog2E) * conic[2];
+  s.log2_opacity = log2(opacity);
+  s.slope_x = -(conic[1] / conic[0]);
+  s.slope_y = -(conic[1] / conic[2]);
+  return s;
+}
+
+// The largest log₂(α / o) over the pixel centres' rectangle [x0, x1] × [y0, y1], relative to the
+// mean. The quadratic is concave with its maximum at the origin, so its maximum over a rectangle
+// lies on an edge that faces the origin.
+template <class Real>
+SNOW_INLINE Real peak_over_rectangle(const SplatTerms<Real>& s, Real x0, Real y0, Real x1,
+                                     Real y1) {
+  const Real zero(0.f);
+  const Real y = min(max(zero, y0), y1), x_on = min(max(s.slope_x * y, x0), x1);
+  const Real x = min(max(zero, x0), x1), y_on = min(max(s.slope_y * x, y0), y1);
+  const Real on_row = (s.A * x_on + s.B * y) * x_on + s.C * y * y;
+  const Real on_column = (s.C * y_on + s.B * x) * y_on + s.A * x * x;
+  return max(on_row, on_column);
+}
+
+// Culling lowers the threshold of log₂α by this much, for rounding.
+constexpr double kCullSlack = 1e-3;
+
+// ---- Compositing --------------------------------------------------------------------------------
+//
+// Front to back, with the transmittance T = Π (1 − α) of the splats in front: a splat has the weight
+// α T, is skipped where α < 1/255, and ends the pixel where it would leave T < 1e-4.
+
+template <class Real>
+SNOW_INLINE auto is_blended(Real log2_alpha) {
+  return log2_alpha >= Real(kLog2MinAlpha);
+}
+
+// Keeps 1 − α away from 0.
+template <class Real>
+SNOW_INLINE Real capped_alpha(Real alpha) {
+  return min(alpha, Real(kMaxAlpha));
+}
+
+template <class Real>
+SNOW_INLINE auto is_open(Real transmittance) {
+  return transmittance >= Real(kMinTransmittance);
+}
+
+// ∂L/∂(log α) of a splat at a pixel: `ahead` is its weight times ∂L/∂C · c, `behind` the sum of that
+// over the splats behind it. No division by T is needed.
+template <class Real>
+SNOW_INLINE Real log_alpha_gradient(Real ahead, Real alpha, Real behind) {
+  return ahead - alpha * behind * reciprocal_estimate(Real(1.f) - alpha);
+}
+
+// Sums of q = ∂L/∂(log α) over pixels, weighted by the powers of d, are all that the geometric
+// gradients need:
+//   ∂ log α/∂mean = K d,  ∂/∂a = −½ dx²,  ∂/∂b = −dx dy,  ∂/∂c = −½ dy²,  ∂/∂o = 1/o
+template <class Real>
+struct BlendMoments {
+  Real q, qx, qy, qxx, qxy, qyy;
+};
+
+template <class Real>
+SNOW_INLINE void splat_terms_vjp(const Real* conic, Real opacity, const BlendMoments<Real>& m,
+                                 Real* d_mean, Real* d_conic, Real& d_opacity) {
+  d_mean[0] = conic[0] * m.qx + conic[1] * m.qy;
+  d_mean[1] = conic[1] * m.qx + conic[2] * m.qy;
+  d_conic[0] = Real(-0.5f) * m.qxx;
+  d_conic[1] = -m.qxy;
+  d_conic[2] = Real(-0.5f) * m.qyy;
+  d_opacity = m.q / opacity;
+}
+
+}  // namespace snow

@@ -1,0 +1,24 @@
+// accumulate_screen_statistics for one splat, on both engines.
+#pragma once
+
+#include "params.h"
+
+namespace snow {
+
+// Rows are distinct Gaussians, so no two threads share a sum. A splat whose gradient is not finite
+// does not count. Columns of Splats2D: 0 and 1 are the mean, 7 the radius.
+template <class T>
+SNOW_INLINE void accumulate_splat(const ScreenStatisticsParams<T>& p, int64_t i, T half_width,
+                                  T half_height) {
+  const int32_t row = p.ids[i];
+  if (row < 0) return;
+  const T* g = p.grad_packed + i * p.stride;
+  const T x = g[0] * half_width, y = g[1] * half_height;
+  const T norm = sqrt(x * x + y * y);
+  if (!is_finite(norm)) return;
+  p.norm_sum[row] += norm;
+  p.views[row] += T(1);
+  if (p.max_radii) p.max_radii[row] = max(p.packed[i * p.stride + 7], p.max_radii[row]);
+}
+
+}  // namespace snow

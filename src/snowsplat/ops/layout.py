@@ -1,0 +1,164 @@
+"""How a struct of parameters is laid out, packed for a kernel, and checked against the library.
+
+A struct is a dataclass that inherits `Params`; `native/params.h` has the same struct in C++. Every
+field has 8 bytes: a tensor goes as its data pointer, None as a null pointer, int and bool as int64,
+float as double, a nested struct as its fields. `Layout.hash` is the number that `layout_of` in
+`native/layout.h` computes from the names, kinds and offsets of the fields.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
+from operator import attrgetter
+from types import UnionType
+from typing import Any, get_args, get_type_hints
+
+import torch
+
+# Constants that Python and C++ share; native/layout.h hashes them too.
+TILE = 16
+"""Edge of a tile in pixels."""
+GROUP_CHANNELS = 4
+"""Channels that one rasterization pass carries at most."""
+SLOT_WIDTH = 16
+"""Scalars of the gradient of one splat in one tile."""
+PACKED_HEADER = 8
+"""Columns of `Splats2D.packed` before the colours."""
+PACKED_STRIDE = 16
+"""Columns of `Splats2D.packed` come in multiples of this."""
+POSE_SUMS = 15
+"""Numbers that make the gradient of a pose: 9 for R, 3 for t, 3 for the camera's position."""
+MAX_NEIGHBOURS = 64
+"""Largest k of `nearest_neighbours.neighbours`."""
+
+_CONSTANTS = {
+    "tile": TILE,
+    "group_channels": GROUP_CHANNELS,
+    "slot_width": SLOT_WIDTH,
+    "packed_header": PACKED_HEADER,
+    "packed_stride": PACKED_STRIDE,
+    "pose_sums": POSE_SUMS,
+    "max_neighbours": MAX_NEIGHBOURS,
+}
+
+_WORD = 8  # bytes of a field
+LARGEST_PARAMS = 1024
+"""Bytes that every struct fits into."""
+
+
+class Params:
+    """The parameters of an operation: the base of dataclasses with one field per member."""
+
+    __slots__ = ()
+
+
+class Layout:
+    """The layout of one subclass of `Params`; see `layout_of`."""
+
+    def __init__(self, params: type[Params]) -> None:
+        leaves = list(_leaves(params))
+        names = [name for name, _ in leaves]
+        self.name = params.__name__
+        self.names = tuple(names)
+        self.kinds = "".join(kind for _, kind in leaves)
+        self.size = _WORD * len(leaves)
+        # Indices of the fields that are tensors.
+        self.pointers = tuple(i for i, kind in enumerate(self.kinds) if kind == "p")
+        #: params → the values of all fields.
+        self.values: Callable[[Params], tuple[Any, ...]] = _getter(names)
+        self._format = struct.Struct("=" + self.kinds.translate({112: "Q", 105: "q", 100: "d"}))
+        text = "".join(f"{name}={value};" for name, value in _CONSTANTS.items())
+        self.hash = _fnv1a(text + _describe(params))
+
+    def pack_into(self, buffer: Any, params: Params) -> None:
+        """Writes the struct to the beginning of `buffer`, which has at least `size` bytes.
+
+        Raises:
+            TypeError: the value of a field is not of its kind.
+        """
+        values = list(self.values(params))
+        try:
+            for i in self.pointers:
+                tensor = values[i]
+                values[i] = 0 if tensor is None else tensor.data_ptr()
+            self._format.pack_into(buffer, 0, *values)
+        except (AttributeError, struct.error):
+            raise self._wrong_kind(params) from None
+
+    def _wrong_kind(self, params: Params) -> TypeError:
+        kinds: dict[str, tuple[type, ...]] = {
+            "p": (torch.Tensor, type(None)),
+            "i": (int,),
+            "d": (float, int),
+        }
+        for name, kind, value in zip(self.names, self.kinds, self.values(params), strict=True):
+            if not isinstance(value, kinds[kind]):
+                wanted = {"p": "a tensor or None", "i": "an int", "d": "a float"}[kind]
+                return TypeError(
+                    f"{self.name}: {name} must be {wanted}, got {type(value).__name__}"
+                )
+        return TypeError(f"{self.name}: an integer has more than 64 bits")
+
+
+def _getter(names: Sequence[str]) -> Callable[[Params], tuple[Any, ...]]:
+    if len(names) == 1:  # attrgetter of one name does not return a tuple
+        one = attrgetter(names[0])
+        return lambda params: (one(params),)
+    return attrgetter(*names)
+
+
+_layouts: dict[type[Params], Layout] = {}
+
+
+def layout_of(params: type[Params]) -> Layout:
+    """The layout of a struct of parameters."""
+    layout = _layouts.get(params)
+    if layout is None:
+        layout = _layouts[params] = Layout(params)
+    return layout
+
+
+def _leaves(params: type[Params], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """(dotted name, kind) of every field that is no struct, in order."""
+    for name, kind in _fields(params):
+        if isinstance(kind, str):
+            yield prefix + name, kind
+        else:
+            yield from _leaves(kind, f"{prefix}{name}.")
+
+
+def _describe(params: type[Params]) -> str:
+    """The text that is hashed: "n:i@0;values:p@8;#16"."""
+    text, offset = "", 0
+    for name, kind in _fields(params):
+        if isinstance(kind, str):
+            text += f"{name}:{kind}@{offset};"
+            offset += _WORD
+        else:
+            text += f"{name}:{{{_describe(kind)}}}@{offset};"
+            offset += _WORD * sum(1 for _ in _leaves(kind))
+    return f"{text}#{offset}"
+
+
+def _fields(params: type[Params]) -> Iterator[tuple[str, str | type[Params]]]:
+    """(name, kind) of the fields: p(ointer), i(nt64), d(ouble), or the struct that is nested."""
+    hints = get_type_hints(params)
+    for field in fields(params):  # type: ignore[arg-type]  # every subclass is a dataclass
+        yield field.name, _kind(hints[field.name])
+
+
+def _kind(hint: Any) -> str | type[Params]:
+    if isinstance(hint, UnionType):
+        (hint,) = (one for one in get_args(hint) if one is not type(None))
+    if issubclass(hint, Params):
+        return hint
+    return {torch.Tensor: "p", int: "i", bool: "i", float: "d"}[hint]
+
+
+def _fnv1a(text: str) -> int:
+    value = 14695981039346656037
+    for byte in text.encode():
+        value = (value ^ byte) * 1099511628211 % 2**64
+    return value
