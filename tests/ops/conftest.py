@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import pytest
 import torch
 
-from snowsplat.ops.cuda.kernels import Argument
+from snowsplat.ops.layout import Params
 from snowsplat.ops.native import LAUNCHERS
 
 from .engines import launcher
@@ -41,7 +41,7 @@ def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
     if exempt or "recorder" in request.fixturenames:  # the recorder is no kernel
         return
 
-    def unmarked(name: str, n: int, args: Sequence[Argument]) -> int:
+    def unmarked(name: str, params: Params) -> int:
         pytest.fail(f"runs the kernel {name} of the CPU; mark the test `isa`")
 
     monkeypatch.setitem(LAUNCHERS, "cpu", unmarked)
