@@ -532,24 +532,24 @@ using namespace snow;
 
 #define SNOW_RASTERIZE_KERNELS(SUFFIX, T, FORWARD_BLOCKS, BACKWARD_BLOCKS)                     \
   SNOW_KERNEL_OF(rasterize_fwd##SUFFIX, kBlock, FORWARD_BLOCKS, RasterizeForwardParams<T>) {   \
-    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                           \
-    const int channels = int(p.channels);                                               \
-    if (channels <= 3)                                                                  \
-      forward<3, false>(p.frame, channels, p.background, p.image, p.alpha, *memory);    \
-    else                                                                                \
-      forward<4, false>(p.frame, channels, p.background, p.image, p.alpha, *memory);    \
-  }                                                                                     \
-  SNOW_KERNEL(rasterize_count##SUFFIX, kBlock, RasterizeCountParams<T>) {               \
-    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                           \
-    forward<1, true, T>(p.frame, 1, nullptr, p.counts, nullptr, *memory);               \
-  }                                                                                     \
+    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                  \
+    const int channels = int(p.channels);                                                      \
+    if (channels <= 3)                                                                         \
+      forward<3, false>(p.frame, channels, p.background, p.image, p.alpha, *memory);           \
+    else                                                                                       \
+      forward<4, false>(p.frame, channels, p.background, p.image, p.alpha, *memory);           \
+  }                                                                                            \
+  SNOW_KERNEL(rasterize_count##SUFFIX, kBlock, RasterizeCountParams<T>) {                      \
+    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                  \
+    forward<1, true, T>(p.frame, 1, nullptr, p.counts, nullptr, *memory);                      \
+  }                                                                                            \
   SNOW_KERNEL_OF(rasterize_bwd##SUFFIX, kBlock, BACKWARD_BLOCKS, RasterizeBackwardParams<T>) { \
-    SNOW_SHARED(BackwardMemory<T>, memory, 1);                                          \
-    if (p.channels <= 3)                                                                \
-      backward<3>(p, *memory);                                                          \
-    else                                                                                \
-      backward<4>(p, *memory);                                                          \
-  }                                                                                     \
+    SNOW_SHARED(BackwardMemory<T>, memory, 1);                                                 \
+    if (p.channels <= 3)                                                                       \
+      backward<3>(p, *memory);                                                                 \
+    else                                                                                       \
+      backward<4>(p, *memory);                                                                 \
+  }                                                                                            \
   SNOW_KERNEL(background_bwd##SUFFIX, 128, BackgroundBackwardParams<T>) { background_row(p); }
 
 SNOW_RASTERIZE_KERNELS(, float, SNOW_FORWARD_BLOCKS, SNOW_BACKWARD_BLOCKS)
