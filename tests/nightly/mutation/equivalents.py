@@ -7,4 +7,110 @@ An entry that no fault matches is reported by mutate.py.
 from __future__ import annotations
 
 #: {(file in the package, lines before, lines after): why no test can notice it}
-EQUIVALENTS: dict[tuple[str, str, str], str] = {}
+EQUIVALENTS: dict[tuple[str, str, str], str] = {
+    (
+        "training/losses.py",
+        "target = photo.rgb if photo.alpha is None else photo.over(background)",
+        "target = photo.rgb if (photo.alpha is None) and False else photo.over(background)",
+    ): "an opaque photo over a background is that photo; 8 bits only save memory",
+    (
+        "training/density/adaptive.py",
+        "large |= torch.where(split, size / SPLIT_SHRINK, size) > settings.prune_world_size",
+        "large = torch.where(split, size / SPLIT_SHRINK, size) > settings.prune_world_size",
+    ): "nothing is large before this line",
+    (
+        "training/density/adaptive.py",
+        "grads = self.grad_sum / self.views.clamp_min(1.0)",
+        "grads = self.grad_sum / self.views.clamp_min(0.9375)",
+    ): "views are whole numbers; where there are none, the sum is 0",
+    (
+        "training/density/mcmc.py",
+        "NOISE_NEGLIGIBLE = 1e-4",
+        "NOISE_NEGLIGIBLE = 9.375e-05",
+    ): "a limit of what is negligible: another one near it is as good",
+    (
+        "scene/geometry.py",
+        "degenerate = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm(dim=-1, keepdim=True)",
+        "degenerate = right.norm(dim=-1, keepdim=True) <= 1e-6 * up.norm(dim=-1, keepdim=True)",
+    ): "rounding decides at equality; it is exact only for up = 0, which has no meaning",
+    (
+        "scene/edit.py",
+        "azimuth = index * (math.pi * (3.0 - math.sqrt(5.0)))",
+        "azimuth = index / (math.pi * (3.0 - math.sqrt(5.0)))",
+    ): "any directions that determine the coefficients give the same matrices",
+    (
+        "scene/edit.py",
+        "identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype)",
+        "identity = torch.tensor([2.0, 0.0, 0.0, 0.0], dtype=dtype)",
+    ): "quaternions need not be normalised",
+    (
+        "trajectory/focus.py",
+        "across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]",
+        "across = torch.eye(3, dtype=None) - forward[:, :, None] * forward[:, None, :]",
+    ): "0 and 1 are exact in float32, and the difference is float64",
+    (
+        "trajectory/video.py",
+        "src_color_range=ColorRange.JPEG,",
+        "",
+    ): "FFmpeg takes RGB for full range by itself",
+    (
+        "trajectory/spline.py",
+        "if count > 2:",
+        "if count >= 2:",
+    ): "with two samples every array of this block is empty",
+    (
+        "trajectory/spline.py",
+        "i = torch.searchsorted(self._times, t, right=True).clamp(1, len(self._times) - 1) - 1",
+        "i = torch.searchsorted(self._times, t, ).clamp(1, len(self._times) - 1) - 1",
+    ): "at a knot the pieces on both sides have the same value",
+    (
+        "trajectory/follow.py",
+        "differ = torch.cat([torch.tensor([True]), _steps(positions, quats, distance) > 1e-6])",
+        "differ = torch.cat([torch.tensor([True]), _steps(positions, quats, distance) >= 1e-6])",
+    ): "rounding decides at equality",
+    (
+        "ops/reference.py",
+        "order = torch.argsort(splats.depths.detach(), stable=True)",
+        "order = torch.argsort(splats.depths.detach(), stable=False)",
+    ): "on the CPU torch sorts stably anyway",
+    (
+        "ops/reference.py",
+        "first = torch.tensor([left + 0.5, top + 0.5]).to(means2d)",
+        "first = torch.tensor([left - 0.5, top + 0.5]).to(means2d)",
+    ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
+    (
+        "ops/reference.py",
+        "first = torch.tensor([left + 0.5, top + 0.5]).to(means2d)",
+        "first = torch.tensor([left + 0.5, top - 0.5]).to(means2d)",
+    ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
+    (
+        "ops/reference.py",
+        "last = torch.tensor([left + w - 0.5, top + h - 0.5]).to(means2d)",
+        "last = torch.tensor([left + w - 0.5, top + h - 0.46875]).to(means2d)",
+    ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
+    (
+        "ops/reference.py",
+        "low, high = means2d - reach - 1e-3, means2d + reach + 1e-3  # never one too few",
+        "low, high = means2d - reach - 0.0009375, means2d + reach + 1e-3  # never one too few",
+    ): "any margin above the rounding does",
+    (
+        "ops/reference.py",
+        "low, high = means2d - reach - 1e-3, means2d + reach + 1e-3  # never one too few",
+        "low, high = means2d - reach - 1e-3, means2d + reach + 1.001  # never one too few",
+    ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
+    (
+        "data/colmap/binary.py",
+        '+ image.name.encode("utf-8", errors="surrogateescape")',
+        '+ image.name.encode(errors="surrogateescape")',
+    ): "UTF-8 is the default",
+    (
+        "data/decode.py",
+        "colours = (colours + (1 - alpha) * behind).clip(0, 255)",
+        "colours = (colours + (1 - alpha) * behind).clip(None, 255)",
+    ): "the sum of values that are not negative is not negative",
+    (
+        "data/image_file.py",
+        "header = start + file.read(_LONGEST_HEADER)",
+        "header = start + file.read(None)",
+    ): "more is read than is needed",
+}
