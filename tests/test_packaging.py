@@ -247,8 +247,8 @@ def test_command_is_installed():
 def test_public_names_are_there_and_typed():
     import snowsplat
 
-    assert sorted(snowsplat._MODULES) == sorted(snowsplat.__all__)
-    for name in snowsplat.__all__:
+    assert sorted([*snowsplat._MODULES, "__version__"]) == sorted(snowsplat.__all__)
+    for name in snowsplat._MODULES:
         assert getattr(snowsplat, name).__name__ == name
     assert set(snowsplat.__all__) <= set(dir(snowsplat))
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
@@ -256,7 +256,7 @@ def test_public_names_are_there_and_typed():
 
 
 def test_importing_the_package_does_not_import_torch():
-    code = "import sys, snowsplat; print('torch' in sys.modules)"
+    code = "import sys, snowsplat, snowsplat.data; print('torch' in sys.modules)"
     result = run(
         sys.executable, "-c", code, env=os.environ | {"PYTHONPATH": str(REPOSITORY / "src")}
     )

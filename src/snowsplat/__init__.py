@@ -17,10 +17,10 @@ package does not import torch. `render` is in `snowsplat.scene.render`, the nume
 in `snowsplat.ops`.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from snowsplat._version import __version__
+from snowsplat.util.lazy import lazy_names
 
 if TYPE_CHECKING:
     from snowsplat.data import Dataset, Points, View, load_dataset
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from snowsplat.formats import read_gaussians
     from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.convert import Edits, convert
+    from snowsplat.pipeline.describe import describe
     from snowsplat.pipeline.evaluate import evaluate
     from snowsplat.pipeline.make import MakeOptions, make
     from snowsplat.pipeline.observer import Observer
@@ -62,6 +63,7 @@ _MODULES = {
     "VideoOptions": "pipeline.videos",
     "View": "data",
     "convert": "pipeline.convert",
+    "describe": "pipeline.describe",
     "evaluate": "pipeline.evaluate",
     "evaluate_views": "evaluation.metrics",
     "load_dataset": "data",
@@ -94,6 +96,7 @@ __all__ = [
     "View",
     "__version__",
     "convert",
+    "describe",
     "evaluate",
     "evaluate_views",
     "load_dataset",
@@ -108,14 +111,4 @@ __all__ = [
     "write_gaussians",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module 'snowsplat' has no attribute {name!r}")
-    value = getattr(import_module(f"snowsplat.{_MODULES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(globals().keys() | set(__all__))
+__getattr__, __dir__ = lazy_names(__name__, _MODULES)

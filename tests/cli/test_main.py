@@ -7,12 +7,15 @@ import subprocess
 import sys
 import warnings
 
+import numpy as np
 import pytest
 import torch
 
 from snowsplat.cli import main as module
+from snowsplat.data.points_ply import write_points
 from snowsplat.formats import write_gaussians
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training import checkpoint
 
 from .conftest import ENVIRONMENT
 
@@ -73,6 +76,13 @@ def test_info_describes_a_scene_without_torch(tmp_path, suffix):
     path = tmp_path / f"scene{suffix}"
     write_gaussians(path, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator(), sh_degree=1))
     assert "torch" not in imported_by("info", path)
+
+
+def test_info_describes_point_clouds_and_checkpoints_without_torch(tmp_path):
+    write_points(tmp_path / "points.ply", np.zeros((3, 3)), np.zeros((3, 3)))
+    path = checkpoint.save(tmp_path, 5, {"a": torch.zeros(3)}, {})
+    for file in (tmp_path / "points.ply", path):
+        assert "torch" not in imported_by("info", file)
 
 
 def test_info_describes_an_output_folder_without_torch(tmp_path):

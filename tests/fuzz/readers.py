@@ -25,7 +25,6 @@ import torch
 from PIL import Image
 from pillow_heif import register_heif_opener
 
-from snowsplat.cli.info import describe
 from snowsplat.data import load_dataset
 from snowsplat.data.decode import ImageSource, load_image, load_mask
 from snowsplat.data.decode import read_header as read_image_header
@@ -34,6 +33,7 @@ from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import FORMATS, GaussianArrays, read_gaussians, write_gaussians
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import unpack
+from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from snowsplat.data import load_dataset
@@ -31,7 +32,7 @@ from snowsplat.sfm.colmap.result import describe_model
 from snowsplat.sfm.ingest import photo_files
 from snowsplat.sfm.ingest.clip import is_video, read_clip
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import checkpoint
+from snowsplat.training import checkpoint, checkpoint_file
 from snowsplat.training.history import History
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
@@ -418,7 +419,7 @@ def write_model_of(folder: Path, names: list[str]) -> None:
 def test_a_model_with_photos_outside(tmp_path, name):
     """The undistorted images would be written outside too."""
     write_model_of(tmp_path, ["a.png", name])
-    with pytest.raises(UserError, match="which is not in .*input"):
+    with pytest.raises(UserError, match="has a photo .* outside of .*input"):
         describe_model(tmp_path, [])
 
 
@@ -549,17 +550,19 @@ def test_a_checkpoint_whose_header_was_changed(tmp_path, rejected):
     assert checkpoint.load(path).meta == {"rate": 0.125}
 
 
-@pytest.mark.parametrize(
-    ("tensor", "meta"),
-    [
-        (torch.ones(4).to(torch.float8_e4m3fn), {}),  # torch cannot sum this dtype
-        (torch.ones(4), [[1, 2]]),  # Python can convert this to a dict
-    ],
-)
-def test_a_checkpoint_of_another_program(tmp_path, rejected, monkeypatch, tensor, meta):
-    monkeypatch.setattr(checkpoint, "check_finite", lambda *_: None)
-    monkeypatch.setattr(checkpoint, "dict", lambda given: given, raising=False)
-    path = checkpoint.save(tmp_path, 5, {"a": tensor}, meta)
+@pytest.mark.parametrize("dtype", [torch.float8_e4m3fn, torch.bfloat16])
+def test_a_checkpoint_with_a_dtype_that_numpy_lacks(tmp_path, rejected, dtype):
+    path = checkpoint.save(tmp_path, 5, {"a": torch.ones(4)}, {})
+    with safe_open(path, framework="np") as file:
+        metadata = file.metadata()
+    save_file({"a": torch.ones(4).to(dtype)}, path, metadata)
+    assert "not a checkpoint" in rejected(lambda: checkpoint.load(path))
+
+
+def test_a_checkpoint_whose_meta_is_a_list(tmp_path, rejected, monkeypatch):
+    """Python can convert this list to a dict."""
+    monkeypatch.setattr(checkpoint_file, "dict", lambda given: given, raising=False)
+    path = checkpoint.save(tmp_path, 5, {"a": torch.ones(4)}, [[1, 2]])
     monkeypatch.undo()
     assert "not a checkpoint" in rejected(lambda: checkpoint.load(path))
 

@@ -14,7 +14,7 @@ from unittest import mock
 import pytest
 import torch
 
-from snowsplat.training import checkpoint
+from snowsplat.training import checkpoint, checkpoint_file
 from snowsplat.util.errors import UserError
 
 
@@ -102,28 +102,25 @@ def test_an_unreadable_file_is_not_treated_as_damaged(tmp_path):
     checkpoint.save(tmp_path, 500, some_tensors(), {})
     checkpoint.save(tmp_path, 1000, some_tensors(), {})
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    for spare in (0, 1):  # torch opens the file a second time
-        taken = []
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(512, limits[0]), limits[1]))
-        try:
-            with contextlib.suppress(OSError):
-                while True:
-                    taken.append(os.open(tmp_path, os.O_RDONLY))
-            for _ in range(spare):
-                os.close(taken.pop())
-            os.close(taken.pop())  # for listing the folder
-            found = checkpoint.files(tmp_path)
-            assert len(found) == 2
-            taken.append(os.open(tmp_path, os.O_RDONLY))
-            with (
-                mock.patch.object(checkpoint, "files", return_value=found),
-                pytest.raises(UserError, match=r"step_001000.*cannot be read"),
-            ):
-                checkpoint.latest(tmp_path)
-        finally:
-            for handle in taken:
-                os.close(handle)
-            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    taken = []
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(512, limits[0]), limits[1]))
+    try:
+        with contextlib.suppress(OSError):
+            while True:
+                taken.append(os.open(tmp_path, os.O_RDONLY))
+        os.close(taken.pop())  # for listing the folder
+        found = checkpoint.files(tmp_path)
+        assert len(found) == 2
+        taken.append(os.open(tmp_path, os.O_RDONLY))
+        with (
+            mock.patch.object(checkpoint, "files", return_value=found),
+            pytest.raises(UserError, match=r"step_001000.*cannot be read"),
+        ):
+            checkpoint.latest(tmp_path)
+    finally:
+        for handle in taken:
+            os.close(handle)
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 def test_any_damaged_byte_is_detected(tmp_path):
@@ -148,7 +145,7 @@ def test_foreign_files_and_other_versions(tmp_path, monkeypatch):
     save_file({"a": torch.zeros(3)}, tmp_path / "step_000001.safetensors")
     with pytest.raises(UserError, match="not a checkpoint"):
         checkpoint.load(tmp_path / "step_000001.safetensors")
-    monkeypatch.setattr(checkpoint, "VERSION", 99)
+    monkeypatch.setattr(checkpoint_file, "VERSION", 99)
     path = checkpoint.save(tmp_path, 2, {"a": torch.zeros(3)}, {})
     monkeypatch.undo()
     with pytest.raises(UserError, match="version 99"):
@@ -162,7 +159,7 @@ def test_a_failed_save_leaves_older_checkpoints(tmp_path, monkeypatch):
     def full_disk(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(checkpoint.safetensors.torch, "save_file", full_disk)
+    monkeypatch.setattr(checkpoint_file.safetensors.numpy, "save_file", full_disk)
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(tmp_path, 3, {"a": torch.zeros(3)}, {})
     assert sorted(p.name for p in tmp_path.iterdir()) == [
@@ -173,7 +170,7 @@ def test_a_failed_save_leaves_older_checkpoints(tmp_path, monkeypatch):
 
 SAVER = """
 import sys, torch
-from snowsplat.training import checkpoint
+from snowsplat.training import checkpoint, checkpoint_file
 table = torch.arange(4_000_000, dtype=torch.float32)
 print("ready", flush=True)
 step = 0

@@ -5,22 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import Annotated, Any, Optional
 
 import tyro
 
 from snowsplat.cli.flags import flag, switch
-from snowsplat.pipeline.output_folder import OutputFolder
-from snowsplat.pipeline.scene_source import training_folder
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import printable, read_json
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from snowsplat.formats import Format, GaussianArrays
-
-_PERCENTILES = (1, 50, 99)
+from snowsplat.util.safe_json import printable
 
 
 @dataclass
@@ -42,9 +33,11 @@ class Info:
     """Print JSON, for programs."""
 
     def run(self) -> int:
-        """Print the description; returns the exit code 0."""
+        """Returns the exit code, 0."""
         if self.path is None:
             raise UserError("info needs a file or folder; name one")
+        from snowsplat.pipeline.describe import describe
+
         facts = describe(self.path)
         if self.json:
             print(json.dumps(facts, indent=2))
@@ -53,164 +46,8 @@ class Info:
         return 0
 
 
-def describe(path: Path) -> dict[str, Any]:
-    """Names and values, all of them JSON values, that describe the file or folder ``path``.
-
-    A scene file or an output folder is described without importing torch.
-
-    Raises:
-        UserError: ``path`` is missing, damaged, or of an unknown kind.
-    """
-    if not path.exists():
-        raise UserError(f"{path}: no such file or folder")
-    if path.suffix == ".safetensors":
-        return _checkpoint(path)
-    if path.is_file():
-        from snowsplat.pipeline.scene_files import format_for_reading
-
-        try:
-            format = format_for_reading(path)
-        except UserError as error:
-            if path.suffix != ".json":  # it may be a dataset
-                raise UserError(f"{error}, checkpoints and datasets") from None
-        else:
-            return _scene(path, format)
-    folder = training_folder(path)
-    if folder.is_one() or folder.scenes():
-        return _output(folder)
-    return _dataset(path)
-
-
-def _scene(path: Path, format: Format) -> dict[str, Any]:
-    from snowsplat.formats import ply
-    from snowsplat.pipeline.scene_files import read_arrays
-    from snowsplat.util.ply import open_table
-
-    facts: dict[str, Any] = {"file": str(path), "bytes": path.stat().st_size}
-    if format.name == "PLY":
-        table = open_table(path)
-        facts["encoding"] = table.format
-        if not ply.is_scene(table):
-            from snowsplat.data.points_ply import read_points
-
-            xyz, _ = read_points(path)
-            return {"kind": "point cloud", **facts, "points": len(xyz), **_bounds(xyz)}
-    gaussians = read_arrays(path)
-    version = f" {format.version(path)}" if format.version else ""
-    facts |= {"format": format.name + version, "lost_in_it": format.loses}
-    return {"kind": "scene", **facts, **_gaussians(gaussians)}
-
-
-def _gaussians(gaussians: GaussianArrays) -> dict[str, Any]:
-    import numpy as np
-
-    from snowsplat.scene.sh_constants import SH_REST_COUNTS
-
-    finite = gaussians.select(gaussians.finite_rows())
-    count, finite_count = len(gaussians.means), len(finite.means)
-    facts: dict[str, Any] = {
-        "gaussians": count,
-        "sh_degree": SH_REST_COUNTS.index(gaussians.sh_rest.shape[1]),
-        "bytes_in_memory": sum(array.nbytes for array in gaussians),
-    }
-    if finite_count < count:
-        facts["not_finite"] = count - finite_count
-    if finite_count:
-        with np.errstate(over="ignore"):
-            opacities = 1 / (1 + np.exp(-finite.opacity_logits))
-            scales = np.exp(finite.log_scales)
-        facts |= _bounds(finite.means)
-        facts["opacity"] = _percentiles(opacities)
-        facts["scale"] = _percentiles(scales.max(1))
-        ratio = scales.max(1) / scales.min(1).clip(1e-12)
-        facts["longest_to_shortest_axis"] = _percentiles(ratio)
-    return facts
-
-
-def _bounds(xyz: np.ndarray) -> dict[str, Any]:
-    import numpy as np
-
-    xyz = xyz[np.isfinite(xyz).all(1)]
-    if not len(xyz):
-        return {}
-    low, high = np.percentile(xyz, [1, 99], axis=0)
-    return {
-        "bounds": [_short(xyz.min(0)), _short(xyz.max(0))],
-        "bounds_of_98_percent": [_short(low), _short(high)],
-    }
-
-
-def _percentiles(values: np.ndarray) -> dict[str, float]:
-    import numpy as np
-
-    found = np.percentile(values, _PERCENTILES)
-    return {f"p{p}": float(f"{v:.4g}") for p, v in zip(_PERCENTILES, found, strict=True)}
-
-
-def _short(values: Any) -> list[float]:
-    return [float(f"{float(v):.5g}") for v in values]
-
-
-def _checkpoint(path: Path) -> dict[str, Any]:
-    from snowsplat.training import checkpoint
-
-    loaded = checkpoint.load(path)
-    return {
-        "kind": "checkpoint",
-        "file": str(path),
-        "bytes": path.stat().st_size,
-        "step": loaded.step,
-        **loaded.meta,
-        "tensors": {name: list(tensor.shape) for name, tensor in loaded.tensors.items()},
-    }
-
-
-def _output(folder: OutputFolder) -> dict[str, Any]:
-    facts: dict[str, Any] = {"kind": "output folder", "path": str(folder.path)}
-    if folder.is_one():
-        settings, background = folder.settings()
-        facts["capture"] = settings.path
-        facts["background"] = list(background)
-    facts["scenes"] = folder.scenes()
-    if folder.checkpoints.is_dir():
-        facts["checkpoints"] = sorted(p.name for p in folder.checkpoints.glob("step_*.safetensors"))
-    metrics = folder.path / "metrics.json"
-    if metrics.is_file():
-        try:
-            values = read_json(metrics)
-            facts["metrics"] = {name: v for name, v in values.items() if name != "views"}
-        except (ValueError, AttributeError):
-            raise UserError(f"{metrics}: damaged; it is not JSON") from None
-    if facts["scenes"]:
-        facts["last_scene"] = describe(folder.scene_path(facts["scenes"][-1]))
-    return facts
-
-
-def _dataset(path: Path) -> dict[str, Any]:
-    from collections import Counter
-
-    from snowsplat.data import load_dataset
-
-    dataset = load_dataset(path)
-    views = [*dataset.train, *dataset.test]
-    sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in views)
-    focal = sorted(view.camera.fx for view in views)
-    return {
-        "kind": "capture",
-        "path": str(path),
-        "description": dataset.description,
-        "photos": len(views),
-        "held_out_with_eval": len(dataset.test),
-        "sizes": dict(sizes),
-        "focal_length_pixels": _short([focal[0], focal[-1]]),
-        "masks": sum(view.mask is not None for view in views),
-        "points": 0 if dataset.points is None else len(dataset.points),
-        "extent": float(f"{dataset.extent:.5g}"),
-        "bounds": [_short(corner) for corner in dataset.bounds.tolist()],
-    }
-
-
 def _print(facts: dict[str, Any], indent: str = "") -> None:
+    """Print one line per fact; a dict that contains dicts or lists is indented below its name."""
     width = max(len(name) for name in facts)
     for name, value in facts.items():
         label = f"{indent}{name.replace('_', ' '):{width}}"

@@ -1,9 +1,18 @@
-"""Posed images: reads COLMAP models and transforms.json files into one type, `Dataset`."""
+"""Posed images: reads COLMAP models and transforms.json files into one type, `Dataset`.
 
-from snowsplat.data.dataset import Dataset, Points, View, scene_extent
-from snowsplat.data.decode import ImageSource, LoadedImage
-from snowsplat.data.image_loader import ImageLoader
-from snowsplat.data.load import DatasetFiles, load_dataset, read_files
+The names below are imported when they are first used: `snowsplat.data.points_ply` and other modules
+can be imported without torch.
+"""
+
+from typing import TYPE_CHECKING
+
+from snowsplat.util.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from snowsplat.data.dataset import Dataset, Points, View, scene_extent
+    from snowsplat.data.decode import ImageSource, LoadedImage
+    from snowsplat.data.image_loader import ImageLoader
+    from snowsplat.data.load import DatasetFiles, load_dataset, read_files
 
 __all__ = [
     "Dataset",
@@ -17,3 +26,17 @@ __all__ = [
     "read_files",
     "scene_extent",
 ]
+
+_MODULES = {
+    "Dataset": "dataset",
+    "DatasetFiles": "load",
+    "ImageLoader": "image_loader",
+    "ImageSource": "decode",
+    "LoadedImage": "decode",
+    "Points": "dataset",
+    "View": "dataset",
+    "load_dataset": "load",
+    "read_files": "load",
+    "scene_extent": "dataset",
+}
+__getattr__, __dir__ = lazy_names(__name__, _MODULES)

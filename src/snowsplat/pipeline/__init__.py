@@ -5,6 +5,7 @@
     render.py    scene -> images; videos.py: scene -> video
     evaluate.py  scene -> PSNR, SSIM, LPIPS
     convert.py   scene file -> another format, edited
+    describe.py  file or folder -> what it contains
     watch.py     the output folder of a training, in the browser
 
 Each function takes paths and options and returns a result or raises a

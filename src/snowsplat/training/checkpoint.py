@@ -3,39 +3,30 @@
 A checkpoint is a set of named tensors (parameters, optimiser moments, random states, statistics,
 the order of the views) and a JSON value in one safetensors file, a format that contains only
 numbers and cannot execute code. The file appears under its name only when it is complete and on
-disk, so a kill at any moment leaves the previous one. The header contains the CRC-32 of each tensor
-and of itself. All are checked when a file is loaded, to detect damaged or truncated files.
+disk, so a kill at any moment leaves the previous one. Checksums are verified when a file is loaded,
+to detect damaged or truncated files; see `checkpoint_file`.
 """
 
-import json
-import os
 import re
 import warnings
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import safetensors
-import safetensors.torch
 import torch
 from torch import Tensor
 
+from snowsplat.training import checkpoint_file
 from snowsplat.training.finite import check_finite
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
-from snowsplat.util.safe_json import check_header, parse_json
 
-#: Incremented when the meaning of the tensors changes: files of another version are rejected.
-VERSION = 1
-_HEADER = "snowsplat"
 _NAME = re.compile(r"step_(\d+)\.safetensors")
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The content of a file, checked: ``tensors`` on the CPU, ``meta`` as passed to `save`."""
+    """The verified content of a file: ``tensors`` on the CPU, ``meta`` as passed to `save`."""
 
     path: Path
     step: int
@@ -54,7 +45,7 @@ def save(
     """Write ``folder/step_000500.safetensors`` atomically, then `remove_old`.
 
     Args:
-        tensors: any shapes and dtypes, 0-dimensional and empty ones too.
+        tensors: any shapes, 0-dimensional and empty ones too; dtypes that NumPy has.
         meta: JSON values.
 
     Raises:
@@ -67,24 +58,9 @@ def save(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"step_{step:06d}.safetensors"
-    stored = {name: _owned(tensor) for name, tensor in tensors.items()}
-    header = {
-        "version": VERSION,
-        "step": step,
-        "meta": dict(meta),
-        "crc32": {name: _crc32(tensor) for name, tensor in stored.items()},
-        "layout": _layout(stored),
-    }
-    text = json.dumps(header)
-    metadata = {_HEADER: text, "crc32": str(zlib.crc32(text.encode()))}
-    with atomic_path(path) as temporary:
-        try:
-            safetensors.torch.save_file(stored, temporary, metadata=metadata)
-        except safetensors.SafetensorError as error:
-            number = re.search(r"os error (\d+)", str(error))
-            if number is None:
-                raise OSError(f"{path}: cannot be written ({error})") from None
-            raise OSError(int(number[1]), os.strerror(int(number[1]))) from None
+    # Contiguous: safetensors writes the memory of an array without regard to its strides.
+    arrays = {name: t.detach().cpu().contiguous().numpy() for name, t in tensors.items()}
+    checkpoint_file.write(path, step, arrays, meta)
     remove_old(folder, step, keep=keep)
     return path
 
@@ -149,56 +125,6 @@ def files(folder: Path | str) -> list[tuple[int, Path]]:
 
 def _read(path: Path) -> Checkpoint:
     """Raises OSError if the file cannot be read, UserError if its content is not valid."""
-    try:
-        check_header(path)
-        with safetensors.safe_open(path, framework="pt", device="cpu") as file:
-            metadata = file.metadata() or {}
-            text = metadata[_HEADER].encode("utf-8", "replace")
-            header = parse_json(text)
-            if header["version"] != VERSION:
-                raise UserError(
-                    f"{path}: checkpoint of version {header['version']}, this program reads "
-                    f"version {VERSION}; resume with the snowsplat that wrote it"
-                )
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        intact = header["crc32"] == {name: _crc32(tensor) for name, tensor in tensors.items()}
-        # Older files lack the next two, and may have an undetected error in the header.
-        intact = intact and header.get("layout", _layout(tensors)) == _layout(tensors)
-        intact = intact and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
-        if not isinstance(header["meta"], dict):
-            raise ValueError("meta is not an object")
-        # Floats of one byte are never written here, and torch supports few operations on them.
-        if any(t.is_floating_point() and t.itemsize < 2 for t in tensors.values()):
-            raise ValueError("unsupported dtype")
-        checkpoint = Checkpoint(path, int(header["step"]), tensors, header["meta"])
-    except RuntimeError as error:  # torch wraps an error of the operating system
-        number = re.search(r"\((\d+)\)$", str(error))
-        if number is None:
-            raise
-        raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from None
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: not a checkpoint, or damaged; use another one") from None
-    if not intact:
-        raise UserError(f"{path}: damaged, checksums do not match; use another one")
-    check_finite(str(path), checkpoint.tensors, "remove it and resume from an earlier one")
-    return checkpoint
-
-
-def _owned(tensor: Tensor) -> Tensor:
-    """On the CPU, contiguous, in its own storage: safetensors rejects views that share one."""
-    tensor = tensor.detach().cpu().contiguous()
-    alone = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
-    return tensor if alone else tensor.clone()
-
-
-def _layout(tensors: Mapping[str, Tensor]) -> dict[str, list[Any]]:
-    return {name: [str(tensor.dtype), list(tensor.shape)] for name, tensor in tensors.items()}
-
-
-def _crc32(tensor: Tensor) -> int:
-    flat = (
-        tensor.reshape(-1).view(torch.uint8)
-        if tensor.numel()
-        else torch.empty(0, dtype=torch.uint8)
-    )
-    return zlib.crc32(flat.numpy().data)
+    file = checkpoint_file.read(path)
+    tensors = {name: torch.from_numpy(array) for name, array in file.arrays.items()}
+    return Checkpoint(path, file.step, tensors, file.meta)

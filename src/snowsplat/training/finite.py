@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from torch import Tensor
-
-from snowsplat.data.dataset import View
-from snowsplat.data.decode import LoadedImage
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from snowsplat.data.dataset import View
+    from snowsplat.data.decode import LoadedImage
+    from snowsplat.scene.gaussians import Gaussians
 
 _LOWER_RATES = "use lower learning rates"
 _FINITE_INIT = "start from finite values"
@@ -40,7 +43,7 @@ def rows_not_finite(tensors: Mapping[str, Tensor]) -> dict[str, int]:
 def check_finite(what: str, tensors: Mapping[str, Tensor], advice: str) -> None:
     """Raises UserError ``"<what>: non-finite values in …; <advice>"`` unless all are finite."""
     if found := rows_not_finite(tensors):
-        raise UserError(f"{what}: non-finite values in {_listed(found)}; {advice}")
+        raise UserError(f"{what}: non-finite values in {listed(found)}; {advice}")
 
 
 def check_state(own: Mapping[str, Tensor], given: Mapping[str, Tensor], views: int) -> None:
@@ -75,7 +78,7 @@ def check_state(own: Mapping[str, Tensor], given: Mapping[str, Tensor], views: i
 def check_parameters(step: int, gaussians: Gaussians) -> None:
     """Raises Diverged unless all parameters are finite at ``step``."""
     if found := rows_not_finite(gaussians.parameters()):
-        raise Diverged(f"step {step}: non-finite Gaussians, {_listed(found)}; {_FINITE_INIT}")
+        raise Diverged(f"step {step}: non-finite Gaussians, {listed(found)}; {_FINITE_INIT}")
 
 
 def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussians) -> None:
@@ -93,7 +96,7 @@ def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussia
     rows = zip(gaussians.parameters(), nonfinite_rows, strict=True)
     found = {name: int(count) for name, count in rows if count}
     raise Diverged(
-        f"step {step}: non-finite gradient or update in {_listed(found)}, skipped; {_LOWER_RATES}"
+        f"step {step}: non-finite gradient or update in {listed(found)}, skipped; {_LOWER_RATES}"
     )
 
 
@@ -108,7 +111,7 @@ def check_loss(
     if math.isfinite(loss):
         return
     if found := rows_not_finite(gaussians.parameters()):
-        cause = f"from non-finite Gaussians, {_listed(found)}; {_FINITE_INIT}"
+        cause = f"from non-finite Gaussians, {listed(found)}; {_FINITE_INIT}"
     elif pixels := rows_not_finite({"": photo.planes.flatten(1).T}):
         cause = f"from {pixels['']:,} non-finite pixels; fix or remove that photo"
     elif not view.camera.is_finite():
@@ -118,7 +121,7 @@ def check_loss(
     raise Diverged(f"step {step}, photo {view.name}: the loss is {loss}, {cause}")
 
 
-def _listed(counts: Mapping[str, int]) -> str:
+def listed(counts: Mapping[str, int]) -> str:
     """As in "means (3 rows), quats (1 row)"."""
     return ", ".join(
         f"{name} ({count:,} {'row' if count == 1 else 'rows'})" for name, count in counts.items()
