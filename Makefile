@@ -89,6 +89,7 @@ layers: $(ENVIRONMENT)
 JOBS ?= auto
 PYTEST = $(PYTHON) -m pytest -n $(JOBS) --dist worksteal
 QUICK := not (sfm or browser or build or emulated or gpu or kill or slow)
+ISA := isa and not (emulated or gpu)
 
 pytest-quick: native
 	$(PYTEST) -m '$(QUICK)'
@@ -99,8 +100,8 @@ pytest: native
 	$(PYTEST)
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
 	    for isa in $$isas; do \
-	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m isa tests/ops tests/training"; \
-	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m isa tests/ops tests/training || exit 1; \
+	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training"; \
+	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training || exit 1; \
 	    done
 	@$(MAKE) --no-print-directory sanitized
 
