@@ -18,7 +18,7 @@ from .scenes import (
     EMULATED_FLOAT64,
     NATIVE_FLOAT32,
     NATIVE_FLOAT64,
-    TWIN,
+    REFERENCE,
     Variant,
 )
 
@@ -72,7 +72,7 @@ def _running(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     return variant
 
 
-@pytest.fixture(params=variants(TWIN, *KERNELS))
+@pytest.fixture(params=variants(REFERENCE, *KERNELS))
 def variant(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
     """Every implementation: for answers that are known in closed form."""
     return _running(request, monkeypatch)
@@ -80,11 +80,11 @@ def variant(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture(params=variants(*KERNELS))
 def native(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
-    """The kernels: for comparison with the float64 twin."""
+    """The kernels: for comparison with the float64 reference."""
     return _running(request, monkeypatch)
 
 
-@pytest.fixture(params=variants(TWIN, *FLOAT64))
+@pytest.fixture(params=variants(REFERENCE, *FLOAT64))
 def double(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
     """The float64 implementations: for finite differences."""
     return _running(request, monkeypatch)

@@ -1,8 +1,8 @@
-"""Extreme scenes by hypothesis, and what must hold of the ops on each: against the float64 twin.
+"""Extreme scenes by hypothesis, and checks of the ops on each against the float64 reference.
 
-Where the twin's own result changes a lot when its input changes by a few roundings, the input
+Where the reference's own result changes a lot when its input changes by a few roundings, the input
 decides nothing, and neither does the comparison: the tolerance of each number is what one rounding
-makes of it, times some, plus how far the twin's goes for such changes of its input.
+makes of it, times some, plus how far the reference's goes for such changes of its input.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _scales(kinds: Sequence[str], pixels: Tensor, g: torch.Generator) -> Tensor:
 
 @dataclass(frozen=True)
 class Compared:
-    """The twin's results, and how far each number goes where its input changes by roundings."""
+    """The reference's results, and how far each number moves if its input changes by roundings."""
 
     value: Tensor
     spread: Tensor
@@ -194,14 +194,14 @@ class Compared:
         tolerance = relative * scale + 10.0 * self.spread
         decided = tolerance.isfinite() & (scale < 1e30) & (self.value.abs() < 1e30)
         found = actual.detach().double()[decided]
-        assert found.isfinite().all(), f"{name}: not finite where the twin is"
+        assert found.isfinite().all(), f"{name}: not finite where the reference is"
         excess = (found - self.value[decided]).abs() - tolerance[decided] - 1e-4 * relative
         worst = float(excess.max()) if len(excess) else 0.0
         assert worst <= 0, f"{name}: off by {worst:.3g} more than {tolerance[decided].max():.3g}"
 
 
 def _every_row(scene: Scene, params: Sequence[Tensor], pose: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, 16) what the twin makes of each Gaussian, NaN where it sees none, and which it sees."""
+    """(N, 16) the reference's row of each Gaussian, NaN if not visible; and which are visible."""
     splats = reference.project(
         **dict(zip(PARAMETERS, params, strict=True)), cam_from_world=pose, **scene.view
     )
@@ -220,7 +220,7 @@ def _of_rows(values: Tensor) -> Tensor:
 
 
 def check_project(variant: Variant, extreme: Extreme) -> None:
-    """Ids that are right where it is clear who is seen, and splats and gradients as the twin's."""
+    """Ids are right where visibility is clear; splats and gradients agree with the reference."""
     scene = extreme.scene()
     count = len(extreme.gaussians)
     leaf = scene.to(variant.dtype)
@@ -233,7 +233,7 @@ def check_project(variant: Variant, extreme: Extreme) -> None:
     params = [scene.params[name] for name in PARAMETERS]
     cotangent = normal(generator(extreme.seed + 1), count, 16)
 
-    def twin(*inputs: Tensor) -> list[Tensor]:
+    def by_reference(*inputs: Tensor) -> list[Tensor]:
         leaves = [t.detach().requires_grad_() for t in inputs]
         rows, seen = _every_row(scene, leaves[:6], leaves[6])
         grads = torch.autograd.grad(
@@ -244,7 +244,9 @@ def check_project(variant: Variant, extreme: Extreme) -> None:
         ]
         return [rows.detach(), seen.double(), *grads]
 
-    rows, seen, *grads = Compared.of(twin, variant, extreme.seed, *params, scene.cam_from_world)
+    rows, seen, *grads = Compared.of(
+        by_reference, variant, extreme.seed, *params, scene.cam_from_world
+    )
     # Single precision has no determinant of the largest, which are not seen for that.
     huge = (rows.value[:, 7] > 3 * LARGE) & (variant.dtype == torch.float32)
     edge = (255 * scene.params["opacity_logits"].sigmoid() - 1).abs() < 1e-5
@@ -339,14 +341,14 @@ def check_rasterize(variant: Variant, extreme: Extreme) -> None:
         reference.TRANSMITTANCE_MIN * (1 + change) for change in (0, 1e-6, -1e-6)
     )
 
-    def twin(values: Tensor) -> list[Tensor]:
+    def by_reference(values: Tensor) -> list[Tensor]:
         values = values.clone()
         values[:, 6] = packed[:, 6]  # equal depths stay so
         with mock.patch.object(reference, "TRANSMITTANCE_MIN", next(ends)):
             return blended(reference, values)
 
     found = blended(variant.ops, packed.to(variant.dtype))
-    wanted = Compared.of(twin, variant, extreme.seed, packed)
+    wanted = Compared.of(by_reference, variant, extreme.seed, packed)
     names = ("image", "alpha", "depth", "gradient of the splats")
     factors = [variant.forward] * 3 + [10 * variant.backward]
     if len(packed):  # what lies behind a splat is a difference of what its pixels show

@@ -1,7 +1,7 @@
 """Scenes, variants and comparisons for the tests of the ops.
 
 All scenes are float64 tensors that float32 represents exactly: what a float32 op and its float64
-twin differ by is then the op's own rounding.
+reference differ by is then the op's own rounding.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_res
 class Variant:
     """One implementation of the ops in one dtype, and the relative errors that it may make.
 
-    engine: "twin", "native" (the CPU's kernels), "emulated" (a GPU's kernels, on the CPU) or "cuda"
-    (a GPU's kernels, there). Its tensors are on the CPU in each case: see `engines.py`.
+    engine: "reference", "native" (the CPU's kernels), "emulated" (a GPU's kernels, on the CPU) or
+    "cuda" (a GPU's kernels, on the GPU). Its tensors are on the CPU in each case: see `engines.py`.
     """
 
     engine: str
@@ -36,13 +36,13 @@ class Variant:
 
     @property
     def ops(self) -> ModuleType:
-        return reference if self.engine == "twin" else ops
+        return reference if self.engine == "reference" else ops
 
     def __str__(self) -> str:
         return f"{self.engine}-{str(self.dtype).removeprefix('torch.')}"
 
 
-TWIN = Variant("twin", torch.float64, 1e-12, 1e-12)
+REFERENCE = Variant("reference", torch.float64, 1e-12, 1e-12)
 NATIVE_FLOAT32 = Variant("native", torch.float32, 1e-4, 1e-3)
 NATIVE_FLOAT64 = Variant("native", torch.float64, 1e-10, 1e-9)
 EMULATED_FLOAT32 = replace(NATIVE_FLOAT32, engine="emulated")

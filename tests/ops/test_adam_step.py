@@ -1,4 +1,4 @@
-"""`adam_step`: what Adam is known to do, and native against the twin."""
+"""`adam_step`: what Adam is known to do, and native against the reference."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from snowsplat.ops import reference
 
 from .scenes import (
     PARAMETERS,
-    TWIN,
+    REFERENCE,
     Scene,
     Variant,
     assert_close,
@@ -84,7 +84,7 @@ def packed_grads(seed: int, count: int) -> Tensor:
 
 
 def gradients(scene: Scene, packed_grad: Tensor) -> dict[str, Tensor]:
-    """The float64 gradient of every parameter, by autograd through the twin's `project`."""
+    """The float64 gradient of every parameter, by autograd through the reference's `project`."""
     leaf = scene.to(torch.float64)
     splats = leaf.project(reference)
     splats.packed.backward(packed_grad)
@@ -133,12 +133,12 @@ def test_step_is_that_of_the_paper(variant: Variant) -> None:
 @pytest.mark.parametrize("regularised", [False, True])
 @pytest.mark.parametrize("visible_only", [False, True])
 @pytest.mark.parametrize(("degree", "rest"), [(0, 0), (0, 15), (1, 3), (1, 15), (2, 8), (3, 15)])
-def test_native_is_the_twin(
+def test_native_agrees_with_the_reference(
     native: Variant, degree: int, rest: int, visible_only: bool, regularised: bool
 ) -> None:
     """Three steps from given moments: every parameter and moment."""
     scene = random_scene(degree, 61, sh_degree=degree, rest=rest)
-    states = [Optimised(v, scene) for v in (TWIN, native)]
+    states = [Optimised(v, scene) for v in (REFERENCE, native)]
     before = states[0].copy()
     for step in (5, 6, 7):
         grad = packed_grads(step, len(states[0].visible()))
@@ -155,8 +155,8 @@ def test_native_is_the_twin(
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 16, 17, 33, 63, 64, 65, 129, 300, 5000])
-def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
-    states = [Optimised(v, random_scene(50 + count, count)) for v in (TWIN, native)]
+def test_native_agrees_with_the_reference_for_any_count(native: Variant, count: int) -> None:
+    states = [Optimised(v, random_scene(50 + count, count)) for v in (REFERENCE, native)]
     before = states[0].copy()
     grad = packed_grads(1, len(states[0].visible()))
     for state in states:
@@ -168,7 +168,7 @@ def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
 
 def test_options_reach_the_step(native: Variant) -> None:
     """Other betas, a large eps, and rates of zero."""
-    states = [Optimised(v, random_scene(2, 20)) for v in (TWIN, native)]
+    states = [Optimised(v, random_scene(2, 20)) for v in (REFERENCE, native)]
     before = states[0].copy()
     grad = packed_grads(1, len(states[0].visible()))
     rates = {**RATES, "quats": 0.0}

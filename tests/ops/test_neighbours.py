@@ -1,4 +1,4 @@
-"""`neighbours`: known distances, and native against the twin."""
+"""`neighbours`: known distances, and native against the reference."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ CLOUDS = {
 
 @pytest.mark.parametrize("k", [1, 3, 20])
 @pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS.keys())
-def test_native_is_the_twin(native: Variant, cloud, k: int) -> None:
+def test_native_agrees_with_the_reference(native: Variant, cloud, k: int) -> None:
     points = as_float32(cloud(generator(0)).double())
     k = min(k, len(points) - 1)
     expected = reference.neighbours(points, k)
@@ -97,7 +97,7 @@ def test_native_is_the_twin(native: Variant, cloud, k: int) -> None:
 
 
 @pytest.mark.parametrize("k", [2, 4, 8, 9, 64])
-def test_native_is_the_twin_for_any_number(native: Variant, k: int) -> None:
+def test_native_agrees_with_the_reference_for_any_number(native: Variant, k: int) -> None:
     points = normal(generator(1), 200, 3)
     expected = reference.neighbours(points, k)
     actual = native.ops.neighbours(points.to(native.dtype), k)
@@ -105,7 +105,7 @@ def test_native_is_the_twin_for_any_number(native: Variant, k: int) -> None:
 
 
 @pytest.mark.parametrize("count", [31, 32, 33, 127, 129, 1023, 1024, 1025])
-def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
+def test_native_agrees_with_the_reference_for_any_count(native: Variant, count: int) -> None:
     points = uniform(generator(count), -1, 1, count, 3)
     expected = reference.neighbours(points)
     actual = native.ops.neighbours(points.to(native.dtype))

@@ -1,4 +1,4 @@
-"""`ssim` and `photometric_loss`: closed forms, a loop, finite differences, native and twin."""
+"""`ssim` and `photometric_loss`: closed forms, a loop, finite differences, native and reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from snowsplat import ops
 from snowsplat.ops import cuda
 
 from .scenes import (
-    TWIN,
+    REFERENCE,
     Variant,
     as_float32,
     assert_close,
@@ -259,28 +259,30 @@ def value_and_gradient(
 @functools.cache
 def expected(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Of the reference, once for all variants."""
-    return value_and_gradient(TWIN, name, height, width)
+    return value_and_gradient(REFERENCE, name, height, width)
 
 
 @pytest.mark.parametrize(
     ("height", "width"), [*SIZES, *TILES, (3, 2000), (3, 16384), (1100, 2), (560, 140)]
 )
 @pytest.mark.parametrize("name", ["ssim", "photometric_loss"])
-def test_native_is_the_twin(native: Variant, name: str, height: int, width: int) -> None:
+def test_native_agrees_with_the_reference(
+    native: Variant, name: str, height: int, width: int
+) -> None:
     value, grad = value_and_gradient(native, name, height, width)
     expected_value, expected_grad = expected(name, height, width)
     assert_close(value, expected_value, native.forward, "value")
     assert_close(grad, expected_grad, native.backward, "gradient")
 
 
-def test_native_is_the_twin_on_flat_images(native: Variant) -> None:
+def test_native_agrees_with_the_reference_on_flat_images(native: Variant) -> None:
     """Without structure the variances are differences of equal numbers, and their rounding counts.
 
     In float32 that is 1e-7 against C2 = 9e-4, so this case alone may err by more.
     """
     a = as_float32(torch.full((20, 30, 3), 0.9, dtype=torch.float64))
     b = as_float32(torch.full((20, 30, 3), 0.85, dtype=torch.float64))
-    values = [v.ops.ssim(a.to(v.dtype), b.to(v.dtype)) for v in (TWIN, native)]
+    values = [v.ops.ssim(a.to(v.dtype), b.to(v.dtype)) for v in (REFERENCE, native)]
     assert_close(values[1], values[0], 5 * native.forward)
 
 

@@ -1,4 +1,4 @@
-"""`project`: closed forms, visibility, finite differences, and native against the twin."""
+"""`project`: closed forms, visibility, finite differences, and native against the reference."""
 
 from __future__ import annotations
 
@@ -259,20 +259,20 @@ CASES = [
 
 
 @pytest.mark.parametrize(("degree", "rest"), CASES)
-def test_native_is_the_twin(native: Variant, degree: int, rest: int) -> None:
+def test_native_agrees_with_the_reference(native: Variant, degree: int, rest: int) -> None:
     compare(native, random_scene(degree, 67, sh_degree=degree, rest=rest))
 
 
 @pytest.mark.parametrize(
     "count", [0, 1, 2, 7, 8, 9, 15, 16, 17, 31, 33, 63, 64, 65, 129, 257, 5000]
 )
-def test_native_is_the_twin_for_any_count(native: Variant, count: int) -> None:
+def test_native_agrees_with_the_reference_for_any_count(native: Variant, count: int) -> None:
     compare(native, random_scene(40 + count, count))
 
 
 @pytest.mark.parametrize("length", [10.0, 100.0, 1000.0])
 @pytest.mark.parametrize("shape", ["needle", "disc"])
-def test_native_is_the_twin_for_long_thin_splats(
+def test_native_agrees_with_the_reference_for_long_thin_splats(
     native: Variant, shape: str, length: float
 ) -> None:
     """det Σ' as a plain difference cancels: a σ of 1000 pixels left 19% of error in float32."""

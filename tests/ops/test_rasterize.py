@@ -1,4 +1,4 @@
-"""`rasterize`: closed forms, a per-pixel loop, finite differences, and native against the twin."""
+"""`rasterize`: closed forms, a per-pixel loop, finite differences, agreement of the engines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from snowsplat.ops import reference
 from snowsplat.ops.splats import Splats2D
 
 from .scenes import (
-    TWIN,
+    REFERENCE,
     Scene,
     Variant,
     assert_close,
@@ -264,7 +264,7 @@ def compare(
     background = uniform(g, 0, 1, splats.channels) if with_background else None
     cotangents = [normal(g, height, width, splats.channels), *normal(g, 2, height, width)]
     results = []
-    for variant in (TWIN, native):
+    for variant in (REFERENCE, native):
         leaf = leaf_splats(splats, variant.dtype)
         b = None
         if background is not None:
@@ -295,12 +295,14 @@ def columns_of(leaf: Splats2D) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("with_background", [False, True])
 @pytest.mark.parametrize("channels", [1, 3, 4, 7, 8, 9, 30])
-def test_native_is_the_twin(native: Variant, channels: int, with_background: bool) -> None:
+def test_native_agrees_with_the_reference(
+    native: Variant, channels: int, with_background: bool
+) -> None:
     splats = random_splats(channels, 60, 23, 17, channels)
     compare(native, splats, 23, 17, with_background=with_background)
 
 
-def test_native_is_the_twin_without_depth(native: Variant) -> None:
+def test_native_agrees_with_the_reference_without_depth(native: Variant) -> None:
     compare(native, random_splats(2, 60, 23, 17), 23, 17, with_depth=False)
 
 
@@ -308,21 +310,21 @@ def test_native_is_the_twin_without_depth(native: Variant) -> None:
     ("width", "height", "count"),
     [(1, 1, 5), (16, 16, 30), (17, 16, 30), (15, 33, 60), (64, 1, 20), (1, 50, 20), (83, 41, 400)],
 )
-def test_native_is_the_twin_at_any_size(
+def test_native_agrees_with_the_reference_at_any_size(
     native: Variant, width: int, height: int, count: int
 ) -> None:
     compare(native, random_splats(width + height, count, width, height), width, height)
 
 
 @pytest.mark.slow
-def test_native_is_the_twin_on_a_long_strip(native: Variant) -> None:
+def test_native_agrees_with_the_reference_on_a_long_strip(native: Variant) -> None:
     """Pixel coordinates of five digits, where float32 leaves a thousandth of a pixel."""
     splats = random_splats(4, 400, 16384, 3, pixels=30.0)
     compare(native, splats, 16384, 3)
 
 
 @pytest.mark.parametrize("opacity", [(0.005, 0.02), (0.1, 0.4), (0.9, 1.0)])
-def test_native_is_the_twin_when_splats_are_many(
+def test_native_agrees_with_the_reference_when_splats_are_many(
     native: Variant, opacity: tuple[float, float]
 ) -> None:
     """Hundreds in a tile: faint ones that all count, and opaque ones of which most do not."""
@@ -330,7 +332,9 @@ def test_native_is_the_twin_when_splats_are_many(
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 31, 32, 33, 64, 65, 255, 256, 257, 1000])
-def test_native_is_the_twin_for_a_tile_of_any_length(native: Variant, count: int) -> None:
+def test_native_agrees_with_the_reference_for_a_tile_of_any_length(
+    native: Variant, count: int
+) -> None:
     """As many splats as the kernels take together, one less, one more, none, and many."""
     splats = random_splats(count, count, 16, 16, pixels=4.0, opacity=(0.005, 0.03))
     compare(native, splats, 16, 16)
@@ -354,7 +358,7 @@ def test_what_lies_behind_finished_pixels(native: Variant, faint: int) -> None:
 
 @pytest.mark.usefixtures("sums_in_order")
 @pytest.mark.parametrize(("channels", "with_depth"), [(1, False), (3, False), (3, True), (9, True)])
-def test_native_is_the_twin_with_sums_in_order(
+def test_native_agrees_with_the_reference_with_sums_in_order(
     native: Variant, channels: int, with_depth: bool
 ) -> None:
     splats = random_splats(channels, 150, 35, 34, channels)
@@ -387,12 +391,12 @@ def test_capacity(native: Variant, in_order: bool, request: pytest.FixtureReques
         assert int(cramped.required) == needed
 
 
-def test_native_is_the_twin_for_tiny_splats(native: Variant) -> None:
+def test_native_agrees_with_the_reference_for_tiny_splats(native: Variant) -> None:
     """Splats below a pixel, many between the centres: none may be lost or counted twice."""
     compare(native, random_splats(12, 500, 40, 40, pixels=0.4), 40, 40)
 
 
-def test_native_is_the_twin_for_needles(native: Variant) -> None:
+def test_native_agrees_with_the_reference_for_needles(native: Variant) -> None:
     splats = random_splats(13, 40, 40, 40)
     angle = torch.arange(40, dtype=torch.float64) * math.pi / 40
     cos, sin, major, minor = angle.cos(), angle.sin(), 30.0, 0.55
@@ -406,7 +410,7 @@ def test_native_is_the_twin_for_needles(native: Variant) -> None:
 
 
 @pytest.mark.slow
-def test_native_is_the_twin_for_tens_of_thousands(native: Variant) -> None:
+def test_native_agrees_with_the_reference_for_tens_of_thousands(native: Variant) -> None:
     """So many that they are sorted in parallel; some depths are equal."""
     count, width, height = 60_000, 128, 96
     if native.engine == "emulated":
@@ -416,12 +420,12 @@ def test_native_is_the_twin_for_tens_of_thousands(native: Variant) -> None:
     compare(native, splats, width, height, with_depth=False)
 
 
-def test_native_is_the_twin_from_gaussian_to_pixel(native: Variant) -> None:
+def test_native_agrees_with_the_reference_from_gaussian_to_pixel(native: Variant) -> None:
     scene = random_scene(21, 120)
     background = torch.tensor([0.1, 0.9, 0.4], dtype=torch.float64)
     cotangent = normal(generator(3), 17, 23, 3)
     results: list[tuple[Tensor, Scene]] = []
-    for variant in (TWIN, native):
+    for variant in (REFERENCE, native):
         leaf = scene.to(variant.dtype)
         splats = leaf.project(variant.ops)
         image, _, _ = variant.ops.rasterize(splats, 23, 17, background.to(variant.dtype))
@@ -451,7 +455,7 @@ def test_backward_of_alpha_or_depth_alone(native: Variant) -> None:
     splats = random_splats(5, 30, 12, 12)
     for output in (0, 1, 2):
         grads = []
-        for variant in (TWIN, native):
+        for variant in (REFERENCE, native):
             leaf = leaf_splats(splats, variant.dtype)
             outputs = variant.ops.rasterize(leaf, 12, 12, with_depth=True)
             outputs[output].square().sum().backward()

@@ -1,4 +1,4 @@
-"""The densification statistics: a closed form, the twin, any number of threads, wrong input."""
+"""The densification statistics: a closed form, the reference, threads, wrong input."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_one_gaussian(variant: Variant) -> None:
 
 
 @pytest.mark.parametrize("with_radii", [True, False])
-def test_native_is_the_twin(native: Variant, with_radii: bool) -> None:
+def test_native_agrees_with_the_reference(native: Variant, with_radii: bool) -> None:
     generator = torch.Generator().manual_seed(1)
     ids = torch.randperm(20_000, generator=generator)[:9_000].sort().values
     packed, grad = torch.randn(2, 9_000, 16, generator=generator, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The numerical operations on tensors, each a native kernel with a readable twin in `reference`.
+"""The numerical operations on tensors: native kernels, each with a readable `reference`.
 
 `project` → `Splats2D` → `rasterize` → `photometric_loss`, and `adam_step` back to the parameters.
 """

@@ -1,4 +1,4 @@
-"""3D Gaussian Splatting in plain PyTorch: the readable twin of every op.
+"""3D Gaussian Splatting in plain PyTorch: the readable reference of every op.
 
 Same names, arguments and results as `snowsplat.ops`, in any floating dtype, differentiable by
 autograd and hundreds of times slower. The native kernels are tested against these functions in
