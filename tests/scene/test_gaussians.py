@@ -132,3 +132,12 @@ def test_finite_rows():
     gaussians.opacity_logits[2] = torch.inf
     assert gaussians.finite_rows().tolist() == [True, False, False, True]
     assert gaussians.select(torch.arange(0)).finite_rows().tolist() == []
+
+
+def test_select_in_place_is_select():
+    g = Gaussians(*(torch.randn_like(t) for t in zeros(6, 3)))
+    index = torch.tensor([4, 0, 4])
+    picked = g.select(index)
+    g.select_(index)
+    for name, tensor in picked.parameters().items():
+        assert torch.equal(g.parameters()[name], tensor)

@@ -156,6 +156,16 @@ def test_similarity_scales_then_rotates_then_translates():
     assert new_from_old.apply(points.float()).dtype == torch.float32
 
 
+def test_similarities_are_in_double_precision():
+    single = Similarity(2, torch.eye(3), torch.ones(3))
+    assert isinstance(single.scale, float)
+    assert single.rotation.dtype == single.translation.dtype == F64
+    points = random_points(5).float()
+    found = similarity_from_points(points, 2 * points + 1)
+    assert found.scale == pytest.approx(2)
+    assert torch.allclose(found.translation, torch.ones(3, dtype=F64), atol=1e-5)
+
+
 def test_similarity_and_its_inverse_cancel():
     points = random_points(20).reshape(2, 10, 3)
     there = similarity()

@@ -113,4 +113,19 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "header = start + file.read(_LONGEST_HEADER)",
         "header = start + file.read(None)",
     ): "more is read than is needed",
+    (
+        "scene/geometry.py",
+        "signs = torch.ones(3, dtype=torch.float64)",
+        "signs = torch.ones(3, )",
+    ): "1 and -1 are exact in float32",
+    (
+        "scene/edit.py",
+        "azimuth = index * (math.pi * (3.0 - math.sqrt(5.0)))",
+        "azimuth = index * (math.pi / (3.0 - math.sqrt(5.0)))",
+    ): "any directions that determine the coefficients give the same matrices",
+    (
+        "scene/orientation.py",
+        "up = mean / max(float(np.linalg.norm(mean)), 1e-12)",
+        "up = mean / max(float(np.linalg.norm(mean)), 9.375e-13)",
+    ): "any small number avoids the division by 0",
 }

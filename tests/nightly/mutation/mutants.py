@@ -145,8 +145,18 @@ class _Visitor(cst.CSTVisitor):
         whole = isinstance(node, cst.Call) and getattr(node.func, "value", None) in _WHOLE_CALLS
         for kind, operator in _OPERATORS:
             if isinstance(node, kind) and not whole:
-                self.changes += [(node, changed) for changed in operator(node)]
+                changes = (changed for changed in operator(node) if not _equal(node, changed))
+                self.changes += [(node, changed) for changed in changes]
         return True
+
+
+def _equal(node: cst.CSTNode, changed: cst.CSTNode) -> bool:
+    """1e38 and 1e38 + 1 are one number."""
+    return (
+        isinstance(node, cst.Float)
+        and isinstance(changed, cst.Float)
+        and node.evaluated_value == changed.evaluated_value
+    )
 
 
 def _is_docstring(node: cst.CSTNode) -> bool:
