@@ -84,3 +84,14 @@ def test_a_suffix_of_the_folder_is_ignored(tmp_path):
     folder.mkdir()
     with pytest.raises(UserError, match="selects no scene format"):
         format_for_writing(Path(folder) / "scene")
+
+
+def test_every_format_states_what_it_loses(tmp_path):
+    assert all(format.loses for format in FORMATS)
+    versions = {".spz": "3", ".sog": "2", ".glb": "2, KHR_gaussian_splatting"}
+    for suffix, version in versions.items():
+        path = tmp_path / f"scene{suffix}"
+        write_gaussians(path, one())
+        format = format_for_reading(path)
+        assert format.version is not None
+        assert format.version(path) == version

