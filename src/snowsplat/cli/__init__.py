@@ -1,5 +1,5 @@
-"""The command line: one short file a verb, which parses, calls and prints.
+"""The command line: one short file per subcommand, which parses, calls `pipeline`, and prints.
 
-At import these modules take the standard library, tyro and rich only; torch comes in when a verb
-runs, so that `--help` and mistakes in flags answer at once.
+These modules import only the standard library, tyro and rich. torch is imported when a subcommand
+runs, so `--help` and errors in flags do not wait for it.
 """

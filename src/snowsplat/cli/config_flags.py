@@ -12,14 +12,14 @@ RECIPE = "the recipe's"
 
 @dataclass
 class ConfigFlags:
-    """None leaves a setting to the recipe."""
+    """One flag per setting. None: the recipe determines the setting."""
 
     iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Training steps, one photo each."""
     max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Largest number of Gaussians; determines memory and time. 0: no limit."""
     checkpoint_every: Annotated[int | None, flag("N", default="none")] = None
-    """Steps between checkpoints, which --resume continues from exactly."""
+    """Steps between checkpoints. With --resume the result is the same as without interruption."""
     seed: Annotated[int | None, flag("N", default="0")] = None
     """Seed of all random choices. The same seed gives a bit-identical scene, on the CPU and, with
     --deterministic, on a GPU."""
@@ -32,7 +32,7 @@ class ConfigFlags:
     """Color behind the scene, and behind transparent photos."""
 
     sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
-    """Degree of the view-dependent color; less takes less memory."""
+    """Degree of the view-dependent color. A lower degree takes less memory."""
     ssim_weight: Annotated[float | None, flag("F", "--lambda-dssim", default=RECIPE)] = None
     """Weight of 1 - SSIM in the loss; the rest is the mean absolute difference."""
     initial_points: Annotated[int | None, flag("N", default=RECIPE)] = None
@@ -78,7 +78,7 @@ class ConfigFlags:
     """Learning rate of the view-dependent colors."""
 
     def config_settings(self) -> dict[str, Any]:
-        """The settings that were given, by name."""
+        """The settings that were given: name -> value."""
         given = {field.name: getattr(self, field.name) for field in fields(ConfigFlags)}
         if self.test_iterations is not None:
             given["test_iterations"] = tuple(step for step in self.test_iterations if step > 0)

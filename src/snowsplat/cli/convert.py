@@ -39,12 +39,12 @@ class Convert:
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE [MORE …] FILE")] = ()
-    """Scene files of any format or output folders of trainings, whose last scene is used; then the
-    file to write."""
+    """Scenes, then the file to write. A scene is a file of any format or the output folder of a
+    training, whose last scene is used."""
     sh_degree: Annotated[int | None, flag("N", default="that of the scene")] = None
-    """0 to 3: degree of the view-dependent color to keep."""
+    """Keep the view-dependent color up to this degree, 0 to 3."""
     crop: Annotated[Box | None, flag("X0 Y0 Z0 X1 Y1 Z1", default="all")] = None
-    """Keep what is in this box."""
+    """Keep only the Gaussians in this box."""
     decimate: Annotated[str | None, flag("N|P%", default="all")] = None
     """Number or percentage of Gaussians to keep: the largest and most opaque."""
     rotate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)

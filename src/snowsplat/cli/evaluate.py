@@ -22,15 +22,15 @@ class Evaluate(SceneFlags):
       snowsplat evaluate out/garden --split train
       snowsplat evaluate out/garden --lpips lpips_vgg.safetensors
 
-    The figures of each view and their means are printed, and written to OUT/metrics.json. Renders
-    are clamped to 0..1 and not rounded to 8 bits. The weights file for LPIPS is created once, where
-    the package lpips is installed, by
+    The metrics of each view and their means are printed and written to OUT/metrics.json. Renders
+    are clamped to 0..1 and not rounded to 8 bits. To create the weights file for LPIPS, run this
+    once where the package lpips is installed:
       weights = {name: w.clone() for name, w in lpips.LPIPS(net="vgg").state_dict().items()}
       safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
     """
 
     split: Annotated[Literal["test", "train"], flag("{test,train}", default="test")] = "test"
-    """The held-out photos, or those of the training."""
+    """test: the held-out photos; train: the photos that the scene was trained on."""
     lpips: Annotated[Path | None, flag("FILE", default="not measured")] = None
     """Weights for LPIPS: of AlexNet or VGG16 and of the linear heads, safetensors or torch."""
 

@@ -24,6 +24,10 @@ class Info:
       snowsplat info garden.spz
       snowsplat info out/garden/point_cloud/iteration_3000/point_cloud.ply
       snowsplat info garden
+
+    Prints the format and size of a file and what it contains: the number of Gaussians or points,
+    the bounds of the scene, percentiles of opacity and scale; for a folder also its photos, scenes,
+    checkpoints and metrics. A checkpoint is verified.
     """
 
     # Not `Path | None`, to check which tyro would import another package for a tenth of a second.

@@ -43,7 +43,7 @@ _FORMER_NAMES = {"capture": "sfm"}
 
 DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, shown in real time.
 
-  snowsplat make PHOTOS                     photos or a video -> a scene: all of what follows
+  snowsplat make PHOTOS                     photos or a video -> a scene: the next steps in one
   snowsplat sfm PHOTOS -o DATASET           photos or a video -> photos with known cameras
   snowsplat train DATASET -o OUT --eval     photos with known cameras -> a scene in OUT
   snowsplat evaluate OUT                    PSNR and SSIM on the held-out photos
@@ -118,8 +118,8 @@ def parse(arguments: Sequence[str]) -> Any:
 def _choices(called: str) -> list[Any]:
     """What tyro chooses from: the subcommand ``called``, and the others without their flags.
 
-    Importing and analysing all of them would take longer than all the rest of a help text. Only
-    completion scripts and suggestions for a misplaced flag need the flags of all.
+    Importing and analysing all of them takes longer than everything else that a help text needs.
+    Only completion scripts and suggestions for a misplaced flag need the flags of all subcommands.
     """
     load_all = called.startswith("-") and called not in ("-h", "--help")
     choices = []

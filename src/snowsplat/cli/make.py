@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.live_page import LivePage
     from snowsplat.pipeline.make import MakeResult
 
-# In the order of the command that resumes.
+# The flags that the command for resuming repeats, in this order.
 _RESUMED_FLAGS = ("output", "quality", "minutes", "threads", "device", "memory", "port", "host")
 
 
@@ -32,13 +32,13 @@ class Make:
 
     Examples:
       snowsplat make photos/                   the scene is photos_scene/photos.ply
-      snowsplat make walk.mp4 -o walk          … or walk/walk.ply
+      snowsplat make walk.mp4 -o walk          the scene is walk/walk.ply
       snowsplat make photos/ --quality best    slower, for larger photos and more Gaussians
       snowsplat make photos/ --minutes 5       the best scene that 5 minutes allow here
 
-    OUT/capture contains the photos, their cameras and a report; OUT/scene the training, and in
-    scene/test/ours_N images of the scene beside the held-out photos. If it is interrupted, rerun
-    the same command to resume. Finished stages are not repeated unless photos or settings changed.
+    OUT/capture contains the photos, their cameras and a report. OUT/scene contains the training,
+    and in scene/test/ours_N the held-out photos and the same views rendered. If the command is
+    interrupted, rerun it to resume. Finished stages are repeated only if photos or settings change.
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
@@ -49,11 +49,11 @@ class Make:
         Literal["draft", "normal", "best"] | None,
         flag("{draft,normal,best}", default="normal, or what the minutes allow"),
     ] = None
-    """draft: a quick preview; best: several times as long as normal. With --minutes: the effort to
-    find the camera poses; the training uses the rest of the time."""
+    """draft: a quick preview; best: takes several times as long as normal. With --minutes, this is
+    the effort to find the camera poses; the training uses the rest of the time."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
-    """Finish within this time. Stages that earlier runs have finished take none of it; an
-    interrupted training resumes with the time that it had left."""
+    """Finish within this time. Only the stages of this run count. An interrupted training resumes
+    with the time that it had left."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
@@ -61,7 +61,7 @@ class Make:
     memory: Annotated[str | None, flag("BYTES", default="what is available")] = None
     """Memory for the training, like 4GB: see train --help."""
     overwrite: Annotated[bool, switch()] = False
-    """Replace a scene of other photos that is in OUT."""
+    """Replace a scene in OUT that was made from other photos."""
     view: Annotated[bool, switch()] = False
     """Show the training in the browser, then the finished scene, until Ctrl-C."""
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
@@ -126,7 +126,7 @@ def _print_summary(made: MakeResult) -> None:
         f"Report on the training:     {made.folder.report}\n"
         f"Rendered test views:        {made.renders}\n"
         f" and held-out photos:       {made.photos}\n"
-        f"On those:                   PSNR {made.psnr:.2f} dB, SSIM {made.ssim:.3f} "
+        f"Quality of these views:     PSNR {made.psnr:.2f} dB, SSIM {made.ssim:.3f} "
         f"({made.views} photos)\n"
         f"Time:                       {duration(made.seconds)}",
         flush=True,

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 
 class TerminalObserver(Observer):
-    """Notes and progress go to stdout, unless ``quiet``; results always do.
+    """Prints results to stdout and, unless ``quiet``, also notes and progress.
 
-    Use it as a context, so that no progress bar is left in the terminal after an error.
+    It is a context manager: leaving the context removes the progress bar, also after an error.
     """
 
     def __init__(self, quiet: bool = False) -> None:
@@ -92,7 +92,7 @@ class TerminalObserver(Observer):
 
 
 class WatchObserver(TerminalObserver):
-    """Of a page that shows saved scenes."""
+    """The observer of `snowsplat watch`, which Ctrl-C ends."""
 
     def page_opened(self, viewer: NetworkViewer) -> None:
         super().page_opened(viewer)

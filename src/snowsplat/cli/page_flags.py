@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PageFlags:
-    """Where the page is."""
+    """The address of the page."""
 
     port: int | None = None
     host: str | None = None

@@ -27,9 +27,10 @@ class Render(SceneFlags):
       snowsplat render out/garden --path keys.json --side-by-side
       snowsplat render garden.ply --path ellipse --video garden.mp4
 
-    The images are OUT/test/ours_N/renders/00000.png …, the photos gt/00000.png …, in the order of
-    the names of the photos; also in OUT/train/ours_N. Videos are OUT/videos/ellipse.mp4 …; a scene
-    file is sufficient for a video along an ellipse or along a list of cameras.
+    The images are written to OUT/test/ours_N/renders (held-out photos) and OUT/train/ours_N/renders
+    as 00000.png … in the order of the names of the photos; copies of the photos to gt/ beside it.
+    Videos are written to OUT/videos. A video along an ellipse or through a list of cameras needs
+    only a scene file.
     """
 
     split: Annotated[Literal["all", "test", "train"], flag("{all,test,train}", default="all")] = (
@@ -43,14 +44,15 @@ class Render(SceneFlags):
     depth: Annotated[
         Literal["none", "16bit", "color"], flag("{none,16bit,color}", default="none")
     ] = "none"
-    """Depth too, as depth/00000.png: 16-bit gray values, whose unit is in
-    world_units_per_step.json, or colored from near (yellow) to far (violet). With --path: a second
-    video, colored."""
+    """Also write the depth, to depth/00000.png …: as 16-bit gray values, whose unit is in
+    world_units_per_step.json, or in colors from near (yellow) to far (violet). With --path, color
+    renders a second video."""
 
     path: Annotated[str | None, flag("{training,ellipse,spiral,FILE}", default="images")] = None
-    """Render a video. training: along the cameras of the photos, smoothed; ellipse: around what
-    they show; spiral: in front of a scene whose cameras look in one direction; or through the
-    cameras of a FILE like OUT/cameras.json, as a loop if the last camera is the first."""
+    """Render a video along this camera path. training: along the cameras of the photos, smoothed;
+    ellipse: around what they show; spiral: in front of a scene whose cameras look in one direction;
+    FILE: through the cameras of a file like OUT/cameras.json, a loop if its first and last camera
+    are equal."""
     seconds: Annotated[float | None, flag("F", default="10")] = None
     """Length of the video."""
     fps: Annotated[float | None, flag("F", default="30")] = None
@@ -58,7 +60,7 @@ class Render(SceneFlags):
     size: Annotated[str | None, flag("WxH|W", default="that of the photos")] = None
     """Size of the video in pixels, or its width."""
     side_by_side: Annotated[bool, switch()] = False
-    """Color and depth beside each other in one video."""
+    """One video with color on the left and depth on the right."""
     video: Annotated[Path | None, flag("FILE.mp4", "--film", default="in OUT/videos")] = None
     """File of the video."""
 
@@ -92,7 +94,7 @@ class Render(SceneFlags):
         elif self.output is not None and self.model_path is not None:
             scene = None
         if scene is None:
-            raise UserError("name the output folder of a training or a scene file, once")
+            raise UserError("render needs one output folder of a training, or one scene file")
         options = VideoOptions(
             path=path,
             seconds=10.0 if self.seconds is None else self.seconds,

@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 @dataclass
 class SceneFlags:
-    """Base of these subcommands."""
+    """The base class of these subcommands."""
 
     output: Annotated[Path | None, tyro.conf.Positional, flag("OUT")] = None
-    """Output folder of a training, of snowsplat or of the reference implementation."""
+    """Output folder of a training with snowsplat or with the reference implementation."""
     model_path: Annotated[Path | None, flag("OUT", "-m", "-o")] = None
-    """The same, as the reference implementation spells it."""
+    """The same as OUT; the spelling of the reference implementation."""
     iteration: Annotated[int | None, flag("N", default="the last")] = None
-    """Which of the scenes in OUT."""
+    """The step after which the scene was saved, if OUT has several."""
     dataset: Annotated[
         Path | None, flag("DATASET", "-s", "--source-path", "--capture", default="as trained")
     ] = None
-    """The photos and their cameras, if they were moved."""
+    """The folder of photos and cameras, if it was moved after the training."""
     resolution: Annotated[int | None, flag("N", "-r", default="as trained")] = None
     """1, 2, 4 or 8 divide the size of the photos; any other number is a width in pixels."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
@@ -40,11 +40,11 @@ class SceneFlags:
     def output_path(self) -> Path:
         """The output folder. Raises: UserError: none named, or two."""
         if (self.output is None) == (self.model_path is None):
-            raise UserError("name the output folder of a training, once")
+            raise UserError("name one output folder of a training")
         return self.output or self.model_path or Path()
 
     def compute(self) -> Compute:
-        """Raises: UserError: fewer than 1 thread."""
+        """The device and threads. Raises: UserError: fewer than 1 thread."""
         return Compute(self.device, self.threads)
 
     def load(self) -> TrainedScene:

@@ -29,9 +29,9 @@ class Sfm:
       snowsplat sfm -s garden --resize          photos in garden/input, as for convert.py
       snowsplat train garden -o out             the next step
 
-    Masks are PHOTOS/masks/IMG.jpg.png or IMG.png (black is ignored), or the transparency of the
-    photos. DATASET/capture_report.html reports the result. If it is interrupted, rerun the same
-    command to resume.
+    Masks are read from PHOTOS/masks/IMG.jpg.png or IMG.png (black pixels are ignored) or from the
+    transparency of the photos. DATASET/capture_report.html shows the cameras and lists the photos
+    that were not used. If the command is interrupted, rerun it to resume.
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
@@ -42,34 +42,34 @@ class Sfm:
     """As in convert.py of the reference implementation: LOCATION/input contains the photos, and
     LOCATION becomes the dataset."""
 
-    fps: Annotated[float | None, flag("F")] = None
+    fps: Annotated[float | None, flag("F", default="2.5, fewer of a long video")] = None
     """Frames to use per second of video."""
-    frames: Annotated[int | None, flag("N")] = None
+    frames: Annotated[int | None, flag("N", default="as --fps determines")] = None
     """Frames to use per video."""
     size: Annotated[int | None, flag("PIXELS", default="unchanged")] = None
-    """Reduce photos and frames whose longer side is longer than this."""
+    """Scale photos and frames down to this length of their longer side."""
     resize: Annotated[bool, switch()] = False
     """Also write images_2, images_4 and images_8: a half, a quarter, an eighth of the size."""
 
     quality: Annotated[
         Literal["draft", "normal", "best"], flag("{draft,normal,best}", default="normal")
     ] = "normal"
-    """Effort to find common points of the photos; best takes several times as long."""
+    """Effort to find points that photos have in common; best takes several times as long."""
     camera_model: Annotated[str | None, flag("MODEL", "--camera")] = None
     """Lens model, by its name in COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, PINHOLE …"""
     mapper: Annotated[
         Literal["incremental", "global"], flag("{incremental,global}", default="incremental")
     ] = "incremental"
-    """How the poses are estimated: one by one, or all at once (faster for many photos)."""
+    """Estimate the poses one after the other, or all at once (faster for many photos)."""
     skip_matching: Annotated[bool, switch()] = False
-    """With -s: use the model in LOCATION/distorted/sparse/0, only undistort."""
+    """With -s: use the COLMAP model in LOCATION/distorted/sparse/0 and only undistort."""
 
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of threads."""
     overwrite: Annotated[bool, switch()] = False
-    """Replace a dataset of other photos in DATASET."""
+    """Replace a dataset in DATASET that was made from other photos."""
     quiet: Annotated[bool, switch("-q")] = False
-    """Print the result only, no progress."""
+    """Print only the result, no progress."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -111,7 +111,7 @@ class Sfm:
         from snowsplat.sfm.dataset_folder import DatasetOptions
         from snowsplat.sfm.ingest.inputs import GatherOptions
 
-        Compute(threads=self.threads)  # checks them
+        Compute(threads=self.threads)  # raises an error if there are fewer than 1
         lens: dict[str, Any] = {}
         if self.camera_model is not None:
             lens["camera_model"] = self.camera_model

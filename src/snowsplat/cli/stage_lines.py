@@ -1,4 +1,4 @@
-"""The lines about finished stages."""
+"""The lines that are printed about finished stages."""
 
 from __future__ import annotations
 

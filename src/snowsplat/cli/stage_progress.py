@@ -19,10 +19,10 @@ _WIDTH = 10  # of the names of stages
 
 
 class StageProgress:
-    """Lines about stages on ``stream``.
+    """Prints lines about stages to ``stream``.
 
-    In a terminal a bar shows the current stage, from `begin` to `end` or `hide`; otherwise a line
-    is printed every few seconds.
+    In a terminal, a progress bar shows the current stage from `begin` to `end` or `hide`. In a
+    file, a line is printed every few seconds.
     """
 
     def __init__(self, quiet: bool = False, stream: TextIO | None = None) -> None:
@@ -59,7 +59,7 @@ class StageProgress:
             self._bar = None
 
     def end(self, line: str, seconds: float, again: bool = False) -> None:
-        """The stage is finished; ``again``: in an earlier run."""
+        """The stage is finished; ``again``: it was finished in an earlier run."""
         self.hide()
         took = "done before" if again else duration(seconds)
         self.say(f"{self._stage:<{_WIDTH}}{line}  ({took})")

@@ -33,7 +33,7 @@ class StepProgress:
         self._start_time = self._last_time = time.monotonic()
         self._last_line = self._start_time - _LINE_SECONDS + 1.0  # the first line after a second
         self._last_step = start
-        self._rate = 0.0  # steps a second
+        self._rate = 0.0  # steps per second
         self._loss = math.nan
         self._psnr = ""
         self._bar: Progress | None = None
@@ -57,7 +57,7 @@ class StepProgress:
 
     @property
     def seconds(self) -> float:
-        """Since the first step began."""
+        """Time since the first step began."""
         return time.monotonic() - self._start_time
 
     def __call__(self, progress: trainer.Progress) -> None:
@@ -110,7 +110,7 @@ class StepProgress:
 
 
 def _whole(total: int) -> Column:
-    """In a narrow terminal a truncated number would be misread: other columns are truncated."""
+    """A column that is never truncated: in a narrow terminal, a part of a number is misleading."""
     return Column(no_wrap=True, min_width=2 * len(str(total)) + 1)
 
 

@@ -25,11 +25,11 @@ class Train(TrainFlags):
       snowsplat train garden -o out -r 4              photos at a quarter of their size: faster
       snowsplat train garden -o out --minutes 5       the best scene that 5 minutes allow here
       snowsplat train garden -o out --recipe paper    the 30,000 steps of the paper
-      snowsplat train garden -o out --checkpoint-every 1000
+      snowsplat train garden -o out --checkpoint-every 1000     save every 1000 steps
       snowsplat train -o out --resume                 continue after Ctrl-C, a crash, a power cut
 
-    The scene is OUT/point_cloud/iteration_N/point_cloud.ply. Ctrl-C saves what is reached. The
-    flags of the reference implementation are accepted (-s -m -i -r -w --eval --iterations …).
+    The scene is OUT/point_cloud/iteration_N/point_cloud.ply. Ctrl-C saves the current scene and a
+    checkpoint. The flags of the reference implementation are accepted (-s -m -i -r -w --eval …).
     """
 
     def run(self) -> int:

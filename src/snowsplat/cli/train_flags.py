@@ -31,13 +31,13 @@ class JobFlags:
     """The origin of all other settings. default: a few thousand quick steps; paper: the schedule
     of the paper, 30,000 steps; mcmc: 30,000 steps with a fixed number of Gaussians."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
-    """Finish within this time, evaluation and saving included: picks the steps, the size of the
-    photos and the number of Gaussians, except for those that are given. With --resume: the time for
-    the rest."""
+    """Finish within this time, including evaluation and saving. The number of steps, the size of
+    the photos and the number of Gaussians are chosen to fit, unless they are given. With --resume:
+    the time for the remaining steps."""
     eval: Annotated[bool, switch()] = False
     """Hold out every 8th photo (or the test split of the dataset) and evaluate on it at the end."""
     test_list: Annotated[Path | None, flag("FILE")] = None
-    """Text file with the names of the photos to hold out instead, one per line. Implies --eval."""
+    """Text file with the names of the photos to hold out, one per line. Implies --eval."""
     images: Annotated[str | None, flag("NAME", "-i", default="images")] = None
     """Name of the folder of photos in the dataset."""
     resolution: Annotated[int | None, flag("N", "-r", default="unchanged")] = None
@@ -56,10 +56,10 @@ class JobFlags:
     printed, contains a secret token."""
 
     memory: Annotated[str | None, flag("BYTES", default="what is available")] = None
-    """Memory for the training, like 4GB: of the GPU, or of the computer beside what Python and its
-    libraries take. Photos are decoded again for each use, and Gaussians are fewer, as needed."""
+    """Memory for the training, like 4GB: of the GPU or, on the CPU, in addition to what Python and
+    its libraries take. To fit, photos are decoded again for each use, and Gaussians are fewer."""
     resume: Annotated[bool, switch()] = False
-    """Continue from the newest checkpoint in OUT, to the same result as without interruption."""
+    """Continue from the newest checkpoint in OUT. The result is as without interruption."""
     overwrite: Annotated[bool, switch()] = False
     """Replace a training that is in OUT."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
@@ -71,9 +71,9 @@ class JobFlags:
     save_iterations: Annotated[tuple[int, ...], flag("[N ...]")] = ()
     """Steps after which to save the scene, in addition to the last one."""
     source_path: Annotated[Path | None, flag("DATASET", "-s")] = None
-    """The dataset, as the reference implementation spells it."""
+    """The same as DATASET; the spelling of the reference implementation."""
     quiet: Annotated[bool, switch("-q")] = False
-    """Print the result only, no progress."""
+    """Print only the result, no progress."""
 
 
 @dataclass
@@ -81,13 +81,13 @@ class TrainFlags(ConfigFlags, JobFlags):
     """All flags of `snowsplat train`."""
 
     def dataset_path(self) -> Path | None:
-        """Raises: UserError: the dataset is named twice."""
+        """The dataset, or None. Raises: UserError: it is named twice."""
         if self.dataset is not None and self.source_path is not None:
-            raise UserError("the dataset is named twice; leave out -s or the other")
+            raise UserError("the dataset is named twice; leave out DATASET or -s")
         return self.dataset or self.source_path
 
     def options(self) -> TrainOptions:
-        """Raises: UserError: contradictory flags."""
+        """The options of `pipeline.train.train`. Raises: UserError: contradictory flags."""
         return TrainOptions(
             recipe=self.recipe,
             settings=self._settings(),

@@ -26,15 +26,15 @@ class View:
       snowsplat view garden.spz
       snowsplat view out/garden --no-browser --port 8080
 
-    Only this computer can open the page, whose URL contains a secret token. The first view is that
-    of the first photo of the training. Drag to turn, scroll to zoom, W A S D to fly; the page lists
-    all controls.
+    By default, only this computer can open the page; its URL contains a secret token. The first
+    view is that of the first photo of the training. Drag to turn, scroll to zoom, W A S D to fly;
+    the page lists all controls.
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
     """A scene file of any format, or the output folder of train or make."""
     iteration: Annotated[int | None, flag("N", default="the last")] = None
-    """Which of the scenes in OUT."""
+    """The step after which the scene was saved, if OUT has several."""
     host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this computer only")] = "127.0.0.1"
     """Address to listen on; 0.0.0.0 accepts connections from the network."""
     port: Annotated[int, flag("N", default="a free one")] = 0

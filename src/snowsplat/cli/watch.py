@@ -19,8 +19,8 @@ class Watch(SceneFlags):
       snowsplat watch out/garden
       snowsplat watch out/garden --port 9000
 
-    While the training runs, the newest scene or checkpoint that it has saved is shown (see train
-    --checkpoint-every). OUT may also be that of `snowsplat make`. Ctrl-C closes the page.
+    While the training runs, the page shows the newest scene or checkpoint that it has saved (see
+    train --checkpoint-every). OUT is the folder of `train` or of `make`. Ctrl-C closes the page.
     """
 
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
@@ -30,7 +30,7 @@ class Watch(SceneFlags):
     printed, contains a secret token."""
 
     def run(self) -> int:
-        """Returns the exit code: 0, after Ctrl-C."""
+        """Runs until Ctrl-C; returns the exit code, 0."""
         path = self.output_path()
         from snowsplat.pipeline.watch import watch
 

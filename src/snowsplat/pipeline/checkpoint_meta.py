@@ -25,8 +25,8 @@ class CheckpointMeta:
         capture: how the dataset was read.
         recipe: the origin of the configuration.
         training: the configuration, see `config_to_json`.
-        time: of a training with a time budget, see `TimeBudget.as_json`.
-        schedule: of a training with a time budget.
+        time: see `TimeBudget.as_json`; only of a training with a time budget.
+        schedule: only of a training with a time budget, which may change it.
     """
 
     capture: DatasetSettings
@@ -51,5 +51,5 @@ class CheckpointMeta:
         return meta
 
     def as_json(self) -> dict[str, Any]:
-        """Without the fields that are None."""
+        """The JSON value; fields that are None are left out."""
         return {key: value for key, value in asdict(self).items() if value is not None}

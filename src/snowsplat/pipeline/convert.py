@@ -62,7 +62,7 @@ class Edits:
             gaussians_to_keep(self.decimate, 0)
 
     def apply(self, scene: Gaussians) -> Gaussians:
-        """The edited scene.
+        """The edited scene; ``scene`` is unchanged.
 
         Raises:
             UserError: no Gaussian is in the box.
@@ -82,7 +82,7 @@ class Edits:
         return scene
 
     def movement(self) -> Similarity | None:
-        """From the old frame to the new one; None if nothing moves: then all bits stay the same."""
+        """From the old frame to the new one; None if nothing moves: all values stay as they are."""
         if not any(self.rotate) and self.scale == 1 and not any(self.translate):
             return None
         rotation = torch.eye(3, dtype=torch.float64)
@@ -101,11 +101,12 @@ def convert(
     *,
     overwrite: bool = False,
 ) -> Format:
-    """Merge scenes, edit the result, and write it, maybe in another format.
+    """Merge scenes, edit the result, and write it in the format of the target's ending.
 
     Args:
         sources: scene files of any format, or output folders, whose last scene is used.
         target: the file to write; its ending selects the format.
+        edits: default: none.
         overwrite: replace ``target``.
 
     Returns:
@@ -140,10 +141,13 @@ def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
 
 
 def gaussians_to_keep(decimate: int | str, count: int) -> int:
-    """The number of ``count`` Gaussians that a number or a percentage means.
+    """How many of ``count`` Gaussians ``decimate`` keeps.
+
+    Args:
+        decimate: a number such as 5000 or "5000", or a percentage such as "50%".
 
     Raises:
-        UserError: neither.
+        UserError: ``decimate`` is neither.
     """
     text = str(decimate)
     if re.fullmatch(r"\d+", text):

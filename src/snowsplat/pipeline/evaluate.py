@@ -29,12 +29,16 @@ def evaluate(
         evaluate(load_trained("out/garden")).psnr
 
     Args:
-        split: the held-out photos, or those of the training.
+        split: "test": the held-out photos; "train": those that the scene was trained on.
         lpips: a weights file, see `snowsplat.evaluation.lpips`; None: LPIPS is not measured.
         on_view: called after each view.
 
+    Returns:
+        PSNR, SSIM and LPIPS of each view, and their means.
+
     Raises:
-        UserError: no photos in this split, a damaged photo or weights file.
+        UserError: there are no photos in this split, or a photo or the weights file is damaged.
+        OSError: metrics.json cannot be written.
     """
     from snowsplat.evaluation.lpips import Lpips
     from snowsplat.evaluation.metrics import evaluate_views

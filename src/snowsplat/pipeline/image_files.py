@@ -72,7 +72,10 @@ def depth_in_color(depth: np.ndarray, near: float, far: float) -> np.ndarray:
 
 
 class PngQueue:
-    """Writes images in the background, a few behind: encoding PNG takes longer than rendering."""
+    """Writes images in background threads, because encoding PNG takes longer than rendering.
+
+    At most eight images are queued. Leaving the context waits for all of them.
+    """
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(2)
@@ -88,7 +91,7 @@ class PngQueue:
                     self._pending.popleft().result()
 
     def write(self, path: Path, pixels: np.ndarray) -> None:
-        """Raises: OSError: an earlier image could not be written."""
+        """Queue an image, see `write_png`. Raises: OSError: an earlier one could not be written."""
         self._pending.append(self._pool.submit(write_png, path, pixels))
         if len(self._pending) > 8:
             self._pending.popleft().result()

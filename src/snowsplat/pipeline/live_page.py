@@ -20,7 +20,7 @@ LOCAL_HOST = "127.0.0.1"
 
 
 class LivePage:
-    """A page at http://localhost:``port``. Use it as a context: its end closes the page.
+    """A page at http://localhost:``port``. It is a context manager: its end closes the page.
 
     with LivePage() as page:
         train("garden", "out/garden", page=page)
@@ -59,8 +59,13 @@ class LivePage:
     ) -> NetworkViewer:
         """Open the page, and report its address to the observer.
 
+        Args:
+            dataset: its cameras and photos are shown.
+            background: red, green, blue in 0..1.
+            label: the title of the page.
+
         Raises:
-            UserError: the port is taken by now.
+            UserError: the port was taken after the constructor had checked it.
         """
         from snowsplat.viewer.live.viewer import NetworkViewer
 
@@ -70,7 +75,7 @@ class LivePage:
         return viewer
 
     def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
-        """Open the page of a training, which calls `after_step`."""
+        """As `open`, for a training. The training then calls `after_step` after each step."""
         from snowsplat.viewer.live.gauge import Gauge
         from snowsplat.viewer.live.training import TrainingViewer
 
@@ -105,7 +110,7 @@ class LivePage:
             self._viewer.hold(scene)
 
     def close(self) -> None:
-        """Close the page, if it is open; the trainer it has shown is released."""
+        """Close the page if it is open, and release the trainer that it has shown."""
         viewer, self._viewer = self._viewer, None
         self._training = self._trainer = None
         if viewer is not None:

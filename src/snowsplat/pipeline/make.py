@@ -31,7 +31,7 @@ RECORD = "make.json"
 HOLD_OUT = 8
 # The part of a preset that concerns the training.
 _OF_TRAINING = ("side", "iterations", "max_gaussians", "densify_interval")
-# What a kill may cost, in seconds.
+# Time between checkpoints in seconds: a kill loses at most this much work.
 _CHECKPOINT_SECONDS = 15.0
 # The shortest training that is useful: in seconds, and as a share of the given time.
 _SHORTEST, _SHORTEST_SHARE = 15.0, 0.15
@@ -46,8 +46,8 @@ class MakeOptions:
     Attributes:
         quality: None: "normal", or what ``minutes`` allow. Together with ``minutes`` it determines
             the effort to find the camera poses; the training uses the rest of the time.
-        minutes: finish within this time. Stages that earlier runs have finished take none of it;
-            an interrupted training resumes with the time that it had left.
+        minutes: finish within this time. Only the stages of this run count. An interrupted training
+            resumes with the time that it had left.
         memory: for the training, see `TrainOptions`.
         compute: device and threads.
 
@@ -116,10 +116,14 @@ def make(
     is repeated if its photos or settings have changed.
 
     Args:
+        inputs: folders of photos, photos and videos; or one of them.
         output: default: NAME_scene in the current folder, NAME being that of the first input. It
             contains capture/ (the dataset), scene/ (the training) and NAME.ply (the scene).
         overwrite: replace a scene of other photos that is in ``output``.
         page: shows the training in the browser.
+
+    Returns:
+        The files of the scene and its quality on the held-out photos.
 
     Raises:
         UserError: unusable photos or settings; poses that cannot be found; a folder with other
@@ -176,7 +180,7 @@ class _Job:
 
     @contextmanager
     def _removed_if_empty(self, existed: bool) -> Iterator[None]:
-        """If nothing comes of the job, the record goes, and with it a new folder."""
+        """If the job wrote only its record, remove the record, and the folder if it is new."""
         try:
             yield
         finally:
@@ -222,7 +226,7 @@ class _Job:
         folder = OutputFolder(self.out / SCENE)
         outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
         scene = self._stage("scene", settings, outputs, lambda: self._train(settings)).result
-        shutil.rmtree(folder.checkpoints, ignore_errors=True)  # not needed any more
+        shutil.rmtree(folder.checkpoints, ignore_errors=True)  # no longer needed
         target = folder.path / "test" / f"ours_{scene['iteration']}"
         self._stage("pictures", {}, [target], self._render)
         return MakeResult(
@@ -304,7 +308,7 @@ class _Job:
         )
 
     def _minutes_left(self, given: float) -> float:
-        """For the training, of ``given`` seconds."""
+        """The time for the training: what is left of ``given`` seconds, at least the minimum."""
         photos = sum(path.is_file() for path in (self.dataset / "images").rglob("*"))
         left = given - self._elapsed() - _RENDER_SECONDS * -(-photos // HOLD_OUT)
         shortest = max(_SHORTEST, _SHORTEST_SHARE * given)
@@ -333,7 +337,7 @@ def _width(dataset: Path, preset: Preset) -> int | None:
 
 
 def _fingerprint(dataset: Path) -> str:
-    """Of the cameras, and of the names and sizes of photos and masks."""
+    """A hash of the cameras, and of the names and sizes of photos and masks."""
     digest = hashlib.sha256()
     for path in sorted((dataset / "sparse" / "0").glob("*.bin")):
         digest.update(path.read_bytes())

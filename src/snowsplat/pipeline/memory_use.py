@@ -39,13 +39,14 @@ class MemoryUse:
         before: int,
         present: int = 0,
     ) -> MemoryUse:
-        """
+        """Plan the memory of a training.
+
         Args:
             budget: bytes, or a text such as "4GB"; None: what is available.
             present: number of Gaussians of a training that is resumed.
 
         Raises:
-            UserError: not a number of bytes, or too few.
+            UserError: ``budget`` is not a number of bytes, or is too small.
         """
         from snowsplat.data.image_loader import available_memory
         from snowsplat.training.memory_budget import parse_bytes, plan_memory

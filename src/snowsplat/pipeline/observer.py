@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Observer:
-    """Derive a class and override the methods of interest: those of this class do nothing.
+    """The base class of observers: its methods do nothing; override those that you need.
 
     A job such as `make` consists of stages. `begin` and `end` enclose each stage; the training
     also reports its steps.

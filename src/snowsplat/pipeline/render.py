@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Depth = Literal["none", "16bit", "color"]
 
-_RANGE_VIEWS = 8  # determine which depths get which colors
+_RANGE_VIEWS = 8  # number of views that determine the range of the depth colors
 
 
 def render_images(

@@ -43,7 +43,8 @@ class TimeBudget:
     def of(
         cls, minutes: float | None, before: dict[str, Any] | None, started: float
     ) -> TimeBudget | None:
-        """
+        """The budget of a training.
+
         Args:
             minutes: the requested time; for a resumed training, the time for the rest of it.
             before: the value of `as_json` in the checkpoint that is resumed.
@@ -61,7 +62,7 @@ class TimeBudget:
 
     @property
     def left(self) -> float:
-        """Seconds."""
+        """The seconds that are left; negative if the time is over."""
         return self.seconds - self.spent - (time.monotonic() - self.started)
 
     def as_json(self) -> dict[str, float]:
@@ -71,7 +72,9 @@ class TimeBudget:
     def plan(
         self, dataset: Dataset, config: TrainConfig, device: torch.device, **may: bool
     ) -> Plan:
-        """What to train. ``dataset`` has full resolution; ``may``: see `make_plan`.
+        """Choose steps, photo size and Gaussians for the time that is left.
+
+        ``dataset`` has full resolution; ``may``: see `make_plan`.
 
         The speed is measured by a small sample training, since the plan decides the resolution,
         the cap and the schedule that a trainer is built with.
@@ -86,7 +89,7 @@ class TimeBudget:
         return f"{duration(self.seconds)} on this machine: {plan}"
 
     def pace(self, trainer: Trainer, slowness: float) -> Pace:
-        """Keeps the training within the time that is left."""
+        """The pace that keeps the training within the time that is left."""
         from snowsplat.training.time_budget.pace import Pace
         from snowsplat.training.time_budget.step_cost import Work
 

@@ -41,13 +41,14 @@ class TrainOptions:
         images: name of the folder of photos in the dataset; default: "images".
         resolution: 1, 2, 4 or 8 divide the size of the photos; any other number is a width in
             pixels; default: unchanged.
-        hold_out: every so many-th photo is held out for testing, if the dataset has no split of its
-            own; default: none.
-        test_list: a text file that names the photos to hold out instead.
-        minutes: finish within this time: picks the steps, the size of the photos and the number of
-            Gaussians, as far as they are not set here. On `resume`: the time for the rest.
-        memory: bytes, or a text such as "4GB", that the training may use beside Python and its
-            libraries; on a GPU, of its memory. Default: what is available.
+        hold_out: hold out every ``hold_out``-th photo for testing, if the dataset has no split of
+            its own; default: none.
+        test_list: a text file with the names of the photos to hold out; replaces ``hold_out``.
+        minutes: finish within this time. The number of steps, the size of the photos and the number
+            of Gaussians are chosen to fit, unless they are set here. On `resume`: the time for the
+            remaining steps.
+        memory: bytes, or a text such as "4GB", for the training: of the GPU or, on the CPU, in
+            addition to what Python and its libraries take. Default: what is available.
         save_iterations: steps after which to save the scene, in addition to the last one.
         checkpoint_seconds: time between checkpoints, if ``settings`` has no checkpoint_every.
         compute: device, threads, determinism.
@@ -115,9 +116,12 @@ def train(
         overwrite: replace a training that is in ``output``.
         page: shows the training in the browser.
 
+    Returns:
+        The files of the scene, and the numbers of the training.
+
     Raises:
-        UserError: an unusable dataset, setting, device or folder; too little memory; numbers that
-            are no longer finite. A folder that was created is removed if nothing came of it.
+        UserError: an unusable dataset, setting, device or folder; too little memory; a loss or
+            parameters that are not finite. A new folder is removed if it contains no results.
         TrainingStopped: Ctrl-C. Scene and checkpoint are saved; `resume` continues.
         KeyboardInterrupt: Ctrl-C before the first step; nothing is left.
     """
@@ -136,7 +140,7 @@ def resume(
     observer: Observer = SILENT,
     page: LivePage | None = None,
 ) -> TrainResult:
-    """Continue a training from its newest checkpoint, to the same result as without interruption.
+    """Continue a training from its newest checkpoint; the result is as without interruption.
 
     Args:
         output: the folder of the training.
@@ -144,6 +148,9 @@ def resume(
             what does not affect the result; anything else must be as it was.
         dataset: where the photos are now, if they were moved. If there is no checkpoint yet, the
             training starts from this dataset.
+
+    Returns:
+        As `train`.
 
     Raises:
         UserError: as `train`; no checkpoint, and no ``dataset`` to start from; other settings.
@@ -167,7 +174,7 @@ class _Job:
         page: LivePage | None,
         started: float,
     ) -> None:
-        from snowsplat.training import trainer  # noqa: F401 (what it imports is used before)
+        from snowsplat.training import trainer  # noqa: F401 (before the memory is measured)
 
         self.out, self.options, self.observer, self.page = out, options, observer, page
         self.started = started

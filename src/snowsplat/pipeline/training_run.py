@@ -57,8 +57,8 @@ class TrainingStopped(KeyboardInterrupt):
     """Ctrl-C during a training.
 
     Attributes:
-        scene: the file with everything that was reached, beside a checkpoint; None if a second
-            Ctrl-C interrupted a step: then the older checkpoints remain.
+        scene: the scene file that was saved, together with a checkpoint; None if a second Ctrl-C
+            interrupted a step: then only the older checkpoints remain.
     """
 
     def __init__(self, message: str, scene: Path | None) -> None:
@@ -98,9 +98,10 @@ class TrainingRun:
         self.history = History.read(self.out.history, self.first_step)
 
     def run(self) -> TrainResult:
-        """
+        """Run all steps and write the results.
+
         Raises:
-            UserError: loss, gradients or parameters are no longer finite.
+            UserError: the loss, gradients or parameters are not finite.
             TrainingStopped: Ctrl-C; see there.
             KeyboardInterrupt: Ctrl-C before the first step was finished; nothing is left.
         """
@@ -135,7 +136,7 @@ class TrainingRun:
         raise TrainingStopped(f"stopped after step {self.trainer.step}: {scene}", scene)
 
     def _record(self, progress: Progress) -> None:
-        measured = progress.metrics is not None  # an evaluation is part of the step, seen from here
+        measured = progress.metrics is not None  # the time of the step includes an evaluation
         self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=not measured)
         self._after_step(progress)
         self.history.step_begins()
@@ -170,7 +171,7 @@ class TrainingRun:
         return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
 
     def _finish_interrupted_writes(self) -> None:
-        """A kill may fall between a checkpoint and the removal of an old one or the scene."""
+        """What a kill right after a checkpoint prevented: remove old ones, save the scene."""
         from snowsplat.training import checkpoint
 
         step = self.first_step
@@ -183,7 +184,7 @@ class TrainingRun:
         return self.out.write_scene(self.trainer.step, self.trainer.gaussians)
 
     def _restore_folder(self) -> None:
-        """Hours of training are not lost because the folder was moved or removed."""
+        """Create the folder again if it was moved or removed, so that the training is not lost."""
         if not self.out.is_one():
             warnings.warn(f"{self.out.path}: was removed; it is created again", stacklevel=2)
             self.out.describe(self.trainer.dataset, self.settings, self.config)
@@ -253,7 +254,7 @@ class TrainingRun:
         from snowsplat.training.config import config_to_json
         from snowsplat.training.report import Trained, write_training_report
 
-        # The page may be given to others: it contains names of files, no paths.
+        # Users may share the report, so it contains names of files but no paths.
         out = self.out.path
         dataset = asdict(self.settings)
         for key in ("path", "test_list"):

@@ -26,7 +26,7 @@ CAMERA_PATHS = ("training", "ellipse", "spiral")
 _LONGEST_SIDE = 1920  # of a video without a requested size
 _SMALLEST, _LARGEST = 16, 8192  # pixels along a side
 _MOST_FRAMES = 100_000
-_RANGE_FRAMES = 8  # determine which depths get which colors
+_RANGE_FRAMES = 8  # number of frames that determine the range of the depth colors
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class VideoSize:
         return cls(width, height)
 
     def of(self, camera: Camera) -> tuple[int, int]:
-        """Width and height, both even; what was not requested follows ``camera``."""
+        """Width and height, both even; a side that was not requested is taken from ``camera``."""
         width, height = camera.width, camera.height
         if self.width is None:
             scale = min(1.0, _LONGEST_SIDE / max(width, height))
         else:
             scale = self.width / width
         wanted = (self.width or width * scale, self.height or height * scale)
-        # Cameras come from files too: one that is narrow would be very high at a large width.
+        # Cameras may come from files. A very narrow one would be extremely high at a large width.
         width, height = (min(_LARGEST, max(_SMALLEST, 2 * int(side / 2 + 0.25))) for side in wanted)
         return width, height
 
@@ -86,7 +86,7 @@ class VideoOptions:
         fps: frames per second.
         size: such as "1280x720" or "1280"; None: that of the photos.
         depth: render a second video of the depth in colors.
-        side_by_side: color and depth beside each other in one video instead.
+        side_by_side: one video instead, with color on the left and depth on the right.
 
     Raises:
         UserError: an unusable length, rate or size.
@@ -113,14 +113,14 @@ class VideoOptions:
 
     @property
     def frames(self) -> int:
-        """Their number."""
+        """The number of frames."""
         return max(1, round(self.seconds * self.fps))
 
     @property
     def name(self) -> str:
         """The name of the file, without its ending."""
-        way = self.path if Path(self.path).suffix == "" else Path(self.path).stem
-        return f"{way}_side_by_side" if self.side_by_side else way
+        name = self.path if Path(self.path).suffix == "" else Path(self.path).stem
+        return f"{name}_side_by_side" if self.side_by_side else name
 
 
 def render_video(
@@ -229,8 +229,8 @@ def cameras_along(
         if path == "training":
             cameras = trajectory.training_path(given, names, frames, distance)
         else:
-            around = trajectory.ellipse_path if path == "ellipse" else trajectory.spiral_path
-            cameras = around(given, frames, distance)
+            make_path = trajectory.ellipse_path if path == "ellipse" else trajectory.spiral_path
+            cameras = make_path(given, frames, distance)
     elif path == "ellipse":
         width, height = size.width or 1280, size.height or (size.width or 1280) * 9 // 16
         cameras = trajectory.orbit_path(gaussians.means, gaussians.opacities, frames, width, height)
@@ -252,7 +252,7 @@ class Video:
         cameras: one per frame, all of one even size.
         file: of the video in color; that of the depth has _depth in its name.
         depth: render a video of the depth too.
-        side_by_side: color on the left and depth on the right in one video instead.
+        side_by_side: one video instead, with color on the left and depth on the right.
     """
 
     gaussians: Gaussians
