@@ -32,8 +32,8 @@ from snowsplat.data import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.process import single_threaded
+from snowsplat.viewer.live.curves import SampledPsnr
 from snowsplat.viewer.live.display import DisplaySettings
-from snowsplat.viewer.live.gauge import Gauge
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer
@@ -152,7 +152,7 @@ def training(path: Path, seconds: float, rounds: int) -> None:
     trainer = Trainer(dataset, config)
     trainer.run(until=1000)
     viewer = NetworkViewer(dataset)
-    hook = TrainingViewer(viewer, Gauge(dataset.train, viewer.background))
+    hook = TrainingViewer(viewer, SampledPsnr(dataset.train, viewer.background))
     camera = dataset.train[0].camera
     found: dict[str, list[float]] = {}
 

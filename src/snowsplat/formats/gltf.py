@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats import glb, packing
-from snowsplat.formats.frames import UP_BACK, flip_axes
+from snowsplat.formats.axis_conventions import UP_BACK, flip_axes
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.glb import Damaged
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS

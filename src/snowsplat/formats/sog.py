@@ -28,9 +28,9 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.formats import packing
-from snowsplat.formats.bundle import Bundle, Damaged
 from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.sog_container import Bundle, Damaged
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
-from snowsplat.formats.frames import UP_BACK, flip_axes
+from snowsplat.formats.axis_conventions import UP_BACK, flip_axes
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.spz_container import (
     ANTIALIASED,

@@ -76,14 +76,14 @@ class LivePage:
 
     def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
         """As `open`, for a training. The training then calls `after_step` after each step."""
-        from snowsplat.viewer.live.gauge import Gauge
+        from snowsplat.viewer.live.curves import SampledPsnr
         from snowsplat.viewer.live.training import TrainingViewer
 
         white = trainer.config.background == "white"
         background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
         viewer = self.open(trainer.dataset, background, label, observer)
         views = trainer.dataset.test or trainer.dataset.train
-        self._training = TrainingViewer(viewer, Gauge(views, viewer.background))
+        self._training = TrainingViewer(viewer, SampledPsnr(views, viewer.background))
         self._trainer = trainer
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:

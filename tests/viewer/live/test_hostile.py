@@ -19,7 +19,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.trainer import Trainer
 from snowsplat.viewer.live import guard
-from snowsplat.viewer.live.gauge import Gauge
+from snowsplat.viewer.live.curves import SampledPsnr
 from snowsplat.viewer.live.guard import call_in_server_thread
 from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer
@@ -39,8 +39,8 @@ class Watched:
     def __init__(self, dataset: Dataset) -> None:
         self.trainer = Trainer(dataset, TrainConfig(iterations=STEPS))
         self.viewer = NetworkViewer(dataset)
-        gauge = Gauge(dataset.train, self.viewer.background)
-        self._training = TrainingViewer(self.viewer, gauge)
+        sampled_psnr = SampledPsnr(dataset.train, self.viewer.background)
+        self._training = TrainingViewer(self.viewer, sampled_psnr)
         thread = self.viewer.server._websock_server._server_thread
         self._stat = Path(f"/proc/self/task/{thread.native_id}/stat")
 

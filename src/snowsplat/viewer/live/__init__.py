@@ -4,15 +4,15 @@ It shows the Gaussians that are being trained. Between two training steps, the i
 wait for are rendered from the same tensors that the next step changes. The command line uses
 `viewer.NetworkViewer`.
 
-    display.py   display settings and pose of a browser
-    pictures.py  Gaussians + camera + display settings → image; no side effects
-    session.py   state of the browsers and of the training, next image to render; thread-safe
-    gauge.py     curves of loss and PSNR
-    server.py    viser on a free port of this machine
-    guard.py     limits what connections may do
-    page.py      the controls of the page
-    photos.py    the cameras of the photos: frustums, and views at their positions
-    keys.py      camera positions stored by a browser, for a video
-    viewer.py    combines all of these
-    training.py  the viewer between the steps of a training
+    display.py      display settings and pose of a browser
+    pictures.py     Gaussians + camera + display settings → image; no side effects
+    session.py      state of the browsers and of the training, next image to render; thread-safe
+    curves.py       curves of loss and PSNR
+    server.py       viser on a free port of this machine
+    guard.py        limits what connections may do
+    page.py         the controls of the page
+    photos.py       the cameras of the photos: frustums, and views at their positions
+    key_cameras.py  camera positions stored by a browser, for a video
+    viewer.py       combines all of these
+    training.py     the viewer between the steps of a training
 """

@@ -13,8 +13,8 @@ import viser
 from torch import Tensor
 
 from snowsplat.util.errors import UserError
+from snowsplat.viewer.live.curves import Curve
 from snowsplat.viewer.live.display import Mode
-from snowsplat.viewer.live.gauge import Curve
 from snowsplat.viewer.live.guard import call_in_server_thread
 from snowsplat.viewer.live.photos import FRUSTUMS, Photos
 from snowsplat.viewer.live.session import Session, Visitor

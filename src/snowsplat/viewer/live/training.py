@@ -7,7 +7,7 @@ import time
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.process import let_interrupt
-from snowsplat.viewer.live.gauge import Curve, Gauge
+from snowsplat.viewer.live.curves import Curve, SampledPsnr
 from snowsplat.viewer.live.page import TrainingPanel
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
@@ -20,12 +20,12 @@ _RATE_SECONDS = 3.0  # over which the displayed rate is averaged, approximately
 class TrainingViewer:
     """Shows and pauses a training; call `after_step` after each step."""
 
-    def __init__(self, viewer: NetworkViewer, gauge: Gauge) -> None:
+    def __init__(self, viewer: NetworkViewer, sampled_psnr: SampledPsnr) -> None:
         self.viewer = viewer
         self._session = viewer.session
         self._session.training = True
         self._panel = TrainingPanel(viewer.server, viewer.session)
-        self._gauge = gauge
+        self._sampled_psnr = sampled_psnr
         self._losses, self._psnrs = Curve(), Curve()
         self._loss = math.nan
         self._rate = 0.0
@@ -72,8 +72,8 @@ class TrainingViewer:
         if now < self._next:
             return
         self._next = now + _SECONDS
-        if self._gauge.can_measure and step > self._measured and now >= self._next_psnr:
-            psnr = self._gauge.measure(gaussians)
+        if self._sampled_psnr.can_measure and step > self._measured and now >= self._next_psnr:
+            psnr = self._sampled_psnr.measure(gaussians)
             self._measured = step
             if math.isfinite(psnr):
                 self._psnrs.add(step, psnr)

@@ -15,7 +15,7 @@ from snowsplat.data import Dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.viewer.live.display import Pose
 from snowsplat.viewer.live.guard import Governor, call_in_server_thread
-from snowsplat.viewer.live.keys import KeyCameras
+from snowsplat.viewer.live.key_cameras import KeyCameras
 from snowsplat.viewer.live.page import Controls, ScenePanel
 from snowsplat.viewer.live.photos import Photos, placed_photo
 from snowsplat.viewer.live.pictures import draw

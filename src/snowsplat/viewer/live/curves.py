@@ -58,7 +58,7 @@ class Curve:
         return points[:, 0].copy(), points[:, 1].copy()
 
 
-class Gauge:
+class SampledPsnr:
     """PSNR of a few fixed views, one at a time, since rendering interrupts the training."""
 
     def __init__(self, views: Sequence[View], background: Tensor) -> None:

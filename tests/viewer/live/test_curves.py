@@ -10,7 +10,7 @@ from snowsplat.data import load_dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.viewer.live.gauge import Curve, Gauge
+from snowsplat.viewer.live.curves import Curve, SampledPsnr
 
 
 def test_a_curve_has_few_points_and_correct_means():
@@ -28,30 +28,30 @@ def test_a_curve_has_few_points_and_correct_means():
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    root = tmp_path_factory.mktemp("gauge") / "capture"
+    root = tmp_path_factory.mktemp("sampled_psnr") / "capture"
     return load_dataset(write_toy_dataset(root, "colmap-bin", 6, 48, 36, n_points=200))
 
 
 def test_psnr_equals_an_evaluation(dataset):
     gaussians = Gaussians.from_points(dataset.points)
     black = torch.zeros(3)
-    gauge = Gauge(dataset.train, black)
+    sampled_psnr = SampledPsnr(dataset.train, black)
     chosen = dataset.train[:4]  # evenly spaced, of five
     expected = evaluate_views(gaussians, chosen).psnr
-    assert gauge.measure(gaussians) == pytest.approx(expected, abs=1e-4)
+    assert sampled_psnr.measure(gaussians) == pytest.approx(expected, abs=1e-4)
     gaussians.opacity_logits += 1.0
-    later = [gauge.measure(gaussians) for _ in range(4)]  # one after the other
+    later = [sampled_psnr.measure(gaussians) for _ in range(4)]  # one after the other
     assert later[0] != pytest.approx(expected, abs=1e-4)
     assert later[3] == pytest.approx(evaluate_views(gaussians, chosen).psnr, abs=1e-4)
-    assert Gauge(dataset.train[:2], black).measure(gaussians) > 0
+    assert SampledPsnr(dataset.train[:2], black).measure(gaussians) > 0
 
 
 def test_without_photos_there_is_no_psnr(dataset, tmp_path):
-    assert not Gauge([], torch.zeros(3)).can_measure
+    assert not SampledPsnr([], torch.zeros(3)).can_measure
     root = write_toy_dataset(tmp_path / "capture", "colmap-bin", 2, 48, 36, n_points=50)
     views = load_dataset(root).train
     for photo in (root / "images").iterdir():
         photo.unlink()
-    gauge = Gauge(views, torch.zeros(3))
-    assert math.isnan(gauge.measure(Gaussians.from_points(dataset.points)))
-    assert not gauge.can_measure
+    sampled_psnr = SampledPsnr(views, torch.zeros(3))
+    assert math.isnan(sampled_psnr.measure(Gaussians.from_points(dataset.points)))
+    assert not sampled_psnr.can_measure
