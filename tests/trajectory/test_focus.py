@@ -60,18 +60,20 @@ def ahead() -> Camera:
 
 
 def test_only_points_within_the_image_are_seen():
-    inside = torch.tensor([[0.0, 0.0, 2.0]])
+    inside = torch.tensor([[0.0, 0.0, 0.5]])
     left, above = torch.tensor([[-6.0, 0.0, 10.0]]), torch.tensor([[0.0, -4.5, 10.0]])
     behind = torch.tensor([[0.0, 0.0, -10.0]])
     for outside in (left, -left * torch.tensor([1, 1, -1]), above, behind):
         points = torch.cat([inside, outside.repeat(5, 1)])
-        assert viewing_distance([ahead()], points) == 2.0
+        assert viewing_distance([ahead()], points) == 0.5
 
 
 def test_viewing_distance_is_the_median_over_cameras_of_medians():
     points = torch.tensor([[0.0, 0, 2], [0, 0, 3], [0, 0, 7]])
     at = [camera_at((0.0, 0.0, -z), torch.tensor([0.0, 0, 9]).double()) for z in (0.0, 10.0, 1.0)]
     assert viewing_distance(at, points) == pytest.approx(4.0)  # of 3, 4 and 13
+    three = [camera_at((0.0, 0.0, -z), torch.tensor([0.0, 0, 9]).double()) for z in (2, 4, 6, 8, 1)]
+    assert viewing_distance(three, points) == pytest.approx(7.0)  # of 4, 5, 7, 9 and 11
     assert viewing_distance([ahead()], torch.zeros(1, 3)) == 1.0  # the point is at the camera
 
 

@@ -109,6 +109,7 @@ def test_key_path_takes_the_shortest_rotation_and_zooms():
     path = key_path([looking(-170, 50.0), looking(170, 80.0)], 50, 3.0)
     assert float(turns(path, closed=False).sum()) == pytest.approx(math.radians(20), rel=0.01)
     assert path[0].fx == pytest.approx(50.0)
+    assert path[-1].fx == pytest.approx(80.0)
     assert path[-1].fy == pytest.approx(80.0)
     widths = [camera.fx for camera in path]
     assert widths == sorted(widths)

@@ -178,6 +178,16 @@ def test_an_oval_covers_the_range_of_the_cameras(turn):
     torch.testing.assert_close(distances, torch.full((400,), math.hypot(4.0, 1.0)).double())
 
 
+def test_an_oval_is_in_the_middle_of_the_outer_cameras():
+    """Most cameras are on one side: the middle of the 10% and 90% quantiles counts."""
+    cameras = [*ring(31, 4.0, 4.0, 2.0), *ring(30, 4.0, 4.0, 0.2)]
+    given = azimuths(cameras)
+    low, high = torch.quantile(given, torch.tensor([0.1, 0.9]).double()).tolist()
+    path = ellipse_path(cameras, 400, math.hypot(4.0, 1.0))
+    assert float(azimuths(path).min()) == pytest.approx(low, abs=2e-3)
+    assert float(azimuths(path).max()) == pytest.approx(high, abs=2e-3)
+
+
 def test_an_oval_of_one_camera_swings_by_two_degrees():
     path = ellipse_path([camera_at((FOCUS[0] + 4.0, FOCUS[1], FOCUS[2]))], 400, 4.0)
     least = math.radians(2)
@@ -232,7 +242,9 @@ def test_spiral_reaches_the_outer_cameras():
     path = spiral_path(cameras, 1000, 5.0)
     places = positions(path) - torch.tensor([2.0, 0.75, 0.0])
     assert float(places[0].norm()) < 1e-6
-    # In y it reaches the radius, 0.6, in the middle of the path, in x sin(0.4 π) of it, 1.6.
+    # In the middle of the path it is above its own middle, by the radius in y, 0.6. In x it
+    # reaches sin(0.4 π) of the radius, 1.6.
+    assert float(places[500, 1]) == pytest.approx(-0.6, rel=0.01)
     assert float(places[:, 1].abs().max()) == pytest.approx(0.6, rel=0.01)
     assert float(places[:, 0].abs().max()) == pytest.approx(1.6 * math.sin(0.4 * math.pi), rel=0.03)
     # Along the viewing direction: half of 2% of the distance, since all cameras are in a plane.

@@ -143,4 +143,24 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "steps = np.arange(256, dtype=np.float64)",
         "steps = np.arange(257, dtype=np.float64)",
     ): "no byte is the index of the last one",
+    (
+        "trajectory/tour.py",
+        "order = torch.tensor(tour, dtype=torch.int64)",
+        "order = torch.tensor(tour, dtype=None)",
+    ): "torch makes int64 of Python's integers",
+    (
+        "trajectory/follow.py",
+        "quats = torch.cat([quats[:1], quats[1:] * signs[:, None].to(quats.dtype)])",
+        "quats = torch.cat([quats[:1], quats[1:] / signs[:, None].to(quats.dtype)])",
+    ): "signs are 1 or -1",
+    (
+        "trajectory/tour.py",
+        'return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]',
+        'return [(int(part), "XXXX") if part.isdecimal() else (-1, part) for part in parts]',
+    ): "all numbers have the same second part",
+    (
+        "trajectory/spline.py",
+        "near, far = [*beside.tolist(), 0.0], [*beyond.tolist(), 0.0, 0.0]",
+        "near, far = [*beside.tolist(), 1.0], [*beyond.tolist(), 0.0, 0.0]",
+    ): "the last factor is never used",
 }
