@@ -122,7 +122,7 @@ def test_refused(refused, trained, tmp_path):
     assert "no such folder" in refused("render", tmp_path / "absent")
     assert "not the output folder" in refused("evaluate", tmp_path)
     assert "there are 30, 60" in refused("render", trained, "--iteration", 7)
-    assert "once" in refused("render", trained, "-m", trained)
+    assert "one output folder" in refused("render", trained, "-m", trained)
     assert "no views" in refused("render", trained, "--skip-train", "--skip-test")
     damaged = tmp_path / "damaged"
     shutil.copytree(trained, damaged)

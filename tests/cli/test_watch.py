@@ -49,7 +49,7 @@ def test_watch_until_ctrl_c(start, trained):
 
 def test_watch_refuses(refused, trained, tmp_path):
     assert "no such folder" in refused("watch", tmp_path / "absent")
-    assert "once" in refused("watch")
+    assert "one output folder" in refused("watch")
     (tmp_path / "empty").mkdir()
     assert "not the output folder" in refused("watch", tmp_path / "empty")
     assert "no scene of iteration 7" in refused("watch", trained, "--iteration", 7)
