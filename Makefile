@@ -1,16 +1,18 @@
-# make demo     photographs a small synthetic scene and reconstructs it with `snowsplat make`
-# make quick    format, lint, types, layers and the fast tests: under a minute once built
-# make test     everything: all tests, on every instruction set, and the kernels of a GPU on the CPU
-# make dev      the development environment; then: make quick, make test, make format, make native
+# make demo     renders photos of a small synthetic scene and reconstructs it with `snowsplat make`
+# make quick    checks of format, lint, types and layers, and the fast tests: under a minute once built
+# make test     the same checks and all tests: on every instruction set, with the GPU kernels on the CPU
+# make dev      creates the development environment for the other targets
+# make format   formats the sources
+# make native   builds the native libraries
 #
 # Each target works on a fresh clone and needs Python >= 3.10 and a C++ compiler. Everything is installed
-# into .venv, made by BOOTSTRAP (python3); PYTHON=path/to/python uses an existing environment instead.
+# into .venv, created by BOOTSTRAP (python3); PYTHON=path/to/python uses an existing environment instead.
 
 SHELL := /bin/sh
 BOOTSTRAP ?= python3
 NO_COMPILER := snowsplat: no C++ compiler found; install one (Debian/Ubuntu: apt install g++)
-NO_PYTHON := snowsplat: $(BOOTSTRAP) is missing or older than 3.10; name one: make BOOTSTRAP=python3.12
-NO_VENV := snowsplat: $(BOOTSTRAP) cannot make environments; install that (Debian/Ubuntu: apt install python3-venv)
+NO_PYTHON := snowsplat: $(BOOTSTRAP) is missing or older than 3.10; choose another: make BOOTSTRAP=python3.12
+NO_VENV := snowsplat: $(BOOTSTRAP) cannot create environments; install venv (Debian/Ubuntu: apt install python3-venv)
 
 ifdef PYTHON
 ENVIRONMENT :=
@@ -18,16 +20,16 @@ else
 PYTHON := .venv/bin/python
 ENVIRONMENT := .venv/.installed
 endif
-# cmake, ninja, ruff and the rest are those of the environment; the package is that of this checkout.
+# Tools (cmake, ninja, ruff, …) come from the environment, the package from this checkout.
 export PATH := $(abspath $(dir $(PYTHON))):$(PATH)
 export PYTHONPATH := $(CURDIR)/src
-# Tests start Python often: without the cached bytecode each start would compile all modules.
+# Tests start Python often. Without cached bytecode, each start would compile all modules.
 unexport PYTHONDONTWRITEBYTECODE
 
 BUILD := build/native
-# Two builds in one checkout wait for each other.
+# Only one build at a time in a checkout.
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
-# One precision is enough: the two have the same source.
+# One precision is enough: both have the same source.
 SANITIZED := emulated-float32
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
@@ -43,7 +45,7 @@ test: lint types layers pytest
 
 dev: native
 
-# The environment. Editable without a build of its own: `make native` puts the libraries into src/.
+# The environment. The editable installation builds nothing: `make native` installs the libraries into src/.
 .venv/.installed: pyproject.toml | compiler
 	@$(BOOTSTRAP) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || \
 	    { echo "$(NO_PYTHON)" >&2; exit 1; }
@@ -58,8 +60,8 @@ compiler:
 	@command -v "$${CXX:-c++}" >/dev/null 2>&1 || command -v g++ >/dev/null 2>&1 || \
 	    command -v clang++ >/dev/null 2>&1 || { echo "$(NO_COMPILER)" >&2; exit 1; }
 
-# One library for each instruction set, and the kernels for each kind of GPU, into src/snowsplat/_lib,
-# and the viewer's page, into _viewer; only what changed is compiled.
+# One library per instruction set and the kernels for each GPU architecture, into src/snowsplat/_lib; the page
+# of the viewer, into src/snowsplat/_viewer. Only changed files are compiled.
 native: $(ENVIRONMENT) | compiler
 	@mkdir -p $(BUILD)
 	@$(LOCK) env -u MAKEFLAGS sh -ec ' \
@@ -84,8 +86,8 @@ types: $(ENVIRONMENT)
 layers: $(ENVIRONMENT)
 	lint-imports --no-logo
 
-# Tests run in one process per core: make test JOBS=1 runs them one after the other. Those that can take
-# seconds carry a mark, which `quick` leaves out (pyproject.toml lists them).
+# Tests run in one process per core; make test JOBS=1 runs them one after another. Slow tests have a mark,
+# and `quick` excludes these marks (listed in pyproject.toml).
 JOBS ?= auto
 PYTEST = $(PYTHON) -m pytest -n $(JOBS) --dist worksteal
 QUICK := not (sfm or browser or build or emulated or gpu or kill or slow)
@@ -94,8 +96,8 @@ ISA := isa and not (emulated or gpu)
 pytest-quick: native
 	$(PYTEST) -m '$(QUICK)'
 
-# All tests on the best instruction set, then on each of the others those that depend on it, then the
-# kernels of a GPU on the CPU once more, under the sanitizers.
+# All tests on the best instruction set; on each other one, the tests that depend on it; then the GPU
+# kernels on the CPU again, under sanitizers.
 pytest: native
 	$(PYTEST)
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
@@ -105,9 +107,9 @@ pytest: native
 	    done
 	@$(MAKE) --no-print-directory sanitized
 
-# The kernels of a GPU, on the CPU, under AddressSanitizer and UndefinedBehaviorSanitizer, and with the
-# threads of a block in the other order: a missing barrier may show in one of the two orders only.
-# With GCC's sanitizers, which can be loaded into a Python that was built without them.
+# The GPU kernels on the CPU under AddressSanitizer and UndefinedBehaviorSanitizer, with the threads of a
+# block in the reverse order: a missing barrier may have an effect in only one of the two orders. These are
+# the sanitizers of GCC, which can be loaded into a Python that was built without them.
 sanitized: native
 	@if [ -f "$$(g++ -print-file-name=libasan.so)" ]; then \
 	    echo "sanitized: $(PYTEST) tests/ops -m emulated -k $(SANITIZED)"; \

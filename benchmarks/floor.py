@@ -42,12 +42,12 @@ BACKWARD = {
     "moments q, q dy, q dy²": 4,
 }
 OPERATIONS = sum(FORWARD.values()) + sum(BACKWARD.values())
-OPERATIONS_A_CLOCK = 2.0
+OPERATIONS_PER_CLOCK = 2.0
 
 
 def floor_ns(lanes: int, lane_use: float, ghz: float) -> float:
     """Nanoseconds per pair, forward and backward together, on one core."""
-    return OPERATIONS / (lanes * lane_use) / (OPERATIONS_A_CLOCK * ghz)
+    return OPERATIONS / (lanes * lane_use) / (OPERATIONS_PER_CLOCK * ghz)
 
 
 def system_ghz() -> float:

@@ -67,10 +67,10 @@ def seconds(function: Callable[[], object], repeats: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--dataset", "--capture", type=Path, help="what the scene was trained on")
+    parser.add_argument("--dataset", "--capture", type=Path, help="dataset of the training")
     parser.add_argument("-r", "--resolution", type=int, default=1, help="1/r of the photos' size")
     parser.add_argument("--gaussians", type=int, default=100_000, help="in the scene that is timed")
-    parser.add_argument("--repeats", type=int, default=3, help="of which the fastest is printed")
+    parser.add_argument("--repeats", type=int, default=3, help="the shortest time is printed")
     arguments = parser.parse_args()
 
     scene = read_gaussians(arguments.scene)

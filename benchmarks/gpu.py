@@ -9,7 +9,7 @@ the CPU; and the same step with gsplat. benchmarks/README.md explains the measur
 
 Each part is a process with a time limit, so a part that crashes or hangs does not affect others.
 The page OUT/gpu.md is rewritten after each finding, and printed at the end. OUT/gpu.json has all
-figures, OUT/gpu.log the output of the parts. Exit code: 0 if all is well, 1 if something failed or
+figures, OUT/gpu.log the output of the parts. Exit code: 0 on success, 1 if something failed or
 exceeded its time, 2 without a GPU.
 """
 
@@ -36,7 +36,7 @@ CAPTURES = ("fox", "lego400")
 
 
 def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
-    """The jobs in their order; those that are not timed run side by side, before the others."""
+    """The jobs in their order; those that are not timed run in parallel, before the others."""
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
@@ -67,25 +67,26 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         command = [sys.executable, str(PARTS), *part]
         return Job(name, command, limit, alone, environment={**environment, **more})
 
-    few = {"SNOWSPLAT_THREADS": "2", "OMP_NUM_THREADS": "2"}
+    two_threads = {"SNOWSPLAT_THREADS": "2", "OMP_NUM_THREADS": "2"}
     most = str(max(1, cores - 6))
-    found = {group: [] for group in (*GROUPS, "beside")}
+    found = {group: [] for group in (*GROUPS, "untimed")}
     found["device"] = [job("device", ["device"], 45, alone=True)]
     if "train" in flags.only:
         part = ["train", *datasets, "--device", "cpu", "--seeds", *map(str, flags.seeds)]
-        found["beside"].append(job("train on the CPU", part, 200, SNOWSPLAT_THREADS=most))
+        found["untimed"].append(job("train on the CPU", part, 200, SNOWSPLAT_THREADS=most))
     if "peer" in flags.only:
-        found["beside"].append(job("build the peer", ["peer-build"], 240))
+        found["untimed"].append(job("build the peer", ["peer-build"], 240))
     if {"stages", "peer"} & set(flags.only):
-        found["beside"].append(job("make scenes", ["scenes", *SIZES, *folder], 120))
+        found["untimed"].append(job("make scenes", ["scenes", *SIZES, *folder], 120))
     for path in sorted(
         [*ROOT.glob("tests/ops/test_*.py"), ROOT / "tests" / "training" / "test_trainer_gpu.py"]
     ):
         name = str(path.relative_to(ROOT))
         part = ["tests", name, "--done", str(scratch / f"{path.stem}.done")]
-        found["tests"].append(job(name, part, 120, **few))
+        found["tests"].append(job(name, part, 120, **two_threads))
     found["sanitizer"] = [
-        job(tool, ["sanitize", tool], 170, **few) for tool in ("memcheck", "racecheck", "synccheck")
+        job(tool, ["sanitize", tool], 170, **two_threads)
+        for tool in ("memcheck", "racecheck", "synccheck")
     ]
     for size in ("1m", "200k", "3m"):
         found["stages"].append(job(f"stages {size}", ["stages", size, *folder], 60, alone=True))
@@ -97,15 +98,15 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
     found["train"] = [job("train on the GPU", part, 100, alone=True)]
     late = []
     if "sanitizer" in flags.only:
-        late.append(job("initcheck", ["sanitize", "initcheck"], 60, alone=True, **few))
+        late.append(job("initcheck", ["sanitize", "initcheck"], 60, alone=True, **two_threads))
     if "train" in flags.only:
         part = ["train", *datasets, "--iterations", "7000"]
         late.append(job("train on the GPU, 7000 steps", part, 90, alone=True))
     wanted = {group: found[group] if group in flags.only else [] for group in GROUPS}
     # First the sanitizers, which take longest, then the tests, which are many.
-    side_by_side = [*found["beside"], *wanted["sanitizer"], *wanted["tests"]]
+    parallel = [*found["untimed"], *wanted["sanitizer"], *wanted["tests"]]
     timed = [*wanted["train"], *wanted["stages"], *wanted["peer"]]
-    return [*wanted["device"], *side_by_side, *timed, *late]
+    return [*wanted["device"], *parallel, *timed, *late]
 
 
 def probe() -> Finding:
@@ -121,7 +122,7 @@ def probe() -> Finding:
         if line.startswith(MARK):
             answer: Finding = json.loads(line[len(MARK) :])
             return answer
-    last = (run.stderr.strip().splitlines() or ["it said nothing"])[-1]
+    last = (run.stderr.strip().splitlines() or ["no output"])[-1]
     return {"kind": "no gpu", "why": f"the package does not load: {last}"}
 
 
@@ -178,15 +179,17 @@ def main() -> int:
             print("\n" + write(running=False), flush=True)
     if received:
         return 128 + received[0]
-    well = all(outcome.state == "done" for outcome in runner.outcomes) and not findings.wrong()
-    return 0 if well else 1
+    ok = all(outcome.state == "done" for outcome in runner.outcomes) and not findings.wrong()
+    return 0 if ok else 1
 
 
 def _flags() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "gpu", help="for three files")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "out" / "gpu", help="folder for the three output files"
+    )
     parser.add_argument(
         "--captures",
         type=Path,
@@ -194,9 +197,9 @@ def _flags() -> argparse.Namespace:
         help=f"a folder with {', '.join(CAPTURES)} and garden_points.npz, or some of them",
     )
     parser.add_argument("--only", nargs="+", default=list(GROUPS), choices=GROUPS)
-    parser.add_argument("--minutes", type=float, default=8.8, help="for all of it")
+    parser.add_argument("--minutes", type=float, default=8.8, help="time limit of the run")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="of the trainings")
-    parser.add_argument("--width", type=int, default=8, help="how many parts run side by side")
+    parser.add_argument("--width", type=int, default=8, help="number of parallel parts")
     parser.add_argument("--peer", type=Path, metavar="DIR", help="gsplat's checkout, built here")
     parser.add_argument("--arch", default="9.0", help="of the card, to build the peer for")
     return parser.parse_args()

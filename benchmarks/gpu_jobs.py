@@ -33,7 +33,7 @@ class Job:
 
     Attributes:
         limit: seconds after which it is ended.
-        alone: starts when no other job runs, and no other job starts beside it.
+        alone: starts when no other job runs, and no other job starts while it runs.
         least: seconds that must be left in the run for it to start.
     """
 
@@ -107,8 +107,8 @@ class Runner:
     def _may_begin(self, job: Job) -> bool:
         if not self._running:
             return True
-        beside_one_alone = any(child.job.alone for child in self._running)
-        return not job.alone and not beside_one_alone and len(self._running) < self._width
+        one_runs_alone = any(child.job.alone for child in self._running)
+        return not job.alone and not one_runs_alone and len(self._running) < self._width
 
     def _begin(self, job: Job) -> None:
         left = self._until - time.monotonic()
@@ -124,7 +124,7 @@ class Runner:
         self._running.remove(child)
         child.read(self._on_finding)
         if outcome.state == "failed" and not outcome.reason:
-            outcome.reason = child.last_line or "it said nothing"
+            outcome.reason = child.last_line or "no output"
         with self._log.open("ab") as log:
             log.write(
                 f"\n===== {child.job.name}: {outcome.state}, {outcome.seconds:.1f} s\n".encode()
@@ -149,7 +149,7 @@ class _Child:
         self._partial = b""
         self.last_line = ""
         try:
-            # A session of its own, so that its children can be ended with it.
+            # A separate session, so that its children are killed with it.
             self._process = subprocess.Popen(
                 list(job.command),
                 stdin=subprocess.DEVNULL,
@@ -179,12 +179,12 @@ class _Child:
             return Outcome(self.job.name, "done", self.seconds)
         if code < 0:
             name = signal.Signals(-code).name
-            said = f"; {self.last_line}" if self.last_line else ""
-            return Outcome(self.job.name, "failed", self.seconds, name + said)
+            detail = f"; {self.last_line}" if self.last_line else ""
+            return Outcome(self.job.name, "failed", self.seconds, name + detail)
         return Outcome(self.job.name, "failed", self.seconds)
 
     def read(self, on_finding: Callable[[str, Finding], None]) -> None:
-        """Read the complete lines that are there."""
+        """Read the complete lines printed so far."""
         *lines, self._partial = (self._partial + self._read.read()).split(b"\n")
         for line in lines:
             text = line.decode(errors="replace").strip()

@@ -73,7 +73,7 @@ def _built_kernels(major: int, minor: int) -> str:
     for lower in range(minor, -1, -1):
         if (built / f"sm_{10 * major + lower}").is_dir():
             return f"built for sm_{10 * major + lower}"
-    return "compiled on the spot"
+    return "compiled at first use"
 
 
 def _clocks() -> str:
@@ -87,10 +87,10 @@ def _clocks() -> str:
             timeout=20,
         )
     except (OSError, subprocess.TimeoutExpired):
-        return "nvidia-smi does not answer"
+        return "nvidia-smi does not respond"
     values = [value.strip() for value in run.stdout.split(",")]
     if run.returncode != 0 or len(values) != 6:
-        return "nvidia-smi does not answer"
+        return "nvidia-smi does not respond"
     driver, sm, most, memory, power, temperature = values
     return f"driver {driver}, SM {sm} of {most}, memory {memory}, {power}, {temperature} °C"
 
@@ -128,7 +128,7 @@ def _multiply_add_rate() -> float:
         library = gpu._check(gpu.cuda.cuLibraryLoadData(code, None, None, 0, None, None, 0))
         error, gpu.functions[name] = gpu._function(library, name)
     if error != 0:
-        raise RuntimeError(f"the driver answers {error}")
+        raise RuntimeError(f"the driver returned error {error}")
     blocks, loops = 64 * card.multi_processor_count, 400
     numbers = torch.tensor([0.999, 0.001], device="cuda")
     out = torch.empty(blocks * threads, device="cuda")
@@ -191,7 +191,7 @@ class Reporter:
             self._note(report.nodeid, "failed")
             self.lost = gpu_is_lost()
             if self.lost:
-                self.session.shouldstop = "the GPU is lost to this process"
+                self.session.shouldstop = "the GPU is unusable in this process"
         elif report.when == "call" or report.skipped:
             self._note(report.nodeid, report.outcome)
 
@@ -259,7 +259,7 @@ def tests(path: str, marker: str, done: Path, attempt: int) -> None:
         os.execv(sys.executable, [sys.executable, __file__, "tests", *again])
     # Failures are reported as findings. A file without tests of this marker is fine.
     if code not in (0, 1, 2, 5) or (code == 2 and not reporter.lost):
-        raise SystemExit(f"pytest ends with {int(code)}")
+        raise SystemExit(f"pytest returned {int(code)}")
 
 
 # ---------------------------------------------------------------------------------- the sanitizer
@@ -332,7 +332,7 @@ class SanitizerLog:
             self._second = False
         return False
 
-    def tell(self, tool: str) -> None:
+    def report(self, tool: str) -> None:
         finding(
             "sanitizer",
             tool=tool,
@@ -347,7 +347,7 @@ class SanitizerLog:
 def sanitize(tool: str) -> None:
     program = find_tool("compute-sanitizer")
     if program is None:
-        raise SystemExit("compute-sanitizer is not here")
+        raise SystemExit("compute-sanitizer is missing")
     environment = dict(os.environ)
     if tool in ("memcheck", "initcheck"):
         # Allocate each tensor separately, so that accesses beyond its end are detected.
@@ -368,10 +368,10 @@ def sanitize(tool: str) -> None:
         for line in process.stdout:
             print(line, end="", flush=True)
             if log.read(line):
-                log.tell(tool)
-    log.tell(tool)
+                log.report(tool)
+    log.report(tool)
     if not log.finished:
-        raise SystemExit(f"the program ended ({process.returncode}) at: {log.last or 'its begin'}")
+        raise SystemExit(f"the program ended ({process.returncode}) at: {log.last or 'the start'}")
 
 
 def find_tool(name: str) -> str | None:
@@ -420,14 +420,14 @@ def stages(size: str, folder: Path, repeats: int) -> None:
     for _ in range(4):  # warm-up: capacity for the instances, kernels, torch's memory
         step.run()
     torch.cuda.synchronize()
-    held = torch.cuda.memory_allocated()
+    allocated = torch.cuda.memory_allocated()
     counts = step.counts()
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
     for _ in range(3):
         step.run()
     finding("frame", size=size, **counts)
-    finding("memory", size=size, held=held, peak=torch.cuda.max_memory_allocated())
+    finding("memory", size=size, allocated=allocated, peak=torch.cuda.max_memory_allocated())
     for in_order in (False, True):
         with sums_in_order(in_order):
             for _ in range(3):
@@ -486,10 +486,12 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
     else:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     found = trainer.evaluate()
-    same = None
+    psnr_on_cpu = None
     if on_gpu:  # evaluate the same scene on the CPU
-        white = (1.0 if background == "white" else 0.0,) * 3
-        same = evaluate_views(trainer.gaussians.to("cpu"), dataset.test, background=white).psnr
+        color = (1.0 if background == "white" else 0.0,) * 3
+        psnr_on_cpu = evaluate_views(
+            trainer.gaussians.to("cpu"), dataset.test, background=color
+        ).psnr
     finding(
         "training",
         dataset=path.name,
@@ -498,7 +500,7 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
         iterations=config.iterations,
         psnr=found.psnr,
         ssim=found.ssim,
-        psnr_on_cpu=same,
+        psnr_on_cpu=psnr_on_cpu,
         seconds=seconds,
         gaussians=len(trainer.gaussians),
         peak=peak,

@@ -1,8 +1,8 @@
-// How many float32 multiply-adds a GPU does in a second: chains of them that do not wait for each
-// other, and nothing else. gpu_parts.py compiles and runs it.
+// Measures the float32 multiply-adds per second of a GPU, with independent chains of them.
+// gpu_parts.py compiles and runs it.
 #include "cuda/device.h"
 
-constexpr int kChains = 8, kUnrolled = 32;  // gpu_parts.py knows them, too
+constexpr int kChains = 8, kUnrolled = 32;  // also in gpu_parts.py
 
 SNOW_KERNEL(multiply_adds, 256, (int64_t loops, const float* numbers, float* out)) {
   const float x = numbers[0], y = numbers[1];

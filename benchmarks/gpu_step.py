@@ -194,10 +194,10 @@ def milliseconds(before: torch.cuda.Event, after: torch.cuda.Event) -> float:
     return float(before.elapsed_time(after))
 
 
-class Behind:
+class BusyGpu:
     """Keeps the GPU busy until all timed work is queued, so that the GPU never waits for the CPU.
 
-        with behind:
+        with busy:
             before = event(); work(); after = event()
 
     If the pause was too short, `late` is True and the next pause is longer.
@@ -207,7 +207,7 @@ class Behind:
         self.late = False
         self._cycles = int(2e9 * seconds)  # clocks are below 2 GHz
 
-    def __enter__(self) -> Behind:
+    def __enter__(self) -> BusyGpu:
         torch.cuda.synchronize()
         torch.cuda._sleep(self._cycles)
         self._over = event()
@@ -223,18 +223,18 @@ class Behind:
 def gpu_times(work: Callable[[], object], repeats: int) -> list[float]:
     """Milliseconds of GPU time for the work that ``work`` queues, without gaps."""
     times: list[float] = []
-    behind = Behind()
+    busy = BusyGpu()
     for _ in range(repeats + 6):
-        with behind:
+        with busy:
             before = event()
             work()
             after = event()
-        if not behind.late:
+        if not busy.late:
             times.append(milliseconds(before, after))
         if len(times) == repeats:
             break
     if not times:
-        raise RuntimeError("the CPU never came to queue a step before the GPU was done")
+        raise RuntimeError("the CPU could not queue a step before the GPU had finished")
     return times
 
 
@@ -257,15 +257,15 @@ def step_times(step: Step, repeats: int) -> dict[str, float]:
 def stage_times(step: Step, execute: Execute, repeats: int) -> dict[str, dict[str, float]]:
     """Milliseconds of each kernel of a step: medians of {native function: {kernel: …}}."""
     found = []
-    behind = Behind()
+    busy = BusyGpu()
     for _ in range(repeats + 6):
         clock = KernelClock(execute, event)
-        with clock.on(GPU.type), behind:
+        with clock.on(GPU.type), busy:
             step.queue()
-        if not behind.late:
+        if not busy.late:
             found.append(kernel_times(clock.laps, milliseconds))
         if len(found) == repeats:
             break
     if not found:
-        raise RuntimeError("the CPU never came to queue a step before the GPU was done")
+        raise RuntimeError("the CPU could not queue a step before the GPU had finished")
     return medians(found)

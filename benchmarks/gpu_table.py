@@ -74,7 +74,7 @@ class Findings:
 def page(findings: Findings, outcomes: Sequence[Outcome], when: str, running: bool) -> str:
     """The page; its length is limited to 12,000 characters."""
     card = findings.one("device") or findings.one("gpu") or {}
-    name = str(card.get("name", "a GPU without a name"))
+    name = str(card.get("name", "GPU"))
     sections = [
         _machine(findings, name, when, running),
         _tests(findings, name),
@@ -105,14 +105,16 @@ def _machine(findings: Findings, name: str, when: str, running: bool) -> str:
     bandwidth, rate, mark = (findings.one(kind) for kind in ("bandwidth", "rate", "mark"))
     measured = []
     if bandwidth is not None:
-        measured.append(f"copying {bandwidth['bytes_a_second'] / 1e12:.2f} TB/s, both ways counted")
+        measured.append(
+            f"copying {bandwidth['bytes_a_second'] / 1e12:.2f} TB/s, reads and writes counted"
+        )
     if rate is not None:
         measured.append(
-            f"{rate['operations_a_second'] / 1e12:.1f}·10¹² float32 multiply-adds a second "
+            f"{rate['operations_a_second'] / 1e12:.1f}·10¹² float32 multiply-adds per second "
             f"(then: {rate['clocks']})"
         )
     if mark is not None:
-        measured.append(f"{1e3 * mark['milliseconds']:.1f} µs between two marks of time")
+        measured.append(f"{1e3 * mark['milliseconds']:.1f} µs between two events")
     if measured:
         lines += ["", f"Measured on {name}: {'; '.join(measured)}."]
     return "\n".join(lines).rstrip()
@@ -142,7 +144,7 @@ def _sanitizer(findings: Findings, name: str) -> str:
         return ""
     lines = [f"## compute-sanitizer on {name}: every op, a training step", ""]
     for f in found:
-        reached = "" if f["finished"] else f"; not finished, at: {f['last'] or 'the begin'}"
+        reached = "" if f["finished"] else f"; not finished, at: {f['last'] or 'the start'}"
         lines.append(f"- {f['tool']}: {f['errors']} errors{reached}")
         lines += [f"  - {line}" for line in f["lines"]]
     return "\n".join(lines[: 2 + 2 * _MOST_LINES])
@@ -176,14 +178,14 @@ def _training(findings: Findings, name: str) -> str:
         return ""
     lines = [f"## Training on {name}, PSNR of held-out photos in dB", ""]
     if rows:
-        head = "capture,steps,seed,CPU,GPU,difference,CPU s,GPU s,steps/s,Gaussians,peak MB"
-        lines += _table([*head.split(","), "seen by the CPU"], rows)
+        head = "dataset,steps,seed,CPU,GPU,difference,CPU s,GPU s,steps/s,Gaussians,peak MB"
+        lines += _table([*head.split(","), "rendered by the CPU"], rows)
     for dataset, found in differences.items():
         mean = sum(found) / len(found)
         verdict = "within" if abs(mean) <= PSNR_GOAL else "NOT within"
         lines += ["", f"{dataset}: mean difference {mean:+.3f} dB, {verdict} {PSNR_GOAL} dB."]
     if absent:
-        lines += ["", f"Not here, so not trained: {', '.join(absent)}."]
+        lines += ["", f"Missing, so not trained: {', '.join(absent)}."]
     return "\n".join(lines)
 
 
@@ -227,7 +229,7 @@ def _frame_line(findings: Findings, size: str) -> str:
     source = scene["source"] if scene else "?"
     return (
         f"{size}: {frame['gaussians']:,} Gaussians of {source}, {frame['width']}×"
-        f"{frame['height']}, {frame['seen']:,} seen, {frame['instances']:,} instances, "
+        f"{frame['height']}, {frame['seen']:,} visible, {frame['instances']:,} instances, "
         f"{frame['pairs']:,} pairs.\n"
     )
 
@@ -278,19 +280,23 @@ def _steps(findings: Findings, name: str) -> str:
         cells.append(f"{ordered['gpu'] / step['gpu']:.2f}" if ordered else "—")
         if memory and frame:
             peak, count = memory["peak"], frame["gaussians"]
-            cells += [f"{peak / 1e6:.0f}", f"{memory['held'] / 1e6:.0f}", f"{peak / count:.0f}"]
+            cells += [
+                f"{peak / 1e6:.0f}",
+                f"{memory['allocated'] / 1e6:.0f}",
+                f"{peak / count:.0f}",
+            ]
         else:
             cells += ["—"] * 3
         rows.append(cells)
     if not rows:
         return ""
-    head = "size,GPU ms,queueing ms,step ms,limit,steps/s,in order ×,peak MB,held MB,bytes each"
-    lines = [f"## {name}: a training step", "", *_table(head.split(","), rows)]
+    head = "size,GPU ms,queueing ms,step ms,limit,steps/s,in order ×,peak MB,allocated MB"
+    lines = [f"## {name}: a training step", "", *_table([*head.split(","), "bytes/Gaussian"], rows)]
     each = _memory_each(findings)
     if each is not None:
         verdict = "within" if each <= MEMORY_GOAL / 1e6 else "NOT within"
-        lines += ["", f"1m to 3m: {each:.0f} bytes more for each Gaussian, {verdict} the goal of "]
-        lines[-1] += f"{MEMORY_GOAL / 1e9:.0f} GB a million on {name}."
+        lines += ["", f"1m to 3m: {each:.0f} bytes more per Gaussian, {verdict} the goal of "]
+        lines[-1] += f"{MEMORY_GOAL / 1e9:.0f} GB per million on {name}."
     return "\n".join(lines)
 
 
@@ -309,7 +315,7 @@ def _memory_each(findings: Findings) -> float | None:
 def _peer(findings: Findings, name: str) -> str:
     none, peer = findings.one("no peer"), findings.one("peer")
     if none is not None:
-        return f"## A peer\n\nNone was measured: {none['why']}."
+        return f"## Peer\n\nNot measured: {none['why']}."
     if peer is None:
         return ""
     rows = []
@@ -321,7 +327,7 @@ def _peer(findings: Findings, name: str) -> str:
         times = [f"{found['ours']:.3f}", f"{found['theirs']:.3f}", f"{ratio:.2f}"]
         rows.append([found["size"], found["what"], *times, goal])
     images = [f"{f['size']}: {f['psnr']:.1f} dB" for f in findings.of("peer image")]
-    lines = [f"## {name}: beside gsplat {peer['version']}", ""]
+    lines = [f"## {name}: compared with gsplat {peer['version']}", ""]
     if images:
         lines += [f"PSNR between the two images: {', '.join(images)}.", ""]
     return "\n".join(lines + _table(["size", "", "ours ms", "gsplat ms", "ratio", ""], rows))

@@ -41,7 +41,7 @@ STAGES = {
 #: Everything outside of the stages: Python, autograd, memory.
 REST = "rest (Python)"
 TOTAL = "total"
-#: Queries of sizes, which return at once: counted with the rest.
+#: Queries of sizes, which take no time: counted with the rest.
 QUERIES = (
     "rasterize_sums_in_order",
     "splat_record_bytes",
@@ -93,13 +93,15 @@ class Stopwatch:
 
 
 class Iteration:
-    """The training iteration of one workload. ``twin``: with the ops of `ops.reference`."""
+    """The training iteration of one workload. ``use_reference``: with `ops.reference`."""
 
-    def __init__(self, workload: Workload, *, visible_only: bool = False, twin: bool = False):
+    def __init__(
+        self, workload: Workload, *, visible_only: bool = False, use_reference: bool = False
+    ):
         self.workload = workload
         self.visible_only = visible_only
-        self.twin = twin
-        self.ops = reference if twin else ops
+        self.use_reference = use_reference
+        self.ops = reference if use_reference else ops
         self.parameters = workload.gaussians.parameters()
         count = len(workload.gaussians)
         # Parameters are rows of larger tensors, as density control leaves them in a training.
@@ -137,16 +139,16 @@ class Iteration:
     def run(
         self,
         watch: Stopwatch,
-        look: Callable[[ops.Splats2D, Tensor], None] | None = None,
+        inspect: Callable[[ops.Splats2D, Tensor], None] | None = None,
     ) -> None:
-        """One iteration. ``look`` is called with the splats and the image before the backward."""
+        """One iteration. ``inspect`` is called with the splats and the image before backward."""
         step, camera, module = 1000, self.workload.camera, self.ops
         splats = self._project(module)
         with torch.enable_grad():
             splats.packed.requires_grad_()
             image, _, _ = module.rasterize(splats, camera.width, camera.height, self.background)
-            if look is not None:
-                look(splats, image)
+            if inspect is not None:
+                inspect(splats, image)
             loss = module.photometric_loss(image, self.target)
             loss.backward()
         assert splats.ids is not None
@@ -179,7 +181,7 @@ class Iteration:
 
     def _lap(self, threads: int) -> dict[str, dict[str, float]]:
         watch, whole = Stopwatch(), Stopwatch()
-        if self.twin:
+        if self.use_reference:
             torch.set_num_threads(threads)
             with whole.stage(TOTAL):
                 self.run(watch)

@@ -2,7 +2,7 @@
 
     python benchmarks/stages.py                                 50k, the best instruction set
     python benchmarks/stages.py --size 50k 200k 1m small --isa all --threads 1 2
-    python benchmarks/stages.py --twin                          compared with plain PyTorch
+    python benchmarks/stages.py --reference                     compared with plain PyTorch
     python benchmarks/stages.py --versus avx2                   two instruction sets, alternating
     python benchmarks/stages.py --versus ../before/src          two builds, alternating
 
@@ -21,7 +21,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from floor import OPERATIONS, OPERATIONS_A_CLOCK, floor_ns, system_ghz
+from floor import OPERATIONS, OPERATIONS_PER_CLOCK, floor_ns, system_ghz
 from iteration import REST, STAGES, TOTAL
 from workloads import SIZES
 
@@ -55,7 +55,7 @@ class Worker:
         repeats: int,
         *,
         visible_only: bool = False,
-        twin: bool = False,
+        reference: bool = False,
         count: bool = False,
     ) -> Measured:
         """Send a request; see worker.py. Raises UserError if it fails."""
@@ -64,7 +64,7 @@ class Worker:
             "threads": threads,
             "repeats": repeats,
             "visible_only": visible_only,
-            "twin": twin,
+            "reference": reference,
             "count": count,
         }
         assert self._process.stdin is not None
@@ -73,7 +73,7 @@ class Worker:
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         if not line:
-            raise UserError("the measuring process died; what it said is above")
+            raise UserError("the measuring process died; its output is above")
         answer: Measured = json.loads(line)
         if "error" in answer:
             raise UserError(answer["error"])
@@ -105,8 +105,8 @@ def main() -> None:
             results += _paired(flags, size, isas[0])
         else:
             results += _absolute(flags, size, isas, ghz)
-    if flags.twin:
-        results += _beside_twin(flags, isas[0])
+    if flags.reference:
+        results += _beside_reference(flags, isas[0])
     if flags.json is not None:
         flags.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
@@ -155,7 +155,7 @@ def _print_stages(columns: list[Measured], ghz: float) -> None:
         found["floor_ns"] = floor_ns(n["lanes"], max(found["lane_use"], 1e-9), ghz)
         found["pair_ns"] = [1e9 * t / max(1, n["pairs"]) for t in _blend_core_seconds(found)]
     print("blend forward + backward")
-    print(_row("  ns a pair and core", [_cells(found["pair_ns"]) for found in columns]))
+    print(_row("  ns per pair, core", [_cells(found["pair_ns"]) for found in columns]))
     shares = [[found["floor_ns"] / ns for ns in found["pair_ns"]] for found in columns]
     print(_row("  share of the floor", [_cells(share) for share in shares]))
     print(_row("  floor, ns", [f"{found['floor_ns']:>7.2f}{'':16}" for found in columns]))
@@ -168,9 +168,9 @@ def _print_counts(size: str, found: Measured) -> None:
     per_splat, per_pixel = n["instances"] / max(1, n["splats"]), n["pairs"] / (width * height)
     print(
         f"\n{size}: {count:,} Gaussians from {found['source']}, {width}x{height}\n"
-        f"{n['splats']:,} splats seen, {n['instances']:,} instances ({per_splat:.1f} a splat, "
+        f"{n['splats']:,} visible splats, {n['instances']:,} instances ({per_splat:.1f} per splat, "
         f"{n['visited'] / max(1, n['instances']):.0%} visited), {n['pairs']:,} blended pairs "
-        f"({per_pixel:.0f} a pixel)"
+        f"({per_pixel:.0f} per pixel)"
     )
 
 
@@ -211,24 +211,24 @@ def _paired(flags: argparse.Namespace, size: str, isa: str) -> list[Measured]:
     return results
 
 
-def _beside_twin(flags: argparse.Namespace, isa: str) -> list[Measured]:
+def _beside_reference(flags: argparse.Namespace, isa: str) -> list[Measured]:
     results = []
-    print(f"\n{flags.twin}: plain PyTorch (ops.reference, float32) beside {isa}, a whole iteration")
-    print(_row("ms, least", [f"{'twin':>9}{'native':>9}{'ratio':>8}{'cpu':>8}"]))
+    print(f"\n{flags.reference}: plain PyTorch (ops.reference, float32) and {isa}, one iteration")
+    print(_row("ms, minimum", [f"{'reference':>10}{'native':>9}{'ratio':>8}{'cpu':>8}"]))
     with Worker(isa) as worker:
         for threads in flags.threads:
-            own = worker.ask(flags.twin, threads, flags.repeats)
-            # An iteration takes seconds, so only a few are made.
-            twin = worker.ask(flags.twin, threads, min(3, flags.repeats), twin=True)
-            (theirs, _, their_cpu), (ours, _, our_cpu) = (_least(f, TOTAL) for f in (twin, own))
-            cells = f"{1e3 * theirs:>9.0f}{1e3 * ours:>9.2f}{theirs / ours:>7.0f}x"
+            own = worker.ask(flags.reference, threads, flags.repeats)
+            # An iteration takes seconds, so at most three are made.
+            slow = worker.ask(flags.reference, threads, min(3, flags.repeats), reference=True)
+            (theirs, _, their_cpu), (ours, _, our_cpu) = (_least(f, TOTAL) for f in (slow, own))
+            cells = f"{1e3 * theirs:>10.0f}{1e3 * ours:>9.2f}{theirs / ours:>7.0f}x"
             cells += f"{their_cpu / our_cpu:>7.0f}x"
             print(_row(f"{threads} thread{'s' * (threads > 1)}", [cells]))
             results.append(
                 {
-                    "size": flags.twin,
+                    "size": flags.reference,
                     "threads": threads,
-                    "twin": twin["wall"],
+                    "reference": slow["wall"],
                     "native": own["wall"],
                 }
             )
@@ -287,10 +287,12 @@ def _machine(ghz: float) -> str:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     line = (
         f"{model}, {cores} cores, {', '.join(native.available_isas())}; floor: {OPERATIONS} vector "
-        f"operations a step, {OPERATIONS_A_CLOCK:g} a clock, {ghz:.2f} GHz"
+        f"operations per step, {OPERATIONS_PER_CLOCK:g} per clock, {ghz:.2f} GHz"
     )
     if hasattr(os, "getloadavg") and os.getloadavg()[0] > 0.5:
-        line += f"\nload average {os.getloadavg()[0]:.1f}: others compute here too; trust ratios"
+        line += (
+            f"\nload average {os.getloadavg()[0]:.1f}: other processes are running; compare ratios"
+        )
     return line
 
 
@@ -299,15 +301,25 @@ def _flags() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--size", nargs="+", default=["50k"], choices=SIZES)
-    parser.add_argument("--isa", nargs="+", default=[], help="or: all; the best by default")
+    parser.add_argument("--isa", nargs="+", default=[], help="or: all (default: the best)")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--repeats", type=int, default=10, help="iterations; rounds of --versus")
     parser.add_argument("--cpu-time", action="store_true", help="--versus compares processor time")
-    parser.add_argument("--visible-only", action="store_true", help="Adam of visible ones alone")
-    parser.add_argument("--versus", metavar="ISA|SRC", help="in turns with it, as a ratio")
-    parser.add_argument("--twin", nargs="?", const="10k", choices=SIZES, metavar="SIZE")
-    parser.add_argument("--ghz", type=float, help="the clock for the floor; else the system's")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="all that was measured")
+    parser.add_argument(
+        "--visible-only", action="store_true", help="Adam updates visible rows only"
+    )
+    parser.add_argument("--versus", metavar="ISA|SRC", help="ratio to it, alternating")
+    parser.add_argument(
+        "--reference",
+        "--twin",
+        nargs="?",
+        const="10k",
+        choices=SIZES,
+        metavar="SIZE",
+        help="compare with the reference implementation in PyTorch",
+    )
+    parser.add_argument("--ghz", type=float, help="clock for the floor (default: as reported)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="store all measurements")
     flags = parser.parse_args()
     if flags.repeats < 1 or min(flags.threads) < 1:
         parser.error("--repeats and --threads must be 1 or more")

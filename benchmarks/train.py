@@ -1,10 +1,10 @@
 """Held-out PSNR against training time, of a dataset and one or more recipes.
 
     python benchmarks/train.py ../shared/captures/fox_small -o out/benchmark
-    python benchmarks/train.py CAPTURE -o OUT --recipe default paper --iterations 7000
-    python benchmarks/train.py CAPTURE -o OUT --set max_gaussians=50000 sh_interval=100
+    python benchmarks/train.py DATASET -o OUT --recipe default paper --iterations 7000
+    python benchmarks/train.py DATASET -o OUT --set max_gaussians=50000 sh_interval=100
 
-Writes OUT/CAPTURE.csv, .json and .svg. The clock is stopped while held-out views are evaluated. It
+Writes OUT/DATASET.csv, .json and .svg. The clock is stopped while held-out views are evaluated. It
 includes the initialisation of the Gaussians.
 """
 
@@ -99,7 +99,7 @@ def _peak_mb() -> float:
 
 def main() -> None:
     flags = _flags()
-    knobs = dict(_knob(text) for text in flags.set)
+    settings = dict(_setting(text) for text in flags.set)
     if flags.threads:
         ops.set_num_threads(flags.threads)
     start = _peak_mb()
@@ -119,13 +119,13 @@ def main() -> None:
     rows: list[Milestone] = []
     for name in flags.recipe:
         config = recipe(
-            name, iterations=flags.iterations, seed=flags.seed, test_iterations=(), **knobs
+            name, iterations=flags.iterations, seed=flags.seed, test_iterations=(), **settings
         )
         rows += train(dataset, name, config, flags.milestones)
-    _write(flags, rows, knobs)
+    _write(flags, rows, settings)
 
 
-def _write(flags: argparse.Namespace, rows: list[Milestone], knobs: dict[str, Any]) -> None:
+def _write(flags: argparse.Namespace, rows: list[Milestone], settings: dict[str, Any]) -> None:
     flags.output.mkdir(parents=True, exist_ok=True)
     name = flags.dataset.resolve().name
     stem = flags.output / name
@@ -137,7 +137,7 @@ def _write(flags: argparse.Namespace, rows: list[Milestone], knobs: dict[str, An
         "capture": name,
         "seed": flags.seed,
         "threads": ops.get_num_threads(),
-        "knobs": knobs,
+        "settings": settings,
         "rows": [asdict(row) for row in rows],
     }
     text = json.dumps(record, indent=1) + "\n"
@@ -151,7 +151,7 @@ def _write(flags: argparse.Namespace, rows: list[Milestone], knobs: dict[str, An
     print(f"{stem}.csv, .json, .svg")
 
 
-def _knob(text: str) -> tuple[str, Any]:
+def _setting(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         raise UserError(f"--set {text}: write it as NAME=VALUE")
@@ -168,10 +168,10 @@ def _flags() -> argparse.Namespace:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/benchmark"))
     parser.add_argument("--recipe", nargs="+", default=["default"], choices=RECIPES)
-    parser.add_argument("--iterations", type=int, help="the recipe's by default")
-    parser.add_argument("-r", "--resolution", type=int, help="as for snowsplat train")
-    parser.add_argument("--set", nargs="+", default=[], metavar="KNOB=VALUE")
-    parser.add_argument("--milestones", type=int, default=12, help="how often to measure")
+    parser.add_argument("--iterations", type=int, help="default: that of the recipe")
+    parser.add_argument("-r", "--resolution", type=int, help="as for `snowsplat train`")
+    parser.add_argument("--set", nargs="+", default=[], metavar="SETTING=VALUE")
+    parser.add_argument("--milestones", type=int, default=12, help="number of evaluations")
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args()

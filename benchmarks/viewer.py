@@ -1,7 +1,7 @@
 """Times of the live viewer: rendering, response to a moving camera, and its cost for a training.
 
     python benchmarks/viewer.py                      200k Gaussians at 960×540
-    python benchmarks/viewer.py --capture DIR        also a training: alone, watched, and watched
+    python benchmarks/viewer.py --dataset DIR        also a training: alone, watched, and watched
                                                      with a camera that always moves
 
 The browser is replaced by a client that receives the images but does not draw them, since a real
@@ -49,7 +49,7 @@ class Client:
         protocol = [f"viser-v{viser.__version__}"]
         self._socket = connect(address, subprotocols=protocol, max_size=None, compression=None)
         self._size = width, height
-        self.pictures = 0
+        self.images = 0
 
     def move(self, cam_from_world: torch.Tensor, fov: float, shift: float) -> None:
         """Set the camera, shifted by ``shift`` to the right."""
@@ -76,7 +76,7 @@ class Client:
             window = msgspec.msgpack.decode(zstandard.decompress(data[16 : 16 + size]))
             for message in window["messages"]:
                 if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
-                    self.pictures += 1
+                    self.images += 1
                     self.newest = Image.open(io.BytesIO(message["rgb_data"]))
                     return True
 
@@ -88,8 +88,8 @@ def milliseconds(times: list[float]) -> str:
     return f"{1000 * min(times):8.1f} {1000 * statistics.median(times):8.1f}"
 
 
-def pictures(name: str, repeats: int) -> None:
-    """Render every mode, without a server."""
+def images(name: str, repeats: int) -> None:
+    """Render all display modes, without a server."""
     scene = workload(name)
     print(
         f"{len(scene.gaussians):,} Gaussians of {scene.source}, ops on "
@@ -141,7 +141,7 @@ def answers(name: str, repeats: int) -> None:
     viewer.close()
     for row, values in times.items():
         print(f"{row:15} {milliseconds(values)}")
-    print(f"answers are {statistics.median(sizes):.0f} pixels wide, full pictures {camera.width}")
+    print(f"answers are {statistics.median(sizes):.0f} pixels wide, full images {camera.width}")
 
 
 def training(path: Path, seconds: float, rounds: int) -> None:
@@ -171,14 +171,14 @@ def training(path: Path, seconds: float, rounds: int) -> None:
             if (client.wait(0.05) and moving) or shift == 0.0:
                 shift += 0.001
                 client.move(camera.cam_from_world, 1.0, shift)
-        shown.append(client.pictures)
+        shown.append(client.images)
         client.close()
 
     shown: list[int] = []
     with single_threaded():
         for _ in range(rounds):
             measure("no viewer", False)
-            measure("nobody there", True)
+            measure("no browser", True)
             for name, moving in (("watched", False), ("moving", True)):
                 stop = threading.Event()
                 thread = threading.Thread(target=watch, args=(moving,))
@@ -189,7 +189,9 @@ def training(path: Path, seconds: float, rounds: int) -> None:
                 thread.join()
                 time.sleep(0.5)
     viewer.close()
-    print(f"\n{len(trainer.gaussians):,} Gaussians, {camera.width}x{camera.height}, steps a second")
+    print(
+        f"\n{len(trainer.gaussians):,} Gaussians, {camera.width}x{camera.height}, steps per second"
+    )
     alone = found["no viewer"]
     for name, rates in found.items():
         shares = [rate / base for rate, base in zip(rates, alone, strict=True)]
@@ -200,14 +202,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", default="200k", choices=SIZES)
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--capture", type=Path, help="measure a training of it too")
-    parser.add_argument("--seconds", type=float, default=8.0, help="of each turn of the training")
+    parser.add_argument("--dataset", "--capture", type=Path, help="also measure a training on it")
+    parser.add_argument(
+        "--seconds", type=float, default=8.0, help="of each measurement of the training"
+    )
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--threads", type=int)
     arguments = parser.parse_args()
     if arguments.threads:
         ops.set_num_threads(arguments.threads)
-    pictures(arguments.size, arguments.repeats)
+    images(arguments.size, arguments.repeats)
     answers(arguments.size, arguments.repeats)
     if arguments.dataset:
         training(arguments.dataset, arguments.seconds, arguments.rounds)

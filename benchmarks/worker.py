@@ -1,7 +1,7 @@
 """The process in which `stages.py` measures: a library stays loaded for the process's lifetime.
 
 A request is a line of JSON on standard input, the response is a line on standard output:
-{"size", "threads", "repeats", "visible_only", "twin", "count"} →
+{"size", "threads", "repeats", "visible_only", "reference", "count"} →
 {"size", "threads", "isa", "source", "gaussians", "wall", "cpu", "counts"}, or {"error"}.
 Between requests it sleeps.
 """
@@ -23,18 +23,18 @@ from snowsplat.util.process import single_threaded
 
 
 def counts(iteration: Iteration, with_pairs: bool) -> dict[str, int]:
-    """Numbers of splats, instances, visited ones and steps; pairs on request: they take seconds."""
+    """Numbers of splats, instances, visited ones and steps; pairs only if requested (seconds)."""
     found: dict[str, int] = {}
     camera = iteration.workload.camera
 
-    def look(splats: Splats2D, image: Tensor) -> None:
+    def inspect(splats: Splats2D, image: Tensor) -> None:
         frame = frame_of(image)
         found.update(splats=len(splats), lanes=LANES[native.isa()], **count_steps(frame))
         if with_pairs:
             found["pairs"] = count_pairs(splats, frame, camera.width, camera.height)
 
     with single_threaded():
-        iteration.run(Stopwatch(), look)
+        iteration.run(Stopwatch(), inspect)
     return found
 
 
@@ -43,15 +43,15 @@ def main() -> None:
     for line in sys.stdin:
         request: dict[str, Any] = json.loads(line)
         try:
-            wanted = (request["size"], request["visible_only"], request["twin"])
+            wanted = (request["size"], request["visible_only"], request["reference"])
             if iteration is None or key != wanted:
                 iteration = None  # release its memory first
                 scene = workload(request["size"])
                 key = wanted
                 iteration = Iteration(
-                    scene, visible_only=request["visible_only"], twin=request["twin"]
+                    scene, visible_only=request["visible_only"], use_reference=request["reference"]
                 )
-                if not request["twin"]:
+                if not request["reference"]:
                     iteration.measure(2, request["threads"])  # warm-up: buffers, caches
             answer: dict[str, Any] = {
                 "isa": native.isa(),
@@ -61,7 +61,7 @@ def main() -> None:
                 "gaussians": len(iteration.workload.gaussians),
                 **iteration.measure(request["repeats"], request["threads"]),
             }
-            if not request["twin"]:
+            if not request["reference"]:
                 answer["counts"] = counts(iteration, request["count"])
         except UserError as error:
             answer = {"error": str(error)}

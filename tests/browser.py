@@ -56,11 +56,11 @@ def chromium() -> str | None:
 
 
 class BrowserError(Exception):
-    """The browser refused a command, a script in a page failed, or nothing came in time."""
+    """A command was rejected, a script in a page failed, or a time limit was exceeded."""
 
 
 class Browser:
-    """One process of Chromium with a profile of its own, both gone at the end."""
+    """A process of Chromium with a temporary profile; both are removed at the end."""
 
     def __init__(self, width: int = 640, height: int = 480) -> None:
         self.width, self.height = width, height
@@ -71,7 +71,7 @@ class Browser:
         self._profile = tempfile.mkdtemp(prefix="snowsplat-chromium-")
         to_browser, self._commands = _pipe()
         self._replies, from_browser = _pipe()
-        # Chromium takes commands at file 3 and writes its answers to file 4.
+        # Chromium reads commands from file descriptor 3 and writes responses to 4.
         shell = f'exec "$@" 3<&{to_browser} 4>&{from_browser}'
         flags = [*_FLAGS, f"--window-size={self.width},{self.height}"]
         command = [program, *flags, f"--user-data-dir={self._profile}", "about:blank"]
@@ -95,7 +95,7 @@ class Browser:
         with contextlib.suppress(BrowserError, OSError, subprocess.TimeoutExpired):
             self.call("Browser.close", timeout=5)
             self._process.wait(5)
-        # The whole group, renderers and the GPU process too, if that was not enough.
+        # If it is still running: the whole group, including renderers and the GPU process.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -103,7 +103,7 @@ class Browser:
         shutil.rmtree(self._profile, ignore_errors=True)
 
     def open(self, url: str, timeout: float = 30.0) -> Page:
-        """A new tab of its own size that shows ``url``; waits until its document is loaded."""
+        """Open a new tab that shows ``url``; waits until its document is loaded."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         page = self._pages[session] = Page(self, session, target)
@@ -136,7 +136,7 @@ class Browser:
         try:
             reply = answer.get(timeout=timeout)
         except Empty:
-            raise BrowserError(f"{method}: no answer in {timeout:.0f} s") from None
+            raise BrowserError(f"{method}: no response in {timeout:.0f} s") from None
         if "error" in reply:
             raise BrowserError(f"{method}: {reply['error'].get('message')}")
         return reply["result"]
@@ -164,8 +164,8 @@ class Page:
     """A tab.
 
     Attributes:
-        console: lines of the console, "error: …" among them, uncaught errors, failed requests.
-        requests: the addresses that the page asked for.
+        console: lines of the console, with uncaught errors and failed requests as "error: …".
+        requests: the addresses that the page requested.
     """
 
     def __init__(self, browser: Browser, session: str, target: str) -> None:
@@ -180,7 +180,7 @@ class Page:
         return [line for line in self.console if line.startswith("error: ")]
 
     def call(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:
-        """One command of the DevTools protocol, to this tab."""
+        """Send one command of the DevTools protocol to this tab."""
         return self._browser.call(method, self._session, timeout, **parameters)
 
     def navigate(self, url: str, timeout: float = 30.0) -> None:
@@ -193,7 +193,7 @@ class Page:
             raise BrowserError(f"{url}: not loaded in {timeout:.0f} s")
 
     def evaluate(self, script: str, timeout: float = 60.0) -> Any:
-        """The value of a JavaScript expression; promises are waited for."""
+        """The value of a JavaScript expression; promises are awaited."""
         result = self.call(
             "Runtime.evaluate",
             timeout,
@@ -207,7 +207,7 @@ class Page:
         return result["result"].get("value")
 
     def wait_for(self, script: str, timeout: float = 30.0) -> Any:
-        """Evaluate again and again until the value is true; gives it."""
+        """Evaluate repeatedly until the value is true; returns it."""
         end = time.monotonic() + timeout
         while not (value := self.evaluate(script)):
             if time.monotonic() > end:
@@ -217,14 +217,14 @@ class Page:
         return value
 
     def screenshot(self, path: Path | None = None) -> np.ndarray:
-        """(H, W, 3) uint8, what the tab shows; kept as a PNG file too where one is named."""
+        """(H, W, 3) uint8: the content of the tab; also stored as PNG if a path is given."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         if path is not None:
             path.write_bytes(data)
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
     def click(self, x: float, y: float) -> None:
-        """Press and release the left button at a place, in pixels from the upper left corner."""
+        """Click with the left button; x and y are pixels from the upper left corner."""
         for kind in ("mousePressed", "mouseReleased"):
             self._mouse(kind, x, y, button="left", clickCount=1)
 
@@ -243,23 +243,23 @@ class Page:
     def _mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
-    def _event(self, method: str, given: dict[str, Any]) -> None:
+    def _event(self, method: str, event: dict[str, Any]) -> None:
         if method == "Page.loadEventFired":
             self._loaded.set()
         elif method == "Network.requestWillBeSent":
-            self.requests.append(given["request"]["url"])
+            self.requests.append(event["request"]["url"])
         elif method == "Runtime.consoleAPICalled":
-            words = [str(a.get("value", a.get("description", ""))) for a in given["args"]]
-            self.console.append(f"{given['type']}: {' '.join(words)}")
+            words = [str(a.get("value", a.get("description", ""))) for a in event["args"]]
+            self.console.append(f"{event['type']}: {' '.join(words)}")
         elif method == "Runtime.exceptionThrown":
-            self.console.append(f"error: {_error_text(given['exceptionDetails'])}")
-        elif method == "Log.entryAdded":  # failed requests, refusals of the content policy
-            entry = given["entry"]
+            self.console.append(f"error: {_error_text(event['exceptionDetails'])}")
+        elif method == "Log.entryAdded":  # failed requests, violations of the content policy
+            entry = event["entry"]
             self.console.append(f"{entry['level']}: {entry['text']} {entry.get('url', '')}")
 
 
 def _pipe() -> tuple[int, int]:
-    """The two ends, both above 9: so that the shell can put them where it is told to."""
+    """The two ends, both above 9, so that the shell can redirect to them."""
     ends = os.pipe()
     above = tuple(fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in ends)
     for end in ends:

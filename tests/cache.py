@@ -1,4 +1,4 @@
-"""Inputs of tests that are expensive to make and depend on sources alone, kept between runs."""
+"""Stores expensive inputs of tests, which depend only on source files, between runs."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _FOLDER = _ROOT / "build" / "tests"
 
 
 def cached(name: str, sources: Iterable[Path], make: Callable[[Path], object]) -> Path:
-    """A folder that ``make`` has filled from the ``sources`` as they are; not to be changed.
+    """The folder that ``make`` fills; read-only for the tests.
 
-    It is made again where one of the sources has changed. Several processes may ask for it at once:
-    each one finds it complete or makes its own, and the first one stays.
+    It is made again after one of the ``sources`` has changed. Several processes may call this at
+    once: each finds it complete or makes it, and the first result is stored.
     """
     key = hashlib.sha256()
     for path in sorted(sources):

@@ -1,4 +1,4 @@
-"""What all tests share: signals, threads of parallel processes, and marks set automatically.
+"""Shared by all tests: signals, threads of parallel processes, and automatic marks.
 
 `make quick` leaves out the marks sfm, browser, build, emulated, kill, slow and gpu; pyproject.toml
 describes them.
@@ -10,17 +10,17 @@ from pathlib import Path
 
 import pytest
 
-# A shell starts background jobs with Ctrl-C ignored, and their children inherit that. Tests that
-# press it mean it to work, here and in the processes that they start.
+# A shell starts background jobs with Ctrl-C ignored, and their children inherit that. Tests
+# that send it need it to work, here and in the processes that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    # There is a process per core. Torch's threads spin while they wait, and would take the cores
-    # from each other. Set before torch is imported; results do not depend on it.
+    # There is one process per core. Torch's threads spin while they wait, so several per process
+    # would compete for the cores. Set before torch is imported; results do not depend on it.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 _HERE = Path(__file__).parent
-#: Marks that follow from the folder of a test, and from the fixtures that it uses.
+#: Marks set by the folder of a test, and by the fixtures that it uses.
 _OF_FOLDERS = {"kill": "kill", "fuzz": "slow"}
 _OF_FIXTURES = {"recorder": "build", "start": "slow"}
 

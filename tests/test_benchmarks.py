@@ -57,7 +57,7 @@ def test_stages_of_an_iteration(tmp_path):
         isa,
         "--repeats",
         2,
-        "--twin",
+        "--reference",
         "tiny",
         "--json",
         file,
@@ -68,8 +68,8 @@ def test_stages_of_an_iteration(tmp_path):
         values = row(text, stage)
         assert len(values) == 6, stage  # min, median, cpu for 1 thread and for 2
         assert min(values) > 0, stage
-    twin, own, ratio, _ = row(text, "1 thread ")
-    assert ratio == pytest.approx(twin / own, rel=0.1)
+    slow, own, ratio, _ = row(text, "1 thread ")
+    assert ratio == pytest.approx(slow / own, rel=0.1)
     assert ratio > 1
 
     one_thread = json.loads(file.read_text())[0]
@@ -164,7 +164,7 @@ def test_formats(tmp_path):
     text = benchmark(
         "formats.py",
         tmp_path / "a.ply",
-        *("--capture", tmp_path / "capture", "--gaussians", 200, "--repeats", 1),
+        *("--dataset", tmp_path / "capture", "--gaussians", 200, "--repeats", 1),
     )
     assert "times of 200; 2 views" in text
     assert row(text, "PLY")[2:4] == [pytest.approx(248, abs=30), float("inf")]
@@ -222,15 +222,15 @@ def test_without_a_gpu_it_prints_one_line(tmp_path):
 
 
 def test_a_job_that_crashes_or_hangs_does_not_affect_others(gpu_modules, tmp_path):
-    tell = 'print(\'@@ {"kind": "x", "value": 1}\', flush=True); '
+    report = 'print(\'@@ {"kind": "x", "value": 1}\', flush=True); '
     outcomes, found, log = run_jobs(
         tmp_path,
         job("a child of its own", f"import subprocess; subprocess.run(['sleep', '{LONG}'])", 1.0),
-        job("late", tell + "import time; time.sleep(60)", limit=1.5),
-        job("crash", tell + "import os; print('last words', flush=True); os.abort()"),
-        job("error", tell + "raise ValueError('what was wrong')"),
+        job("late", report + "import time; time.sleep(60)", limit=1.5),
+        job("crash", report + "import os; print('last words', flush=True); os.abort()"),
+        job("error", report + "raise ValueError('what was wrong')"),
         job("no program", ""),
-        job("well", tell + "print('@@ not json'); print('@@ {\"half', end='')"),
+        job("normal", report + "print('@@ not json'); print('@@ {\"half', end='')"),
     )
     states = {name: outcome.state for name, outcome in outcomes.items()}
     assert states == {
@@ -239,14 +239,14 @@ def test_a_job_that_crashes_or_hangs_does_not_affect_others(gpu_modules, tmp_pat
         "crash": "failed",
         "error": "failed",
         "no program": "done",
-        "well": "done",
+        "normal": "done",
     }
     assert outcomes["crash"].reason == "SIGABRT; last words"
     assert outcomes["error"].reason == "ValueError: what was wrong"
     assert outcomes["late"].reason == "ended after 2 s"
     assert 1.5 <= outcomes["late"].seconds < 10
     # Their earlier findings are not lost.
-    assert sorted(name for name, _ in found) == ["crash", "error", "late", "well"]
+    assert sorted(name for name, _ in found) == ["crash", "error", "late", "normal"]
     assert "===== crash: failed" in log
     assert "last words" in log
     assert "kind" not in log
@@ -475,7 +475,7 @@ def test_cpu_training_with_few_packages_installed(gpu_modules, tmp_path):
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.split('.')[0] in {'tyro', 'pycolmap', 'viser', 'av', 'pillow_heif',\n"
         "                                  'zstandard'}:\n"
-        "            raise ImportError(f'{name} is not here')\n"
+        "            raise ImportError(f'{name} is missing')\n"
         "sys.meta_path.insert(0, Blocked())\n"
     )
     paths = os.pathsep.join([str(blocked), str(ROOT / "src")])
@@ -539,7 +539,7 @@ def test_the_page_of_a_gpu(gpu_modules):
         counts = {"gaussians": count, "seen": count // 2, "instances": 4 * count}
         add(size, "frame", size=size, pairs=10**8, width=1920, height=1080, **counts)
         add(size, "scene", size=size, source="a garden")
-        add(size, "memory", size=size, peak=peak, held=peak / 2)
+        add(size, "memory", size=size, peak=peak, allocated=peak / 2)
         for in_order in (False, True):
             kernels = {"adam_step": {"adam_update": 2.0, "adam_splat_of": 0.832}, "new": {"k": 1.0}}
             if in_order:
@@ -564,13 +564,13 @@ def test_the_page_of_a_gpu(gpu_modules):
         in text
     )
     assert "fox: mean difference +0.250 dB, NOT within 0.1 dB" in text
-    assert "Not here, so not trained: lego400" in text
+    assert "Missing, so not trained: lego400" in text
     # 1m: 1000000 × (59 × 24 + 4) + 500000 × 64 bytes at 2 TB/s take 0.726 of the 2.832 ms.
     assert "| Adam | 2.832 | 0.726 | 26% |" in text
     assert "| new | 1.000 |  |  |" in text
     assert "| rest (PyTorch) | 1.168 |" in text
     assert "| 1m | 5.000 | 2.000 | 5.500 | GPU | 182 | 1.20 | 1000 | 500 | 1000 |" in text
-    assert "1m to 3m: 750 bytes more for each Gaussian, within the goal" in text
+    assert "1m to 3m: 750 bytes more per Gaussian, within the goal" in text
     assert "| 1m | training step | 5.000 | 15.000 | 3.00 | goal 2: reached |" in text
     assert "Done: a 10 s." in text
     assert "- b: late after 60 s; ended after 60 s" in text
@@ -634,12 +634,12 @@ def fake_gpu(gpu_modules, monkeypatch):
 
     from .ops import emulation
 
-    def nothing(*args):
+    def one_megabyte(*args):
         return 1 << 20
 
     monkeypatch.setattr(torch.cuda, "Event", FakeEvent)
     for name in ("_sleep", "empty_cache"):
-        monkeypatch.setattr(torch.cuda, name, nothing)
+        monkeypatch.setattr(torch.cuda, name, one_megabyte)
     begun = []
 
     def reset():
@@ -648,7 +648,7 @@ def fake_gpu(gpu_modules, monkeypatch):
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: begun.append(True))
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", reset)
     for name in ("memory_allocated", "max_memory_allocated"):
-        monkeypatch.setattr(torch.cuda, name, nothing)
+        monkeypatch.setattr(torch.cuda, name, one_megabyte)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 20, 1 << 20))
     card = argparse.Namespace(name="Card X", major=9, minor=0, multi_processor_count=2)
     card.total_memory, card.L2_cache_size = 10**9, 10**6
@@ -702,7 +702,7 @@ def test_the_measuring_parts_run(fake_gpu, capsys, tmp_path):
         assert min(step["gpu"], step["host"], step["wall"]) > 0
     page = page_of(found)
     frame = next(one for one in found if one["kind"] == "frame")
-    assert f"60 Gaussians of random Gaussians, 40×30, {frame['seen']} seen" in page
+    assert f"60 Gaussians of random Gaussians, 40×30, {frame['seen']} visible" in page
     for name in ("project: cull", "blend backward", "Adam", "whole step"):
         assert f"| {name} | " in page
     assert "| reduce | " in page
@@ -717,7 +717,7 @@ def test_comparison_with_a_peer(fake_gpu, capsys, monkeypatch):
     gpu_peer.build()
     (none,) = found_in(capsys.readouterr().out)
     assert none["kind"] == "no peer"
-    assert "None was measured" in page_of([none])
+    assert "Not measured" in page_of([none])
 
     def rasterization(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane,
@@ -756,19 +756,19 @@ def test_comparison_with_a_peer(fake_gpu, capsys, monkeypatch):
     assert whats == ["image", "image and gradient", "training step"]
     assert all(min(one["ours"], one["theirs"]) > 0 for one in found[2:])
     page = page_of(found)
-    assert "beside gsplat 9.9" in page
+    assert "compared with gsplat 9.9" in page
     assert "| 1m | training step | " in page
 
 
 FAKE_RUN = """
 import sys
 import gpu, gpu_jobs
-tell = "print('@@ {}', flush=True); "
+report = "print('@@ {}', flush=True); "
 def job(name, code, **more):
     return gpu_jobs.Job(name, [sys.executable, "-c", code], 30.0, **more)
 gpu.probe = lambda: {"kind": "gpu", "name": "Card X"}
-failure = tell.format('{"kind": "failure", "test": "t", "line": "no"}')
-tests = tell.format('{"kind": "tests", "passed": 1, "failed": 1, "skipped": 0, "total": 2}')
+failure = report.format('{"kind": "failure", "test": "t", "line": "no"}')
+tests = report.format('{"kind": "tests", "passed": 1, "failed": 1, "skipped": 0, "total": 2}')
 gpu.jobs = lambda flags, scratch: [
     job("tests", failure + tests),
     job("train", "import os; os.abort()"),
@@ -789,11 +789,11 @@ def test_a_complete_run_writes_its_page(tmp_path, long):
     if long:
         page, until = tmp_path / "gpu.md", time.monotonic() + 60
 
-        def both_are_over():
+        def both_have_ended():
             text = page.read_text() if page.exists() else ""
             return "- train: failed" in text and "Done: tests" in text
 
-        while not both_are_over():
+        while not both_have_ended():
             assert time.monotonic() < until
             time.sleep(0.05)
         assert "(not finished)" in page.read_text()

@@ -1,4 +1,4 @@
-"""The demo's check of the poses; the demo itself is run by `make demo`."""
+"""The check of the poses in the demo; `make demo` runs the demo itself."""
 
 import runpy
 from pathlib import Path

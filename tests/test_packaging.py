@@ -1,4 +1,4 @@
-"""What a user meets first: the wheel, where it is put, a machine without a compiler."""
+"""Installation: the wheel, the source distribution, a machine without a compiler."""
 
 import hashlib
 import os
@@ -50,7 +50,7 @@ def test_one_wheel_for_every_python_of_a_platform(wheel):
     assert platform != "any"
 
 
-def test_wheel_carries_the_libraries_and_all_of_python(wheel):
+def test_wheel_contains_the_libraries_and_all_of_python(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for isa in native.available_isas():
         assert f"snowsplat/_lib/libsnowsplat_{isa}.so" in names
@@ -61,7 +61,7 @@ def test_wheel_carries_the_libraries_and_all_of_python(wheel):
     assert not any(name.startswith("snowsplat/native/cpu") for name in names)
 
 
-def test_wheel_carries_the_kernels_of_a_gpu_built_and_as_sources(wheel):
+def test_wheel_contains_gpu_kernels_as_cubins_and_sources(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     native_folder = REPOSITORY / "src" / "snowsplat" / "native"
     sources = [*native_folder.glob("*.h"), *native_folder.glob("cuda/*")]
@@ -81,7 +81,7 @@ def test_wheel_carries_the_kernels_of_a_gpu_built_and_as_sources(wheel):
     assert wheel.stat().st_size < 10e6
 
 
-def test_source_distribution_carries_all_that_a_build_needs(tmp_path):
+def test_source_distribution_contains_all_files_of_a_build(tmp_path):
     build = pytest.importorskip("scikit_build_core.build")
     before = os.getcwd()
     os.chdir(REPOSITORY)
@@ -102,18 +102,18 @@ def test_source_distribution_carries_all_that_a_build_needs(tmp_path):
     assert set(needed) <= names
 
 
-def test_without_nvrtc_the_kernels_of_a_gpu_are_left_out_with_a_line(tmp_path):
-    """Only CMake's part, up to what would be built."""
+def test_without_nvrtc_gpu_kernels_are_omitted_with_a_message(tmp_path):
+    """Only the configuration by CMake; nothing is compiled."""
     cmake = shutil.which("cmake", path=f"{Path(sys.executable).parent}{os.pathsep}/usr/bin")
     ninja = shutil.which("ninja", path=f"{Path(sys.executable).parent}{os.pathsep}/usr/bin")
     if cmake is None or ninja is None:
         pytest.skip("needs cmake and ninja (make dev installs them)")
-    lonely = tmp_path / "python"
-    lonely.write_text(f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
-    lonely.chmod(0o755)
+    isolated = tmp_path / "python"
+    isolated.write_text(f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
+    isolated.chmod(0o755)
     line = "snowsplat: built without GPU kernels; they are compiled when first used"
     command = [cmake, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={ninja}", "-S", REPOSITORY]
-    command += ["-B", tmp_path / "build", f"-DPython3_EXECUTABLE={lonely}"]
+    command += ["-B", tmp_path / "build", f"-DPython3_EXECUTABLE={isolated}"]
     result = run(*command, env={k: v for k, v in os.environ.items() if k != "LD_LIBRARY_PATH"})
     assert result.returncode == 0, result.stderr
     if line not in result.stderr.splitlines():
@@ -129,7 +129,7 @@ def nvrtc_of_the_system() -> bool:
     return result.returncode == 0
 
 
-def test_wheel_carries_the_viewer_and_its_licence(wheel):
+def test_wheel_contains_the_viewer_and_its_licence(wheel):
     with zipfile.ZipFile(wheel) as archive:
         files = {name: archive.read(f"snowsplat/_viewer/{name}") for name in VIEWER_FILES}
         assert sum("_viewer/" in name for name in archive.namelist()) == len(files)
@@ -143,7 +143,7 @@ def test_wheel_carries_the_viewer_and_its_licence(wheel):
     assert not files
 
 
-def test_what_is_vendored_is_pinned_and_told():
+def test_the_vendored_archive_is_pinned_and_documented():
     (archive,) = THIRD_PARTY.glob("*.tar.xz")
     assert archive.stat().st_size < 1.5e6
     assert hashlib.sha256(archive.read_bytes()).hexdigest() in (
@@ -157,7 +157,7 @@ def test_what_is_vendored_is_pinned_and_told():
         )
 
 
-def test_an_archive_that_was_tampered_with_is_not_built(tmp_path):
+def test_a_modified_archive_is_rejected(tmp_path):
     copy = tmp_path / "checkout"
     shutil.copytree(THIRD_PARTY, copy / "third_party")
     shutil.copy(REPOSITORY / "CMakeLists.txt", copy)
@@ -168,16 +168,16 @@ def test_an_archive_that_was_tampered_with_is_not_built(tmp_path):
         pytest.skip("needs cmake (make dev installs it)")
     result = run(cmake, "-S", copy, "-B", tmp_path / "build")
     assert result.returncode != 0
-    assert "is not the file that it should be" in " ".join(result.stderr.split())
+    assert "has the wrong checksum" in " ".join(result.stderr.split())
 
 
-def test_wheel_works_out_of_the_checkout(wheel, tmp_path):
+def test_wheel_works_outside_of_the_checkout(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path)
     code = (
         "import snowsplat; from snowsplat.ops import native; native.set_num_threads(1);"
         "print(snowsplat.__file__, snowsplat.__version__, native.isa())"
     )
-    # Without -S the environment's editable install of the checkout would come first.
+    # Without -S, the environment's editable installation of the checkout would be imported.
     clean = {k: v for k, v in os.environ.items() if not k.startswith("SNOWSPLAT_")}
     clean["PYTHONPATH"] = os.pathsep.join(map(str, (tmp_path, Path(torch.__file__).parents[1])))
     result = run(sys.executable, "-S", "-c", code, cwd=tmp_path, env=clean)
@@ -185,7 +185,7 @@ def test_wheel_works_out_of_the_checkout(wheel, tmp_path):
     assert result.stdout.split() == [str(file), __version__, native.available_isas()[-1]]
 
 
-def test_libraries_need_nothing_but_the_c_library():
+def test_libraries_depend_only_on_the_c_library():
     if not (readelf := shutil.which("readelf")):
         pytest.skip("needs readelf (apt install binutils)")
     for isa in native.available_isas():
@@ -214,7 +214,7 @@ def bare_path(tmp_path) -> str:
     return str(folder)
 
 
-def test_cmake_without_a_compiler_says_what_to_install(tmp_path, bare_path):
+def test_cmake_without_a_compiler_names_the_package_to_install(tmp_path, bare_path):
     environment = {"PATH": bare_path, "HOME": str(tmp_path)}
     command = ["cmake", "-G", "Ninja", "-S", REPOSITORY, "-B", tmp_path / "build"]
     result = run(f"{bare_path}/cmake", *command[1:], env=environment)
@@ -222,7 +222,7 @@ def test_cmake_without_a_compiler_says_what_to_install(tmp_path, bare_path):
     assert NO_COMPILER in [line.strip() for line in result.stderr.splitlines()]
 
 
-def test_make_without_a_compiler_says_what_to_install(bare_path):
+def test_make_without_a_compiler_names_the_package_to_install(bare_path):
     command = [f"{bare_path}/make", "--no-print-directory", f"PYTHON={bare_path}/python", "native"]
     result = run(*command, cwd=REPOSITORY, env={"PATH": bare_path})
     assert result.returncode != 0
@@ -240,11 +240,11 @@ def test_command_is_installed():
         env=os.environ | {"PYTHONPATH": str(REPOSITORY / "src")},
     )
     assert result.returncode == 0, result.stderr
-    for verb in ("train", "render", "evaluate", "info"):
-        assert verb in result.stdout
+    for subcommand in ("train", "render", "evaluate", "info"):
+        assert subcommand in result.stdout
 
 
-def test_public_names_are_there_and_typed():
+def test_public_names_can_be_imported():
     import snowsplat
 
     assert sorted([*snowsplat._MODULES, "__version__"]) == sorted(snowsplat.__all__)

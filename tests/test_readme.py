@@ -1,4 +1,4 @@
-"""The README's examples are what the program does."""
+"""The examples in the README work."""
 
 import re
 import runpy
@@ -59,13 +59,13 @@ def commands() -> list[str]:
 
 
 @pytest.mark.parametrize("command", commands())
-def test_command_is_understood(command):
+def test_command_is_valid(command):
     program, *arguments = shlex.split(command)
     assert program == "snowsplat"
     assert type(cli.parse(arguments)) is cli.load_subcommand(arguments[0])
 
 
-def test_flags_named_exist(capsys):
+def test_named_flags_exist(capsys):
     for name in cli.SUBCOMMANDS:
         with pytest.raises(SystemExit):
             cli.parse([name, "--help"])
@@ -74,7 +74,7 @@ def test_flags_named_exist(capsys):
         assert flag.replace("_", "-") in known, flag
 
 
-def test_files_named_exist():
+def test_linked_files_exist():
     root = Path(__file__).resolve().parents[1]
     for link in re.findall(r"\]\(([^):]+)\)", README):
         assert (root / link).exists(), link

@@ -1,4 +1,4 @@
-"""A small dataset, and the command line called in this process or as a process of its own."""
+"""A small dataset; the command line, called in this process or as a separate one."""
 
 import os
 import subprocess
@@ -25,7 +25,7 @@ class Result:
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory) -> Path:
-    """9 views, 48×36; not to be changed."""
+    """9 views, 48×36; read-only for the tests."""
     root = tmp_path_factory.mktemp("cli")
     return write_toy_dataset(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
 
@@ -38,8 +38,8 @@ def run(capsys) -> Callable[..., Result]:
         capsys.readouterr()
         try:
             code = main([str(argument) for argument in arguments])
-        except SystemExit as leaving:  # tyro: help, or a mistake in the flags
-            code = int(leaving.code or 0)
+        except SystemExit as ended:  # tyro: help, or invalid flags
+            code = int(ended.code or 0)
         captured = capsys.readouterr()
         return Result(code, captured.out, captured.err)
 
@@ -48,7 +48,7 @@ def run(capsys) -> Callable[..., Result]:
 
 @pytest.fixture
 def refused(run) -> Callable[..., str]:
-    """Call the command with a mistake in the input; gives its one line."""
+    """Call the command with invalid input; returns its one-line error."""
 
     def refused(*arguments: object) -> str:
         result = run(*arguments)
@@ -63,7 +63,7 @@ def refused(run) -> Callable[..., str]:
 
 @pytest.fixture
 def start() -> Callable[..., subprocess.Popen]:
-    """Start the command as a process of its own."""
+    """Start the command as a separate process."""
 
     def start(*arguments: object) -> subprocess.Popen:
         return subprocess.Popen(

@@ -1,4 +1,4 @@
-"""`convert` and, of what it writes, `info`: formats into one another, changes, mistakes."""
+"""`convert`, and `info` about its output: all pairs of formats, edits, invalid input."""
 
 import json
 import re
@@ -57,12 +57,12 @@ def test_every_format_into_every_other(run, ply, tmp_path, first):
             torch.testing.assert_close(read.means.sort(0).values, means, rtol=0, atol=0.01)
 
 
-def test_nothing_changes_where_nothing_is_asked_for(run, ply, tmp_path):
+def test_without_edits_the_file_is_the_same(run, ply, tmp_path):
     assert run("convert", ply, tmp_path / "b.ply").code == 0
     assert (tmp_path / "b.ply").read_bytes() == ply.read_bytes()
 
 
-def test_changes_and_their_order(run, ply, tmp_path):
+def test_edits_and_their_order(run, ply, tmp_path):
     flags = ("--crop", -1, -1, -1, 1, 0.5, 1, "--rotate", 0, 0, 90, "--scale", 2)
     flags += ("--translate", 10, 0, -1, "--decimate", "50%", "--sh-degree", 1)
     result = run("convert", ply, tmp_path / "b.ply", *flags)
@@ -77,7 +77,7 @@ def test_changes_and_their_order(run, ply, tmp_path):
     torch.testing.assert_close(after.means, expected)
 
 
-def test_turns_are_about_x_then_y_then_z(run, tmp_path):
+def test_rotations_are_about_x_then_y_then_z(run, tmp_path):
     one = scene(1, 0)
     one.means[:] = torch.tensor([[0.0, 1.0, 0.0]])
     write_gaussians(tmp_path / "a.ply", one)
@@ -87,7 +87,7 @@ def test_turns_are_about_x_then_y_then_z(run, tmp_path):
     torch.testing.assert_close(means, torch.tensor([[1.0, 0.0, 0.0]]), rtol=0, atol=1e-6)
 
 
-def test_several_become_one(run, ply, tmp_path):
+def test_several_scenes_are_merged(run, ply, tmp_path):
     write_gaussians(tmp_path / "b.spz", scene(30, 3, seed=1))
     assert run("convert", ply, tmp_path / "b.spz", tmp_path / "c.ply").code == 0
     both = read_gaussians(tmp_path / "c.ply")
@@ -108,7 +108,7 @@ def test_the_newest_scene_of_an_output_folder(run, refused, ply, tmp_path):
     assert "holds no scene" in refused("convert", tmp_path / "empty", tmp_path / "d.spz")
 
 
-def test_a_file_that_is_there(run, refused, ply, tmp_path):
+def test_an_existing_file(run, refused, ply, tmp_path):
     target = tmp_path / "b.spz"
     target.write_bytes(b"mine")
     assert "--overwrite" in refused("convert", ply, target)
@@ -118,7 +118,7 @@ def test_a_file_that_is_there(run, refused, ply, tmp_path):
     assert len(read_gaussians(ply)) == 9
 
 
-def test_mistakes(refused, ply, tmp_path):
+def test_invalid_input(refused, ply, tmp_path):
     out = tmp_path / "b.ply"
     assert "name of a file" in refused("convert", ply)
     assert "selects no scene format" in refused("convert", ply, tmp_path / "b.obj")
@@ -151,7 +151,7 @@ def test_info_of_every_format(run, ply, tmp_path, format):
     np.testing.assert_allclose(bounds, [expected.amin(0), expected.amax(0)], atol=0.01)
 
 
-def test_info_tells_versions_and_what_it_does_not_know(run, refused, ply, tmp_path):
+def test_info_reports_versions_and_rejects_other_files(run, refused, ply, tmp_path):
     assert run("convert", ply, tmp_path / "b.spz").code == 0
     assert json.loads(run("info", tmp_path / "b.spz", "--json").out)["format"] == "SPZ 3"
     assert run("convert", ply, tmp_path / "b.sog").code == 0
@@ -162,7 +162,7 @@ def test_info_tells_versions_and_what_it_does_not_know(run, refused, ply, tmp_pa
     assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
 
 
-def test_a_page_of_a_training_starts_where_a_photo_was_taken(run, ply, tmp_path):
+def test_the_page_of_a_training_starts_at_the_view_of_a_photo(run, ply, tmp_path):
     folder = tmp_path / "out/point_cloud/iteration_7"
     folder.mkdir(parents=True)
     shutil.copy(ply, folder / "point_cloud.ply")

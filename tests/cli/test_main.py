@@ -1,4 +1,4 @@
-"""The frame of the command line: help, mistakes, exit codes, and which modules it imports."""
+"""The top level of the command line: help, invalid flags, exit codes, imported modules."""
 
 import inspect
 import logging
@@ -28,7 +28,7 @@ def replace_run(monkeypatch):
     return lambda function: monkeypatch.setattr(module.load_subcommand("info"), "run", function)
 
 
-def test_help_lists_the_subcommands_and_each_has_its_own(run):
+def test_help_lists_the_subcommands_and_each_has_help(run):
     result = run()
     assert result.code == 0
     for name, summary in module.SUBCOMMANDS.items():
@@ -39,7 +39,7 @@ def test_help_lists_the_subcommands_and_each_has_its_own(run):
         assert own.code == 0
         assert f"  snowsplat {name} " in own.out  # an example, on its own line
         assert "Examples:" in own.out
-        assert "None" not in own.out  # tyro's text for a default that it was not given
+        assert "None" not in own.out  # tyro's text for a missing default
 
 
 def imported_by(*arguments: object) -> set[str]:
@@ -62,7 +62,7 @@ def imported_by(*arguments: object) -> set[str]:
 
 
 @pytest.mark.slow
-def test_help_and_mistakes_import_neither_torch_nor_other_subcommands():
+def test_help_and_invalid_flags_import_neither_torch_nor_other_subcommands():
     assert imported_by("--help") == set()
     assert imported_by("trian") == set()
     assert imported_by("info") == {"snowsplat.cli.info"}
@@ -107,7 +107,7 @@ def test_a_misplaced_flag_is_found_in_its_subcommand(run):
     "arguments",
     [["train", "--iteratoins", "3"], ["train", "x", "-o", "y", "--recipe", "none"]],
 )
-def test_mistakes_in_the_flags(run, arguments):
+def test_invalid_flags(run, arguments):
     result = run(*arguments)
     assert result.code == 2
     assert result.out == ""
@@ -149,17 +149,17 @@ def test_errors_of_the_system_and_warnings_are_one_line(replace_run, run):
         run("info", "x")
 
 
-def test_no_memory_is_one_line_that_says_what_helps(replace_run, refused):
+def test_out_of_memory_is_a_one_line_error_with_advice(replace_run, refused):
     def torch_allocates(self):
         torch.empty(2**60, dtype=torch.uint8)
 
-    def a_gpu_is_full(self):
+    def gpu_allocates(self):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
 
     def python_allocates(self):
         raise MemoryError
 
-    for fails in (torch_allocates, a_gpu_is_full, python_allocates):
+    for fails in (torch_allocates, gpu_allocates, python_allocates):
         replace_run(fails)
         assert "out of memory; train with --memory" in refused("info", "x")
 
@@ -172,13 +172,13 @@ def test_no_memory_is_one_line_that_says_what_helps(replace_run, refused):
 
 
 @pytest.mark.slow
-def test_a_training_whose_reader_has_gone_is_not_done(dataset, tmp_path):
-    """As of `| head -1`: silent, but no success."""
+def test_a_training_whose_standard_output_is_closed_fails(dataset, tmp_path):
+    """As with `| head -1`: no message, but a non-zero exit code."""
     read, write = os.pipe()
     os.close(read)
-    words = ["train", dataset, "-o", tmp_path / "out", "--iterations", 9, "--device", "cpu"]
+    arguments = ["train", dataset, "-o", tmp_path / "out", "--iterations", 9, "--device", "cpu"]
     done = subprocess.run(
-        [sys.executable, "-m", "snowsplat", *map(str, words)],
+        [sys.executable, "-m", "snowsplat", *map(str, arguments)],
         env=ENVIRONMENT,
         stdout=write,
         stderr=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""`snowsplat make`, from photos to files: what is made, what a kill leaves, what is done again."""
+"""`snowsplat make`, from photos to files: its output, kills, repeated stages."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from snowsplat import synthetic
-from snowsplat.pipeline import make as making
+from snowsplat.pipeline import make as make_module
 from snowsplat.pipeline.make import RECORD, STAGES
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.synthetic import write_synthetic_photos
@@ -23,21 +23,21 @@ from snowsplat.util.stages import Stages
 from ..cache import cached
 
 QUICK = replace(PRESETS["draft"], iterations=120)
-#: The command with as short a training, and a checkpoint every moment, in a process of its own.
+#: The command as a separate process, with the same short training and frequent checkpoints.
 PROGRAM = """
 import sys
 from dataclasses import replace
-from snowsplat.pipeline import make as making
+from snowsplat.pipeline import make as make_module
 from snowsplat.cli.main import main
-making._CHECKPOINT_SECONDS = 0.2
-making.PRESETS["draft"] = replace(making.PRESETS["draft"], iterations=120)
+make_module._CHECKPOINT_SECONDS = 0.2
+make_module.PRESETS["draft"] = replace(make_module.PRESETS["draft"], iterations=120)
 sys.exit(main())
 """
 
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
-    """20 photos, 320×240; not to be changed. The name is one that people use."""
+    """20 photos, 320×240; read-only for the tests. The name has spaces and an umlaut."""
     folder = tmp_path_factory.mktemp("make") / "Häuser am See"
     sources = Path(synthetic.__file__).parent.glob("*.py")
     photos = cached(
@@ -56,13 +56,13 @@ def files(folder: Path) -> set[str]:
 
 
 def state(out: Path) -> dict[str, int]:
-    """When each file was written, but for the records of what is done."""
+    """Modification time of each file except the records of finished stages."""
     made = (name for name in files(out) if Path(name).name not in ("make.json", "capture.json"))
     return {name: (out / name).stat().st_mtime_ns for name in made}
 
 
 @pytest.mark.sfm
-def test_from_photos_to_files_and_what_is_done_again(
+def test_from_photos_to_files_and_repeated_stages(
     run, refused, quick, photos, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -87,7 +87,7 @@ def test_from_photos_to_files_and_what_is_done_again(
     assert facts["kind"] == "output folder"
     assert facts["scenes"] == [120]
 
-    # The same again: nothing is done.
+    # The same command again: all stages are skipped.
     before = state(out)
     again = run(*command)
     assert again.code == 0, again.err
@@ -95,14 +95,14 @@ def test_from_photos_to_files_and_what_is_done_again(
     assert state(out) == before
     assert f"PSNR {metrics['psnr']:.2f} dB" in again.out
 
-    # A file that is missing: that stage and the later ones.
+    # A file is missing: that stage and the later ones are repeated.
     shutil.rmtree(out / "scene/test")
     again = run(*command)
     assert "pictures: done again (its files are missing)" in again.out
     assert state(out).keys() == before.keys()
     assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_120/point_cloud.ply"]
 
-    # Another setting of the training: the cameras stay.
+    # Another training setting: the cameras are kept.
     monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=60))
     again = run(*command)
     assert again.code == 0, again.err
@@ -111,7 +111,7 @@ def test_from_photos_to_files_and_what_is_done_again(
     assert (out / "scene/test/ours_60").is_dir()
     assert not (out / "scene/test/ours_120").exists()
 
-    # Other photos are not what is in there.
+    # Other photos: the existing output is not replaced.
     fewer = tmp_path / "fewer"
     fewer.mkdir()
     for photo in sorted(photos.iterdir())[:17]:
@@ -123,8 +123,8 @@ def test_from_photos_to_files_and_what_is_done_again(
 
 @pytest.fixture
 def killed(photos, tmp_path) -> Callable[..., str]:
-    """Run the command as a process and kill it when a file is there; gives what it printed."""
-    environment = os.environ | {"PYTHONPATH": str(Path(making.__file__).parents[2])}
+    """Run the command as a process, kill it when a condition holds; returns its output."""
+    environment = os.environ | {"PYTHONPATH": str(Path(make_module.__file__).parents[2])}
 
     def killed(out: Path, when: Callable[[], bool], with_signal: int) -> str:
         arguments = ["make", str(photos), "-o", str(out), "--quality", "draft", "--threads", "1"]
@@ -149,7 +149,7 @@ def killed(photos, tmp_path) -> Callable[..., str]:
 
 @pytest.mark.sfm
 def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
-    """Each time the same command goes on; what was finished is not done again."""
+    """The same command resumes each time; finished stages are not repeated."""
     out = tmp_path / "out"
 
     def recorded(stage: str) -> bool:
@@ -177,10 +177,10 @@ def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
     assert not list(out.rglob("*.tmp"))
 
 
-# Refused
+# Errors
 
 
-def test_places_that_are_taken(refused, dataset, tmp_path):
+def test_output_folders_with_other_files(refused, dataset, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("mine")
@@ -198,13 +198,13 @@ def test_places_that_are_taken(refused, dataset, tmp_path):
         (["PHOTOS", "--threads", 0], "--threads: 0 is too small"),
     ],
 )
-def test_mistakes_write_nothing(refused, dataset, tmp_path, flags, expected):
-    words = [dataset / "images" if word == "PHOTOS" else word for word in flags]
-    assert expected in refused("make", *words, "-o", tmp_path / "out")
+def test_errors_write_nothing(refused, dataset, tmp_path, flags, expected):
+    arguments = [dataset / "images" if flag == "PHOTOS" else flag for flag in flags]
+    assert expected in refused("make", *arguments, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_two_photos_leave_nothing(refused, dataset, tmp_path):
+def test_two_photos_are_too_few_and_leave_no_files(refused, dataset, tmp_path):
     two = tmp_path / "two"
     two.mkdir()
     for name in ("view_00.png", "view_01.png"):
@@ -213,17 +213,14 @@ def test_two_photos_leave_nothing(refused, dataset, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-# Times
-
-
-def test_a_stop_before_the_cameras_leaves_the_folder_ours(refused, dataset, tmp_path):
-    """Somebody removed the dataset in it, to have the cameras found anew."""
+def test_an_error_before_the_cameras_keeps_the_record(refused, dataset, tmp_path):
+    """The user has removed the dataset, so that the cameras are estimated again."""
     out, two = tmp_path / "out", tmp_path / "two"
     (out / "scene").mkdir(parents=True)
     Stages(out / RECORD, STAGES).save()
     two.mkdir()
     for name in ("view_00.png", "view_01.png"):
         shutil.copy(dataset / "images" / name, two)
-    for _ in range(2):  # and the same command comes as far again
+    for _ in range(2):  # the second run fails at the same point
         assert "only 2 usable images" in refused("make", two, "-o", out)
         assert files(out) == {RECORD}

@@ -1,4 +1,4 @@
-"""`--memory`: a dataset ten times as large as the memory that it may take."""
+"""`--memory`: a dataset that is ten times as large as the allowed memory."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ COUNT = 10 * BUDGET // (3 * WIDTH * HEIGHT)
 pytestmark = pytest.mark.slow
 
 
-def snowsplat_cli(*words: str) -> subprocess.CompletedProcess[str]:
+def snowsplat_cli(*arguments: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(SOURCES), "SNOWSPLAT_DEVICE": "cpu"}
-    command = [sys.executable, "-m", "snowsplat", *words]
+    command = [sys.executable, "-m", "snowsplat", *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Few photos under very many names."""
+    """Four photos under many names (hard links)."""
     folder: Path = tmp_path_factory.mktemp("large")
     random = np.random.default_rng(0)
     frames = []
@@ -46,26 +46,33 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         c, s = math.cos(2 * math.pi * i / COUNT), math.sin(2 * math.pi * i / COUNT)
         pose = [[c, 0, s, 4 * s], [0, 1, 0, 0], [-s, 0, c, 4 * c], [0, 0, 0, 1]]
         frames.append({"file_path": name, "transform_matrix": pose})
-    about = {"w": WIDTH, "h": HEIGHT, "fl_x": 600, "fl_y": 600, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(about))
+    content = {"w": WIDTH, "h": HEIGHT, "fl_x": 600, "fl_y": 600, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
     return folder
 
 
 def test_a_dataset_of_ten_times_the_memory_trains(dataset: Path, tmp_path: Path) -> None:
-    words = ("-o", str(tmp_path / "out"), "--memory", f"{BUDGET // 10**6}MB", "--iterations", "100")
-    run = snowsplat_cli("train", str(dataset), *words, "--densify-from-iter", "20")
+    arguments = (
+        "-o",
+        str(tmp_path / "out"),
+        "--memory",
+        f"{BUDGET // 10**6}MB",
+        "--iterations",
+        "100",
+    )
+    run = snowsplat_cli("train", str(dataset), *arguments, "--densify-from-iter", "20")
     assert run.returncode == 0, run.stderr
     assert re.search(r"^memory: \d+ MB at most \(.*photos \d+ MB\)$", run.stdout, re.MULTILINE)
     assert re.search(r"^for lack of memory: at most [\d,]+ Gaussians", run.stdout, re.MULTILINE)
     assert "of the photos stay decoded" in run.stdout
-    taken = re.search(r"at most (\d+) MB, (\d+) of them Python", run.stdout)
-    assert taken is not None
-    assert int(taken[1]) - int(taken[2]) <= BUDGET / 1e6
+    used = re.search(r"at most (\d+) MB, (\d+) of them Python", run.stdout)
+    assert used is not None
+    assert int(used[1]) - int(used[2]) <= BUDGET / 1e6
 
 
-def test_too_little_is_said_before_anything_is_made(dataset: Path, tmp_path: Path) -> None:
+def test_invalid_budgets_are_rejected_before_any_output(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    for words, line in (
+    for arguments, line in (
         (
             ("--memory", "40MB"),
             r"snowsplat: --memory: 40 MB is too little for photos .* a lower resolution\n",
@@ -75,7 +82,7 @@ def test_too_little_is_said_before_anything_is_made(dataset: Path, tmp_path: Pat
             r"snowsplat: --memory: 'lots' is not a size; use e.g. 4GB or 800MB\n",
         ),
     ):
-        run = snowsplat_cli("train", str(dataset), "-o", str(out), *words)
+        run = snowsplat_cli("train", str(dataset), "-o", str(out), *arguments)
         assert run.returncode == 2
         assert re.fullmatch(line, run.stderr), run.stderr
         assert not out.exists()

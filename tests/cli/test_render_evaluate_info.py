@@ -1,4 +1,4 @@
-"""What is done with a scene afterwards: `render`, `evaluate`, `info`."""
+"""The subcommands that use a trained scene: `render`, `evaluate`, `info`."""
 
 import json
 import shutil
@@ -17,18 +17,18 @@ from snowsplat.training import checkpoint
 
 @pytest.fixture(scope="module")
 def trained(dataset, tmp_path_factory) -> Path:
-    """An output folder with two scenes; renders and metrics come and go."""
+    """An output folder with two scenes; the tests replace its renderings and metrics."""
     out = tmp_path_factory.mktemp("trained") / "out"
     flags = ["--iterations", "60", "--save-iterations", "30", "--eval", "--quiet"]
     assert main(["train", str(dataset), "-o", str(out), *flags]) == 0
     return out
 
 
-def picture(path: Path) -> np.ndarray:
+def image(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path)).astype(np.float64)
 
 
-def test_render_beside_the_photos(run, trained, dataset):
+def test_render_writes_images_and_photos(run, trained, dataset):
     result = run("render", trained)
     assert result.code == 0, result.err
     for split, names in (("test", [0, 8]), ("train", [1, 2, 3, 4, 5, 6, 7])):
@@ -37,11 +37,11 @@ def test_render_beside_the_photos(run, trained, dataset):
         for kind in ("renders", "gt"):
             assert sorted(p.name for p in (folder / kind).iterdir()) == expected
         for i, name in enumerate(names):
-            photo = picture(dataset / f"images/view_{name:02d}.png")
-            np.testing.assert_array_equal(picture(folder / f"gt/{i:05d}.png"), photo)
-    # The pictures are what was measured, but for rounding to 8 bits.
+            photo = image(dataset / f"images/view_{name:02d}.png")
+            np.testing.assert_array_equal(image(folder / f"gt/{i:05d}.png"), photo)
+    # The PSNR of the written images equals the measured one, except for rounding to 8 bits.
     metrics = json.loads((trained / "metrics.json").read_text())
-    render, photo = (picture(trained / f"test/ours_60/{k}/00001.png") for k in ("renders", "gt"))
+    render, photo = (image(trained / f"test/ours_60/{k}/00001.png") for k in ("renders", "gt"))
     psnr = -10 * np.log10(np.mean(((render - photo) / 255) ** 2))
     assert psnr == pytest.approx(metrics["views"]["view_08.png"]["psnr"], abs=0.02)
 
@@ -54,14 +54,14 @@ def test_render_depth(run, trained):
     depth = Image.open(folder / "00000.png")
     assert depth.mode.startswith("I")
     units = np.asarray(depth).astype(np.float64) * steps["00000.png"]
-    # The cameras are 3 from the middle, the surroundings at most 9 away.
+    # The cameras are 3 units from the centre; the background is at most 9 units away.
     assert 1.5 < np.median(units[units > 0]) < 9.5
     assert run("render", "-m", trained, *flags, "--skip_train", "--depth", "color").code == 0
     assert Image.open(folder / "00000.png").mode == "RGB"
     assert not (trained / "train/ours_30").exists()
 
 
-def test_evaluate_repeats_what_training_measured(run, trained):
+def test_evaluate_reproduces_the_metrics_of_the_training(run, trained):
     before = json.loads((trained / "metrics.json").read_text())
     result = run("evaluate", trained)
     assert result.code == 0, result.err
@@ -91,8 +91,8 @@ def test_evaluate_with_lpips(run, refused, trained, tmp_path):
     assert run("evaluate", trained).code == 0
 
 
-def test_a_folder_that_the_reference_made(run, trained, dataset, tmp_path):
-    """It has cfg_args and no config.json; nothing in it is executed."""
+def test_a_folder_of_the_reference_implementation(run, trained, dataset, tmp_path):
+    """It has cfg_args but no config.json. Its content is not executed."""
     theirs = tmp_path / "theirs"
     shutil.copytree(trained / "point_cloud", theirs / "point_cloud")
     (theirs / "cfg_args").write_text(
@@ -118,7 +118,7 @@ def test_a_dataset_that_has_moved(run, refused, trained, dataset, tmp_path):
     assert run("evaluate", moved, "-s", dataset).code == 0
 
 
-def test_refused(refused, trained, tmp_path):
+def test_errors(refused, trained, tmp_path):
     assert "no such folder" in refused("render", tmp_path / "absent")
     assert "not the output folder" in refused("evaluate", tmp_path)
     assert "there are 30, 60" in refused("render", trained, "--iteration", 7)
@@ -139,7 +139,7 @@ def test_refused(refused, trained, tmp_path):
 
 def test_info(run, refused, trained, dataset, tmp_path):
     def facts(path: Path) -> dict:
-        assert run("info", path).code == 0  # for people
+        assert run("info", path).code == 0  # as text
         result = run("info", path, "--json")
         assert result.code == 0, result.err
         return json.loads(result.out)
@@ -169,7 +169,7 @@ def test_info(run, refused, trained, dataset, tmp_path):
     assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
 
 
-def test_info_says_nothing_that_a_terminal_obeys(run, refused, tmp_path):
+def test_info_prints_no_control_characters(run, refused, tmp_path):
     meta = {"a\x1b[2J": "\ud800 \x1b]0;title\x07", "b": {"\x9b2J": [1]}}
     path = checkpoint.save(tmp_path, 5, {"a": torch.zeros(3)}, meta)
     result = run("info", path)

@@ -1,4 +1,4 @@
-"""`snowsplat sfm`: what stands in the folder, what is done again, what failures leave."""
+"""`snowsplat sfm`: the output folder, repeated stages, the state after failures."""
 
 import errno
 import json
@@ -27,13 +27,13 @@ pytestmark = pytest.mark.sfm
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
-    """10 photos, 320×240; not to be changed."""
+    """10 photos, 320×240; read-only for the tests."""
     return scenes.write_photos(tmp_path_factory.mktemp("capture") / "photos", 10)
 
 
 @pytest.fixture(scope="module")
 def captured(photos, tmp_path_factory) -> Path:
-    """Their dataset, with smaller copies; not to be changed."""
+    """Their dataset, with smaller copies; read-only for the tests."""
     out = tmp_path_factory.mktemp("captured") / "garden"
     command = [sys.executable, "-m", "snowsplat", "sfm", photos, "-o", out, *QUICK, "--resize"]
     done = subprocess.run(list(map(str, command)), env=ENVIRONMENT, capture_output=True, text=True)
@@ -42,7 +42,7 @@ def captured(photos, tmp_path_factory) -> Path:
 
 
 def times(folder: Path) -> dict[str, int]:
-    """When each file was written, but for the record."""
+    """Modification time of each file except the record."""
     found = (p for p in folder.rglob("*") if p.is_file() and p.name != "capture.json")
     return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in found}
 
@@ -65,7 +65,7 @@ def test_layout_is_that_of_convert_py(captured, photos):
     assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
     record = json.loads((captured / "capture.json").read_text())
     assert list(record["stages"]) == list(STAGES)
-    # What was turned can be turned back: the record has the similarity.
+    # The alignment can be inverted: the record has the similarity transform.
     scale = record["stages"]["images"]["result"]["scene_from_sfm"]["scale"]
     ours, theirs = (
         sorted(m.images[i].projection_center()[0] for i in m.reg_image_ids())
@@ -78,7 +78,7 @@ def test_layout_is_that_of_convert_py(captured, photos):
     assert len(dataset.points) == model.num_points3D()
 
 
-def test_the_same_again_does_nothing_and_a_changed_photo_is_noticed(
+def test_finished_stages_are_skipped_and_a_changed_photo_is_detected(
     captured, photos, run, tmp_path
 ):
     out, mine = tmp_path / "garden", tmp_path / "mine"
@@ -110,25 +110,25 @@ def test_photos_in_place(captured, photos, run, refused, tmp_path):
     assert result.code == 0, result.err
     assert times(place / "input") == before
     assert load_dataset(place).train
-    # They are not ours to replace, not even by some of them.
+    # The original photos are never replaced, not even by a subset of them.
     for inputs in (sorted((place / "input").iterdir())[:5], [photos]):
         line = refused("sfm", *inputs, "-o", place, "--overwrite", *QUICK)
         assert f"{place / 'input'}: holds the original photos" in line
     assert times(place / "input") == before
 
-    # A model that is there already is undistorted as it is.
+    # An existing model is only undistorted.
     given = tmp_path / "given"
     shutil.copytree(photos, given / "input")
     shutil.copytree(captured / "distorted" / "sparse", given / "distorted" / "sparse")
     model = (given / "distorted" / "sparse" / "0" / "images.bin").read_bytes()
-    assert "distorted" in refused("sfm", "-s", given)  # not ours: nothing of it is touched
+    assert "distorted" in refused("sfm", "-s", given)  # not created by snowsplat: stays unchanged
     result = run("sfm", "-s", given, "--skip-matching")
     assert result.code == 0, result.err
     assert (given / "distorted" / "sparse" / "0" / "images.bin").read_bytes() == model
     assert len(load_dataset(given).train) == len(load_dataset(captured).train)
 
 
-def test_a_folder_that_is_taken_is_left_alone(captured, refused, photos, tmp_path):
+def test_a_folder_with_other_files_stays_unchanged(captured, refused, photos, tmp_path):
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "mine.txt").write_text("mine")
@@ -141,13 +141,13 @@ def test_a_folder_that_is_taken_is_left_alone(captured, refused, photos, tmp_pat
     assert [path.name for path in taken.iterdir()] == ["mine.txt"]
 
 
-def test_a_failure_leaves_nothing(refused, photos, tmp_path):
+def test_a_failure_leaves_no_files(refused, photos, tmp_path):
     two = tmp_path / "two"
     two.mkdir()
     for photo in sorted(photos.iterdir())[:2]:
         shutil.copy(photo, two)
-    for mistake in (two, tmp_path / "nothing"):
-        refused("sfm", mistake, "-o", tmp_path / "new" / "out")
+    for inputs in (two, tmp_path / "nothing"):
+        refused("sfm", inputs, "-o", tmp_path / "new" / "out")
         assert not (tmp_path / "new" / "out").exists()
     refused("sfm", "-s", tmp_path)
     refused("sfm")
@@ -158,7 +158,7 @@ def test_a_failure_leaves_nothing(refused, photos, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) in (["new", "two"], ["two"])
 
 
-def test_a_full_disk_loses_nothing_that_is_finished(captured, photos, run, tmp_path, monkeypatch):
+def test_a_full_disk_keeps_finished_stages(captured, photos, run, tmp_path, monkeypatch):
     out = tmp_path / "garden"
 
     def full(*_, **__):
@@ -175,7 +175,7 @@ def test_a_full_disk_loses_nothing_that_is_finished(captured, photos, run, tmp_p
 
 
 @pytest.mark.parametrize("stage", ["photos", "poses", "images"])
-def test_killed_at_any_stage_the_same_command_goes_on(stage, photos, run, tmp_path):
+def test_after_a_kill_in_any_stage_the_same_command_resumes(stage, photos, run, tmp_path):
     out = tmp_path / "garden"
     command = [sys.executable, "-m", "snowsplat", "sfm", photos, "-o", out, *QUICK]
     begun = {

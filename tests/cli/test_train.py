@@ -1,4 +1,4 @@
-"""`snowsplat train`, from flags to files: what is written, what is refused, what a stop leaves."""
+"""`snowsplat train`, from flags to files: its output, errors, interruption and resuming."""
 
 import json
 import os
@@ -56,7 +56,7 @@ def test_the_output_folder(run, dataset, tmp_path):
     assert metrics["psnr"] > 12
     assert set(metrics["views"]) == {"view_00.png", "view_08.png"}
     assert b"element vertex 300" in (out / "input.ply").read_bytes()[:200]
-    # Piped into a file: whole lines, the last of them the result.
+    # Standard output is not a terminal: complete lines, the last one has the result.
     lines = result.out.splitlines()
     assert "7 photos to train on, 2 held out, 48x36, 300 points" in lines[0]
     assert any(line.startswith("step 30/30 (100%)") and "it/s" in line for line in lines)
@@ -121,7 +121,7 @@ def test_every_setting_is_a_flag_and_a_setting_of_some_recipe():
     assert list(RECIPES) == list(get_args(Recipe))
 
 
-def test_a_setting_that_the_recipe_does_not_have(refused, dataset, tmp_path):
+def test_a_setting_of_another_recipe(refused, dataset, tmp_path):
     line = refused(
         "train", dataset, "-o", tmp_path / "out", "--recipe", "mcmc", "--percent-dense", 0.1
     )
@@ -129,7 +129,7 @@ def test_a_setting_that_the_recipe_does_not_have(refused, dataset, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-# Repeatable, resumable
+# Reproducing and resuming
 
 
 def test_seed_threads_checkpoints_and_quiet_do_not_matter(run, dataset, tmp_path):
@@ -161,7 +161,7 @@ def test_kill_9_and_resume_give_the_same_scene(run, start, dataset, tmp_path):
     wait_for(killed / "checkpoints/step_000060.safetensors", process)
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    # The newest one may rot as well: the one before it will do.
+    # If the newest checkpoint is damaged too, the one before it is used.
     newest = max((killed / "checkpoints").iterdir())
     newest.write_bytes(newest.read_bytes()[:1000])
     result = run("train", "-o", killed, "--resume")
@@ -194,8 +194,8 @@ def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path):
     assert not whole.exists()
 
 
-def test_a_second_ctrl_c_saves_no_half_step(run, dataset, tmp_path, monkeypatch):
-    """What it leaves is as after a kill, and goes on to the same scene."""
+def test_a_second_ctrl_c_saves_no_incomplete_step(run, dataset, tmp_path, monkeypatch):
+    """The files are as after a kill, and the training resumes to the same scene."""
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     flags = ("--recipe", "mcmc", *QUICK, "--checkpoint-every", 10)
     assert run("train", dataset, "-o", whole, *flags).code == 0
@@ -207,8 +207,8 @@ def test_a_second_ctrl_c_saves_no_half_step(run, dataset, tmp_path, monkeypatch)
             os.kill(os.getpid(), signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)
 
-    with monkeypatch.context() as pressing:
-        pressing.setattr(Trainer, "_optimize", press_twice)
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_optimize", press_twice)
         result = run("train", dataset, "-o", stopped, *flags)
     assert (result.code, result.err) == (130, "snowsplat: stopped by Ctrl-C\n")
     newest = stopped / "checkpoints/step_000020.safetensors"
@@ -219,25 +219,27 @@ def test_a_second_ctrl_c_saves_no_half_step(run, dataset, tmp_path, monkeypatch)
     assert scene(stopped) == scene(whole)
 
 
-def test_resume_refuses_another_training(refused, run, dataset, tmp_path):
+def test_resume_rejects_other_settings(refused, run, dataset, tmp_path):
     out = tmp_path / "out"
     assert run("train", dataset, "-o", out, *QUICK, "--checkpoint-every", 30).code == 0
     assert "other settings" in refused("train", "-o", out, "--resume", "--seed", 5)
     assert "recipe" in refused("train", "-o", out, "--resume", "--recipe", "paper")
     assert "beyond" in refused("train", "-o", out, "--resume", "--iterations", 10)
     assert "exclude" in refused("train", dataset, "-o", out, "--resume", "--overwrite")
-    # Nor on other photos than before, or to test on those that it was trained on.
+    # Other photos, or another split, which would test on photos that were trained on.
     (tmp_path / "tests.txt").write_text("view_04\n")
     for flags in (["-r", 2], ["--eval"], ["--test-list", tmp_path / "tests.txt"], ["-i", "more"]):
         assert "other settings" in refused("train", "-o", out, "--resume", *flags)
     moved = shutil.copytree(dataset, tmp_path / "moved")
     assert run("train", moved, "-o", out, "--resume", "-r", 1).code == 0
     before = scene(out)
-    assert run("train", "-o", out, "--resume").code == 0  # all is done: the same again
+    assert (
+        run("train", "-o", out, "--resume").code == 0
+    )  # already finished: the scene is written again
     assert scene(out) == before
 
 
-def test_resume_where_nothing_is(refused, run, dataset, tmp_path):
+def test_resume_without_a_checkpoint(refused, run, dataset, tmp_path):
     out = tmp_path / "out"
     assert "no complete checkpoint" in refused("train", "-o", out, "--resume")
     assert not out.exists()
@@ -248,7 +250,7 @@ def test_resume_where_nothing_is(refused, run, dataset, tmp_path):
 
 
 def test_resume_with_less_memory_than_its_gaussians_take(refused, run, tmp_path):
-    """They stay as many as they are: to say that there are fewer would not make it so."""
+    """Resuming cannot reduce the number of Gaussians, so the budget must suffice for all."""
     dataset, out = tmp_path / "capture", tmp_path / "out"
     write_toy_dataset(dataset, "blender", 3, 48, 36)
     flags = ("--recipe", "paper", "--initial-points", 5000, "--checkpoint-every", 2)
@@ -261,7 +263,7 @@ def test_resume_with_less_memory_than_its_gaussians_take(refused, run, tmp_path)
 
 
 def test_resume_keeps_no_second_copy_of_the_state(run, dataset, tmp_path, monkeypatch):
-    """That of the checkpoint is no part of what it says that it takes."""
+    """The tensors of the checkpoint are released before the training starts."""
     out, read = tmp_path / "out", []
     assert run("train", dataset, "-o", out, *QUICK, "--checkpoint-every", 20).code == 0
     load, train = checkpoint.latest, TrainingRun.run
@@ -271,17 +273,17 @@ def test_resume_keeps_no_second_copy_of_the_state(run, dataset, tmp_path, monkey
         read.extend(weakref.ref(tensor) for tensor in start.tensors.values())
         return start
 
-    def looking(training: TrainingRun) -> TrainResult:
+    def checked_run(training: TrainingRun) -> TrainResult:
         assert read
         assert not [tensor for tensor in read if tensor() is not None]
         return train(training)
 
     monkeypatch.setattr(checkpoint, "latest", latest)
-    monkeypatch.setattr(TrainingRun, "run", looking)
+    monkeypatch.setattr(TrainingRun, "run", checked_run)
     assert run("train", "-o", out, "--resume").code == 0
 
 
-# In a given time
+# Time budget
 
 
 def test_minutes(run, dataset, tmp_path):
@@ -298,13 +300,13 @@ def test_minutes(run, dataset, tmp_path):
     assert training["iterations"] == step > 1
     assert training["density"]["max_gaussians"] == 864
 
-    # It is finished, so there is nothing left to do; with --iterations it goes on by steps.
+    # The training is finished; --iterations continues it by steps.
     assert run("train", "-o", out, "--resume", "--iterations", step + 50).code == 0
     assert len(scene(out, step + 50)) > 1000
 
 
-def test_a_stopped_training_keeps_to_its_time(start, run, dataset, tmp_path):
-    """What was spent is known, and so is the schedule as it was stretched."""
+def test_a_resumed_training_keeps_its_time_budget(start, run, dataset, tmp_path):
+    """The checkpoint has the time used so far and the adapted schedule."""
     out = tmp_path / "out"
     process = start("train", dataset, "-o", out, "--minutes", 2, "--checkpoint-every", 50)
     wait_for(out / "checkpoints/step_000200.safetensors", process)
@@ -320,10 +322,10 @@ def test_a_stopped_training_keeps_to_its_time(start, run, dataset, tmp_path):
     assert "in total, of 1.8 s" in result.out
 
 
-# Refused
+# Errors
 
 
-def test_places_that_are_taken(refused, run, dataset, tmp_path):
+def test_output_folders_with_other_files(refused, run, dataset, tmp_path):
     out = tmp_path / "out"
     out.write_text("a file")
     assert "is a file" in refused("train", dataset, "-o", out, *QUICK)
@@ -370,12 +372,12 @@ def test_places_that_are_taken(refused, run, dataset, tmp_path):
         (["--test-list", "absent.txt"], "absent.txt"),
     ],
 )
-def test_flags_that_make_no_sense(refused, dataset, tmp_path, flags, expected):
+def test_invalid_flags(refused, dataset, tmp_path, flags, expected):
     assert expected in refused("train", dataset, "-o", tmp_path / "out", *flags)
     assert not (tmp_path / "out").exists()
 
 
-def test_bad_datasets_write_nothing(refused, dataset, tmp_path):
+def test_invalid_datasets_write_no_files(refused, dataset, tmp_path):
     out = tmp_path / "out"
     assert "no such folder" in refused("train", tmp_path / "absent", "-o", out)
     (tmp_path / "empty").mkdir()
@@ -384,7 +386,7 @@ def test_bad_datasets_write_nothing(refused, dataset, tmp_path):
     shutil.copytree(dataset, damaged)
     (damaged / "images/view_03.png").write_bytes(b"not an image")
     assert "view_03.png" in refused("train", damaged, "-o", out)
-    # A whole header, then nothing: found out only when the photo's turn comes.
+    # A valid header with truncated data: detected only when the photo is decoded.
     photo = (dataset / "images/view_03.png").read_bytes()
     (damaged / "images/view_03.png").write_bytes(photo[: len(photo) // 2])
     assert "view_03.png" in refused("train", damaged, "-o", out, *QUICK, "-q")
@@ -398,9 +400,9 @@ def test_bad_datasets_write_nothing(refused, dataset, tmp_path):
 
 
 def test_divergence_names_the_last_good_checkpoint(refused, run, dataset, tmp_path):
-    """And it makes a scene; nothing that diverged is on disk."""
+    """A scene can be made from it; no diverged value is stored."""
     out = tmp_path / "out"
-    # The rate grows 60-fold a step, until single precision has no number for it.
+    # The learning rate grows 60-fold per step, until it exceeds the range of float32.
     rates = ["--lr-means-final", 1e40, "--lr-means-steps", 25]
     line = refused("train", dataset, "-o", out, *QUICK, *rates, "--checkpoint-every", 3, "-q")
     diverged = int(re.search(r"step (\d+): non-finite .* means \(", line)[1])

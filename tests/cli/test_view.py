@@ -1,4 +1,4 @@
-"""`snowsplat view`: finds the scene, says where the page is, ends by Ctrl-C."""
+"""`snowsplat view`: finds the scene, prints the address of the page, ends on Ctrl-C."""
 
 import shutil
 import signal
@@ -30,8 +30,8 @@ def scene(out: Path) -> Path:
     return out / "point_cloud/iteration_60/point_cloud.ply"
 
 
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
-def test_serves_until_it_is_told_to_end(start, out, sign):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_serves_until_a_signal(start, out, number):
     process = start("view", out, "--no-browser")
     assert str(scene(out)) in process.stdout.readline()
     url = process.stdout.readline().strip()
@@ -40,7 +40,7 @@ def test_serves_until_it_is_told_to_end(start, out, sign):
         assert b"<title>out - snowsplat</title>" in page.read()
     with urllib.request.urlopen(f"{url}scene.compressed.ply", timeout=10) as content:
         assert content.read(4) == b"ply\n"
-    process.send_signal(sign)
+    process.send_signal(number)
     assert process.wait(10) == 0
     assert process.stderr.read() == ""
 
@@ -61,7 +61,7 @@ def test_a_real_browser_at_the_printed_address(start, out):
 
 @pytest.fixture
 def served(run, monkeypatch):
-    """Run the verb up to where it waits: its result, the addresses opened, the site's arguments."""
+    """Run `view` until it waits: its result, the opened addresses, the arguments of the site."""
     from snowsplat.viewer.web import scene as static_scene
 
     def served(*arguments: object, environment: Sequence[str] = ()):
@@ -81,14 +81,14 @@ def served(run, monkeypatch):
     return served
 
 
-def test_it_opens_the_browser_where_one_can_be_seen(served, out):
+def test_opens_a_browser_if_there_is_a_display(served, out):
     result, opened, _ = served(out, environment=["DISPLAY"])
     assert opened == [result.out.splitlines()[1]]
     assert served(out, "--no-browser", environment=["DISPLAY"])[1] == []
     assert served(out)[1] == []
 
 
-def test_over_ssh_it_says_how_to_reach_it(served, out):
+def test_over_ssh_it_prints_the_port_forwarding_command(served, out):
     result, opened, _ = served(out, environment=["SSH_CONNECTION"])
     port = result.out.splitlines()[1].split(":")[2].split("/")[0]
     assert f"ssh -L {port}:127.0.0.1:{port} " in result.out
@@ -96,7 +96,7 @@ def test_over_ssh_it_says_how_to_reach_it(served, out):
     assert "ssh" not in served(out)[0].out
 
 
-def test_open_to_others_it_says_where_they_find_it(served, out):
+def test_with_a_public_host_it_prints_the_address_for_other_computers(served, out):
     here, others = served(out, "--host", "0.0.0.0", "--no-browser")[0].out.splitlines()[1:]
     assert here.startswith("http://127.0.0.1:")
     assert others.endswith(here.replace("127.0.0.1", socket.gethostname()))
@@ -109,10 +109,10 @@ def test_which_scene_and_which_cameras(served, out, tmp_path):
     assert gaussians.means.equal(thirty.means)
     assert len(cameras) == 9
     assert background == (0.0, 0.0, 0.0)
-    assert len(served(scene(out))[2][2]) == 9  # the folder around it is found
+    assert len(served(scene(out))[2][2]) == 9  # the output folder is found from the scene file
     shutil.copy(scene(out), tmp_path / "garden.ply")
     assert served(tmp_path / "garden.ply")[2][2] == []
-    # What `snowsplat make` leaves: OUT/garden.ply is a copy of the scene in OUT/scene.
+    # The output of `snowsplat make`: OUT/garden.ply is a copy of the scene in OUT/scene.
     shutil.copytree(out, tmp_path / "scene")
     assert len(served(tmp_path / "garden.ply")[2][2]) == 9
     assert len(served(tmp_path)[2][2]) == 9
@@ -129,7 +129,7 @@ def test_scenes_of_other_formats(served, out, tmp_path):
         assert len(shown) == len(gaussians)
 
 
-def test_refused(refused, out, tmp_path):
+def test_errors(refused, out, tmp_path):
     assert "needs a scene" in refused("view")
     assert "no such file" in refused("view", tmp_path / "absent")
     assert "holds no scene" in refused("view", tmp_path)

@@ -1,4 +1,4 @@
-"""`snowsplat watch`, and `--view` of `train` and `make`: what is refused, what is said, Ctrl-C."""
+"""`snowsplat watch`, and `--view` of `train` and `make`: errors, printed addresses, Ctrl-C."""
 
 import signal
 import socket
@@ -23,7 +23,7 @@ def trained(dataset, tmp_path_factory) -> Path:
 
 
 def url_of(process) -> str:
-    """Reads what a process says, up to where its page is."""
+    """The address of the page, from the output of a process."""
     while line := process.stdout.readline():
         if line.startswith("watch it in a browser: "):
             return line.split()[-1]
@@ -47,7 +47,7 @@ def test_watch_until_ctrl_c(start, trained):
     assert (process.returncode, err) == (0, "")
 
 
-def test_watch_refuses(refused, trained, tmp_path):
+def test_errors(refused, trained, tmp_path):
     assert "no such folder" in refused("watch", tmp_path / "absent")
     assert "one output folder" in refused("watch")
     (tmp_path / "empty").mkdir()
@@ -57,7 +57,7 @@ def test_watch_refuses(refused, trained, tmp_path):
     assert "--host: cannot listen at 192.0.2.1" in refused("watch", trained, "--host", "192.0.2.1")
 
 
-def test_a_port_that_is_taken(refused, trained, dataset, tmp_path):
+def test_a_port_in_use(refused, trained, dataset, tmp_path):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()
@@ -71,7 +71,7 @@ def test_a_port_that_is_taken(refused, trained, dataset, tmp_path):
         assert not out.exists()
 
 
-def test_a_place_without_a_page(refused, dataset, tmp_path):
+def test_host_and_port_need_view(refused, dataset, tmp_path):
     for flags in (["--port", 9000], ["--host", "0.0.0.0"]):
         assert "add --view" in refused("train", dataset, "-o", tmp_path / "out", *flags)
         assert "add --view" in refused("make", dataset / "images", "-o", tmp_path / "out", *flags)
@@ -93,7 +93,7 @@ def test_the_page_of_a_training_stays_until_ctrl_c(start, run, dataset, tmp_path
     assert (viewed / name).read_bytes() == (plain / name).read_bytes()
 
 
-def test_other_computers_are_told_an_address_that_cannot_be_guessed(start, trained):
+def test_the_address_for_other_computers_has_a_secret_token(start, trained):
     process = start("watch", trained, "--host", "0.0.0.0")
     url = url_of(process)
     others = process.stdout.readline()

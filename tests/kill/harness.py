@@ -166,7 +166,7 @@ def _wait_for_the_group(pid: int) -> None:
         if all(_is_dead(member) for member in _members(pid)):
             return
         time.sleep(0.002)
-    raise Defect("a process of a killed command lives on")
+    raise Defect("a process of a killed command still runs")
 
 
 def _members(group: int) -> list[Path]:
@@ -201,7 +201,7 @@ def check_whole(folder: Path) -> int:
         try:
             _open(path)
         except Exception as error:
-            raise Defect(f"{path.relative_to(folder)} is torn: {error!r}") from error
+            raise Defect(f"{path.relative_to(folder)} is incomplete: {error!r}") from error
         count += 1
     return count
 
@@ -293,7 +293,7 @@ class Job:
     """
 
     name: str
-    verb: str
+    subcommand: str
     output: str
     command: Callable[[Path, bool], list[object]]
     check_done: Callable[[Path, Path], None]
@@ -334,7 +334,7 @@ class Killer:
         return self._references[job.name]
 
     def kill(self, jobs: Sequence[Job], kills: int, number: int = 0) -> list[Defect]:
-        """Rounds of the jobs in turn until this number of kills; returns the findings."""
+        """Run rounds of the jobs in turn until this number of kills; returns the defects."""
         moments = random.Random(f"{self.seed} {number}")
         found: list[Defect] = []
         before = sum(tally.kills for tally in self.tallies.values())
@@ -377,15 +377,15 @@ class Killer:
                 job.check_killed(output, whole / job.output)
             ended = self.zygote.run(job.command(output, True))
             if ended.code != 0:
-                raise Defect(f"exit code {ended.code} at last\n{ended.text}")
+                raise Defect(f"exit code {ended.code} of the final run\n{ended.text}")
             check_whole(folder)
             left = leftovers(folder, self.zygote.temporary)
             if left:
                 raise Defect(f"left behind: {', '.join(left)}")
             job.check_done(output, whole / job.output)
         except Exception as error:
-            story = "; ".join(history)
-            raise Defect(f"{job.name}, round {number} ({story}): {error}") from error
+            runs = "; ".join(history)
+            raise Defect(f"{job.name}, round {number} ({runs}): {error}") from error
         tally.rounds += 1
         shutil.rmtree(folder)
 
@@ -463,7 +463,7 @@ def train_jobs(dataset: Path) -> list[Job]:
         if f"iteration_{metrics['iteration']}" not in {scene.name for scene in scenes}:
             raise Defect("no scene of the last step")
         if not all((scene / "point_cloud.ply").is_file() for scene in scenes):
-            raise Defect("a folder without its scene")
+            raise Defect("a folder without a scene")
         if not (output / "report.html").is_file():
             raise Defect("no report")
 
@@ -474,8 +474,8 @@ def train_jobs(dataset: Path) -> list[Job]:
         return command
 
     def timed(output: Path, again: bool) -> list[object]:
-        words = ["train", dataset, "-o", output, "--minutes", 0.05, "--eval", "--device", "cpu"]
-        return [*words, "--checkpoint-every", 5, "--threads", 1, *(["--resume"] * again)]
+        arguments = ["train", dataset, "-o", output, "--minutes", 0.05, "--eval", "--device", "cpu"]
+        return [*arguments, "--checkpoint-every", 5, "--threads", 1, *(["--resume"] * again)]
 
     def replacing(output: Path, _: bool) -> list[object]:
         return ["train", dataset, "-o", output, *_PLAIN, "--overwrite"]
@@ -495,9 +495,9 @@ def train_jobs(dataset: Path) -> list[Job]:
 def _older_training(folder: Path, dataset: Path) -> Path:
     out = folder / "older"
     if not out.exists():
-        words = ["train", dataset, "-o", out, "--iterations", 25, "--checkpoint-every", 5]
+        arguments = ["train", dataset, "-o", out, "--iterations", 25, "--checkpoint-every", 5]
         subprocess.run(
-            [sys.executable, "-m", "snowsplat", *map(str, words), "--device", "cpu", "--quiet"],
+            [sys.executable, "-m", "snowsplat", *map(str, arguments), "--device", "cpu", "--quiet"],
             env={**os.environ, "PYTHONPATH": _SOURCE},
             check=True,
             stdout=subprocess.DEVNULL,
@@ -509,17 +509,17 @@ def sfm_jobs(photos: Path) -> list[Job]:
     """From photos, with smaller copies."""
 
     def command(output: Path, _: bool) -> list[object]:
-        return ["capture", photos, "-o", output, "--quality", "draft", "--threads", 1, "--resize"]
+        return ["sfm", photos, "-o", output, "--quality", "draft", "--threads", 1, "--resize"]
 
-    return [Job("capture", "capture", "garden", command, _check_dataset)]
+    return [Job("sfm", "sfm", "garden", command, _check_dataset)]
 
 
 def make_jobs(photos: Path) -> list[Job]:
     """From photos to rendered images."""
 
     def command(output: Path, _: bool) -> list[object]:
-        words = ["make", photos, "-o", output, "--quality", "draft", "--threads", 1]
-        return [*words, "--device", "cpu"]
+        arguments = ["make", photos, "-o", output, "--quality", "draft", "--threads", 1]
+        return [*arguments, "--device", "cpu"]
 
     def check_done(output: Path, whole: Path) -> None:
         if names_in(output) != names_in(whole):
@@ -548,7 +548,7 @@ def _check_dataset(output: Path, whole: Path) -> None:
         model = read_model(folder / "sparse" / "0")
         centres.append({image.name: _centre(image) for image in model.images})
     if centres[0].keys() != centres[1].keys():
-        raise Defect("other photos are placed")
+        raise Defect("other photos are registered")
     mine, theirs = (np.array([c[name] for name in sorted(c)]) for c in centres)
     size = np.ptp(theirs, axis=0).max()
     if np.abs(mine - theirs).max() > 1e-3 * size:

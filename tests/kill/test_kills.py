@@ -38,7 +38,7 @@ def test_train(killer, dataset):
     assert not killer.kill(train_jobs(dataset), 4)
 
 
-def test_dataset(killer, photos):
+def test_sfm(killer, photos):
     assert not killer.kill(sfm_jobs(photos), 3)
 
 
@@ -79,14 +79,14 @@ def test_an_old_checkpoint_left_by_a_kill_is_removed(zygote, dataset, tmp_path):
     command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
     command += ["--device", "cpu", "--threads", 1]
     assert zygote.run(command).code == 0
-    kept = names_in(out / "checkpoints")
-    assert kept == {"step_000020.safetensors", "step_000030.safetensors"}
+    remaining = names_in(out / "checkpoints")
+    assert remaining == {"step_000020.safetensors", "step_000030.safetensors"}
     shutil.copy(
         out / "checkpoints/step_000020.safetensors", out / "checkpoints/step_000010.safetensors"
     )
     done = zygote.run([*command, "--resume"])
     assert done.code == 0, done.text
-    assert names_in(out / "checkpoints") == kept
+    assert names_in(out / "checkpoints") == remaining
 
 
 def test_damaged_checkpoints_are_not_overwritten(zygote, dataset, tmp_path):
@@ -100,7 +100,7 @@ def test_damaged_checkpoints_are_not_overwritten(zygote, dataset, tmp_path):
     before = {name: (out / name).read_bytes() for name in names_in(out)}
     ended = zygote.run([*command, "--resume"])
     assert ended.code == 2
-    assert "holds checkpoints but no whole checkpoint to resume" in ended.text
+    assert "holds checkpoints but no complete checkpoint to resume" in ended.text
     assert {name: (out / name).read_bytes() for name in names_in(out)} == before
 
 

@@ -1,4 +1,4 @@
-"""Full and read-only disks, lost folders, limits, narrow terminals: one-line errors, no loss."""
+"""Full and read-only disks, removed folders, limits, narrow terminals: one-line errors, no loss."""
 
 import json
 import os
@@ -89,43 +89,43 @@ def commands(place: Path, trained: Path, dataset: Path, photos: Path) -> dict[st
         "train": ["train", dataset, "-o", place / "t", "--iterations", 9, *CPU],
         "resume": ["train", "-o", output, "--resume", "--iterations", 60, *CPU],
         "render": ["render", output, *CPU],
-        "film": ["render", output, "--path", "ellipse", "--seconds", 0.2, *CPU],
+        "video": ["render", output, "--path", "ellipse", "--seconds", 0.2, *CPU],
         "evaluate": ["evaluate", output, *CPU],
-        "capture": ["capture", photos, "-o", place / "c", "--quality", "draft", "--threads", 1],
+        "sfm": ["sfm", photos, "-o", place / "c", "--quality", "draft", "--threads", 1],
         "make": ["make", photos, "-o", place / "m", "--quality", "draft", *CPU],
     }
 
 
-VERBS = ["convert", "train", "resume", "render", "film", "evaluate", "capture", "make"]
+SUBCOMMANDS = ["convert", "train", "resume", "render", "video", "evaluate", "sfm", "make"]
 
 
 # Disks
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_a_read_only_folder(verb, zygote, place, trained, dataset, photos):
+@pytest.mark.parametrize("subcommand", SUBCOMMANDS)
+def test_a_read_only_folder(subcommand, zygote, place, trained, dataset, photos):
     shutil.copytree(trained, place / "trained")
     before = {name: digest(place / name) for name in names_in(place)}
     with read_only(place):
-        ended = zygote.run(commands(place, trained, dataset, photos)[verb])
+        ended = zygote.run(commands(place, trained, dataset, photos)[subcommand])
     refused(ended, rf"{place}\S*: Read-only file system")
     assert {name: digest(place / name) for name in names_in(place)} == before
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_a_full_disk(verb, zygote, place, trained, dataset, photos):
+@pytest.mark.parametrize("subcommand", SUBCOMMANDS)
+def test_a_full_disk(subcommand, zygote, place, trained, dataset, photos):
     # There is hardly more space than the existing files need.
     used = sum((trained / name).stat().st_size // 4096 + 1 for name in names_in(trained)) * 4
     with full(place, used + 60 + 4 * len(names_in(trained))):
         shutil.copytree(trained, place / "trained")
         fill(place)
         before = {name: digest(place / name) for name in names_in(place)}
-        ended = zygote.run(commands(place, trained, dataset, photos)[verb])
+        ended = zygote.run(commands(place, trained, dataset, photos)[subcommand])
         refused(ended, r"No space left on device|the disk is full|the disk has 0")
         assert not leftovers(place)
         after = {name: digest(place / name) for name in names_in(place)}
         changed = {name for name in before if after.get(name) != before[name]}
-        assert not changed, f"{verb} changed {changed}"
+        assert not changed, f"{subcommand} changed {changed}"
 
 
 def test_a_disk_that_becomes_full_during_a_training(zygote, place, dataset):
@@ -163,12 +163,14 @@ def test_a_disk_too_full_for_the_first_scene(zygote, place, dataset):
         assert again.code == 0, again.text
 
 
-def test_a_disk_that_becomes_full_during_a_dataset(zygote, place, photos):
+def test_a_disk_that_becomes_full_during_sfm(zygote, place, photos):
     """Finished stages are kept; with free space the same command resumes."""
     out = place / "garden"
-    command = ["capture", photos, "-o", out, "--quality", "draft", "--threads", 1]
+    command = ["sfm", photos, "-o", out, "--quality", "draft", "--threads", 1]
     with full(place, 700):
-        refused(zygote.run(command), rf"{out}: the disk is full; make room, then give the same")
+        refused(
+            zygote.run(command), rf"{out}: the disk is full; free some space, then run the same"
+        )
         assert list(json.loads((out / "capture.json").read_text())["stages"]) == ["photos"]
         subprocess.run(["mount", "-o", "remount,size=50m", place], check=True)
         again = zygote.run(command)
@@ -177,7 +179,7 @@ def test_a_disk_that_becomes_full_during_a_dataset(zygote, place, photos):
         assert not leftovers(place)
 
 
-# Folders that vanish
+# Removed folders
 
 
 def when(condition: Callable[[], bool], then: Callable[[], object]) -> Callable[[int], None]:
@@ -207,7 +209,7 @@ def test_a_training_whose_folder_is_moved_continues(zygote, place, dataset):
     )
     assert ended.code == 0, ended.text
     assert ended.text.count("snowsplat: ") == 1
-    assert f"snowsplat: warning: {out}: is gone; it is made anew" in ended.text
+    assert f"snowsplat: warning: {out}: was removed; it is created again" in ended.text
     check_whole(place)
     assert not leftovers(place)
     assert checkpoint.latest(elsewhere / "checkpoints") is not None
@@ -215,7 +217,7 @@ def test_a_training_whose_folder_is_moved_continues(zygote, place, dataset):
     assert zygote.run(["evaluate", out, *CPU]).code == 0
 
 
-def test_a_training_whose_photos_vanish(zygote, place, dataset):
+def test_a_training_whose_photos_are_removed(zygote, place, dataset):
     """At the start, and before it resumes: saved files are kept."""
     mine, out = place / "capture", place / "out"
     shutil.copytree(dataset, mine)
@@ -238,12 +240,12 @@ def test_a_training_whose_photos_vanish(zygote, place, dataset):
     assert not leftovers(place)
 
 
-@pytest.mark.parametrize("verb", ["capture", "make"])
-def test_photos_or_the_folder_vanish_during_sfm(verb, zygote, place, photos):
+@pytest.mark.parametrize("subcommand", ["sfm", "make"])
+def test_photos_or_the_folder_are_removed_during_sfm(subcommand, zygote, place, photos):
     mine, out = place / "photos", place / "out"
     shutil.copytree(photos, mine)
-    command = [verb, mine, "-o", out, "--quality", "draft", "--threads", 1]
-    inner = out / "capture" if verb == "make" else out
+    command = [subcommand, mine, "-o", out, "--quality", "draft", "--threads", 1]
+    inner = out / "capture" if subcommand == "make" else out
     begun = (inner / "distorted" / "database.db").exists
     # The photos have been copied already, so it may succeed.
     ended = zygote.run(command, while_it_runs=when(begun, lambda: shutil.rmtree(inner / "input")))
@@ -257,13 +259,13 @@ def test_photos_or_the_folder_vanish_during_sfm(verb, zygote, place, photos):
 # Limits
 
 
-@pytest.mark.parametrize("verb", ["convert", "train", "resume", "render", "film", "capture"])
-def test_a_limit_of_the_size_of_files(verb, zygote, place, trained, dataset, photos):
+@pytest.mark.parametrize("subcommand", ["convert", "train", "resume", "render", "video", "sfm"])
+def test_a_limit_of_the_size_of_files(subcommand, zygote, place, trained, dataset, photos):
     shutil.copytree(trained, place / "trained")
     before = {name: digest(place / name) for name in names_in(place)}
-    limit = {"capture": 50_000, "resume": 5000}.get(verb, 500)
+    limit = {"sfm": 50_000, "resume": 5000}.get(subcommand, 500)
     ended = zygote.run(
-        commands(place, trained, dataset, photos)[verb], limits={"RLIMIT_FSIZE": limit}
+        commands(place, trained, dataset, photos)[subcommand], limits={"RLIMIT_FSIZE": limit}
     )
     refused(ended, r"File too large")
     assert not leftovers(place)
@@ -272,12 +274,14 @@ def test_a_limit_of_the_size_of_files(verb, zygote, place, trained, dataset, pho
     assert all(digest(place / name) == before[name] for name in kept)
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_a_limit_of_open_files(verb, zygote, place, trained, dataset, photos):
+@pytest.mark.parametrize("subcommand", SUBCOMMANDS)
+def test_a_limit_of_open_files(subcommand, zygote, place, trained, dataset, photos):
     """So low that hardly any file can be opened."""
     shutil.copytree(trained, place / "trained")
     before = names_in(place)
-    ended = zygote.run(commands(place, trained, dataset, photos)[verb], limits={"RLIMIT_NOFILE": 1})
+    ended = zygote.run(
+        commands(place, trained, dataset, photos)[subcommand], limits={"RLIMIT_NOFILE": 1}
+    )
     refused(ended, r"Too many open files")
     assert not leftovers(place)
     assert names_in(place) >= before
@@ -306,10 +310,10 @@ def bars(text: str) -> list[str]:
 
 
 def test_a_narrow_terminal(zygote, place, trained, dataset, photos):
-    all_of_them = commands(place, trained, dataset, photos)
+    all_commands = commands(place, trained, dataset, photos)
     shutil.copytree(trained, place / "trained")
     longer = ["train", dataset, "-o", place / "t", "--iterations", 500, *CPU]
-    for command in (longer, all_of_them["capture"], all_of_them["film"], all_of_them["evaluate"]):
+    for command in (longer, all_commands["sfm"], all_commands["video"], all_commands["evaluate"]):
         ended = zygote.run(command, columns=24)
         assert ended.code == 0, ended.text
         assert "Traceback" not in ended.text

@@ -107,11 +107,11 @@ def _child(run: dict) -> None:
     sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
     sys.argv = ["snowsplat", *run["argv"]]
     from snowsplat.cli.main import main
-    from snowsplat.pipeline import make as making
+    from snowsplat.pipeline import make
 
     # `make` with a very short training that always writes checkpoints.
-    making._CHECKPOINT_SECONDS = 0.1
-    making.PRESETS["draft"] = replace(making.PRESETS["draft"], iterations=120)
+    make._CHECKPOINT_SECONDS = 0.1
+    make.PRESETS["draft"] = replace(make.PRESETS["draft"], iterations=120)
     count = os.open(run["log"] + ".changes", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for name, value in run.get("limits", {}).items():
         which = getattr(resource, name)
@@ -122,8 +122,8 @@ def _child(run: dict) -> None:
     _kill_at(run.get("at"), run.get("delay", 0.0), run["watched"], changes)
     try:
         code = main(run["argv"])
-    except SystemExit as leaving:
-        code = int(leaving.code or 0)
+    except SystemExit as ended:
+        code = int(ended.code or 0)
     except BaseException:
         sys.excepthook(*sys.exc_info())
         code = 1

@@ -39,7 +39,9 @@ def main() -> int:
     )
     parser.add_argument("--runs", type=int, default=20_000, help="of each reader")
     parser.add_argument("--seconds", type=float, default=300.0, help="at most, of each reader")
-    parser.add_argument("--only", action="append", metavar="TEXT", help="readers named so")
+    parser.add_argument(
+        "--only", action="append", metavar="TEXT", help="only readers whose names contain it"
+    )
     parser.add_argument("--findings", type=Path, default=Path("build/fuzz"), metavar="FOLDER")
     parser.add_argument("--random", action="store_true", help="without atheris")
     parser.add_argument("--seed", type=int, default=0)
@@ -57,7 +59,7 @@ def _all(flags: argparse.Namespace) -> int:
     names = [reader.name for reader in READERS]
     wanted = [n for n in names if not flags.only or any(text in n for text in flags.only)]
     if not wanted:
-        print(f"no reader is named so; there are: {', '.join(names)}", file=sys.stderr)
+        print(f"no reader has such a name; there are: {', '.join(names)}", file=sys.stderr)
         return 2
     print("guided by coverage (atheris)" if guided else "at random: atheris is not installed")
     flags.findings.mkdir(parents=True, exist_ok=True)
@@ -91,11 +93,11 @@ def _one(name: str, flags: argparse.Namespace, guided: bool) -> tuple[int, float
         except subprocess.TimeoutExpired:
             code = -1
     seconds = time.monotonic() - start
-    told = json.loads(note.read_text()) if note.exists() else {"runs": 0, "failure": ""}
-    failure = told["failure"]
+    report = json.loads(note.read_text()) if note.exists() else {"runs": 0, "failure": ""}
+    failure = report["failure"]
     if code != 0 and not failure:
         failure = f"the process ended with {code}, see {log} and the last file beside it"
-    return told["runs"], seconds, failure
+    return report["runs"], seconds, failure
 
 
 def _file_name(reader: str) -> str:
@@ -132,7 +134,7 @@ class _Child:
         generator = random.Random(self.flags.seed)
         while self.runs < self.flags.runs and time.monotonic() < self.end:
             self.try_out(self.damaged(self.reader.valid, generator))
-        self._tell("")
+        self._report("")
         return 0
 
     def _guided(self) -> int:
@@ -160,12 +162,12 @@ class _Child:
 
     def _one_input(self, data: bytes) -> None:
         if self.runs >= self.flags.runs or time.monotonic() > self.end:
-            self._tell("")
+            self._report("")
             os._exit(0)  # libFuzzer can only be ended by a failure
         self.try_out(data)
 
     def damaged(self, data: bytes, generator: random.Random) -> bytes:
-        """Of one kind or another."""
+        """Damage the bytes, or their JSON."""
         changes = [self.damage.random_change(generator) for _ in range(generator.randint(1, 4))]
         as_json = self.reader.json and generator.random() < 0.5
         return (self.damage.damaged_json if as_json else self.damage.damaged)(data, changes)
@@ -183,13 +185,13 @@ class _Child:
             if isinstance(error, KeyboardInterrupt):
                 raise
             traceback.print_exc()
-            kept = self.last.rename(self.last.with_suffix(".failed"))
+            stored = self.last.rename(self.last.with_suffix(".failed"))
             first = (str(error).splitlines() or [""])[0][:200]
-            self._tell(f"{type(error).__name__}: {first}; {kept}")
+            self._report(f"{type(error).__name__}: {first}; {stored}")
             os._exit(1)
         self.runs += 1
 
-    def _tell(self, failure: str) -> None:
+    def _report(self, failure: str) -> None:
         self.note.write_text(json.dumps({"runs": self.runs, "failure": failure}))
 
 

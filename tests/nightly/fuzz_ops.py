@@ -52,7 +52,7 @@ def main() -> int:
         command = [sys.executable, __file__, "--part", name, str(cases), "--seed", str(flags.seed)]
         if subprocess.run(command, env=environment, check=False).returncode != 0:
             failed.append(name)
-    print(f"something does not hold on: {', '.join(failed)}" if failed else "all of it holds")
+    print(f"failed on: {', '.join(failed)}" if failed else "all checks hold")
     return 1 if failed else 0
 
 
@@ -81,12 +81,14 @@ def _part(name: str, cases: int, seed: int) -> int:
             started, done = time.monotonic(), [0]
             try:
                 _run(check, variant, count, seed, done)
-                said = "holds"
+                verdict = "holds"
             except Exception:
                 traceback.print_exc(file=sys.stdout)
-                said, wrong = "DOES NOT HOLD", wrong + 1
+                verdict, wrong = "DOES NOT HOLD", wrong + 1
             seconds = time.monotonic() - started
-            print(f"{name} {variant} {check}: {done[0]} cases, {said}, {seconds:.0f} s", flush=True)
+            print(
+                f"{name} {variant} {check}: {done[0]} cases, {verdict}, {seconds:.0f} s", flush=True
+            )
     return 1 if wrong else 0
 
 

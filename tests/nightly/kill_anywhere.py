@@ -35,25 +35,25 @@ from snowsplat.formats import write_gaussians
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
-VERBS = ("capture", "train", "make", "convert")
+SUBCOMMANDS = ("sfm", "train", "make", "convert")
 # Shares of all kills; slow subcommands have fewer.
-_SHARES = {"capture": 0.2, "train": 0.35, "make": 0.15, "convert": 0.3}
+_SHARES = {"sfm": 0.2, "train": 0.35, "make": 0.15, "convert": 0.3}
 
 
-def jobs(folder: Path, verbs: list[str]) -> list[Job]:
+def jobs(folder: Path, subcommands: list[str]) -> list[Job]:
     """The jobs of all subcommands, with small inputs in ``folder``."""
     found: list[Job] = []
-    if "convert" in verbs:
+    if "convert" in subcommands:
         write_gaussians(folder / "in.ply", some_gaussians(4000, 1))
         write_gaussians(folder / "other.ply", some_gaussians(100, 2))
         found += convert_jobs(folder / "in.ply", folder / "other.ply")
-    if "train" in verbs:
+    if "train" in subcommands:
         write_toy_dataset(folder / "capture", "colmap-bin", 9, 48, 36, n_points=300)
         found += train_jobs(folder / "capture")
-    if "capture" in verbs or "make" in verbs:
+    if "sfm" in subcommands or "make" in subcommands:
         write_synthetic_photos(folder / "photos", n_views=16, width=320, height=240)
-        found += sfm_jobs(folder / "photos") if "capture" in verbs else []
-        found += make_jobs(folder / "photos") if "make" in verbs else []
+        found += sfm_jobs(folder / "photos") if "sfm" in subcommands else []
+        found += make_jobs(folder / "photos") if "make" in subcommands else []
     return found
 
 
@@ -62,22 +62,24 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--kills", type=int, default=200, help="in all, at least (default: 200)")
-    parser.add_argument("--verbs", nargs="+", choices=VERBS, default=list(VERBS))
+    parser.add_argument(
+        "--subcommands", "--verbs", nargs="+", choices=SUBCOMMANDS, default=list(SUBCOMMANDS)
+    )
     parser.add_argument("--seed", type=int, default=int(time.time()), help="default: the time")
     parser.add_argument("--folder", type=Path, help="to work in (default: a temporary one)")
     flags = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="kill_anywhere_", dir=flags.folder))
     print(f"seed {flags.seed}, in {folder}", flush=True)
-    everything = jobs(folder, flags.verbs)
-    share = sum(_SHARES[verb] for verb in flags.verbs)
+    everything = jobs(folder, flags.subcommands)
+    share = sum(_SHARES[subcommand] for subcommand in flags.subcommands)
     defects: list[Defect] = []
     start = time.monotonic()
     with Zygote(folder / "work") as zygote:
         killer = Killer(zygote, flags.seed)
-        for verb in flags.verbs:
-            of_verb = [job for job in everything if job.verb == verb]
-            found = killer.kill(of_verb, math.ceil(flags.kills * _SHARES[verb] / share))
-            print_tally(killer, verb)
+        for subcommand in flags.subcommands:
+            selected = [job for job in everything if job.subcommand == subcommand]
+            found = killer.kill(selected, math.ceil(flags.kills * _SHARES[subcommand] / share))
+            print_tally(killer, subcommand)
             for defect in found:
                 print(f"DEFECT {defect}", flush=True)
             defects += found
@@ -88,9 +90,9 @@ def main() -> int:
     return 1 if defects else 0
 
 
-def print_tally(killer: Killer, verb: str) -> None:
+def print_tally(killer: Killer, subcommand: str) -> None:
     for name, tally in killer.tallies.items():
-        if name.split()[0] == verb:
+        if name.split()[0] == subcommand:
             print(
                 f"{name:24}{tally.kills:5} kills in {tally.rounds} rounds, {tally.files} files "
                 f"opened after them; {tally.ended} runs ended before their kill",

@@ -37,7 +37,7 @@ def main() -> int:
             failed += [] if _tests(package, isa) else [isa]
     if "threads" not in flags.skip and not _threads():
         failed.append("threads")
-    print(f"found something in: {', '.join(failed)}" if failed else "nothing was found")
+    print(f"errors in: {', '.join(failed)}" if failed else "no errors")
     return 1 if failed else 0
 
 
@@ -91,7 +91,7 @@ def _tests(package: Path, isa: str) -> bool:
     command += ["-o", f"pythonpath={package}"]
     environment = _preloaded() | {"PYTHONPATH": str(package), "SNOWSPLAT_ISA": isa}
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    lines = run.stdout.strip().splitlines() or ["pytest said nothing"]
+    lines = run.stdout.strip().splitlines() or ["no output of pytest"]
     print(f"{isa}: {lines[-1]}, {time.monotonic() - started:.0f} s in all", flush=True)
     if run.returncode != 0:
         print(run.stdout[-5000:], run.stderr[-5000:], flush=True)
@@ -107,7 +107,7 @@ def _threads() -> bool:
     sources = sorted((NATIVE / "cpu").glob("*.cpp"))
     subprocess.run([*command, *sources, "-o", program], check=True)
     run = subprocess.run([program], capture_output=True, text=True)
-    print(f"threads: {run.stdout.strip() or 'no word'}; exit code {run.returncode}", flush=True)
+    print(f"threads: {run.stdout.strip() or 'no output'}; exit code {run.returncode}", flush=True)
     if run.returncode != 0:
         print(run.stderr[-5000:], flush=True)
     return run.returncode == 0

@@ -7,7 +7,7 @@ least-squares slope over the last half below BOUND), threads and descriptors wit
 training must have made steps all the time, and the terminal must have no unexpected output. Before
 that, a thousand connections must leave the training RATIO of its steps per second.
 
-    python tests/nightly/soak_servers.py CAPTURE --minutes 60
+    python tests/nightly/soak_servers.py DATASET --minutes 60
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ LIMITS = {"threads": 320, "descriptors": 400}
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"}
 
 
-def _hear() -> None:
+def _accept_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -75,7 +75,7 @@ class Server:
             stderr=subprocess.STDOUT,
             text=True,
             # A shell starts background processes with Ctrl-C ignored, also their children.
-            preexec_fn=_hear,
+            preexec_fn=_accept_ctrl_c,
         )
         server = cls(name, process)
         threading.Thread(target=server._read, daemon=True).start()
@@ -93,8 +93,8 @@ class Server:
     @property
     def step(self) -> int:
         """The last step that it reported."""
-        told = [line for line in self.output[-50:] if line.startswith("step ")]
-        return int(re.findall(r"\d+", told[-1].replace(",", ""))[0]) if told else 0
+        lines = [line for line in self.output[-50:] if line.startswith("step ")]
+        return int(re.findall(r"\d+", lines[-1].replace(",", ""))[0]) if lines else 0
 
     def sample(self, seconds: float) -> None:
         folder = Path(f"/proc/{self.process.pid}")
@@ -116,12 +116,14 @@ class Server:
         last = table[len(table) // 2 :]
         slope = 60.0 * np.polyfit(last[:, 0], last[:, 1], 1)[0]
         drift = np.median(last[-len(last) // 4 :, 1]) - np.median(last[: len(last) // 4, 1])
-        print(f"{self.name}: memory over the last half {slope:+.3f} MiB a minute ({drift:+.1f} MiB")
+        print(
+            f"{self.name}: memory over the last half {slope:+.3f} MiB per minute ({drift:+.1f} MiB"
+        )
         print(f"  between its first and last quarters); threads at most {table[:, 2].max():.0f},")
         print(f"  descriptors at most {table[:, 3].max():.0f}")
         found = []
         if slope > BOUND:
-            found.append(f"{self.name}: memory grows by {slope:.2f} MiB a minute")
+            found.append(f"{self.name}: memory grows by {slope:.2f} MiB per minute")
         for column, (what, most) in enumerate(LIMITS.items(), 2):
             if table[:, column].max() > most:
                 found.append(f"{self.name}: {table[:, column].max():.0f} {what}")
@@ -130,7 +132,7 @@ class Server:
         strange = re.compile("Traceback|Error|Warning|viser|websockets|asyncio", re.IGNORECASE)
         for line in self.output:
             if strange.search(line) and not line.startswith("step "):
-                found.append(f"{self.name}: said {line.strip()!r}")
+                found.append(f"{self.name}: printed {line.strip()!r}")
         return found
 
 
@@ -159,8 +161,8 @@ def undisturbed(training: Server) -> float:
                 process.kill()
                 process.wait()
     quiet, noisy = (float(np.median(rates[attacked])) for attacked in (False, True))
-    print(f"steps a second: {quiet:.1f} alone, {noisy:.1f} among 1000 connections, idle and")
-    print(f"  hammering: {noisy / quiet:.2f} of it (medians of 8 turns of 6 s)")
+    print(f"steps per second: {quiet:.1f} alone, {noisy:.1f} with 1000 idle and active")
+    print(f"  connections: ratio {noisy / quiet:.2f} (medians of 8 measurements of 6 s)")
     return noisy / quiet
 
 
@@ -173,7 +175,7 @@ class Crowd:
         self.done: Counter[str] = Counter()
         self.wrong: list[str] = []
         self._threads = [
-            threading.Thread(target=self._come, args=(seed + i, kind), daemon=True)
+            threading.Thread(target=self._visit_repeatedly, args=(seed + i, kind), daemon=True)
             for i, kind in enumerate([*"vvvv", *"ss", *"hh"])
         ]
 
@@ -186,14 +188,14 @@ class Crowd:
         for thread in self._threads:
             thread.join(30)
 
-    def _come(self, seed: int, kind: str) -> None:
+    def _visit_repeatedly(self, seed: int, kind: str) -> None:
         rng = random.Random(seed)
         while not self._over.is_set():
             visit = {"v": self._visit, "s": self._load, "h": self._attack}[kind]
             try:
                 self.done[visit(rng)] += 1
             except (OSError, TimeoutError, WebSocketException, InvalidHandshake):
-                self.done["was cut off"] += 1
+                self.done["disconnected by the server"] += 1
             self._over.wait(rng.uniform(0.0, 3.0))
 
     def _visit(self, rng: random.Random) -> str:
@@ -238,7 +240,7 @@ class Crowd:
             answer = get(url)
         # The server may reject it because of the other connections, but the response must be valid.
         if status(answer) in (0, 503):
-            return "turned away"
+            return "rejected"
         if status(answer) != wanted:
             self.wrong.append(f"{url}: {answer[:200]!r}")
         return what
@@ -288,7 +290,7 @@ def main() -> int:
             alive = [server for server in (training, scene) if server.process.poll() is None]
             if len(alive) < 2:
                 found += [
-                    f"{server.name}: ended by itself with {server.process.returncode}; at last: "
+                    f"{server.name}: ended by itself with {server.process.returncode}; output: "
                     + "".join(server.output[-20:])
                     for server in (training, scene)
                     if server not in alive
@@ -313,7 +315,7 @@ def main() -> int:
             server.end()
         found += [*training.defects(), *scene.defects(), *crowd.wrong]
         if min(steps[1:], default=1.0) <= 0.0:
-            found.append("the training stood still")
+            found.append("the training made no steps")
         for what, times in sorted(crowd.done.items()):
             print(f"{times:7d} {what}")
     print(*found, sep="\n")

@@ -9,7 +9,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
 
 
-def test_how_many_to_keep():
+def test_number_of_gaussians_to_keep():
     assert [gaussians_to_keep(text, 400) for text in ("0", "17", "0%", "50%", "12.5%", "100%")] == [
         *(0, 17, 0, 200, 50, 400)
     ]
@@ -17,7 +17,7 @@ def test_how_many_to_keep():
         gaussians_to_keep("¾", 400)
 
 
-def test_edits_that_cannot_be_applied():
+def test_invalid_edits():
     for edits, setting in (
         ({"sh_degree": 4}, "sh_degree"),
         ({"scale": 0.0}, "scale"),
@@ -29,7 +29,7 @@ def test_edits_that_cannot_be_applied():
         assert error.value.setting == setting
 
 
-def test_two_scenes_become_one(tmp_path):
+def test_two_scenes_are_merged(tmp_path):
     zeros = torch.zeros(3, 1, 3)
     one = Gaussians(
         torch.arange(9.0).reshape(3, 3),

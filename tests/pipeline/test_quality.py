@@ -1,9 +1,9 @@
-"""The quality of `make` that a given time allows."""
+"""The quality that `make` chooses for a time budget."""
 
 from snowsplat.pipeline.quality import quality_within
 
 
-def test_the_quality_that_a_time_allows():
+def test_quality_within_a_time_budget():
     assert [quality_within(seconds, 50, 0, 2) for seconds in (30, 60, 300, 3600)] == [
         *("draft", "draft", "normal", "best"),
     ]

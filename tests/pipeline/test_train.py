@@ -18,7 +18,7 @@ from snowsplat.util.errors import SettingError, UserError
 
 
 class Recorder(Observer):
-    """What a training reports, in order."""
+    """Records the events of a training, in order."""
 
     def __init__(self, interrupt_at: int = 0) -> None:
         self.events: list[str] = []
@@ -46,7 +46,7 @@ def options(steps: int, **changes) -> TrainOptions:
     return TrainOptions(settings={"iterations": steps}, **changes)
 
 
-def test_from_a_dataset_to_figures_and_images_without_printing(dataset, tmp_path, capfd):
+def test_from_a_dataset_to_metrics_and_images_without_printing(dataset, tmp_path, capfd):
     recorder, out = Recorder(), tmp_path / "out"
     result = train(dataset, out, options(5, hold_out=8), observer=recorder)
     assert recorder.events == [
@@ -61,7 +61,7 @@ def test_from_a_dataset_to_figures_and_images_without_printing(dataset, tmp_path
     scene = load_trained(out)
     assert (len(scene.gaussians), scene.iteration) == (result.gaussians, 5)
     names = []
-    evaluation = evaluate(scene, on_view=lambda figures: names.append(figures.name))
+    evaluation = evaluate(scene, on_view=lambda metrics: names.append(metrics.name))
     assert names == ["view_00.png", "view_08.png"]
     assert result.evaluation is not None
     assert evaluation == result.evaluation[1]
@@ -90,14 +90,14 @@ def test_options_that_contradict_each_other():
         TrainOptions(minutes=0.0)
 
 
-def test_a_taken_folder_names_the_settings(dataset, tmp_path):
+def test_the_error_of_a_nonempty_folder_names_the_settings(dataset, tmp_path):
     train(dataset, tmp_path / "out", options(2))
     with pytest.raises(UserError, match="use `resume` to continue it, `overwrite` to replace it"):
         train(dataset, tmp_path / "out", options(2))
 
 
 def test_a_time_budget_reads_the_dataset_once(tmp_path, monkeypatch):
-    """Photos become smaller, so there are two datasets; their files are read for the first one."""
+    """The photos are downscaled, so there are two datasets; files are read only for the first."""
     dataset = write_toy_dataset(tmp_path / "dataset", "colmap-bin", 4, 480, 40, n_points=300)
     calls, read = [], load._read
 

@@ -22,7 +22,7 @@ def trained(dataset, tmp_path_factory) -> Path:
     return out
 
 
-def test_the_newest_is_shown_as_it_comes(trained, tmp_path):
+def test_the_newest_scene_is_shown(trained, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(trained, out)
     folder = OutputFolder(out)
@@ -40,7 +40,7 @@ def test_the_newest_is_shown_as_it_comes(trained, tmp_path):
     assert of_checkpoint.gaussians.means.equal(tensors["gaussians.means"])
     assert newest() is of_checkpoint  # not read again
 
-    # A newer one comes, first damaged, then whole.
+    # A newer scene appears, first damaged, then complete.
     path = folder.scene_path(50)
     path.parent.mkdir()
     path.write_bytes(b"ply\n")
@@ -51,7 +51,7 @@ def test_the_newest_is_shown_as_it_comes(trained, tmp_path):
     assert later.number != of_checkpoint.number
     shutil.rmtree(out / "point_cloud")
     shutil.rmtree(out / "checkpoints")
-    assert newest() is later  # replaced at this moment
+    assert newest() is later  # as while the files are replaced
     assert NewestScene(folder, None)().gaussians is None
     assert "--checkpoint-every" in " ".join(NewestScene(folder, None)().about)
 
@@ -65,7 +65,7 @@ def test_a_checkpoint_of_something_else(trained, tmp_path):
             NewestScene(out, None)()
 
 
-def test_the_folder_of_make_holds_that_of_a_training(trained, tmp_path):
+def test_the_folder_of_make_contains_that_of_the_training(trained, tmp_path):
     shutil.copytree(trained, tmp_path / "made" / "scene")
     assert watched_folder(tmp_path / "made").path == tmp_path / "made" / "scene"
     assert watched_folder(trained).path == trained

@@ -7,8 +7,8 @@ import av
 import numpy as np
 import pytest
 
-from snowsplat.trajectory import video as film_module
-from snowsplat.trajectory.video import film
+from snowsplat.trajectory import video as video_module
+from snowsplat.trajectory.video import video_writer
 from snowsplat.util.errors import UserError
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
@@ -22,7 +22,7 @@ def image(i: int) -> np.ndarray:
 
 
 def write(path: Path) -> None:
-    with film(path, WIDTH, HEIGHT, 24) as add:
+    with video_writer(path, WIDTH, HEIGHT, 24) as add:
         for i in range(FRAMES):
             add(image(i))
 
@@ -34,7 +34,7 @@ def decoded(path: Path) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("encoder", ["libx264", "mpeg4"])
 def test_decoded_frames_equal_written_frames(tmp_path, monkeypatch, encoder):
-    monkeypatch.setattr(film_module, "_ENCODERS", (encoder,))
+    monkeypatch.setattr(video_module, "_ENCODERS", (encoder,))
     write(tmp_path / "a.mp4")
     frames = decoded(tmp_path / "a.mp4")
     assert len(frames) == FRAMES
@@ -66,9 +66,9 @@ def test_quality_is_that_of_h264_at_crf_18(tmp_path):
 
 def test_other_encoders_get_a_bit_rate(tmp_path, monkeypatch):
     """0.25 bits per pixel, of blocks that change with every frame and need more."""
-    monkeypatch.setattr(film_module, "_ENCODERS", ("mpeg4",))
+    monkeypatch.setattr(video_module, "_ENCODERS", ("mpeg4",))
     random = np.random.default_rng(0)
-    with film(tmp_path / "a.mp4", 128, 96, 24) as add:
+    with video_writer(tmp_path / "a.mp4", 128, 96, 24) as add:
         for _ in range(48):
             blocks = np.kron(random.random((12, 16, 3)), np.ones((8, 8, 1)))
             add((60 * blocks + 90).astype(np.uint8))
@@ -78,24 +78,24 @@ def test_other_encoders_get_a_bit_rate(tmp_path, monkeypatch):
 
 
 def test_the_smallest_video(tmp_path):
-    with film(tmp_path / "a.mp4", 2, 2, 24) as add:
+    with video_writer(tmp_path / "a.mp4", 2, 2, 24) as add:
         add(np.full((2, 2, 3), 255, np.uint8))
     assert decoded(tmp_path / "a.mp4")[0].min() > 250
 
 
 def interrupted(path: Path, stop: type[BaseException]) -> None:
-    with film(path, WIDTH, HEIGHT, 24) as add:
+    with video_writer(path, WIDTH, HEIGHT, 24) as add:
         add(image(0))
         raise stop
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, ValueError])
 def test_a_block_that_raises_leaves_no_file(tmp_path, stop):
-    (tmp_path / "a.mp4").write_bytes(b"the old one")
+    (tmp_path / "a.mp4").write_bytes(b"old")
     with pytest.raises(stop):
         interrupted(tmp_path / "a.mp4", stop)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
-    assert (tmp_path / "a.mp4").read_bytes() == b"the old one"
+    assert (tmp_path / "a.mp4").read_bytes() == b"old"
 
 
 def test_a_full_disk_raises_and_leaves_no_file(tmp_path):
@@ -113,14 +113,17 @@ def test_a_full_disk_raises_and_leaves_no_file(tmp_path):
 
 def test_invalid_arguments_are_rejected(tmp_path, monkeypatch):
     for size, fps in (((63, 48), 24), ((64, 47), 24), ((0, 0), 24), ((64, 48), 0)):
-        with pytest.raises(ValueError, match="a video needs"), film(tmp_path / "a.mp4", *size, fps):
+        with (
+            pytest.raises(ValueError, match="a video needs"),
+            video_writer(tmp_path / "a.mp4", *size, fps),
+        ):
             pass
     with (
         pytest.raises(ValueError, match="does not fit"),
-        film(tmp_path / "a.mp4", 66, HEIGHT, 24) as add,
+        video_writer(tmp_path / "a.mp4", 66, HEIGHT, 24) as add,
     ):
         add(image(0))
-    monkeypatch.setattr(film_module, "_ENCODERS", ("no_such_encoder",))
+    monkeypatch.setattr(video_module, "_ENCODERS", ("no_such_encoder",))
     with pytest.raises(UserError, match="cannot encode videos"):
         write(tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())
@@ -132,7 +135,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
 
     def peak(count: int) -> int:
         tracemalloc.start()
-        with film(tmp_path / "a.mp4", WIDTH, HEIGHT, 24) as add:
+        with video_writer(tmp_path / "a.mp4", WIDTH, HEIGHT, 24) as add:
             for i in itertools.islice(itertools.cycle(range(10)), count):
                 add(image(i))
         memory = tracemalloc.get_traced_memory()[1]

@@ -272,7 +272,7 @@ class Video:
         """
         import torch
 
-        from snowsplat.trajectory.video import film
+        from snowsplat.trajectory.video import video_writer
         from snowsplat.util.files import remove_temporaries
         from snowsplat.util.stages import Outcome
 
@@ -286,7 +286,7 @@ class Video:
             remove_temporaries(self.file.parent, [file.name for file, _ in files])
             near, far = self._depth_range()
             adds = [
-                stack.enter_context(film(file, factor * width, height, self.fps))
+                stack.enter_context(video_writer(file, factor * width, height, self.fps))
                 for file, factor in files
             ]
             for i, camera in enumerate(self.cameras):

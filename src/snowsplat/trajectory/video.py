@@ -1,4 +1,4 @@
-"""`film`: writes images as the frames of an mp4 file."""
+"""Writes images as the frames of an mp4 file: `video_writer`."""
 
 from __future__ import annotations
 
@@ -26,15 +26,17 @@ _LIMITED_RANGE = 1
 
 
 @contextmanager
-def film(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
+def video_writer(
+    path: Path, width: int, height: int, fps: float
+) -> Iterator[Callable[[np.ndarray], None]]:
     """Write a video: the context is a function that adds a frame, (height, width, 3) uint8 RGB.
 
-        with film(Path("walk.mp4"), 640, 480, 30) as add:
+        with video_writer(Path("walk.mp4"), 640, 480, 30) as add:
             add(pixels)
 
     The file appears under its name when the block ends. If the block raises (also on Ctrl-C), an
-    existing file stays unchanged. Memory does not grow with the number of frames. The
-    index is at the start of the file, so that browsers can play it while loading it.
+    existing file stays unchanged. Memory does not grow with the number of frames. The index is at
+    the start of the file, so that browsers can play it while loading it.
 
     Args:
         path: the mp4 file, in an existing folder.
