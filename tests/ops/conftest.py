@@ -25,7 +25,7 @@ from .scenes import (
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_torch_thread() -> Iterator[None]:
-    """Scenes are tiny: torch's threads would only wait for each other."""
+    """The scenes are tiny, so several torch threads would only be slower."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -34,11 +34,11 @@ def _one_torch_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A test that runs the CPU's kernels fails unless it is repeated on each instruction set."""
+    """Fails if a test runs CPU kernels without the mark `isa`."""
     exempt = {"isa", "emulated", "gpu"}.intersection(
         mark.name for mark in request.node.iter_markers()
     )
-    if exempt or "recorder" in request.fixturenames:  # the recorder is no kernel
+    if exempt or "recorder" in request.fixturenames:  # the recorder is not a kernel
         return
 
     def unmarked(name: str, params: Params) -> int:
@@ -48,7 +48,7 @@ def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
 
 
 def variants(*among: Variant) -> list:
-    """As parameters of a fixture, with the marks of their engines.
+    """Parameters of a fixture, with the marks of their engines.
 
     Only the CPU's kernels depend on the instruction set, so only they are marked `isa`: the
     reference and the kernels of a GPU would repeat the same check.
@@ -65,7 +65,7 @@ KERNELS = (NATIVE_FLOAT32, EMULATED_FLOAT32, CUDA_FLOAT32, *FLOAT64)
 
 
 def _running(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
-    """The variant asked for, with the launcher of its engine in place of the CPU's."""
+    """The requested variant, with the launcher of its engine instead of the CPU's."""
     variant: Variant = request.param
     if variant.engine in ("emulated", "cuda"):
         monkeypatch.setitem(LAUNCHERS, "cpu", launcher(variant.engine))
@@ -74,7 +74,7 @@ def _running(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.fixture(params=variants(REFERENCE, *KERNELS))
 def variant(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
-    """Every implementation: for answers that are known in closed form."""
+    """Every implementation: for results that are known in closed form."""
     return _running(request, monkeypatch)
 
 

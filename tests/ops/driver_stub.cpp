@@ -1,5 +1,5 @@
-// Stands in for the driver of a GPU (libcuda.so.1) where there is none, so that the way through the
-// real cuda-bindings is walked: it has the few functions that we call and writes a launch down.
+// Replaces the driver of a GPU (libcuda.so.1), so that tests can use the real cuda-bindings without a
+// GPU: it has the few functions that we call, and records a launch.
 #include <cstdint>
 #include <cstring>
 

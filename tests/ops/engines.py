@@ -1,4 +1,4 @@
-"""Runs the kernels of a GPU with CPU tensors, so that one test body serves every engine."""
+"""Runs GPU kernels with CPU tensors, so that a test works for every engine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from . import emulation
 
 
 def launcher(engine: str) -> Callable[[str, Params], int]:
-    """For `native.LAUNCHERS["cpu"]`. Without a GPU the tests of "cuda" are skipped."""
+    """A value for `native.LAUNCHERS["cpu"]`. Tests of "cuda" are skipped without a GPU."""
     if engine == "cuda" and not torch.cuda.is_available():
         pytest.skip("needs a GPU that torch can use")
     execute = emulation.execute if engine == "emulated" else execute_on_gpu

@@ -1,8 +1,8 @@
 """Extreme scenes by hypothesis, and checks of the ops on each against the float64 reference.
 
-Where the reference's own result changes a lot when its input changes by a few roundings, the input
-decides nothing, and neither does the comparison: the tolerance of each number is what one rounding
-makes of it, times some, plus how far the reference's goes for such changes of its input.
+If the result of the reference changes a lot when its input changes by a few roundings, the exact
+result is undefined. The tolerance of each number is therefore a multiple of one rounding error, plus
+the change of the reference for such changes of its input.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .scenes import (
     world_points,
 )
 
-#: Of a Gaussian: each is drawn by itself, the plain one first, to which hypothesis shrinks.
+#: Values of a Gaussian, drawn independently; hypothesis shrinks to the first, an ordinary value.
 PLACES = (
     *("plain", "same depth", "same place", "behind", "at camera", "around camera", "at near"),
     *("just in front", "just behind", "far", "farther", "beside", "on axis", "border"),
@@ -46,15 +46,15 @@ COLORS = ("plain", "1e6", "1e20", "-100", "0")
 SIZES = ((23, 17), (1, 1), (1, 40), (40, 1), (16, 16), (33, 9))
 FOCALS = (1.0, 1e-6, 1e-2, 1e3, 1e6)  # times the size of the image
 
-#: What counts as representable in single precision, squares and products of it included.
+#: Limit for values whose squares and products are representable in single precision.
 LARGE = 1e9
-#: Squares of gradients beyond it overflow: such are not taken.
+#: Squares of larger gradients overflow, so these are skipped.
 _LARGEST_GRADIENT = {torch.float32: 1e18, torch.float64: 1e150}
 
 
 @dataclass(frozen=True)
 class Extreme:
-    """What a scene is made of; all else comes from the seed."""
+    """The parameters of a scene; everything else is derived from the seed."""
 
     seed: int
     size: tuple[int, int]
@@ -82,7 +82,7 @@ class Extreme:
             if kind == "axis":
                 quats[i] = torch.tensor([0.0, 0.0, -1.0, 0.0])
         logits = 1.8 * normal(g, count)
-        edge = math.log(1 / 254)  # of what is visible at all
+        edge = math.log(1 / 254)  # the visibility threshold
         special = {"100": 100.0, "-100": -100.0, "faint": edge - 0.01, "edge": edge, "half": 0.0}
         for i, kind in enumerate(kinds[3]):
             logits[i] = special.get(kind, logits[i])
@@ -162,7 +162,7 @@ class Compared:
     def of(
         function: Callable[..., Sequence[Tensor]], variant: Variant, seed: int, *inputs: Tensor
     ) -> list[Compared]:
-        """``function``: of float64 inputs; several results."""
+        """``function``: maps float64 inputs to several results."""
         rounding = 1e-5 if variant.dtype == torch.float32 else 1e-10
         values = function(*inputs)
         spreads = [torch.zeros_like(value) for value in values]
@@ -171,10 +171,10 @@ class Compared:
             changes = [
                 rounding * (2 * torch.rand(t.shape, generator=g).double() - 1) for t in inputs
             ]
-            for sign in (1.0, -1.0):  # both ways, so that what lies on a border falls to both sides
+            for sign in (1.0, -1.0):  # both signs, so that values at a threshold fall on both sides
                 moved = [t * (1 + sign * c) for t, c in zip(inputs, changes, strict=True)]
                 for spread, value, other in zip(spreads, values, function(*moved), strict=True):
-                    # Where this is NaN nothing is compared.
+                    # NaN: not compared.
                     torch.maximum(spread, (other - value).abs(), out=spread)
         return [Compared(v, s) for v, s in zip(values, spreads, strict=True)]
 
@@ -182,13 +182,13 @@ class Compared:
         return Compared(self.value[rows], self.spread[rows])
 
     def in_rows(self) -> Compared:
-        """With the spread of its row for each number: few changes of the input reach them all."""
+        """Uses the spread of the row for each number, since few input changes affect all numbers."""
         return Compared(self.value, _of_rows(self.spread))
 
     def check(
         self, actual: Tensor, relative: float, name: str, scale: Tensor | None = None
     ) -> None:
-        """``scale``: of what a number is made, where its parts may cancel."""
+        """``scale``: magnitude of the summands of a number if they may cancel."""
         assert actual.shape == self.value.shape, f"{name}: {actual.shape}, not {self.value.shape}"
         scale = self.value.abs() if scale is None else scale
         tolerance = relative * scale + 10.0 * self.spread
@@ -212,7 +212,7 @@ def _every_row(scene: Scene, params: Sequence[Tensor], pose: Tensor) -> tuple[Te
 
 
 def _of_rows(values: Tensor) -> Tensor:
-    """The sum of absolutes over each row, in the shape of ``values``."""
+    """The sum of absolute values over each row, in the shape of ``values``."""
     return values.abs().sum(tuple(range(1, values.ndim)), keepdim=True).expand_as(values)
 
 
@@ -247,7 +247,7 @@ def check_project(variant: Variant, extreme: Extreme) -> None:
     rows, seen, *grads = Compared.of(
         by_reference, variant, extreme.seed, *params, scene.cam_from_world
     )
-    # Single precision has no determinant of the largest, which are not seen for that.
+    # In single precision, the determinant of the largest overflows, so they are invisible.
     huge = (rows.value[:, 7] > 3 * LARGE) & (variant.dtype == torch.float32)
     edge = (255 * scene.params["opacity_logits"].sigmoid() - 1).abs() < 1e-5
     clear = (seen.spread == 0) & ~huge & ~edge
@@ -270,7 +270,7 @@ def check_project(variant: Variant, extreme: Extreme) -> None:
         assert grad.isfinite().all(), f"the gradient of {name} is not finite"
         seen_rows = wanted.at(both).in_rows()
         scale = _of_rows(seen_rows.value)
-        if name == "quats":  # what a turn changes cancels where the scales are equal
+        if name == "quats":  # the effect of a rotation cancels if the scales are equal
             parts = grads[PARAMETERS.index("log_scales")].at(both).value.abs().sum(1, keepdim=True)
             scale = scale + parts / params[2][both].norm(dim=1, keepdim=True).clamp_min(1e-30)
         seen_rows.check(grad[both], 10 * variant.backward, f"gradient of {name}", scale)
@@ -279,7 +279,7 @@ def check_project(variant: Variant, extreme: Extreme) -> None:
 
 
 def check_adam(variant: Variant, leaf: Scene, ids: Tensor, cotangent: Tensor) -> None:
-    """The gradients that the fused step uses are those of `project`, in its first moments."""
+    """The gradients in the fused step, visible in the first moments, are those of `project`."""
     params = {name: p.detach().clone() for name, p in leaf.params.items()}
     m, v = ({name: torch.zeros_like(p) for name, p in params.items()} for _ in range(2))
     nonfinite_rows = torch.zeros(6, dtype=torch.int32)
@@ -305,19 +305,19 @@ def check_adam(variant: Variant, leaf: Scene, ids: Tensor, cotangent: Tensor) ->
         skipped = int(nonfinite_rows[i])
         assert skipped <= too_large, f"{skipped} rows of {name} skipped, {too_large} have a reason"
         error = (m[name] - 0.1 * grad).abs() - variant.backward * _of_rows(grad)
-        # Kernels take numbers for zero that are too small to have all of their digits.
+        # Kernels flush denormal numbers to zero.
         assert (error[~large] <= torch.finfo(variant.dtype).tiny).all(), f"the moment of {name}"
 
 
 def check_rasterize(variant: Variant, extreme: Extreme) -> None:
-    """Image, alpha, depth and the gradient of the splats that a scene is projected to."""
+    """Image, alpha, depth and the gradient of the splats of a projected scene."""
     splats = extreme.scene().to(variant.dtype, requires_grad=False).project(variant.ops)
     width, height = extreme.size
     g = generator(extreme.seed + 2)
     background = uniform(g, 0.0, 1.0, 3)
     cotangents = [normal(g, height, width, 3), normal(g, height, width), normal(g, height, width)]
     a, b, c = splats.conics.double().unbind(dim=1)
-    # Of longer ones, thousands of times as long as wide, a rounded conic is none.
+    # If splats are thousands of times as long as wide, a rounded conic is not positive definite.
     fit = a * c - b * b > 3 * a * c * torch.finfo(variant.dtype).eps
     assert splats.ids is not None
     splats = Splats2D(splats.packed[fit], splats.ids[fit], 3)
@@ -336,14 +336,14 @@ def check_rasterize(variant: Variant, extreme: Extreme) -> None:
             grad = leaf.grad
         return [*(output.detach() for output in outputs), grad]
 
-    # Two splats at their most opaque leave 1e-4 of the light, and less than that ends a pixel.
+    # Two splats of the maximum opacity leave a transmittance of 1e-4, the limit of a pixel.
     ends = itertools.cycle(
         reference.TRANSMITTANCE_MIN * (1 + change) for change in (0, 1e-6, -1e-6)
     )
 
     def by_reference(values: Tensor) -> list[Tensor]:
         values = values.clone()
-        values[:, 6] = packed[:, 6]  # equal depths stay so
+        values[:, 6] = packed[:, 6]  # equal depths stay equal
         with mock.patch.object(reference, "TRANSMITTANCE_MIN", next(ends)):
             return blended(reference, values)
 
@@ -351,7 +351,7 @@ def check_rasterize(variant: Variant, extreme: Extreme) -> None:
     wanted = Compared.of(by_reference, variant, extreme.seed, packed)
     names = ("image", "alpha", "depth", "gradient of the splats")
     factors = [variant.forward] * 3 + [10 * variant.backward]
-    if len(packed):  # what lies behind a splat is a difference of what its pixels show
+    if len(packed):  # the colour behind a splat is computed as a difference
         factors[3] *= max(1.0, float(packed[:, 6:11].max()))
     for w, f, name, factor in zip(wanted, found, names, factors, strict=True):
         w.check(f, factor, name, None if name != "alpha" else torch.ones_like(w.value))
@@ -379,8 +379,7 @@ def check_statistics(variant: Variant, extreme: Extreme, splats: Splats2D, grad:
 
 
 def check_harm(variant: Variant, extreme: Extreme, value: float, picks: Sequence[int]) -> None:
-    """Gaussians that are not finite leave all others their bits; ``picks``: whose, and which of its
-    parameters."""
+    """Non-finite Gaussians do not change the bits of the others; ``picks``: Gaussians and parameters."""
     results = []
     count = len(extreme.gaussians)
     healthy = torch.ones(count, dtype=torch.bool)
@@ -420,7 +419,7 @@ def check_harm(variant: Variant, extreme: Extreme, value: float, picks: Sequence
         rows |= {f"gradient of {n}": p.grad for n, p in leaf.params.items() if p.grad is not None}
         seen = {"ids": ids[healthy[ids]], "packed": splats.packed.detach()[healthy[ids]]}
         results.append(seen | {n: t[healthy] for n, t in rows.items()})
-        # This has to come to an end, no more.
+        # This only has to terminate.
         drawn = Splats2D(splats.packed.detach().requires_grad_(), splats.ids, 3)
         image, _, _ = variant.ops.rasterize(drawn, *extreme.size, with_depth=True)
         image.sum().backward()
@@ -434,7 +433,7 @@ LONG = ((16384, 3), (3, 16384))
 def photos(
     sizes: Sequence[tuple[int, int]] = ((7, 5), (1, 1), (1, 60), (60, 1), (11, 11), (33, 34)),
 ) -> st.SearchStrategy[tuple[int, tuple[int, int], str, bool]]:
-    """seed, size, kind, whether the photo is of bytes."""
+    """seed, size, kind, whether the photo has 8-bit values."""
     kinds = ["noise", "black", "white", "equal", "negative", "1e6", "1e-20"]
     return st.tuples(
         st.integers(0, 2**20), st.sampled_from(sizes), st.sampled_from(kinds), st.booleans()
@@ -469,8 +468,8 @@ def check_photometric(
     (loss, grad), (wanted_loss, wanted_grad) = found
     assert loss.isfinite()
     assert grad.isfinite().all()
-    # Variances are differences of squares, which single precision does not have of 1e6. And the
-    # slope of |a − b| is any where they are equal.
+    # Variances are differences of squares, which single precision cannot represent for 1e6. And the
+    # slope of |a − b| is undefined where they are equal.
     if kind == "1e6" and variant.dtype == torch.float32:
         return
     assert abs(float(loss - wanted_loss)) <= 10 * variant.forward * max(1.0, float(wanted_loss))
@@ -512,7 +511,7 @@ def check_neighbours(variant: Variant, cloud: tuple[int, int, int, tuple[str, ..
     torch.testing.assert_close(found[some], wanted[some], rtol=1e-5, atol=1e-19)
 
 
-#: What is drawn for each check, and the check.
+#: The strategies of each check, and the check.
 CHECKS: dict[str, tuple[tuple[st.SearchStrategy, ...], Callable[..., None]]] = {
     "project": ((extremes(),), check_project),
     "rasterize": ((extremes(),), check_rasterize),

@@ -1,4 +1,4 @@
-// Called by test_native.py through launch(): writes down the parameters that arrive.
+// Called by test_native.py through launch(): records its parameters.
 #include "cpu/entry.h"
 
 struct Nested {
@@ -24,7 +24,7 @@ SNOW_ENTRY(record, RecordParams) {
   return p.nothing ? 0 : (int64_t(1) << 40) + p.n;
 }
 
-// With another layout than Python expects.
+// A layout that differs from what Python expects.
 struct SwappedParams {
   int64_t n;
   const float* nothing;

@@ -1,6 +1,6 @@
 // For ThreadSanitizer, by tests/nightly/sanitize_native.py: a frame forward and backward and an Adam
-// step on random Gaussians, by several threads, while others do the same and the number of threads
-// changes. The results have to be the same to the bit each time.
+// step on random Gaussians, by several threads, while other threads do the same and the number of threads
+// changes. The results must be bit-identical each time.
 #include <cstdint>
 #include <cstdio>
 #include <cstring>

@@ -23,7 +23,7 @@ PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_res
 
 @dataclass(frozen=True)
 class Variant:
-    """One implementation of the ops in one dtype, and the relative errors that it may make.
+    """An implementation of the ops in one dtype, and its allowed relative errors.
 
     engine: "reference", "native" (the CPU's kernels), "emulated" (a GPU's kernels, on the CPU) or
     "cuda" (a GPU's kernels, on the GPU). Its tensors are on the CPU in each case: see `engines.py`.
@@ -60,7 +60,7 @@ class Scene:
     view: dict[str, Any]  # width, height, fx, fy, cx, cy, sh_degree
 
     def to(self, dtype: torch.dtype, requires_grad: bool = True) -> Scene:
-        """Fresh leaves of another dtype."""
+        """New leaf tensors of another dtype."""
         params = {
             name: p.detach().to(dtype, copy=True).requires_grad_(requires_grad)
             for name, p in self.params.items()
@@ -104,7 +104,7 @@ def as_float32(values: Tensor) -> Tensor:
 
 
 def view_of(width: int, height: int, focal: float | None = None, sh_degree: int = 3) -> dict:
-    """A camera without symmetry: fx ≠ fy, the principal point off the centre."""
+    """An asymmetric camera: fx ≠ fy, the principal point is not at the centre."""
     focal = focal or 0.9 * max(width, height)
     focal = float(torch.tensor(focal).float())
     return {
@@ -144,9 +144,9 @@ def random_scene(
     rest: int = 15,
     pixels: float = 2.0,
 ) -> Scene:
-    """Gaussians all over the view and somewhat beyond it, with σ of about `pixels` pixels.
+    """Gaussians in the view and slightly beyond, with σ of about `pixels` pixels.
 
-    Some lie behind the camera, some outside of the image and some are too transparent to be seen.
+    Some lie behind the camera, some outside of the image and some are too transparent to be visible.
     """
     g = generator(seed)
     view, pose = view_of(width, height, sh_degree=sh_degree), tilted_pose()
@@ -199,7 +199,7 @@ def random_splats(
     pixels: float = 2.5,
     opacity: tuple[float, float] = (0.02, 1.0),
 ) -> Splats2D:
-    """2D splats made by hand (float64), of any shape, all over an image and a little beyond it."""
+    """Random 2D splats (float64) of different shapes, in an image and slightly beyond."""
     g = generator(seed)
     means2d = uniform(g, -0.1, 1.1, count, 2) * torch.tensor([width, height])
     angle = uniform(g, 0, math.pi, count)
@@ -233,7 +233,7 @@ def differentiable_columns(splats: Splats2D) -> Tensor:
 
 
 def relative_error(actual: Tensor, expected: Tensor) -> float:
-    """L2 of the difference over L2 of what is expected (absolute where that is 0)."""
+    """L2 norm of the difference, divided by that of the expected values unless it is 0."""
     assert actual.shape == expected.shape, f"{actual.shape} is not {expected.shape}"
     if expected.numel() == 0:
         return 0.0

@@ -36,7 +36,7 @@ RATES = {
 
 
 class Optimised:
-    """A scene with moments, and what one training step does to it with the ops of a variant."""
+    """A scene with moments, and one training step with the ops of a variant."""
 
     def __init__(self, variant: Variant, scene: Scene, *, fresh: bool = False) -> None:
         self.variant = variant
@@ -79,7 +79,7 @@ class Optimised:
 
 
 def packed_grads(seed: int, count: int) -> Tensor:
-    """A cotangent (M, 16) with something in every column: radii and padding have to be ignored."""
+    """A cotangent (M, 16), nonzero in every column: radii and padding must be ignored."""
     return normal(generator(seed), count, 16)
 
 
@@ -108,7 +108,7 @@ def test_first_step_is_the_learning_rate(variant: Variant) -> None:
         torch.testing.assert_close(moved[clear], expected[clear], rtol=1e-3, atol=1e-6)
 
 
-def test_step_is_that_of_the_paper(variant: Variant) -> None:
+def test_step_matches_the_paper(variant: Variant) -> None:
     """Three steps of torch.optim.Adam on the same gradients."""
     scene = random_scene(1, 25)
     state = Optimised(variant, scene, fresh=True)
@@ -122,7 +122,7 @@ def test_step_is_that_of_the_paper(variant: Variant) -> None:
         splats.packed.backward(grad)
         adam.step()
         state.step(grad, step)
-    tolerance = max(variant.backward, 1e-9)  # eps is inside the root here, outside there
+    tolerance = max(variant.backward, 1e-9)  # eps is inside the root here, outside in torch
     for name in PARAMETERS:
         adam_state = adam.state[leaf.params[name]]
         assert_close(state.params[name], leaf.params[name], tolerance, name)
@@ -144,7 +144,7 @@ def test_native_agrees_with_the_reference(
         grad = packed_grads(step, len(states[0].visible()))
         for state in states:
             for k, (name, p) in enumerate(state.params.items()):
-                # Not all of them: a parameter without a regulariser has no .grad.
+                # Not for all: a parameter without a regulariser has no .grad.
                 wanted = regularised and name in ("means", "opacity_logits", "sh_rest")
                 p.grad = 0.1 * normal(generator(100 * step + k), *p.shape).to(p) if wanted else None
             state.step(grad, step, visible_only=visible_only)
@@ -180,7 +180,7 @@ def test_options_reach_the_step(native: Variant) -> None:
         assert_close(change, tensor - before[name], native.backward, name)
 
 
-def test_invisible_rows_are_left_alone(variant: Variant) -> None:
+def test_invisible_rows_stay_unchanged(variant: Variant) -> None:
     """visible_only: their values and moments keep every bit, even where a `.grad` is given."""
     state = Optimised(variant, random_scene(3, 40))
     ids = state.visible().long()
@@ -197,7 +197,7 @@ def test_invisible_rows_are_left_alone(variant: Variant) -> None:
 
 
 def test_moments_of_invisible_rows_decay(variant: Variant) -> None:
-    """Dense Adam: no gradient, so that m shrinks by β1, v by β2, and the value still moves."""
+    """Dense Adam: the gradient is 0, so m decays by β1, v by β2, and the value still changes."""
     state = Optimised(variant, random_scene(3, 40))
     ids = state.visible().long()
     hidden = torch.ones(40, dtype=torch.bool)
@@ -214,7 +214,7 @@ def test_moments_of_invisible_rows_decay(variant: Variant) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_rows_of_inactive_degrees_are_left_alone(variant: Variant, degree: int) -> None:
+def test_rows_of_inactive_degrees_stay_unchanged(variant: Variant, degree: int) -> None:
     state = Optimised(variant, random_scene(4, 20, sh_degree=degree))
     state.params["sh_rest"].grad = torch.ones_like(state.params["sh_rest"])
     before = state.copy()
@@ -227,7 +227,7 @@ def test_rows_of_inactive_degrees_are_left_alone(variant: Variant, degree: int) 
 
 
 def test_gradient_of_a_regulariser_is_added(variant: Variant) -> None:
-    """Alone, it moves every value by its rate against its sign, visible or not."""
+    """Without another gradient, it changes every value by its rate, visible or not."""
     state = Optimised(variant, random_scene(8, 20), fresh=True)
     before = state.copy()
     for p in state.params.values():
@@ -252,7 +252,7 @@ def test_nothing_visible(variant: Variant) -> None:
 
 @pytest.mark.parametrize("visible_only", [False, True])
 def test_rows_without_a_gaussian(native: Variant, visible_only: bool) -> None:
-    """A GPU's splats of the id -1 are passed over; the CPU, which makes none, refuses them."""
+    """On a GPU, splats of the id -1 are skipped; on the CPU, they are an error."""
     states = [Optimised(native, random_scene(3, 130)) for _ in range(2)]
     before = states[0].copy()
     ids = states[0].visible()
@@ -274,7 +274,7 @@ def test_rows_without_a_gaussian(native: Variant, visible_only: bool) -> None:
 
 
 def test_not_valid(variant: Variant) -> None:
-    """`valid` says so where the tensors are."""
+    """`valid` is on the device of the tensors."""
     states = [Optimised(variant, random_scene(3, 70)) for _ in range(3)]
     before = states[0].copy()
     grad = packed_grads(0, len(states[0].visible()))
@@ -289,7 +289,7 @@ def test_not_valid(variant: Variant) -> None:
 
 
 @pytest.mark.parametrize("rest", [0, 15])
-def test_rows_that_are_not_finite_are_counted_and_skipped(variant: Variant, rest: int) -> None:
+def test_nonfinite_rows_are_counted_and_skipped(variant: Variant, rest: int) -> None:
     """A row counts once for each parameter in which a value is not finite."""
     degree = 0 if rest == 0 else 3
     state = Optimised(variant, random_scene(3, 40, sh_degree=degree, rest=rest))
@@ -308,7 +308,7 @@ def test_rows_that_are_not_finite_are_counted_and_skipped(variant: Variant, rest
     assert all(bool(tensor.isfinite().all()) for tensor in state.tensors().values())
 
 
-def test_values_at_rest_stay(variant: Variant) -> None:
+def test_zero_moments_and_gradients_change_nothing(variant: Variant) -> None:
     """Zero moments and no gradient: 0 / √(0 + eps²) is 0, not NaN."""
     state = Optimised(variant, random_scene(6, 10), fresh=True)
     before = state.copy()
@@ -354,7 +354,7 @@ def test_wrong_input(change: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("group", ["params", "exp_avg", "exp_avg_sq"])
 def test_wrong_tensors(group: str) -> None:
-    """Another shape, another dtype, or a name that is missing."""
+    """A wrong shape, a wrong dtype, or a missing name."""
     for wrong in (torch.zeros(4, 4), torch.zeros(4, 3).double(), None):
         given = arguments()
         given[group] = {n: t for n, t in given[group].items() if n != "means"}

@@ -1,4 +1,4 @@
-"""The kernels of a GPU as NVRTC compiles them, for each architecture: no GPU is needed to look."""
+"""GPU kernels compiled by NVRTC for each architecture; no GPU is needed."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def symbols(table: bytes, names: bytes) -> Iterator[tuple[str, bool]]:
 
 
 def attributes(info: bytes) -> Iterator[tuple[int, bytes]]:
-    """What a cubin says of its kernels: number and content."""
+    """The attributes of the kernels in a cubin: number and content."""
     at = 0
     while at < len(info):
         form, attribute, size = struct.unpack_from("<BBH", info, at)
@@ -103,9 +103,9 @@ def kernels_in(cubin: bytes) -> dict[str, Built]:
         if not section.startswith(".nv.info."):
             continue
         name = section.removeprefix(".nv.info.")
-        said = list(attributes(content))
-        (threads,) = (struct.unpack("<III", c)[0] for a, c in said if a == MAX_THREADS)
-        sizes = [struct.unpack("<IHHI", c)[3] >> 18 for a, c in said if a == PARAMETER]
+        found = list(attributes(content))
+        (threads,) = (struct.unpack("<III", c)[0] for a, c in found if a == MAX_THREADS)
+        sizes = [struct.unpack("<IHHI", c)[3] >> 18 for a, c in found if a == PARAMETER]
         found[name] = Built(threads, sizes, local[name])
     return found
 
@@ -127,7 +127,7 @@ def layouts_in(cubin: bytes) -> dict[str, int]:
 
 
 def cubin_of(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> bytes:
-    """What `make native` made, if it is of these sources, else made now."""
+    """The cubin of `make native` if it matches the sources; otherwise a new one."""
     source = nvrtc.path_of(file)
     built = PACKAGE / "_lib" / "cuda" / f"sm_{architecture}" / f"{file}.cubin"
     made_of = [*nvrtc.sources(source), Path(nvrtc.__file__)]
@@ -136,8 +136,8 @@ def cubin_of(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> bytes:
     return compiler.compile(source, f"sm_{architecture}")[0]
 
 
-def compiled_anew(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> tuple[bytes, str]:
-    """Cubin and warnings; kept between runs until the sources or the compiler change."""
+def compiled_and_cached(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> tuple[bytes, str]:
+    """Cubin and warnings, cached between runs until the sources or the compiler change."""
     source = nvrtc.path_of(file)
 
     def compile_into(folder: Path) -> None:
@@ -153,14 +153,14 @@ def compiled_anew(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> tuple[
 @pytest.mark.parametrize("file", FILES)
 def test_compiles_without_a_warning(file, compiler):
     for architecture in (ARCHITECTURES[0], ARCHITECTURES[-1]):
-        cubin, log = compiled_anew(file, architecture, compiler)
+        cubin, log = compiled_and_cached(file, architecture, compiler)
         assert log == ""
         assert cubin.startswith(b"\x7fELF")
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("file", FILES)
-def test_cubins_hold_what_is_launched(file, architecture, compiler):
+def test_cubins_contain_all_launched_kernels(file, architecture, compiler):
     expected = {name: kernel for name, kernel in KERNELS.items() if kernel.file == file}
     cubin = cubin_of(file, architecture, compiler)
     found = kernels_in(cubin)
@@ -178,7 +178,7 @@ def test_cubins_hold_what_is_launched(file, architecture, compiler):
             assert built.local_bytes <= LOCAL_BYTES, name
 
 
-def test_a_cubin_says_its_local_memory(compiler, tmp_path):
+def test_the_local_memory_of_a_cubin(compiler, tmp_path):
     source = tmp_path / "spills.cu"
     source.write_text(
         '#include "cuda/device.h"\n'
@@ -201,7 +201,7 @@ def cpu_entries() -> set[str]:
 
 
 def called(names: tuple[str, ...]) -> set[str]:
-    """Texts that the ops give to these functions first."""
+    """First string arguments of calls of these functions in the ops."""
     found = set()
     for path in (PACKAGE / "ops").glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -235,13 +235,13 @@ STATISTIC_SOURCES = [
 ]
 
 
-def test_sources_of_a_kernel_are_all_that_it_includes(tmp_path):
+def test_sources_of_a_kernel_include_all_headers(tmp_path):
     found = nvrtc.sources(nvrtc.path_of("statistic"))
     assert [path.name for path in found] == STATISTIC_SOURCES
     assert all(path.is_absolute() for path in found)
 
 
-def test_what_does_not_compile_says_why_and_where(compiler, tmp_path):
+def test_a_compile_error_has_the_message_and_the_line(compiler, tmp_path):
     source = tmp_path / "wrong.cu"
     source.write_text(
         '#include "cuda/device.h"\nSNOW_KERNEL(wrong, 32, snow::SizeQueryParams) { nonsense(); }\n'
@@ -257,8 +257,8 @@ def test_what_does_not_compile_says_why_and_where(compiler, tmp_path):
     assert not (tmp_path / "wrong.cubin").exists()
 
 
-def test_the_script_needs_nothing_but_python(compiler, tmp_path):
-    """As the build of a wheel runs it: neither torch nor snowsplat can be imported."""
+def test_the_script_needs_only_python(compiler, tmp_path):
+    """As in the build of a wheel: neither torch nor snowsplat can be imported."""
     source, cubin = nvrtc.path_of("statistic"), tmp_path / "in a folder" / "statistic.cubin"
     library = nvrtc.find((12,))
     script = [sys.executable, "-I", "-S", nvrtc.__file__, source, "--target", "sm_86"]
@@ -270,13 +270,13 @@ def test_the_script_needs_nothing_but_python(compiler, tmp_path):
     target, *names = Path(f"{cubin}.d").read_text().replace(r"\ ", "?").split()
     assert target == f"{cubin}:".replace(" ", "?")
     assert [Path(name).name for name in names] == STATISTIC_SOURCES
-    # The same code every time, without the paths of this machine.
+    # The code is reproducible, and has no paths of this machine.
     once, again = (compiler.compile(source, "sm_86")[0] for _ in range(2))
     assert once == again
     assert str(REPOSITORY).encode() not in once
 
 
-def test_without_nvrtc_it_says_so():
+def test_without_nvrtc_there_is_a_message():
     script = [sys.executable, "-I", "-S", nvrtc.__file__, "--find"]
     result = subprocess.run(script, capture_output=True, text=True, env={})
     if result.returncode == 0:

@@ -1,4 +1,4 @@
-"""The native ops give the same bits for any number of threads, and again for every run."""
+"""The native ops are bit-identical for any number of threads and in every run."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def test_rasterize(dtype: torch.dtype, channels: int, count: int) -> None:
 
 @pytest.mark.usefixtures("sums_in_order")
 @pytest.mark.parametrize("channels", [3, 5])
-def test_rasterize_once_more(native: Variant, channels: int) -> None:
-    """On a GPU, too, gradients are summed in one order, where torch is asked for it."""
+def test_rasterize_with_sums_in_order(native: Variant, channels: int) -> None:
+    """Also on a GPU, gradients are summed in a fixed order if torch's setting requests it."""
     made = random_splats(2, 400, 60, 45, channels)
     results = []
     for _ in range(3):
@@ -129,7 +129,7 @@ def test_neighbours(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("visible_only", [False, True])
 def test_training_steps(dtype: torch.dtype, visible_only: bool) -> None:
-    """Project, blend, compare, and step, three times over: nothing differs in the end."""
+    """Three complete steps: project, rasterize, loss, Adam."""
     rates = dict.fromkeys(the_scene().params, 0.01)
     results = []
     target = uniform(generator(1), 0, 1, HEIGHT, WIDTH, 3).to(dtype)

@@ -1,4 +1,4 @@
-"""Which device is computed on, and what is said where it cannot be a GPU."""
+"""Selection of the device, and the messages if a GPU cannot be used."""
 
 import importlib
 import sys
@@ -12,29 +12,29 @@ from snowsplat import ops
 from snowsplat.ops.cuda import availability
 from snowsplat.util.errors import UserError
 
-TOO_OLD = "A card (compute capability 6.1) is too old; it takes 7.5, which came in 2018, or newer"
+TOO_OLD = "A card (compute capability 6.1) is too old; use one of 7.5 (2018) or newer"
 
 
 @pytest.fixture(autouse=True)
 def machine(monkeypatch) -> SimpleNamespace:
-    """A machine with a GPU of use, to be made worse."""
+    """A machine with a usable GPU; tests then change it."""
     monkeypatch.delenv("SNOWSPLAT_DEVICE", raising=False)
-    here = SimpleNamespace(
+    fake = SimpleNamespace(
         usable=True, capabilities=[(8, 6), (9, 0)], architectures=["sm_75", "sm_80", "sm_90"]
     )
-    here.driver = SimpleNamespace(error=0, cuda=(12, 4))
+    fake.driver = SimpleNamespace(error=0, cuda=(12, 4))
     cuda = torch.cuda
     monkeypatch.setattr(torch.version, "cuda", "12.6")
-    monkeypatch.setattr(cuda, "is_available", lambda: here.usable)
-    monkeypatch.setattr(cuda, "device_count", lambda: len(here.capabilities))
+    monkeypatch.setattr(cuda, "is_available", lambda: fake.usable)
+    monkeypatch.setattr(cuda, "device_count", lambda: len(fake.capabilities))
     monkeypatch.setattr(cuda, "get_device_name", lambda index: "A card")
-    monkeypatch.setattr(cuda, "get_device_capability", lambda index: here.capabilities[index])
-    monkeypatch.setattr(cuda, "get_arch_list", lambda: here.architectures)
+    monkeypatch.setattr(cuda, "get_device_capability", lambda index: fake.capabilities[index])
+    monkeypatch.setattr(cuda, "get_arch_list", lambda: fake.architectures)
     monkeypatch.setattr(cuda, "is_initialized", lambda: False)
     monkeypatch.setattr(availability, "why_unusable", availability.why_unusable.__wrapped__)
-    monkeypatch.setattr(availability, "_driver", lambda: here.driver)
+    monkeypatch.setattr(availability, "_driver", lambda: fake.driver)
     monkeypatch.setitem(sys.modules, "cuda.bindings.driver", SimpleNamespace())
-    return here
+    return fake
 
 
 def chosen(text: str | None = None) -> tuple[str, list[str]]:
@@ -59,7 +59,7 @@ def test_a_gpu_is_the_default(monkeypatch):
     assert chosen() == chosen("cuda") == ("cuda:1", [])
 
 
-def test_the_environment_names_the_default(monkeypatch):
+def test_the_environment_sets_the_default(monkeypatch):
     monkeypatch.setenv("SNOWSPLAT_DEVICE", "cpu")
     assert chosen() == ("cpu", [])
     assert chosen("cuda:1") == ("cuda:1", [])
@@ -75,18 +75,17 @@ def test_the_environment_names_the_default(monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["gpu", "mps", "cuda:x", "cuda:-1", "", "0"])
-def test_what_is_no_device(text):
-    assert refused(text) == f"--device {text}: this is no device for us; use cpu, cuda or cuda:1"
+def test_unsupported_devices(text):
+    assert refused(text) == f"--device {text}: unsupported device; use cpu, cuda or cuda:1"
 
 
-def test_a_machine_without_a_gpu_is_told_nothing(machine):
+def test_no_message_without_a_gpu(machine):
     machine.usable = False
     for driver in (None, SimpleNamespace(error=availability._NO_DEVICE, cuda=(12, 4))):
         machine.driver = driver
         assert chosen() == ("cpu", [])
     assert refused("cuda") == (
-        "--device cuda: there is no NVIDIA GPU that the driver knows; "
-        "leave --device out to use the CPU"
+        "--device cuda: the driver finds no NVIDIA GPU; leave --device out to use the CPU"
     )
     machine.driver = None
     assert refused("cuda:0") == (
@@ -96,7 +95,7 @@ def test_a_machine_without_a_gpu_is_told_nothing(machine):
 
 
 def unused(reason: str) -> None:
-    """The CPU is used, and the line says why; who asks for the GPU is refused."""
+    """The CPU is used, with the reason in a line; requesting the GPU is an error."""
     line = f"the GPU cannot be used: {reason}; computing on the CPU"
     assert chosen() == ("cpu", [line])
     assert "\n" not in line
@@ -106,7 +105,7 @@ def unused(reason: str) -> None:
 
 def test_torch_without_cuda(machine, monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", None)
-    unused("this PyTorch is built without CUDA; install one with it (pytorch.org says how)")
+    unused("this PyTorch is built without CUDA; install one with it (see pytorch.org)")
     machine.driver = None
     assert chosen() == ("cpu", [])
 
@@ -114,8 +113,8 @@ def test_torch_without_cuda(machine, monkeypatch):
 def test_too_old_a_driver(machine):
     machine.usable, machine.driver.cuda = False, (11, 4)
     unused(
-        "the NVIDIA driver is too old: it knows CUDA 11.4 and this PyTorch needs 12.6; update the "
-        "driver, or install a PyTorch for an older CUDA (pytorch.org says how)"
+        "the NVIDIA driver is too old: it supports CUDA 11.4 and this PyTorch needs 12.6; update "
+        "the driver, or install a PyTorch for an older CUDA (see pytorch.org)"
     )
 
 
@@ -124,7 +123,7 @@ def test_a_driver_that_fails(machine):
     unused("the NVIDIA driver fails (error 999); restart the machine or reinstall it")
 
 
-def test_what_torch_says_becomes_the_line(machine, monkeypatch):
+def test_the_message_of_torch_is_reported(machine, monkeypatch):
     def unavailable() -> bool:
         warnings.warn("CUDA: it is\nbroken (Triggered internally at x.cpp:1.)", stacklevel=1)
         return False
@@ -139,7 +138,7 @@ def test_what_torch_says_becomes_the_line(machine, monkeypatch):
 
 
 @pytest.mark.parametrize("capability", [(6, 1), (7, 0), (7, 2)])
-def test_too_old_a_card(capability, machine):
+def test_too_old_a_gpu(capability, machine):
     machine.capabilities[0] = capability
     unused(TOO_OLD.replace("6.1", f"{capability[0]}.{capability[1]}"))
     assert chosen("cuda:1") == ("cuda:1", [])
@@ -158,7 +157,7 @@ def test_too_old_a_card(capability, machine):
         ((8, 6), [], True),
     ],
 )
-def test_a_card_that_this_torch_does_not_know(capability, architectures, runs, machine):
+def test_a_gpu_that_this_torch_does_not_support(capability, architectures, runs, machine):
     machine.capabilities, machine.architectures = [capability], architectures
     if runs:
         assert chosen() == ("cuda:0", [])
@@ -166,13 +165,13 @@ def test_a_card_that_this_torch_does_not_know(capability, architectures, runs, m
         shown = f"A card (compute capability {capability[0]}.{capability[1]})"
         unused(
             f"this PyTorch, for CUDA 12.6, has no kernels for {shown}; "
-            "install another PyTorch (pytorch.org says how)"
+            "install another PyTorch (see pytorch.org)"
         )
 
 
-def test_a_device_that_is_not_there(machine):
+def test_a_missing_device(machine):
     machine.capabilities = [(8, 6)]
-    assert "there is no cuda:1; this machine has cuda:0 alone;" in refused("cuda:1")
+    assert "there is no cuda:1; this machine has only cuda:0;" in refused("cuda:1")
 
 
 def test_without_the_bindings(monkeypatch):
@@ -187,9 +186,9 @@ def test_without_the_bindings(monkeypatch):
     unused("the package cuda-bindings is missing: pip install cuda-bindings")
 
 
-def test_the_driver_is_asked_directly(monkeypatch):
+def test_the_driver_is_queried_directly(monkeypatch):
     monkeypatch.undo()
-    asked = availability._driver.__wrapped__
+    query = availability._driver.__wrapped__
 
     class Library:
         def __init__(self, error: int) -> None:
@@ -201,7 +200,7 @@ def test_the_driver_is_asked_directly(monkeypatch):
 
     for error, there in ((0, True), (100, True), (999, True), (34, False)):
         monkeypatch.setattr(availability.ctypes, "CDLL", lambda name, e=error: Library(e))
-        driver = asked()
+        driver = query()
         assert (driver is not None) == there
         if driver is not None:
             assert (driver.error, driver.cuda) == (error, (12, 8))
@@ -212,4 +211,4 @@ def test_the_driver_is_asked_directly(monkeypatch):
         raise OSError(f"{name}: cannot open shared object file")
 
     monkeypatch.setattr(availability.ctypes, "CDLL", absent)
-    assert asked() is None
+    assert query() is None

@@ -1,4 +1,4 @@
-"""Loading and launching on a GPU, with something in the place of its driver that writes down."""
+"""Loading and launching on a GPU, with a fake driver that records the calls."""
 
 import ctypes
 import os
@@ -54,7 +54,7 @@ BUILT = (75, 80, 86, 89, 90, 100, 120)  # as in CMakeLists.txt
 
 
 class OnGpu(torch.Tensor):
-    """A tensor that says it is on cuda:`index`."""
+    """A tensor that reports the device cuda:`index`."""
 
     index = 0
     __torch_function__ = torch._C._disabled_torch_function_impl
@@ -73,7 +73,7 @@ def on_gpu(tensor: torch.Tensor, kind: type = OnGpu) -> torch.Tensor:
 
 
 class FakeDriver:
-    """What cuda.bindings.driver is to us: each function gives an error number and results."""
+    """Replaces cuda.bindings.driver: each function returns an error number and results."""
 
     def __init__(self):
         self.calls = []
@@ -156,7 +156,7 @@ class FakeDriver:
 
 @pytest.fixture
 def built(tmp_path, monkeypatch) -> Path:
-    """Cubins for each architecture that the wheel has; they say which they are."""
+    """Cubins for each architecture of the wheel; their content is their name."""
     folder = tmp_path / "built"
     for number in BUILT:
         (folder / f"sm_{number}").mkdir(parents=True)
@@ -168,7 +168,7 @@ def built(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def gpus(built, monkeypatch) -> FakeDriver:
-    """Two cards, of compute capability 8.6 and 9.0, each with a stream of its own."""
+    """Two GPUs, of compute capability 8.6 and 9.0, each with its own stream."""
     fake = FakeDriver()
     monkeypatch.setattr(driver, "_bindings", lambda: fake)
     monkeypatch.setattr(driver, "_gpus", {})
@@ -193,7 +193,7 @@ class FakeCompiler:
 
 @pytest.fixture
 def compiler(tmp_path, monkeypatch) -> FakeCompiler:
-    """In NVRTC's place, with a cache of its own."""
+    """Replaces NVRTC, with a separate cache folder."""
     fake = FakeCompiler()
     monkeypatch.setattr(cubins, "_nvrtc", lambda cuda_major: fake)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -203,7 +203,7 @@ def compiler(tmp_path, monkeypatch) -> FakeCompiler:
 # ---- launching
 
 
-def test_the_struct_arrives_where_the_driver_reads_it(gpus):
+def test_the_driver_reads_the_struct(gpus):
     tensor = on_gpu(torch.zeros(5))
     driver.run(KERNEL, "some_kernel", 7, SomeParams(n=3, tensor=tensor, large=-(2**40), real=0.1))
     (launch,) = gpus.launches
@@ -215,8 +215,8 @@ def test_the_struct_arrives_where_the_driver_reads_it(gpus):
 @pytest.mark.parametrize(
     ("function", "error"), [(None, 0), ("cuLibraryGetGlobal", 500), ("cuMemcpyDtoH", 1)]
 )
-def test_a_kernel_with_another_struct_is_refused(function, error, gpus):
-    """Before it is launched; and a kernel from before there were structs has no layout."""
+def test_a_kernel_with_another_struct_is_rejected(function, error, gpus):
+    """Before the launch. Kernels older than the structs have no layout."""
     if function is None:
         gpus.layout += 1
     gpus.fails[function] = error
@@ -258,21 +258,21 @@ def test_code_is_loaded_once_for_each_file_and_device(gpus):
     ]
 
 
-def test_the_context_is_that_of_the_device_and_left_as_it_was(gpus):
+def test_the_context_is_set_and_restored(gpus):
     first, second = on_gpu(torch.zeros(1)), on_gpu(torch.zeros(1), OnSecondGpu)
     driver.run(KERNEL, "one", 1, SomeParams(tensor=first))
     driver.run(KERNEL, "one", 1, SomeParams(tensor=second))
     assert gpus.cuCtxGetCurrent() == (0, 0)
     gpus.cuCtxPushCurrent(1000)
     pushes = gpus.count("cuCtxPushCurrent")
-    driver.run(KERNEL, "one", 1, SomeParams(tensor=first))  # is current: nothing to do
+    driver.run(KERNEL, "one", 1, SomeParams(tensor=first))  # already current
     assert gpus.count("cuCtxPushCurrent") == pushes
     driver.run(KERNEL, "one", 1, SomeParams(tensor=second))
     assert gpus.cuCtxGetCurrent() == (0, 1000)
     assert [launch.context for launch in gpus.launches] == [1000, 1001, 1000, 1001]
 
 
-def test_threads_have_arguments_of_their_own(gpus):
+def test_threads_have_separate_arguments(gpus):
     tensor = on_gpu(torch.zeros(1))
     driver.run(KERNEL, "one", 1, SomeParams(tensor=tensor))
     addresses, wrong = set(), []
@@ -301,7 +301,7 @@ def test_threads_have_arguments_of_their_own(gpus):
 
 
 def test_launching_costs_little(gpus):
-    """What Python does for a struct of eight tensors; the driver's own time comes on top."""
+    """The time of Python for a struct of eight tensors, without that of the driver."""
     names = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest", "grad", "ids")
     tensors = {name: on_gpu(torch.zeros(1)) for name in names}
     params = ManyParams(**tensors, n=5, width=0.5, height=1.5, rows=4, degree=3)
@@ -337,7 +337,7 @@ def test_launching_costs_little(gpus):
         ("cuKernelGetFunction", 3, "update the NVIDIA driver, or use device cpu"),
     ],
 )
-def test_errors_of_the_driver_are_lines_for_the_user(function, error, do, gpus):
+def test_errors_of_the_driver_are_one_line(function, error, do, gpus):
     gpus.fails[function] = error
     line = f"^cuda:1: some_kernel: CUDA_ERROR_{error}, in words; {do}$"
     for _ in range(2):
@@ -350,13 +350,13 @@ def test_errors_of_the_driver_are_lines_for_the_user(function, error, do, gpus):
     driver.run(KERNEL, "some_kernel", 1, SomeParams(tensor=on_gpu(torch.zeros(1), OnSecondGpu)))
 
 
-def test_a_driver_that_does_not_start_is_a_line_too(gpus):
+def test_a_driver_that_does_not_start_is_a_one_line_error(gpus):
     gpus.fails["cuInit"] = 803
     with pytest.raises(UserError, match="^cuda:0: CUDA_ERROR_803, in words; update"):
         driver.run(KERNEL, "one", 1, SomeParams(tensor=on_gpu(torch.zeros(1))))
 
 
-def test_a_gpu_that_cannot_be_used_says_why(gpus, monkeypatch):
+def test_an_unusable_gpu_is_an_error_with_the_reason(gpus, monkeypatch):
     monkeypatch.setattr(driver, "why_unusable", lambda index: "it is too old")
     tensor = on_gpu(torch.zeros(1))
     params = BackgroundBackwardParams(
@@ -368,7 +368,7 @@ def test_a_gpu_that_cannot_be_used_says_why(gpus, monkeypatch):
 
 @pytest.mark.parametrize("error", [200, 209, 218, 222])
 @pytest.mark.parametrize("where", ["loading", "finding"])
-def test_a_cubin_that_does_not_fit_is_followed_by_one_made_here(error, where, gpus, compiler):
+def test_after_an_incompatible_cubin_the_kernel_is_compiled(error, where, gpus, compiler):
     if where == "loading":
         gpus.fails[b"statistic 86"] = error
     else:
@@ -380,7 +380,7 @@ def test_a_cubin_that_does_not_fit_is_followed_by_one_made_here(error, where, gp
 
 
 @pytest.mark.slow
-def test_nothing_of_the_driver_is_loaded_for_the_cpu():
+def test_the_driver_is_not_loaded_for_the_cpu():
     code = (
         "import torch, sys; before = set(sys.modules);"
         "from snowsplat import ops; from snowsplat.ops.cuda import driver, cubins;"
@@ -448,7 +448,7 @@ except driver.UserError as error:
 
 
 @pytest.mark.build
-def test_the_way_through_the_real_bindings(tmp_path):
+def test_the_real_bindings_with_a_stub_driver(tmp_path):
     pytest.importorskip("cuda.bindings.driver")
     source = Path(__file__).with_name("driver_stub.cpp")
     compiler, library = os.environ.get("CXX", "c++"), tmp_path / "libcuda.so.1"
@@ -494,24 +494,24 @@ def test_the_nearest_built_cubin_comes_first(capability, cubin, built, compiler)
     assert next(codes) == f"statistic {cubin}".encode()
     assert not compiler.compiled
     number = 10 * capability[0] + capability[1]
-    target = f"sm_{number}" if number != 121 else "compute_120"  # that it does not know
+    target = f"sm_{number}" if number != 121 else "compute_120"  # not supported by the compiler
     assert list(codes) == [f"statistic for {target}, 1".encode()]
 
 
-def test_a_card_of_another_major_version_has_its_code_made_here(built, compiler):
-    # Not known to this compiler: the driver translates PTX for the newest that is.
+def test_for_another_major_version_kernels_are_compiled(built, compiler):
+    # Not supported by this compiler: the driver compiles PTX for the newest supported one.
     assert list(cubins.candidates("statistic", (13, 0), 13)) == [b"statistic for compute_120, 1"]
     assert list(cubins.candidates("statistic", (11, 0), 13)) == [b"statistic for compute_103, 2"]
     assert list(cubins.candidates("statistic", (5, 0), 12)) == [b"statistic for sm_50, 3"]
 
 
-def test_without_built_kernels_all_are_made_here(tmp_path, monkeypatch, compiler):
+def test_without_built_kernels_all_are_compiled(tmp_path, monkeypatch, compiler):
     monkeypatch.setattr(cubins, "_BUILT", tmp_path / "nothing")
     assert list(cubins.candidates("rasterize", (8, 6), 12)) == [b"rasterize for sm_86, 1"]
 
 
 @pytest.mark.parametrize(("major", "package"), [(12, "nvrtc-cu12"), (13, "nvrtc")])
-def test_without_nvrtc_the_line_names_the_package(major, package, built, monkeypatch):
+def test_without_nvrtc_the_error_names_the_package(major, package, built, monkeypatch):
     def nothing(majors):
         assert list(majors) == list(range(major, 11, -1))
         raise nvrtc.NotFound
@@ -532,7 +532,7 @@ def compiled(capability: tuple[int, int] = (13, 0)) -> bytes:
     return code
 
 
-def test_what_was_compiled_is_kept(built, compiler, tmp_path):
+def test_compiled_code_is_cached(built, compiler, tmp_path):
     first = compiled()
     assert compiled() == first
     assert len(compiler.compiled) == 1
@@ -543,7 +543,7 @@ def test_what_was_compiled_is_kept(built, compiler, tmp_path):
 
 
 @pytest.mark.parametrize("damage", [b"", b"short", None, "cut", "changed"])
-def test_a_damaged_file_is_made_anew(damage, built, compiler, tmp_path):
+def test_a_damaged_file_is_compiled_again(damage, built, compiler, tmp_path):
     compiled()
     (file,) = (tmp_path / "cache" / "snowsplat" / "kernels").iterdir()
     whole = file.read_bytes()
@@ -557,25 +557,25 @@ def test_a_damaged_file_is_made_anew(damage, built, compiler, tmp_path):
     assert len(compiler.compiled) == 2
 
 
-def test_a_cache_that_cannot_be_written_is_no_error(built, compiler, tmp_path, monkeypatch):
+def test_an_unwritable_cache_is_not_an_error(built, compiler, tmp_path, monkeypatch):
     (tmp_path / "cache").write_text("a file, where a folder should be")
     assert compiled().endswith(b", 1")
     assert compiled().endswith(b", 2")
 
-    def nobody():
+    def no_home():
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setattr(Path, "home", nobody)
+    monkeypatch.setattr(Path, "home", no_home)
     assert compiled().endswith(b", 3")
 
 
-def test_the_cache_is_where_it_is_by_custom(monkeypatch, tmp_path):
+def test_the_cache_folder(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     expected = tmp_path / ".cache" / "snowsplat" / "kernels" / "rasterize-sm_90-key"
     assert cubins._cache_path("rasterize", "sm_90", "key") == expected
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # is to be ignored
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # must be ignored
     assert cubins._cache_path("rasterize", "sm_90", "key") == expected
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "Local"))
@@ -584,7 +584,7 @@ def test_the_cache_is_where_it_is_by_custom(monkeypatch, tmp_path):
     )
 
 
-def test_the_key_changes_with_all_that_the_code_depends_on(tmp_path, monkeypatch):
+def test_the_key_depends_on_everything_that_affects_the_code(tmp_path, monkeypatch):
     source = tmp_path / "one.cu"
     (tmp_path / "one.h").write_text("// a header")
     source.write_text('#include "one.h"\n#include "cuda/device.h"\n')

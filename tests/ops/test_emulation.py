@@ -1,4 +1,4 @@
-"""The emulation of CUDA blocks itself: it finds the faults it is there for, and counts right."""
+"""The emulation of CUDA blocks: it detects faults, and its results are correct."""
 
 import os
 import subprocess
@@ -42,7 +42,7 @@ def run(
     total: torch.Tensor | None = None,
     blocks: int = 1,
 ) -> None:
-    """``tensors``: what the kernel writes, or what it reads and what it writes."""
+    """``tensors``: the output, or the input and the output of the kernel."""
     *given, out = tensors
     params = FaultParams(n=n, given=given[0] if given else None, out=out, total=total)
     emulation.execute(Kernel("faults", FaultParams, threads, threads), name, blocks, params)
@@ -65,12 +65,12 @@ def zeros(count: int) -> torch.Tensor:
         ("not_in_its_mask", 32, 3, r"lane 3 is not in the mask that it gives \(faults.cu:"),
     ],
 )
-def test_what_waits_for_ever_is_reported(name, threads, n, message, order, monkeypatch):
+def test_deadlocks_are_reported(name, threads, n, message, order, monkeypatch):
     monkeypatch.setenv("SNOWSPLAT_ORDER", order)
     with pytest.raises(RuntimeError, match=f"{name}: block 0: .*{message}"):
         run(name, threads, n, zeros(threads))
     out = zeros(64)
-    run("double_all", 64, 64, out + 3)  # and the next kernel starts afresh
+    run("double_all", 64, 64, out + 3)  # the next kernel is not affected
 
 
 def test_all_threads_at_one_barrier_are_fine():
@@ -79,13 +79,13 @@ def test_all_threads_at_one_barrier_are_fine():
         run(name, 64, n, out)
         assert out.tolist() == [1] * 64
     run("short_warp", 48, 32, zeros(48))
-    # A barrier within warps alone: those of the other warp wait for the block.
+    # A barrier of one warp, while the threads of the other wait for the block.
     with pytest.raises(RuntimeError, match="divergent barrier"):
         run("barrier_or_vote", 64, 32, zeros(64))
 
 
 @pytest.mark.parametrize("order", ["backward", "1", "2"])
-def test_a_missing_barrier_shows_in_another_order(order, monkeypatch):
+def test_a_missing_barrier_is_visible_in_another_order(order, monkeypatch):
     given, right, out = torch.arange(64, dtype=torch.int32), zeros(64), zeros(64)
     run("missing_barrier", 64, 1, given, right)
     assert right.tolist() == [0, *range(63)]
@@ -95,7 +95,7 @@ def test_a_missing_barrier_shows_in_another_order(order, monkeypatch):
 
 
 @pytest.mark.parametrize("order", ["forward", "backward", "7"])
-def test_warps_too_need_their_barriers(order, monkeypatch):
+def test_a_missing_warp_barrier_is_visible(order, monkeypatch):
     monkeypatch.setenv("SNOWSPLAT_ORDER", order)
     out = zeros(32)
     run("missing_warp_barrier", 32, 1, LANES, out)
@@ -104,7 +104,7 @@ def test_warps_too_need_their_barriers(order, monkeypatch):
     assert not torch.equal(out, LANES.flip(0))
 
 
-def test_shared_memory_begins_as_nan_in_every_block():
+def test_shared_memory_is_nan_at_the_start_of_every_block():
     out = torch.zeros(32)
     run("never_written", 32, 20, out, blocks=3)
     assert (out[:20] == 1).all()
@@ -119,12 +119,12 @@ def test_shared_memory_begins_as_nan_in_every_block():
         ("shifted_too_far, 32, 40, zeros(32)", "shift exponent 40 is too large"),
     ],
 )
-def test_the_sanitizers_find_what_reaches_too_far(call, found):
+def test_the_sanitizers_find_accesses_out_of_bounds(call, found):
     compiler = os.environ.get("CXX", "c++")
     libraries = []
     for name in ("libasan.so", "libubsan.so"):
-        asked = [compiler, f"-print-file-name={name}"]
-        path = subprocess.run(asked, capture_output=True, text=True).stdout.strip()
+        command = [compiler, f"-print-file-name={name}"]
+        path = subprocess.run(command, capture_output=True, text=True).stdout.strip()
         if not os.path.isabs(path):
             pytest.skip(f"needs {name}, which comes with GCC")
         libraries.append(path)
@@ -177,7 +177,7 @@ def test_values_of_exchanges():
     assert unsigned == expected
 
 
-def test_a_double_travels_whole():
+def test_exchange_of_a_double():
     given, out = torch.rand(32, dtype=torch.float64), torch.zeros(32, dtype=torch.float64)
     run("wide_values", 32, 5, given, out)
     assert torch.equal(out, given[LANES.long() ^ 5])
@@ -194,10 +194,10 @@ def test_partial_masks():
     assert found == [[7], [above], [odd], [1]]
 
 
-def test_warps_run_on_their_own():
+def test_warps_run_independently():
     out = zeros(96)
     run("warps_apart", 96, 3, out)
-    # Of lane i comes i + i.
+    # Lane i has i + i.
     assert out.view(3, 32).tolist() == [
         [sum(2 * i for i in range(3 * w + 1))] * 32 for w in range(3)
     ]

@@ -1,6 +1,6 @@
-"""Extreme input: whatever finite numbers the parameters hold, all results are finite.
+"""Extreme input: for any finite parameters, all results are finite.
 
-What hypothesis finds, here for seconds, in tests/nightly/fuzz_ops.py for as long as one likes.
+The search by hypothesis takes seconds here; tests/nightly/fuzz_ops.py runs it for longer.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ COUNT = 64
 
 
 def wild(seed: int) -> dict[str, Tensor]:
-    """Parameters of `random_scene`, made extreme one by one: the tests choose among them."""
+    """Extreme values for each parameter of `random_scene`; the tests choose among them."""
     g = generator(seed)
     scene = random_scene(seed, COUNT)
     means, pose = scene.params["means"], scene.cam_from_world
@@ -81,7 +81,7 @@ SINGLE = [(name, case) for name, cases in NAMES.items() for case in cases.split(
 
 
 def check(variant: Variant, scene: Scene) -> None:
-    """Projects, blends with depth, and steps; looks at every number on the way."""
+    """Projects, rasterizes with depth, and takes a step; all intermediate numbers are checked."""
     leaf = scene.to(variant.dtype)
     splats = leaf.project(variant.ops)
     splats.packed.retain_grad()
@@ -139,7 +139,7 @@ def test_one_extreme(variant: Variant, name: str, case: str) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_extremes_together(variant: Variant, seed: int) -> None:
-    """Every parameter of every Gaussian from another case."""
+    """Every parameter of every Gaussian is from another case."""
     scene, cases = random_scene(seed, COUNT), wild(seed)
     g = generator(1000 + seed)
     for name, listed in NAMES.items():
@@ -151,8 +151,10 @@ def test_extremes_together(variant: Variant, seed: int) -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_what_is_not_finite_harms_itself_alone(variant: Variant, name: str, value: float) -> None:
-    """The ids stay in order and in range, and every other Gaussian keeps all of its bits."""
+def test_nonfinite_gaussians_do_not_affect_others(
+    variant: Variant, name: str, value: float
+) -> None:
+    """Ids stay sorted and in range, and the results of all other Gaussians are bit-identical."""
     clean, broken = random_scene(6, 130), random_scene(6, 130)
     healthy = torch.ones(130, dtype=torch.bool)
     healthy[::5] = False
@@ -211,8 +213,8 @@ def test_splats_of_any_size(variant: Variant, scale: float) -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_splat_that_is_not_finite_draws_nothing(native: Variant, value: float) -> None:
-    """Where its mean or its conic is not; and the others see nothing of it."""
+def test_nonfinite_splats_are_not_drawn(native: Variant, value: float) -> None:
+    """A non-finite mean or conic; the other splats are not affected."""
     splats = random_splats(3, 120, 23, 17)
     broken = splats.packed.clone()
     for i in range(0, 120, 7):
@@ -230,15 +232,15 @@ def test_a_splat_that_is_not_finite_draws_nothing(native: Variant, value: float)
     assert_close(grads[0][rows], grads[1], native.backward)
 
 
-#: Cases, by the engine: emulation takes a hundred times as long.
+#: Number of cases by engine: the emulation is a hundred times slower.
 EXAMPLES = {"native": 25, "emulated": 3, "cuda": 25}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in CHECKS if name != "long images"])
-def test_whatever_hypothesis_finds(native: Variant, name: str) -> None:
-    """Projecting with its gradient and the step of Adam, blending with its gradient and the
-    statistics, the harm done to others by what is not finite, distances, the loss."""
+def test_random_extremes(native: Variant, name: str) -> None:
+    """Projection with its gradient and Adam, rasterization with its gradient and the statistics,
+    non-finite Gaussians among others, distances, the loss."""
     strategies, holds = CHECKS[name]
 
     @settings(
@@ -257,7 +259,7 @@ def test_whatever_hypothesis_finds(native: Variant, name: str) -> None:
 
 @pytest.mark.parametrize("size", LONG)
 def test_long_images(native: Variant, size: tuple[int, int]) -> None:
-    """Of 16384 by 3 pixels, and upright: the loss, and what is seen at both ends."""
+    """16384×3 and 3×16384 pixels: the loss, and the image at both ends."""
     if native.dtype == torch.float32:
         check_photometric(native, (1, size, "noise", True), 0.2)
     width, height = size
@@ -274,17 +276,17 @@ def test_long_images(native: Variant, size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
 @pytest.mark.parametrize("visible_only", [False, True])
-def test_no_gradient_gets_into_what_it_breaks(
+def test_gradients_that_overflow_are_skipped(
     variant: Variant, value: float, visible_only: bool
 ) -> None:
-    """Rows with such numbers are counted; those keep what they had, all others take their step."""
+    """Rows with such numbers are counted and stay unchanged; all others are updated."""
     scene = random_scene(6, 130)
     ids = scene.to(variant.dtype, requires_grad=False).project(variant.ops).ids
     assert ids is not None
     grad = normal(generator(2), len(ids), 16)
     extra = torch.zeros(130, dtype=variant.dtype)
     breaks = value if variant.dtype == torch.float32 or value != 1e30 else 1e300
-    grad[3, 5], grad[8, 9] = breaks, breaks  # of an opacity, and of a colour
+    grad[3, 5], grad[8, 9] = breaks, breaks  # gradients of an opacity and of a colour
     extra[int(ids[20])] = breaks
     results = []
     for packed_grad in (grad, torch.where(grad.abs() < 1e9, grad, 0.0)):
@@ -309,7 +311,7 @@ def test_no_gradient_gets_into_what_it_breaks(
         for tensors in (state.params, m, v):
             assert_finite(dict(tensors))
         results.append((state.params, m, v))
-        # Added to what was there; a colour is of the direction, hence of the mean, too.
+        # A colour depends on the direction, so its gradient also affects the mean.
         assert nonfinite_rows.tolist() == ([2, 1, 1, 3, 2, 2] if broken else [1] * 6)
     rows = ids[torch.tensor([3, 8, 20])].long()
     others = torch.ones(130, dtype=torch.bool)
@@ -322,7 +324,7 @@ def test_no_gradient_gets_into_what_it_breaks(
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_statistics_without_what_is_not_finite(variant: Variant, value: float) -> None:
+def test_statistics_skip_nonfinite_gradients(variant: Variant, value: float) -> None:
     splats = random_splats(2, 4, 23, 17)
     packed = splats.packed.to(variant.dtype).requires_grad_()
     packed.grad = torch.ones_like(packed)

@@ -26,7 +26,7 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
 
 @pytest.fixture
 def fresh(monkeypatch):
-    """The loader as it is before the first launch, and again after the test."""
+    """Resets the loader to the state before the first launch, also after the test."""
     monkeypatch.delenv("SNOWSPLAT_ISA", raising=False)
     monkeypatch.delenv("SNOWSPLAT_THREADS", raising=False)
     for name in ("available_isas", "_library"):
@@ -53,7 +53,7 @@ class RecordParams(Params):
 
 @pytest.fixture(scope="module")
 def recorder(tmp_path_factory):
-    """A library that writes down the parameters that arrive."""
+    """A library that records its parameters."""
     folder = tmp_path_factory.mktemp("lib")
     source = Path(__file__).with_name("launch_abi.cpp")
     compiler = os.environ.get("CXX", "c++")
@@ -134,7 +134,7 @@ def test_fields_have_their_kinds(recording, changes, found):
         native.launch("record", record_params(**changes))
 
 
-def test_a_struct_of_another_function_is_refused(recording):
+def test_a_struct_of_another_function_is_rejected(recording):
     with pytest.raises(TypeError, match="record takes RecordParams, not Nested"):
         native.launch("record", Nested(a=1.0, b=2))
 
@@ -144,7 +144,7 @@ def test_every_field_has_to_be_given():
         RecordParams(n=1, out=None, nothing=None, first=None, second=None, whole=1)
 
 
-# A field is missing, has another name, kind or place, or a constant is another.
+# A field is missing, or has another name, kind or offset, or a constant is different.
 @dataclass(slots=True, kw_only=True)
 class Shorter(Params):
     n: int
@@ -169,19 +169,19 @@ OUTDATED = "the native library for recorder does not match the Python files"
 
 
 @pytest.mark.parametrize("params", [Shorter, Renamed, OtherKind, Nested])
-def test_another_layout_is_found_when_the_library_is_loaded(recording, monkeypatch, params):
+def test_another_layout_is_detected_when_the_library_is_loaded(recording, monkeypatch, params):
     monkeypatch.setattr(native, "ENTRIES", {"record": params})
     with pytest.raises(UserError, match=rf"^{OUTDATED} \(record\); rebuild it: .*make native"):
         native.isa()
 
 
-def test_fields_in_another_order_are_found(recording, monkeypatch):
+def test_fields_in_another_order_are_detected(recording, monkeypatch):
     monkeypatch.setattr(native, "ENTRIES", {"record_swapped": RecordParams})
     with pytest.raises(UserError, match=rf"^{OUTDATED} \(record_swapped\); rebuild it"):
         native.isa()
 
 
-def test_another_constant_is_found(recording, monkeypatch):
+def test_another_constant_is_detected(recording, monkeypatch):
     assert native.isa() == "recorder"
     native._library.cache_clear()
     monkeypatch.setitem(layout._CONSTANTS, "tile", 32)
@@ -198,8 +198,8 @@ def reduce_params(slots: torch.Tensor, grad_packed: torch.Tensor) -> SplatsReduc
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
-def test_cuda_without_a_gpu_says_why():
-    # Fake tensors carry the device and no memory.
+def test_cuda_without_a_gpu_is_an_error_with_the_reason():
+    # Fake tensors have a device but no memory.
     from torch._subclasses.fake_tensor import FakeTensorMode
 
     class OnGpu(torch.Tensor):
@@ -256,10 +256,10 @@ def test_unknown_isa_names_the_valid_ones(fresh, monkeypatch):
         native.isa()
 
 
-def test_isa_this_machine_lacks_names_the_ones_it_has(fresh, monkeypatch):
+def test_an_unsupported_isa_names_the_supported_ones(fresh, monkeypatch):
     monkeypatch.setenv("SNOWSPLAT_ISA", "avx512")
     monkeypatch.setattr(native, "available_isas", lambda: ("baseline",))
-    with pytest.raises(UserError, match="avx512 does not run here; .* have baseline"):
+    with pytest.raises(UserError, match="avx512 is not supported here; .* have baseline"):
         native.isa()
 
 

@@ -20,7 +20,7 @@ def grid(*counts: int, spacing: float = 1.0) -> Tensor:
 
 
 def test_grid(variant: Variant) -> None:
-    """Every point of a grid has three neighbours at the spacing, every corner exactly three."""
+    """Every point of a grid has at least three neighbours at the grid spacing."""
     points = grid(7, 5, 4, spacing=0.25).to(variant.dtype)
     distances = variant.ops.neighbours(points, k=4)
     assert distances.dtype == variant.dtype
@@ -51,7 +51,7 @@ def test_all_at_the_same_place(variant: Variant, k: int) -> None:
 
 
 def test_far_apart(variant: Variant) -> None:
-    """As far as squares of float32 reach, and the box of the points farther than that."""
+    """Distances near the overflow of squares in float32; the bounding box exceeds it."""
     points = torch.tensor([[-3e18, 0, 0], [0, 4e18, 0], [0, 0, 0]]).to(variant.dtype)
     expected = torch.tensor([[3e18, 5e18], [4e18, 5e18], [3e18, 4e18]])
     assert_close(variant.ops.neighbours(points, k=2) / 1e18, expected / 1e18, 1e-6)
@@ -62,7 +62,7 @@ def test_far_apart(variant: Variant) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_fewer_points_than_neighbours(variant: Variant, count: int) -> None:
-    """What does not exist is infinitely far away."""
+    """Missing neighbours are at an infinite distance."""
     distances = variant.ops.neighbours(grid(count, 1, 1).to(variant.dtype), k=3)
     assert distances.shape == (count, 3)
     assert distances.isfinite().sum(dim=1).tolist() == [count - 1] * count
@@ -92,7 +92,7 @@ def test_native_agrees_with_the_reference(native: Variant, cloud, k: int) -> Non
     k = min(k, len(points) - 1)
     expected = reference.neighbours(points, k)
     actual = native.ops.neighbours(points.to(native.dtype), k)
-    # Every distance by itself: the L2 over all would let the outlier hide the rest.
+    # Each distance separately: in the L2 norm over all, the outlier would hide the others.
     torch.testing.assert_close(actual.double(), expected, rtol=native.forward * 1e-1, atol=1e-12)
 
 

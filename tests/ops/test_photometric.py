@@ -23,13 +23,13 @@ from .scenes import (
 )
 
 SIZES = [(1, 1), (5, 3), (3, 5), (11, 11), (17, 23), (16, 16), (33, 64), (70, 41)]
-# About the tiles of a GPU: 32 columns, 24 rows of float or 12 of double.
+# Near the tile sizes of a GPU: 32 columns, 24 rows of float or 12 of double.
 TILES = [(11, 31), (12, 32), (13, 33), (23, 63), (24, 64), (25, 65), (1, 300), (300, 1)]
 C1, C2 = 0.01**2, 0.03**2
 
 
 def images(seed: int, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A smooth picture and a noisy, shifted version of it, (H, W, 3) planar, in [0, 1]."""
+    """A smooth image and a noisy, shifted version of it, (H, W, 3) planar, in [0, 1]."""
     g = generator(seed)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     waves = [torch.sin(0.3 * x + 0.2 * y + phase) for phase in (0.0, 1.0, 2.0)]
@@ -44,7 +44,7 @@ def window() -> list[float]:
 
 
 def ssim_slowly(a: Tensor, b: Tensor) -> float:
-    """The definition, a pixel at a time: moments under the window, zeros outside of the image."""
+    """The definition, pixel by pixel: moments under the window, zeros outside of the image."""
     height, width, channels = a.shape
     w = window()
     total = 0.0
@@ -78,7 +78,7 @@ def test_ssim_of_equal_images_is_one(variant: Variant, height: int, width: int) 
 
 
 def test_ssim_of_one_pixel(variant: Variant) -> None:
-    """The window sees the pixel with its central weight, and zeros."""
+    """Only the central weight of the window applies; all other values are zeros."""
     p, q = 0.75, 0.25
     a, b = torch.full((1, 1, 3), p).to(variant.dtype), torch.full((1, 1, 3), q).to(variant.dtype)
     w = window()[5] ** 2
@@ -88,7 +88,7 @@ def test_ssim_of_one_pixel(variant: Variant) -> None:
 
 
 def test_ssim_of_constant_images(variant: Variant) -> None:
-    """Inside flat images only the luminance counts: (2 p q + C1) / (p² + q² + C1) a pixel.
+    """In constant images only the luminance counts: (2 p q + C1) / (p² + q² + C1) per pixel.
 
     With n × n pixels the sum is (n − 10)² of those, and a border that grows linearly with n, so the
     second difference in n is twice the luminance.
@@ -122,7 +122,7 @@ def test_loss_is_the_weighted_sum(variant: Variant) -> None:
     assert float(default) == pytest.approx(0.8 * l1 + 0.2 * dssim, rel=1e-5)
 
 
-def test_bytes_are_a_target_too(variant: Variant) -> None:
+def test_targets_with_8_bits(variant: Variant) -> None:
     a, b = images(3, 17, 23)
     a = a.to(variant.dtype).requires_grad_()
     levels = (b * 255).round().to(torch.uint8)
@@ -140,7 +140,7 @@ def test_bytes_are_a_target_too(variant: Variant) -> None:
 
 
 def test_storage_does_not_matter(variant: Variant) -> None:
-    """Interleaved images (H, W, C) are as good as planar ones."""
+    """Results for interleaved images (H, W, C) equal those for planar ones."""
     a, b = (i.to(variant.dtype) for i in images(4, 17, 23))
     assert not a.is_contiguous()
     planar = variant.ops.photometric_loss(a, b)
@@ -203,7 +203,7 @@ def test_finite_differences_across_tiles(double: Variant, changed: tuple[slice, 
 
 
 def test_without_a_gradient(native: Variant) -> None:
-    """The value is the same whether or not somebody wants its gradient, and every time."""
+    """The value is the same with and without a gradient, and in every run."""
     a, b = (i.to(native.dtype) for i in images(10, 40, 37))
     values = [native.ops.photometric_loss(image, b) for image in (a, a, a.clone().requires_grad_())]
     assert torch.equal(values[0], values[1])
@@ -211,11 +211,11 @@ def test_without_a_gradient(native: Variant) -> None:
 
 
 def test_channels_one_after_the_other(native: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where images are large a GPU takes few channels at a time: the same to the bit."""
+    """For large images a GPU processes few channels at a time, with bit-identical results."""
     a, b = (i.to(native.dtype) for i in images(11, 27, 35))
     results = []
-    for room in (cuda.photometric._MAPS_BYTES, 6 * 27 * 35 * a.element_size(), 0):
-        monkeypatch.setattr(cuda.photometric, "_MAPS_BYTES", room)
+    for limit in (cuda.photometric._MAPS_BYTES, 6 * 27 * 35 * a.element_size(), 0):
+        monkeypatch.setattr(cuda.photometric, "_MAPS_BYTES", limit)
         image = a.clone().requires_grad_()
         value = native.ops.photometric_loss(image, b)
         value.backward()
@@ -226,8 +226,8 @@ def test_channels_one_after_the_other(native: Variant, monkeypatch: pytest.Monke
         assert torch.equal(grad, results[0][1])
 
 
-def test_not_a_number_stays_where_it_is(native: Variant) -> None:
-    """The gradient of a pixel depends on those at most 10 away."""
+def test_nan_affects_only_near_pixels(native: Variant) -> None:
+    """The gradient of a pixel depends only on pixels at most 10 away."""
     a, b = images(12, 40, 50)
     a[20, 25, 1] = math.nan
     image = a.to(native.dtype).requires_grad_()
@@ -258,7 +258,7 @@ def value_and_gradient(
 
 @functools.cache
 def expected(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Of the reference, once for all variants."""
+    """Results of the reference, computed once for all variants."""
     return value_and_gradient(REFERENCE, name, height, width)
 
 
@@ -278,7 +278,7 @@ def test_native_agrees_with_the_reference(
 def test_native_agrees_with_the_reference_on_flat_images(native: Variant) -> None:
     """Without structure the variances are differences of equal numbers, and their rounding counts.
 
-    In float32 that is 1e-7 against C2 = 9e-4, so this case alone may err by more.
+    In float32 this is 1e-7 compared with C2 = 9e-4, so the tolerance is larger in this test.
     """
     a = as_float32(torch.full((20, 30, 3), 0.9, dtype=torch.float64))
     b = as_float32(torch.full((20, 30, 3), 0.85, dtype=torch.float64))

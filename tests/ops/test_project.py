@@ -41,7 +41,7 @@ def single(
     quat: tuple[float, float, float, float] = (1, 0, 0, 0),
     logit: float = 1.0,
 ) -> Scene:
-    """One Gaussian before a camera at the origin that looks along z."""
+    """One Gaussian in front of a camera at the origin that looks along z."""
     tensor = partial(torch.tensor, dtype=torch.float64)
     params = {
         "means": tensor([mean]),
@@ -78,8 +78,8 @@ def test_gaussian_on_the_axis(variant: Variant) -> None:
     close(splats.colors[0], torch.tensor([0.5 + 0.5 * c0, 0.5 - 0.25 * c0, 0.0]))
 
 
-def test_quaternion_turns_the_axes(variant: Variant) -> None:
-    """wxyz: a quarter turn about z swaps x and y; an eighth makes x → (x + y)/√2, positive xy."""
+def test_quaternion_rotates_the_axes(variant: Variant) -> None:
+    """wxyz: a rotation by 90° about z swaps x and y; by 45°, x → (x + y)/√2, with positive xy."""
     quarter, eighth = math.pi / 4, math.pi / 8
     turned = single((0, 0, 2), (0.2, 0.05, 0.1), (math.cos(quarter), 0, 0, math.sin(quarter)))
     plain = single((0, 0, 2), (0.05, 0.2, 0.1))
@@ -122,8 +122,8 @@ def test_isotropic_gaussian_off_the_axis(variant: Variant) -> None:
     assert_close(splats.means2d, centre, 1e-6)
 
 
-def test_jacobian_is_held_outside_of_the_image(variant: Variant) -> None:
-    """The centre is at x/z = 1.5; the ratio in J stops 15% of the width beyond the border."""
+def test_jacobian_is_clamped_outside_of_the_image(variant: Variant) -> None:
+    """The centre is at x/z = 1.5; the ratio in J is clamped 15% of the width beyond the border."""
     s, z = 1.0, 2.0
     splats = single((3.0, 0, z), (s, s, s)).to(variant.dtype).project(variant.ops)
     fx, fy, cx = VIEW["fx"], VIEW["fy"], VIEW["cx"]
@@ -133,7 +133,7 @@ def test_jacobian_is_held_outside_of_the_image(variant: Variant) -> None:
     assert_close(splats.means2d[:, 0], torch.tensor([fx * 1.5 + cx]), 1e-6)
 
 
-def test_what_is_visible(variant: Variant) -> None:
+def test_visibility(variant: Variant) -> None:
     """Near plane, opacity, and the box of the ellipse {α ≥ 1/255} against the pixel centres."""
     cx, fx, z = VIEW["cx"], VIEW["fx"], 2.0
     sigma = math.sqrt((fx * 0.1 / z) ** 2 + 0.3)
@@ -143,7 +143,7 @@ def test_what_is_visible(variant: Variant) -> None:
     def at_column(px: float) -> tuple[float, float, float]:
         return ((px - cx) * z / fx, 0.0, z)
 
-    # Far outside, J is larger by the slant: take the scale along z away, and y does not matter.
+    # Far outside, J grows with the angle; without the scale along z, y has no effect.
     scales = (0.1, 0.1, 1e-6)
     cases = [
         (single((0, 0, 2)), True),
@@ -199,7 +199,7 @@ def test_moving_world_and_camera_together_changes_nothing(variant: Variant) -> N
     assert_close(after.packed, before.packed, 1e-5)
 
 
-def test_harmonics_are_those_of_the_books() -> None:
+def test_harmonics_match_the_definition() -> None:
     """Yₗₘ = (−1)ᵐ N Pₗ^|m|(cos θ) · {√2 sin |m|φ, 1, √2 cos mφ} for m < 0, m = 0, m > 0."""
     directions = normal(generator(0), 50, 3)
     directions = directions / directions.norm(dim=1, keepdim=True)
@@ -218,10 +218,10 @@ def test_harmonics_are_those_of_the_books() -> None:
 
 
 def test_harmonics_of_degree_one_point_along_the_axes(variant: Variant) -> None:
-    """The coefficients weigh −y, z, −x, by √(3/4π), of the world direction from the camera."""
+    """The basis is −y, z, −x, times √(3/4π), of the direction from the camera in the world."""
     scene = single((0.4, -0.3, 2.0))
     scene.params["sh_dc"].zero_()
-    scene.params["sh_rest"] = torch.eye(3, dtype=torch.float64)[None]  # each its own channel
+    scene.params["sh_rest"] = torch.eye(3, dtype=torch.float64)[None]  # one channel each
     scene = replace(scene, cam_from_world=tilted_pose())
     R, t = scene.cam_from_world[:, :3], scene.cam_from_world[:, 3]
     direction = scene.params["means"][0] - torch.linalg.solve(R, -t)
@@ -232,7 +232,7 @@ def test_harmonics_of_degree_one_point_along_the_axes(variant: Variant) -> None:
 
 
 def test_the_reference_computes_in_the_precision_of_the_means() -> None:
-    """The pose is float64 for any precision."""
+    """The pose is float64 in every precision."""
     scene = random_scene(1, 20)
     exact = scene.to(torch.float64).project(reference)
     rounded = scene.to(torch.float32).project(reference)
@@ -275,7 +275,7 @@ def test_native_agrees_with_the_reference_for_any_count(native: Variant, count: 
 def test_native_agrees_with_the_reference_for_long_thin_splats(
     native: Variant, shape: str, length: float
 ) -> None:
-    """det Σ' as a plain difference cancels: a σ of 1000 pixels left 19% of error in float32."""
+    """det Σ' as a difference cancels: with a σ of 1000 pixels, the error was 19% in float32."""
     scene = random_scene(3, 64, 64, 48)
     R, t = scene.cam_from_world[:, :3], scene.cam_from_world[:, 3]
     depth = (scene.params["means"] @ R.T + t)[:, 2].abs()
@@ -308,15 +308,15 @@ def compare(native: Variant, scene: Scene) -> None:
         assert_close(grad, leaf.grad, native.backward, f"gradient of {name}")
 
 
-def test_gradients_only_where_asked(native: Variant) -> None:
+def test_only_requested_gradients_are_computed(native: Variant) -> None:
     scene = random_scene(6, 25).to(native.dtype, requires_grad=False)
-    for asked in (*PARAMETERS, "cam_from_world"):
+    for required in (*PARAMETERS, "cam_from_world"):
         leaves = {n: t.detach().clone() for n, t in scene.leaves().items()}
-        leaves[asked].requires_grad_()
+        leaves[required].requires_grad_()
         splats = native.ops.project(**leaves, **scene.view)
         splats.packed.square().sum().backward()
-        assert leaves[asked].grad is not None
-        assert leaves[asked].grad.norm() > 0
+        assert leaves[required].grad is not None
+        assert leaves[required].grad.norm() > 0
     with torch.no_grad():
         assert not scene.project(native.ops).packed.requires_grad
 
@@ -330,10 +330,10 @@ def test_rows_beyond_the_degree_get_no_gradient(variant: Variant) -> None:
     assert grad[:, 3:].norm() == 0
 
 
-def test_rows_of_the_unseen_are_empty(native: Variant) -> None:
-    """On a GPU, which keeps a row for each Gaussian: zeros, and nothing of their gradient is used.
+def test_rows_of_invisible_gaussians_are_empty(native: Variant) -> None:
+    """On a GPU, invisible Gaussians have rows of zeros, whose gradient is ignored.
 
-    On the CPU there are none.
+    On the CPU there are no such rows.
     """
     scene = random_scene(9, 130).to(native.dtype)
     splats = native.ops.project(**scene.leaves(), **scene.view)
@@ -360,7 +360,7 @@ def test_rows_of_the_unseen_are_empty(native: Variant) -> None:
 
 
 def test_native_takes_any_strides(native: Variant) -> None:
-    """A transposed or sliced tensor is as good as a contiguous one."""
+    """Transposed and sliced tensors have the same results as contiguous ones."""
     scene = random_scene(8, 20).to(native.dtype, requires_grad=False)
     strided = {n: torch.stack([p, p], dim=-1)[..., 0] for n, p in scene.params.items()}
     assert not strided["means"].is_contiguous()
@@ -369,7 +369,7 @@ def test_native_takes_any_strides(native: Variant) -> None:
 
 
 def test_points_seen_from_the_world_frame() -> None:
-    """The helper of these tests: cam_from_world maps `world_points` back."""
+    """Checks the helper of these tests: cam_from_world inverts `world_points`."""
     scene = random_scene(9, 5)
     points = normal(generator(2), 5, 3)
     world = world_points(scene.cam_from_world, points)

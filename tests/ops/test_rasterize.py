@@ -35,9 +35,9 @@ from .scenes import (
 def flat_stack(
     opacities: list[float], depths: list[float] | None = None, colors: Tensor | None = None
 ) -> Splats2D:
-    """Splats so wide that α is the opacity all over a small image.
+    """Splats so wide that α is the opacity in all pixels of a small image.
 
-    The i-th has the i-th of `colors`, by default channel i alone.
+    The i-th has the i-th of `colors`, by default only channel i.
     """
     count = len(opacities)
     wide = 1e-9
@@ -53,7 +53,7 @@ def flat_stack(
 def blend_slowly(
     splats: Splats2D, width: int, height: int, background: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The definition, a pixel and a splat at a time."""
+    """The definition, one pixel and one splat at a time."""
     rows = sorted(range(len(splats)), key=lambda row: (float(splats.depths[row]), row))
     image = torch.zeros(height, width, splats.channels, dtype=torch.float64)
     alpha, depth = torch.zeros(height, width).double(), torch.zeros(height, width).double()
@@ -83,7 +83,7 @@ BACKGROUND = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float64)
 
 @functools.cache
 def blended_slowly(seed: int) -> tuple[Splats2D, tuple[Tensor, ...]]:
-    """Splats and their image, once for all variants."""
+    """Splats and their image, computed once for all variants."""
     splats = random_splats(seed, 70, 19, 18, opacity=(0.3, 1.0))
     return splats, tuple(blend_slowly(splats, 19, 18, BACKGROUND))
 
@@ -136,7 +136,7 @@ def test_shapes_and_storage(variant: Variant) -> None:
 
 
 def test_opacity_is_clamped(variant: Variant) -> None:
-    """α stops at 0.99, and there neither opacity nor conic nor centre has a gradient."""
+    """α is clamped at 0.99, where opacity, conic and centre have no gradient."""
     splats = leaf_splats(flat_stack([1.0]), variant.dtype)
     image, alpha, _ = variant.ops.rasterize(splats, 3, 2)
     assert_close(alpha, torch.full((2, 3), 0.99), 1e-5)
@@ -147,7 +147,7 @@ def test_opacity_is_clamped(variant: Variant) -> None:
 
 
 def test_opaque_stack_stops(variant: Variant) -> None:
-    """T falls to 0.2, …, 0.2⁵ = 3.2e-4; the sixth would make it 6.4e-5 and is not blended."""
+    """T decreases to 0.2, …, 0.2⁵ = 3.2e-4; the sixth splat would make it 6.4e-5 and is skipped."""
     splats = leaf_splats(flat_stack([0.8] * 9), variant.dtype)
     image, alpha, depth = variant.ops.rasterize(splats, 3, 2, with_depth=True)
     weights = torch.tensor([0.8 * 0.2**i if i < 5 else 0.0 for i in range(9)])
@@ -161,7 +161,7 @@ def test_opaque_stack_stops(variant: Variant) -> None:
 
 
 def test_a_finished_pixel_stays_finished(variant: Variant) -> None:
-    """After the stop nothing is blended, not even what is transparent enough."""
+    """A finished pixel blends no further splat, however transparent."""
     splats = leaf_splats(flat_stack([0.99, 0.95, 0.9, 0.01]), variant.dtype)
     image, _, _ = variant.ops.rasterize(splats, 1, 1)
     assert_close(image[0, 0], torch.tensor([0.99, 0.01 * 0.95, 0, 0]), 1e-5)
@@ -181,7 +181,7 @@ def test_equal_depths_blend_by_row(variant: Variant) -> None:
 
 @pytest.mark.parametrize("depth", [0.21, 1.5, 1000.0, 1e-3, 1e6])
 def test_close_depths_blend_in_order(variant: Variant, depth: float) -> None:
-    """Depths one float32 step apart are still told apart."""
+    """Depths that differ by one float32 step are distinguished."""
     near = torch.tensor(depth)
     far = torch.nextafter(near, torch.tensor(math.inf))
     splats = leaf_splats(flat_stack([0.5, 0.5], [float(far), float(near)]), variant.dtype)
@@ -198,7 +198,7 @@ def test_order_of_rows_does_not_matter(variant: Variant) -> None:
     assert_close(images[0], images[1], variant.forward)
 
 
-def test_nothing_to_blend(variant: Variant) -> None:
+def test_no_splats(variant: Variant) -> None:
     splats = leaf_splats(random_splats(0, 0, 5, 4), variant.dtype)
     background = torch.tensor([0.25, 0.5, 1.0], dtype=variant.dtype, requires_grad=True)
     image, alpha, depth = variant.ops.rasterize(splats, 5, 4, background, with_depth=True)
@@ -213,7 +213,7 @@ def test_nothing_to_blend(variant: Variant) -> None:
 
 @pytest.mark.parametrize("with_depth", [False, True])
 def test_finite_differences(double: Variant, with_depth: bool) -> None:
-    """Every column and the background, on splats where no threshold is near."""
+    """Every column and the background, for splats that are not near a threshold."""
     with torch.no_grad():
         splats = smooth_scene().project(reference)
     background = uniform(generator(4), 0, 1, 3).requires_grad_()
@@ -232,7 +232,7 @@ def test_finite_differences(double: Variant, with_depth: bool) -> None:
 def check_gradients(
     double: Variant, outputs: Callable[..., Any], inputs: tuple[Tensor, ...]
 ) -> None:
-    """By finite differences; the emulation, which is slow, along a random direction alone."""
+    """By finite differences; with the slow emulation, only along a random direction."""
     fast = double.engine == "emulated"
     torch.manual_seed(0)
     assert torch.autograd.gradcheck(outputs, inputs, eps=1e-6, atol=1e-6, rtol=1e-6, fast_mode=fast)
@@ -318,7 +318,7 @@ def test_native_agrees_with_the_reference_at_any_size(
 
 @pytest.mark.slow
 def test_native_agrees_with_the_reference_on_a_long_strip(native: Variant) -> None:
-    """Pixel coordinates of five digits, where float32 leaves a thousandth of a pixel."""
+    """Pixel coordinates of five digits, where float32 has a resolution of a thousandth of a pixel."""
     splats = random_splats(4, 400, 16384, 3, pixels=30.0)
     compare(native, splats, 16384, 3)
 
@@ -327,7 +327,7 @@ def test_native_agrees_with_the_reference_on_a_long_strip(native: Variant) -> No
 def test_native_agrees_with_the_reference_when_splats_are_many(
     native: Variant, opacity: tuple[float, float]
 ) -> None:
-    """Hundreds in a tile: faint ones that all count, and opaque ones of which most do not."""
+    """Hundreds per tile: faint splats that are all blended, and opaque ones, most of them skipped."""
     compare(native, random_splats(11, 500, 20, 18, pixels=5.0, opacity=opacity), 20, 18)
 
 
@@ -335,14 +335,14 @@ def test_native_agrees_with_the_reference_when_splats_are_many(
 def test_native_agrees_with_the_reference_for_a_tile_of_any_length(
     native: Variant, count: int
 ) -> None:
-    """As many splats as the kernels take together, one less, one more, none, and many."""
+    """As many splats as the kernels process together, one less, one more, none, and many."""
     splats = random_splats(count, count, 16, 16, pixels=4.0, opacity=(0.005, 0.03))
     compare(native, splats, 16, 16)
 
 
 @pytest.mark.parametrize("faint", [0, 5, 31, 37, 250, 257])
-def test_what_lies_behind_finished_pixels(native: Variant, faint: int) -> None:
-    """The tile is finished with the third splat of 0.95, or before; the others get no gradient."""
+def test_splats_behind_finished_pixels(native: Variant, faint: int) -> None:
+    """The tile is finished after at most three splats of 0.95; the others have no gradient."""
     opacities = [0.01] * faint + [0.95] * 4 + [0.5] * 70
     colors = uniform(generator(faint), -0.2, 1.0, len(opacities), 3)
     splats = flat_stack(opacities, colors=colors)
@@ -368,7 +368,7 @@ def test_native_agrees_with_the_reference_with_sums_in_order(
 
 @pytest.mark.parametrize("in_order", [False, True])
 def test_capacity(native: Variant, in_order: bool, request: pytest.FixtureRequest) -> None:
-    """What fits is the same; of what does not, a part, and nothing beyond the memory set aside."""
+    """A sufficient capacity has no effect; otherwise only some splats are drawn, within the memory."""
     if in_order:
         request.getfixturevalue("sums_in_order")
     splats = random_splats(6, 200, 40, 33)
@@ -392,7 +392,7 @@ def test_capacity(native: Variant, in_order: bool, request: pytest.FixtureReques
 
 
 def test_native_agrees_with_the_reference_for_tiny_splats(native: Variant) -> None:
-    """Splats below a pixel, many between the centres: none may be lost or counted twice."""
+    """Splats smaller than a pixel, many between centres: none may be lost or counted twice."""
     compare(native, random_splats(12, 500, 40, 40, pixels=0.4), 40, 40)
 
 
@@ -411,7 +411,7 @@ def test_native_agrees_with_the_reference_for_needles(native: Variant) -> None:
 
 @pytest.mark.slow
 def test_native_agrees_with_the_reference_for_tens_of_thousands(native: Variant) -> None:
-    """So many that they are sorted in parallel; some depths are equal."""
+    """So many splats that they are sorted in parallel; some depths are equal."""
     count, width, height = 60_000, 128, 96
     if native.engine == "emulated":
         count, width, height = 12_000, 64, 40
@@ -440,11 +440,11 @@ def test_native_agrees_with_the_reference_from_gaussian_to_pixel(native: Variant
         assert_close(grad, leaf_tensor.grad, native.backward, f"gradient of {name}")
 
 
-@pytest.mark.parametrize("asked", ["packed", "background"])
-def test_gradients_only_where_asked(native: Variant, asked: str) -> None:
+@pytest.mark.parametrize("required", ["packed", "background"])
+def test_only_requested_gradients_are_computed(native: Variant, required: str) -> None:
     splats = leaf_splats(random_splats(0, 20, 9, 9), native.dtype, requires_grad=False)
     background = torch.rand(3, generator=generator(0)).to(native.dtype)
-    leaf = splats.packed if asked == "packed" else background
+    leaf = splats.packed if required == "packed" else background
     leaf.requires_grad_()
     native.ops.rasterize(splats, 9, 9, background)[0].square().sum().backward()
     assert leaf.grad is not None
@@ -464,7 +464,7 @@ def test_backward_of_alpha_or_depth_alone(native: Variant) -> None:
 
 
 def test_two_dimensional_fitting(variant: Variant) -> None:
-    """Splats made by hand, without ids, learn a picture by gradient descent."""
+    """Splats without ids are fitted to an image by gradient descent."""
     target = torch.zeros(16, 16, 3, dtype=variant.dtype)
     target[4:12, 6:14] = torch.tensor([0.9, 0.5, 0.1], dtype=variant.dtype)
     start = random_splats(0, 24, 16, 16, opacity=(0.4, 0.8))
@@ -543,7 +543,7 @@ def test_pack_and_its_views() -> None:
     assert_close(splats.radii, 3 * major.sqrt(), 1e-9)
 
 
-# How many splats a pixel blends
+# Number of splats per pixel
 
 
 @pytest.mark.parametrize(
@@ -560,7 +560,7 @@ def test_count_of_a_stack(variant: Variant, opacities: list[float], expected: in
     assert bool((counts == expected).all())
 
 
-def test_counts_of_native_and_twin(native: Variant) -> None:
+def test_counts_match_the_reference(native: Variant) -> None:
     splats = random_splats(3, 300, 45, 37)
     exact = reference.count_blended(splats, 45, 37)
     assert float(exact.max()) > 5

@@ -21,7 +21,7 @@ def splats_of(ids: Tensor, packed: Tensor, grad: Tensor) -> Splats2D:
 
 
 def test_one_gaussian(variant: Variant) -> None:
-    """A gradient of (3, 4) on a 2×2 screen has norm 5; rows that are not seen stay as they are."""
+    """A gradient of (3, 4) on a 2×2 screen has norm 5; invisible rows stay unchanged."""
     norm_sum = torch.tensor([1.0, 2.0, 3.0], dtype=variant.dtype)
     views = torch.tensor([0.0, 7.0, 0.0], dtype=variant.dtype)
     radii = torch.tensor([1.0, 1.0, 9.0], dtype=variant.dtype)
@@ -57,7 +57,7 @@ def test_native_agrees_with_the_reference(native: Variant, with_radii: bool) -> 
 
 
 def test_rows_without_a_gaussian(native: Variant) -> None:
-    """Splats of the id -1 are passed over, and where `valid` is False all are."""
+    """Splats of the id -1 are skipped; if `valid` is False, all are."""
     packed, grad = torch.ones(2, 3, 16, dtype=native.dtype)
     packed[::2], grad[::2] = math.nan, math.nan
     splats = splats_of(torch.tensor([-1, 2, -1]), packed, grad)

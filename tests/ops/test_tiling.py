@@ -1,4 +1,4 @@
-"""Sorting splats into tiles on a GPU: the sort and the prefix sums, and what is made of them."""
+"""Sorting splats into tiles on a GPU: radix sort, prefix sums, tile lists."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ CPU = natives.LAUNCHERS["cpu"]
 
 @pytest.fixture(params=variants(EMULATED_FLOAT32, CUDA_FLOAT32))
 def run(request: pytest.FixtureRequest) -> Run:
-    """Runs the kernels of a GPU on CPU tensors."""
+    """Runs GPU kernels on CPU tensors."""
     variant: Variant = request.param
     if variant.engine == "cuda" and not torch.cuda.is_available():
         pytest.skip("needs a GPU that torch can use")
@@ -59,7 +59,7 @@ def run(request: pytest.FixtureRequest) -> Run:
 
 
 def random_keys(seed: int, n: int, dtype: torch.dtype, distinct: int = 2**62) -> Tensor:
-    """Of all bits, or few different ones."""
+    """Keys with all bits random, or few different keys."""
     values = torch.randint(-(2**62), 2**62, (n,), generator=generator(seed)) * 2 + 1
     return ((values.abs() % distinct) if distinct < 2**62 else values).to(dtype)
 
@@ -72,7 +72,7 @@ def unsigned(keys: Tensor) -> list[int]:
 def sort(
     run: Run, keys: Tensor, bits: tuple[int, int], count: int | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The sorted keys and the numbers they had, from memory with a margin that nobody may touch."""
+    """The sorted keys and the numbers they had, in memory with a margin that must stay unchanged."""
     n = len(keys)
     dtypes = (keys.dtype, keys.dtype, torch.int32, torch.int32)
     a, b, c, d = (torch.full((n + 8,), 99, dtype=dtype) for dtype in dtypes)
@@ -87,7 +87,7 @@ def sort(
 @pytest.mark.parametrize("n", [1, 2, 31, 33, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK + 77])
 @pytest.mark.parametrize("dtype", [torch.int16, torch.int32, torch.int64])
 def test_sort_is_a_stable_sort(run: Run, dtype: torch.dtype, n: int) -> None:
-    bits = 16 if n > BLOCK and dtype == torch.int64 else 8 * dtype.itemsize  # for time's sake
+    bits = 16 if n > BLOCK and dtype == torch.int64 else 8 * dtype.itemsize  # to save time
     keys = random_keys(n, n, dtype, distinct=2**62 if n % 2 else 5)
     plain = [k % 2**bits for k in unsigned(keys)]
     got, values = sort(run, keys, (0, bits))
@@ -105,7 +105,7 @@ def test_sort_by_some_bits(run: Run, bits: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 700, BLOCK, BLOCK + 5, 2 * BLOCK, 10**12])
-def test_sort_of_as_many_as_there_are(run: Run, count: int) -> None:
+def test_sort_of_a_count_on_the_device(run: Run, count: int) -> None:
     keys = random_keys(4, 2 * BLOCK, torch.int16, distinct=50)
     there = min(count, 2 * BLOCK)
     got, values = sort(run, keys, (0, 6), count)
@@ -124,7 +124,7 @@ def test_sort_of_given_values(run: Run) -> None:
     assert torch.equal(got[1], wanted)
 
 
-def test_sort_of_nothing(run: Run) -> None:
+def test_sort_of_no_keys(run: Run) -> None:
     keys, values = sort(run, torch.empty(0, dtype=torch.int32), (0, 32))
     assert len(keys) == len(values) == 0
 
@@ -165,9 +165,9 @@ def test_exclusive_scan_beyond_32_bits(run: Run) -> None:
 
 @dataclass
 class Binned:
-    """What blending gets, and how many instances it takes in all."""
+    """The input of the compositing, and the number of instances that it needs."""
 
-    rows: list[list[int]]  # of the splats of each tile, in order
+    rows: list[list[int]]  # rows of the splats of each tile, in order
     slots: list[list[int]]  # the numbers of these instances
     ranges: list[list[int]]  # of the slots of each row
     needed: int
@@ -182,7 +182,7 @@ def bin_splats(
     capacity: int = -1,
     with_slots: bool = True,
 ) -> Binned:
-    """As `rasterize` does, in memory with a margin that nobody may touch."""
+    """As `rasterize` does, in memory with a margin that must stay unchanged."""
     suffix = "" if native.dtype == torch.float32 else "_f64"
     packed = packed.to(native.dtype).contiguous()
     m, stride = packed.shape
@@ -266,16 +266,16 @@ def bin_splats(
 
 
 def least_on_edge(a: float, b: float, c: float, fixed: float, low: float, high: float) -> float:
-    """The least a f² + 2 b f t + c t² for t in [low, high]."""
+    """The minimum of a f² + 2 b f t + c t² for t in [low, high]."""
     t = min(max(-b * fixed / c, low), high)
     return a * fixed * fixed + 2 * b * fixed * t + c * t * t
 
 
 def touched_tiles(row: list[float], width: int, height: int, margin: float) -> set[int]:
-    """The definition: tiles whose pixel centres span a rectangle in which α comes near 1/255.
+    """The definition: tiles whose pixel centres span a rectangle in which α reaches about 1/255.
 
-    And near those that the ellipse α ≥ 1/255 spans; if that is one alone, it counts as touched.
-    With a margin > 0, also what is that near to being touched; < 0: not what nearly is not.
+    Only tiles of the rectangle of the ellipse α ≥ 1/255; a single such tile counts as touched.
+    A margin > 0 adds tiles that are nearly touched; < 0 removes tiles that are barely touched.
     """
     x, y, a, b, c, opacity = row[:6]
     tiles_x = -(-width // TILE)
@@ -306,7 +306,7 @@ def touched_tiles(row: list[float], width: int, height: int, margin: float) -> s
 
 
 def check_binning(native: Variant, packed: Tensor, width: int, height: int) -> Binned:
-    """Each tile has the splats that touch it, in order of depth; slots number them by splat."""
+    """Each tile has the splats that touch it, in order of depth; slots are numbered by splat."""
     got = bin_splats(native, packed, width, height)
     rows = packed.to(native.dtype).double().tolist()
     margin = 1e-3 if native.dtype == torch.float32 else 1e-9
@@ -341,7 +341,7 @@ def test_tiles_of_images_of_any_size(native: Variant, width: int, height: int) -
 
 @pytest.mark.parametrize("pixels", [15.0, 60.0, 400.0])
 def test_tiles_of_large_splats(native: Variant, pixels: float) -> None:
-    """Ellipses of many tiles at every angle, between small ones; and more of them than warps."""
+    """Ellipses of many tiles at different angles, between small ones; more of them than warps."""
     splats = random_splats(6, 40, 320, 240, pixels=pixels).packed
     small = random_splats(7, 40, 320, 240).packed
     mixed = torch.stack([splats, small], dim=1).flatten(0, 1)
@@ -350,7 +350,7 @@ def test_tiles_of_large_splats(native: Variant, pixels: float) -> None:
 
 
 def test_tiles_are_those_of_the_cpu(native: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for a rounding where a splat touches a tile just so, and in order of depth."""
+    """Except for rounding where a splat barely touches a tile; in order of depth."""
     splats = random_splats(15, 6000, 640, 368, pixels=8.0).packed
     got = bin_splats(native, splats, 640, 368)
     monkeypatch.setitem(natives.LAUNCHERS, "cpu", CPU)
@@ -364,7 +364,7 @@ def test_tiles_are_those_of_the_cpu(native: Variant, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("across", [1, 2, 31, 32, 33, 70])
 def test_tiles_of_a_splat_as_wide(native: Variant, across: int) -> None:
-    """Rectangles of a row and a column of tiles, around what a thread looks at alone."""
+    """Rectangles of one row or column of tiles, near the limit of what one thread tests."""
     wide = 1e-9
     packed = torch.zeros(2, 16, dtype=torch.float64)
     packed[:, :7] = torch.tensor([2.0, 3.0, wide, 0, wide, 0.5, 1.0])
@@ -383,23 +383,23 @@ def test_tiles_beyond_16_bits(native: Variant) -> None:
 
 
 def test_tiles_order_of_depths(native: Variant) -> None:
-    """Ties by row, depths below 0 and infinite ones."""
+    """Equal depths are ordered by row; negative and infinite depths."""
     splats = random_splats(9, 300, 48, 32, pixels=6.0).packed
     depths = torch.tensor([2.0, 1.0, -3.0, math.inf, -math.inf, 1e-30, 1e30], dtype=torch.float64)
     splats[:, 6] = depths[torch.randint(0, len(depths), (300,), generator=generator(0))]
     check_binning(native, splats, 48, 32)
 
 
-def test_tiles_of_what_is_nowhere(native: Variant) -> None:
+def test_tiles_of_invisible_splats(native: Variant) -> None:
     splats = random_splats(10, 60, 64, 48, opacity=(0.5, 1.0)).packed
     splats[0] = 0  # an empty row
     splats[1, 5] = 0.0039  # below 1/255
     splats[2, :2] = torch.tensor([-500.0, 20.0])
     splats[3, :2] = torch.tensor([20.0, 900.0])
-    splats[4, 2:5] = torch.tensor([1.0, 2.0, 1.0])  # no ellipse
+    splats[4, 2:5] = torch.tensor([1.0, 2.0, 1.0])  # not an ellipse
     odd = [(c, v) for c in range(5) for v in (math.nan, math.inf, -math.inf)] + [(5, math.nan)]
     for row, (column, value) in enumerate(odd, start=5):
-        if native.engine == "native":  # which is never given any
+        if native.engine == "native":  # which has no such splats
             splats[row] = 0
         else:
             splats[row, column] = value
@@ -410,33 +410,33 @@ def test_tiles_of_what_is_nowhere(native: Variant) -> None:
     assert len(seen) > 20
 
 
-def test_tiles_all_nowhere(native: Variant) -> None:
+def test_tiles_all_invisible(native: Variant) -> None:
     got = bin_splats(native, torch.zeros(5, 16), 40, 40)
     assert got.needed == 0
     assert all(begin == end for begin, end in got.ranges)
 
 
-@pytest.mark.parametrize("room", [0, 1, 100, 137, 10_000])
-def test_tiles_with_room_for_some(native: Variant, room: int) -> None:
-    """The instances whose slots there is room for, and no others."""
+@pytest.mark.parametrize("capacity", [0, 1, 100, 137, 10_000])
+def test_tiles_with_a_small_capacity(native: Variant, capacity: int) -> None:
+    """Only the instances whose slots are within the capacity."""
     splats = random_splats(11, 70, 64, 80, pixels=8.0).packed
     splats[:3, 2:5] = 1e-9 * torch.tensor([1.0, 0.0, 1.0])
     splats[0, 6] = 0.1
     whole = bin_splats(native, splats, 64, 80)
-    got = bin_splats(native, splats, 64, 80, capacity=room)
+    got = bin_splats(native, splats, 64, 80, capacity=capacity)
     assert got.needed == whole.needed > 140
     if native.engine == "native":
-        room = whole.needed  # on the CPU there is always enough
+        capacity = whole.needed  # on the CPU there is always enough
     pairs = [list(zip(*both, strict=True)) for both in zip(whole.rows, whole.slots, strict=True)]
-    kept = [[(row, slot) for row, slot in pair if slot < room] for pair in pairs]
-    assert got.rows == [[row for row, _ in pair] for pair in kept]
-    assert got.slots == [[slot for _, slot in pair] for pair in kept]
-    assert got.ranges == [[min(end, room) for end in span] for span in whole.ranges]
+    expected = [[(row, slot) for row, slot in pair if slot < capacity] for pair in pairs]
+    assert got.rows == [[row for row, _ in pair] for pair in expected]
+    assert got.slots == [[slot for _, slot in pair] for pair in expected]
+    assert got.ranges == [[min(end, capacity) for end in span] for span in whole.ranges]
 
 
 @pytest.mark.parametrize("size", [64, 300])
 def test_tiles_without_slots(native: Variant, size: int) -> None:
-    """Where gradients are summed in no order, slots are left out; the order is the same."""
+    """If gradients are summed in no fixed order, there are no slots; the order is the same."""
     if native.engine == "native":
         pytest.skip("the CPU always has slots")
     splats = random_splats(12, 200, size, size, pixels=5.0).packed

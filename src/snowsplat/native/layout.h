@@ -1,5 +1,5 @@
 // The layout of a struct of parameters as one number. Python fills these structs (ops/params.py) and
-// computes the same number; when it loads a library it compares the two.
+// computes the same number; when it loads a library, it compares the two numbers.
 //
 //   struct ExampleParams {
 //     int64_t n;
@@ -7,7 +7,7 @@
 //     SNOW_FIELDS(n, values)  // every member, in order
 //   };
 //
-// layout_of<ExampleParams>() is a hash of the text "n:i@0;values:p@8;#16": of every field the name,
+// layout_of<ExampleParams>() is a hash of the text "n:i@0;values:p@8;#16": for each field the name,
 // the kind (p pointer, i int64_t, d double, or {…} for a nested struct) and the offset in bytes,
 // then the size of the struct. The text begins with the constants that Python and C++ share.
 #pragma once
@@ -17,7 +17,7 @@
 namespace snow {
 
 constexpr int kTile = 16;           // edge of a tile in pixels
-constexpr int kGroupChannels = 4;   // channels that one rasterization pass carries at most
+constexpr int kGroupChannels = 4;   // most channels of one rasterization pass
 constexpr int kSlotWidth = 16;      // scalars of a (tile, splat) gradient: ≤ 4 colours, 6 moments
 constexpr int kPackedHeader = 8;    // columns of Splats2D before the colours
 constexpr int kPackedStride = 16;   // columns of Splats2D with three colours

@@ -1,6 +1,6 @@
 // The parameters of every operation: one struct each, passed across the boundary between Python and
 // the kernels. A CPU entry takes a pointer to the struct, a CUDA kernel takes it by value. The
-// Python side fills them by name (ops/params.py); layout.h says how the two are kept equal.
+// Python side fills them by name (ops/params.py); layout.h describes how the two are compared.
 //
 // Every field has 8 bytes. `n` comes first: how many items the operation processes. T is float or
 // double. Pointers marked "or null" are optional. Shapes are row-major.
@@ -34,7 +34,7 @@ struct CameraParams {
   const T* cam_from_world;  // (3, 4): rotation and translation
   double width, height;     // pixels
   double fx, fy, cx, cy;    // pixels
-  double near;              // world units; what is nearer is not seen
+  double near;              // world units; nearer Gaussians are not visible
   SNOW_FIELDS(cam_from_world, width, height, fx, fy, cx, cy, near)
 };
 
@@ -82,7 +82,7 @@ struct ProjectForwardParams {
   SNOW_FIELDS(n, ids, gaussians, camera, packed)
 };
 
-// project_bwd: the gradient of the splats carried to the Gaussians and the pose.
+// project_bwd: gradients of the Gaussians and the pose from the gradient of the splats.
 template <class T>
 struct ProjectBackwardParams {
   int64_t n;           // splats
@@ -90,18 +90,18 @@ struct ProjectBackwardParams {
   GaussianTensors<T> gaussians;
   CameraParams<T> camera;
   const T* grad_packed;        // (n, 16)
-  GaussianGradients<T> grads;  // out; rows that no splat came from are not written
+  GaussianGradients<T> grads;  // out; rows without a splat are not written
   double* pose;                // out, or null: (project_pose_blocks, 15) sums, to be added up
   SNOW_FIELDS(n, ids, gaussians, camera, grad_packed, grads, pose)
 };
 
 // ---- adam_step ----------------------------------------------------------------------------------
 
-// A parameter of the Gaussians, its moments and what changes it.
+// A parameter of the Gaussians, its moments, additional gradient and learning rate.
 template <class T>
 struct AdamTensor {
   T *value, *m, *v;
-  const T* extra;  // a gradient to add, of the shape of `value`; or null
+  const T* extra;  // additional gradient, of the shape of `value`; or null
   double rate;     // lr / (1 − β₁ᵗ)
   SNOW_FIELDS(value, m, v, extra, rate)
 };
@@ -119,8 +119,8 @@ struct AdamStepParams {
   double inv_correction2;   // 1 / (1 − β₂ᵗ)
   double eps2;              // ε²
   int64_t visible_only;     // 1: Gaussians without a splat keep their values and moments
-  const bool* valid;        // (1,), or null; false: nothing changes
-  int32_t* nonfinite_rows;  // (6,), or null: counts to which skipped rows are added
+  const bool* valid;        // (1,), or null; false: changes nothing
+  int32_t* nonfinite_rows;  // (6,), or null: increased by the number of skipped rows
   SNOW_FIELDS(n, splats, ids, grad_packed, camera, sh_rest_rows, sh_degree, means, log_scales,
               quats, opacity_logits, sh_dc, sh_rest, beta1, beta2, inv_correction2, eps2,
               visible_only, valid, nonfinite_rows)
@@ -139,7 +139,7 @@ struct ScreenStatisticsParams {
   T* norm_sum;           // (N,) the norm of the gradient of the mean is added
   T* views;              // (N,) 1 is added
   T* max_radii;          // (N,), or null: becomes the maximum with the radius
-  const bool* valid;     // (1,), or null; false: nothing changes
+  const bool* valid;     // (1,), or null; false: changes nothing
   SNOW_FIELDS(n, ids, packed, grad_packed, stride, width, height, norm_sum, views, max_radii, valid)
 };
 
@@ -158,7 +158,7 @@ struct SplatsPrepareParams {
   SNOW_FIELDS(n, packed, stride, width, height, columns, records, keys)
 };
 
-// splats_recolor: the records take other channels. CPU only.
+// splats_recolor: replaces the channels of the records. CPU only.
 template <class T>
 struct SplatsRecolorParams {
   int64_t n;
@@ -180,7 +180,7 @@ struct SplatsSortParams {
   SNOW_FIELDS(n, keys, keys2, order, order2)
 };
 
-// What tiles_count and tiles_fill share.
+// Parameters shared by tiles_count and tiles_fill.
 template <class T>
 struct TileBinning {
   const uint32_t* order;          // (splats,) from splats_sort
@@ -188,13 +188,13 @@ struct TileBinning {
   int64_t stride;                 // columns
   const SplatRecord<T>* records;  // (splats,); CPU only
   int64_t tiles_x, tiles_y;       // tiles of the image
-  int64_t parts;                  // of the work, from tiles_parts; CPU only
-  void* workspace;                // tiles_workspace_bytes, carried from tiles_count to tiles_fill
-  uint32_t* tile_start;           // out, (tiles + 1,) first instance of each tile
+  int64_t parts;                  // number of parallel parts, from tiles_parts; CPU only
+  void* workspace;       // of tiles_workspace_bytes; written by tiles_count, read by tiles_fill
+  uint32_t* tile_start;  // out, (tiles + 1,) first instance of each tile
   SNOW_FIELDS(order, packed, stride, records, tiles_x, tiles_y, parts, workspace, tile_start)
 };
 
-// tiles_count: how many instances, pairs of a splat and a tile it touches, there are.
+// tiles_count: the number of instances (pairs of a splat and a tile that it touches).
 template <class T>
 struct TilesCountParams {
   int64_t n;  // splats
@@ -209,9 +209,9 @@ template <class T>
 struct TilesFillParams {
   int64_t n;  // splats
   TileBinning<T> binning;
-  int64_t capacity;          // instances that the arrays have room for
+  int64_t capacity;          // size of the instance arrays
   uint32_t* instance_splat;  // out, (capacity,) sorted by tile
-  uint32_t* instance_slot;   // out, (capacity,) its number splat by splat; CUDA: or null
+  uint32_t* instance_slot;   // out, (capacity,) index in the list ordered by splat; CUDA: or null
   uint32_t* slot_range;  // out, (n, 2) first slot of a splat and the one after its last; or null
   SNOW_FIELDS(n, binning, capacity, instance_splat, instance_slot, slot_range)
 };
@@ -227,7 +227,7 @@ struct FrameParams {
   const int64_t* columns;          // (4,) the columns that are the channels; −1: zero
   const SplatRecord<T>* records;   // (splats,); CPU only
   const uint32_t* tile_start;      // (tiles + 1,)
-  uint32_t* tile_end;              // (tiles,) where the forward pass stopped, every pixel opaque
+  uint32_t* tile_end;              // (tiles,) where the forward pass stopped: all pixels finished
   const uint32_t* instance_splat;  // (instances,)
   void* instance_blocks;           // (instances,) bits of the pixel blocks that a splat touches
   SNOW_FIELDS(width, height, packed, stride, columns, records, tile_start, tile_end, instance_splat,
@@ -259,8 +259,8 @@ struct RasterizeBackwardParams {
   int64_t n;  // tiles
   FrameParams<T> frame;
   int64_t channels;               // 1 to 4
-  const uint32_t* instance_slot;  // (instances,), or null where slots is
-  const T* image;                 // (channels, height, width) as the forward pass left it
+  const uint32_t* instance_slot;  // (instances,), or null if `slots` is null
+  const T* image;                 // (channels, height, width), output of the forward pass
   const T* grad_image;            // the same shape
   const T* alpha;                 // (height, width)
   const T* grad_alpha;            // (height, width), or null
@@ -271,7 +271,7 @@ struct RasterizeBackwardParams {
               grad_packed)
 };
 
-// splats_reduce: the gradient of a splat from those of its instances.
+// splats_reduce: the gradient of a splat as the sum over its instances.
 template <class T>
 struct SplatsReduceParams {
   int64_t n;                   // splats
@@ -280,7 +280,7 @@ struct SplatsReduceParams {
   const T* packed;             // (n, stride)
   int64_t stride;              // columns
   int64_t channels;            // 1 to 4
-  const int64_t* columns;      // (4,) where the gradients of the channels go
+  const int64_t* columns;      // (4,) destination columns of the gradients of the channels
   int64_t add;                 // 1: add to grad_packed; 0: write every column
   T* grad_packed;              // (n, stride)
   SNOW_FIELDS(n, slots, slot_range, packed, stride, channels, columns, add, grad_packed)
@@ -300,14 +300,14 @@ struct BackgroundBackwardParams {
 
 // ---- photometric --------------------------------------------------------------------------------
 
-// L1 and SSIM between two images. Target is T, or uint8_t with 255 for 1.
+// L1 and SSIM between two images. Target is T, or uint8_t, where 255 means 1.
 template <class T, class Target>
 struct PhotometricParams {
   int64_t n;                      // channels
   int64_t width, height;          // pixels
   const T* image;                 // (n, height, width)
   const Target* target;           // (n, height, width)
-  double l1_weight, ssim_weight;  // of the two in the gradient
+  double l1_weight, ssim_weight;  // weights of the two in the gradient
   T* grad;                        // out, of the weighted sum, or null
   double* means;                  // out, (2,) mean |a − b| and mean SSIM
   SNOW_FIELDS(n, width, height, image, target, l1_weight, ssim_weight, grad, means)
@@ -320,13 +320,13 @@ struct NeighboursParams {
   int64_t n;        // points
   const T* points;  // (n, 3)
   int64_t k;        // 1 to 64
-  T* distances;     // out, (n, k) ascending; infinity where there are fewer others
+  T* distances;     // out, (n, k) ascending; infinity if there are fewer others
   SNOW_FIELDS(n, points, k, distances)
 };
 
 // ---- sizes --------------------------------------------------------------------------------------
 
-// The question how large a scratch tensor has to be; the entry returns the answer.
+// Queries the size of a scratch tensor; the entry returns it.
 struct SizeQueryParams {
   int64_t n;      // items
   int64_t tiles;  // tiles_workspace_bytes only

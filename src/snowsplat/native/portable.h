@@ -1,6 +1,6 @@
-// The functions that the maths headers are written with, so that the same code serves every `Real`:
-// float and double (CUDA), Simd<float, W> (CPU) and Simd<double, W> (gradient checks). A branch that
-// depends on data is written as select(), because SIMD lanes may take different sides.
+// Functions used by the maths headers, so that the same code works for every `Real`: float and double
+// (CUDA), Simd<float, W> (CPU) and Simd<double, W> (gradient checks). Branches that depend on data
+// are written as select(), because SIMD lanes may take different branches.
 #pragma once
 
 #if defined(__CUDACC_RTC__)  // NVRTC has no headers of the C library
@@ -44,7 +44,7 @@ SNOW_INLINE double log2(double a) { return ::log2(a); }
 SNOW_INLINE double exp2_blend(double a) { return ::exp2(a); }
 SNOW_INLINE double fma(double a, double b, double c) { return ::fma(a, b, c); }
 
-// 1/a and 1/√a. A GPU has instructions for those of float.
+// 1/a and 1/√a. GPUs have instructions for these in float.
 SNOW_INLINE double reciprocal(double a) { return 1.0 / a; }
 SNOW_INLINE double rsqrt(double a) { return 1.0 / ::sqrt(a); }
 SNOW_INLINE double reciprocal_estimate(double a) { return 1.0 / a; }

@@ -5,8 +5,8 @@
 //   Σ' = J W Σ Wᵀ Jᵀ + 0.3 I  2D covariance, W the rotation of cam_from_world, J the Jacobian of
 //                             the pinhole projection at the mean
 //
-// Written as Σ' = U Uᵀ + 0.3 I with U = T M, T = J W (2×3), M = R S (3×3): no 3D covariance is
-// formed.
+// Written as Σ' = U Uᵀ + 0.3 I with U = T M, T = J W (2×3), M = R S (3×3), without computing the 3D
+// covariance.
 #pragma once
 
 #include "params.h"
@@ -14,14 +14,14 @@
 
 namespace snow {
 
-// What is derived from CameraParams once per call (CPU) or per thread (CUDA).
+// Values derived from CameraParams, once per call (CPU) or per thread (CUDA).
 template <class T>
 struct PinholeCamera {
   T rotation[9], translation[3];  // cam_from_world
   T position[3];                  // camera centre in the world, -Rᵀ t
   T fx, fy, cx, cy, width, height, near;
-  // J is evaluated with x/z and y/z clamped to 15% beyond the image: farther out the linearisation
-  // of the projection grows without bound.
+  // J is evaluated with x/z and y/z clamped to 15% beyond the image, because farther out the
+  // linearisation of the projection is unbounded.
   T min_tx, max_tx, min_ty, max_ty;
 
   // Real: the type in which the limits are computed. double on the CPU; T on a GPU, where every
@@ -47,7 +47,7 @@ struct PinholeCamera {
 };
 
 template <class Real>
-struct GaussianShape {  // the inputs of one Gaussian that geometry depends on
+struct GaussianShape {  // the inputs of one Gaussian that affect its geometry
   Real mean[3], log_scale[3], quat[4], opacity_logit;
 };
 
@@ -199,7 +199,7 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
   const Real u = p.x * iz, v = p.y * iz;
   const auto free_x = (u >= Real(cam.min_tx)) & (Real(cam.max_tx) >= u);
   const auto free_y = (v >= Real(cam.min_ty)) & (Real(cam.max_ty) >= v);
-  // With respect to u = x/z and v = y/z: through the mean, and through J where it is not clamped.
+  // With respect to u = x/z and v = y/z: through the mean, and through J if it is not clamped.
   const Real zero(0.f);
   const Real du = fx * d.mean2d[0] - select(free_x, dj02 * fx * iz, zero);
   const Real dv = fy * d.mean2d[1] - select(free_y, dj12 * fy * iz, zero);
@@ -234,7 +234,7 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
 }
 
 // In front of the near plane, at least 1/255 opaque, and the box of the ellipse {α ≥ 1/255} reaches
-// the range of the pixel centres. Values that are not finite fail a comparison.
+// the range of the pixel centres. Non-finite values fail one of these comparisons.
 template <class Real, class T>
 SNOW_INLINE auto is_visible(const ProjectedGaussian<Real>& p, const PinholeCamera<T>& c) {
   Real k2 = squared_cutoff(p.opacity);

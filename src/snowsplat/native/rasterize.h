@@ -2,7 +2,7 @@
 // composited.
 //
 // With d = pixel − mean, α(d) = o exp(−½ dᵀ K d) (Kerbl et al. 2023, eq. 3 and appendix). Kernels
-// use the base-2 logarithm, in which the opacity is a summand and the test α ≥ 1/255 one
+// use the base-2 logarithm: the opacity becomes a summand, and the test α ≥ 1/255 a single
 // comparison:
 //
 //   log₂ α = A dx² + B dx dy + C dy² + log₂ o,
@@ -25,8 +25,8 @@ SNOW_INLINE Real squared_cutoff(Real opacity) {
 }
 
 // The pixels that the box of a splat's ellipse {α ≥ 1/255} covers, clamped to an image whose last
-// pixel is (right, bottom). `visible` is false where the box misses the image or the splat is no
-// ellipse.
+// pixel is (right, bottom). `visible` is false if the box does not overlap the image or the conic is
+// not an ellipse.
 template <class Real>
 struct PixelExtent {
   Real x0, y0, x1, y1;
@@ -45,7 +45,7 @@ struct PixelExtent {
   }
 };
 
-// Unsigned integers in the order of the floats: the keys by which splats are sorted by depth.
+// Unsigned integers with the same order as the floats: the keys for sorting splats by depth.
 SNOW_INLINE uint32_t ordered_bits(float x) {
   const uint32_t b = bits_of(x);
   return b >> 31 ? ~b : b | 0x80000000u;
@@ -78,7 +78,7 @@ SNOW_INLINE SplatTerms<Real> splat_terms(Real mean_x, Real mean_y, const Real* c
 
 // The largest log₂(α / o) over the pixel centres' rectangle [x0, x1] × [y0, y1], relative to the
 // mean. The quadratic is concave with its maximum at the origin, so its maximum over a rectangle
-// lies on an edge that faces the origin.
+// lies on an edge facing the origin.
 template <class Real>
 SNOW_INLINE Real peak_over_rectangle(const SplatTerms<Real>& s, Real x0, Real y0, Real x1,
                                      Real y1) {
@@ -90,13 +90,13 @@ SNOW_INLINE Real peak_over_rectangle(const SplatTerms<Real>& s, Real x0, Real y0
   return max(on_row, on_column);
 }
 
-// Culling lowers the threshold of log₂α by this much, for rounding.
+// Culling lowers the threshold of log₂α by this margin, because of rounding.
 constexpr double kCullSlack = 1e-3;
 
 // ---- Compositing --------------------------------------------------------------------------------
 //
-// Front to back, with the transmittance T = Π (1 − α) of the splats in front: a splat has the weight
-// α T, is skipped where α < 1/255, and ends the pixel where it would leave T < 1e-4.
+// Front to back, with the transmittance T = Π (1 − α) of the splats in front. A splat has the weight
+// α T and is skipped if α < 1/255. A pixel is finished when the next splat would make T < 1e-4.
 
 template <class Real>
 SNOW_INLINE auto is_blended(Real log2_alpha) {
@@ -121,8 +121,7 @@ SNOW_INLINE Real log_alpha_gradient(Real ahead, Real alpha, Real behind) {
   return ahead - alpha * behind * reciprocal_estimate(Real(1.f) - alpha);
 }
 
-// Sums of q = ∂L/∂(log α) over pixels, weighted by the powers of d, are all that the geometric
-// gradients need:
+// The geometric gradients follow from sums of q = ∂L/∂(log α) over pixels, weighted by powers of d:
 //   ∂ log α/∂mean = K d,  ∂/∂a = −½ dx²,  ∂/∂b = −dx dy,  ∂/∂c = −½ dy²,  ∂/∂o = 1/o
 template <class Real>
 struct BlendMoments {

@@ -8,7 +8,7 @@ namespace snow {
 
 constexpr int kMaxShCoefficients = 16;
 
-// Columns of sh_rest that are active at a degree.
+// Number of columns of sh_rest that a degree uses.
 SNOW_INLINE int sh_columns(int degree) { return 3 * ((degree + 1) * (degree + 1) - 1); }
 
 constexpr double kSH0 = 0.28209479177387814;

@@ -1,9 +1,9 @@
-// Simd<T, W>: W lanes of T with the few operations the kernels need.
+// Simd<T, W>: W lanes of T with the operations that the kernels need.
 //
-// The primary template rests on compiler vectors and serves every target (SSE2 and NEON at W = 4,
+// The primary template uses compiler vectors and works on every target (SSE2 and NEON at W = 4,
 // and double); simd_avx2.h and simd_avx512.h have specialisations with the same members, written in
-// intrinsics only where the compiler's choice is poor. Arithmetic is left to the operators, so that
-// the compiler contracts multiply-adds.
+// intrinsics only where the compiler generates slow code. Arithmetic uses operators, so that the
+// compiler contracts multiply-adds.
 #pragma once
 
 #include <cstdint>
@@ -78,7 +78,7 @@ struct Simd {
 
   SNOW_INLINE static Simd load(const T* p) { return Simd(Vec(*(const VecUnaligned*)p)); }
   SNOW_INLINE void store(T* p) const { *(VecUnaligned*)p = v; }
-  // The first n lanes; the others read as 0 and are not touched in memory.
+  // Loads the first n lanes; the others are 0, and their memory is not accessed.
   SNOW_INLINE static Simd load_first(const T* p, int n) {
     Simd r(T(0));
     for (int l = 0; l < W && l < n; l++) r.v[l] = p[l];
@@ -146,8 +146,8 @@ struct Simd {
 };
 
 // ---- rows ⇄ lanes -------------------------------------------------------------------------------
-// Parameters are stored a Gaussian a row, (N, K); the kernels want a Gaussian a lane. These move W
-// rows of K columns between the two, four columns at a time as 4×4 transposes inside 128-bit lanes.
+// Parameters are stored with one Gaussian per row, (N, K); kernels need one Gaussian per lane. These
+// functions convert W rows of K columns, four columns at a time, by 4×4 transposes in 128-bit lanes.
 
 #if defined(__SSE2__)
 SNOW_INLINE __m128 load_quad(const float* p, int n) {
@@ -186,7 +186,7 @@ struct RowMover {
 };
 
 // ---- sums over lanes ----------------------------------------------------------------------------
-// out[k] = sum of the lanes of in[k], k < K <= 16; out has room for 16.
+// out[k] = sum of the lanes of in[k], k < K <= 16; out has 16 elements.
 template <int K, class V>
 SNOW_INLINE void sum_lanes(const V* in, typename V::Scalar* out) {
   for (int k = 0; k < K; k++) {
@@ -217,8 +217,8 @@ using VecF = Simd<float, 4>;
 #endif
 using VecD = Simd<double, 4>;
 
-// W rows of `columns` columns ⇄ `columns` vectors. Calls, not inlined: a kernel moves a dozen tensors,
-// and unrolled they would not fit the instruction cache.
+// W rows of `columns` columns ⇄ `columns` vectors. Not inlined: a kernel converts a dozen tensors, and
+// the unrolled code would not fit into the instruction cache.
 template <class V>
 __attribute__((noinline)) void gather_rows(const typename V::Scalar* base, int64_t stride,
                                            const int64_t* row, int columns, V* out) {
@@ -245,8 +245,8 @@ __attribute__((noinline)) void scatter_rows(typename V::Scalar* base, int64_t st
 
 SNOW_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
 
-// Denormals cost 1.7× in blending: every kernel turns them off on each of its threads, and restores
-// what the caller had.
+// Denormals make blending 1.7× slower. Every kernel flushes them to zero on each of its threads, and
+// restores the caller's mode.
 struct FlushDenormals {
 #if defined(__x86_64__)
   unsigned saved = _mm_getcsr();

@@ -1,4 +1,4 @@
-// Simd<float, 8> in AVX2 and FMA: see simd.h, which includes this where the compiler has them.
+// Simd<float, 8> in AVX2 and FMA: see simd.h, which includes this if the compiler supports them.
 #pragma once
 
 #include "simd.h"

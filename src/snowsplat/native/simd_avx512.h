@@ -1,4 +1,4 @@
-// Simd<float, 16> in AVX-512 (F and DQ): see simd.h, which includes this where the compiler has them.
+// Simd<float, 16> in AVX-512 (F and DQ): see simd.h, which includes this if the compiler supports them.
 #pragma once
 
 #include "simd.h"

@@ -12,7 +12,7 @@ SNOW_INLINE V map_lanes(V x, double (*f)(double)) {
 }
 
 // 2^x for blending, x in about [-30, 1]: minimax quartic on [0, 1), relative error 2.6e-6.
-// Lanes far outside give garbage; the caller masks them.
+// Lanes far outside of this range are undefined; the caller masks them.
 template <int W>
 SNOW_INLINE Simd<float, W> exp2_blend(Simd<float, W> x) {
   using V = Simd<float, W>;

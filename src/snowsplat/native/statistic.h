@@ -5,8 +5,8 @@
 
 namespace snow {
 
-// Rows are distinct Gaussians, so no two threads share a sum. A splat whose gradient is not finite
-// does not count. Columns of Splats2D: 0 and 1 are the mean, 7 the radius.
+// Rows are distinct Gaussians, so no two threads share a sum. A splat with a non-finite
+// gradient is skipped. Columns of Splats2D: 0 and 1 are the mean, 7 the radius.
 template <class T>
 SNOW_INLINE void accumulate_splat(const ScreenStatisticsParams<T>& p, int64_t i, T half_width,
                                   T half_height) {

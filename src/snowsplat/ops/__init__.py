@@ -1,4 +1,4 @@
-"""The numerical operations on tensors: native kernels, each with a readable `reference`.
+"""The numerical operations on tensors, as native kernels, with a PyTorch reference in `reference`.
 
 `project` → `Splats2D` → `rasterize` → `photometric_loss`, and `adam_step` back to the parameters.
 """

@@ -1,4 +1,4 @@
-"""`adam_step`: the gradient of the splats carried through `project`, fused with Adam."""
+"""`adam_step`: the backward pass of `project`, fused with Adam."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def adam_step(
     valid: Tensor | None = None,
     nonfinite_rows: Tensor | None = None,
 ) -> None:
-    """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
+    """Backpropagates the splats' gradient through `project` and takes one Adam step, in place.
 
     The gradients of the parameters are never written to memory, which halves the time of this part
     of a training step. The camera arguments and `sh_degree` are those passed to `project`.
@@ -54,16 +54,16 @@ def adam_step(
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
 
-    valid: (1,) bool on the device; False skips the step, without the CPU having to wait for the
-        value. None means True.
-    nonfinite_rows: (6,) int32 counts, in the order of the parameters; None disables counting. A
-        value that the step would make infinite or NaN keeps its value and moments, and the rows
-        with such values are added to the counts. No non-finite gradient reaches the parameters.
+    valid: (1,) bool on the device; False skips the step. The CPU does not wait for the value.
+        None means True.
+    nonfinite_rows: (6,) int32 counts, in the order of the parameters; None disables counting. If
+        the step would make a value infinite or NaN, the value and its moments stay unchanged, and
+        its row is counted. No non-finite gradient reaches the parameters.
 
     Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
     p −= lr · m̂ / √(v̂ + eps²) (Kingma & Ba 2015, with ε inside the root).
 
-    Raises ValueError where shapes, dtypes or devices do not fit.
+    Raises ValueError if shapes, dtypes or devices do not match.
     """
     for what, given in (
         ("params", params),
@@ -130,5 +130,5 @@ def adam_step(
     )
     if done < 0:
         raise ValueError(
-            "adam_step: on the CPU ids must be rows of the parameters; drop the splats of id -1"
+            "adam_step: on the CPU ids must be rows of the parameters; remove the splats of id -1"
         )

@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass
 class Capacity:
-    """The number of instances, pairs of a splat and a tile that it touches, that a frame may have.
+    """The number of instances (pairs of a splat and a tile that it touches) that a frame may have.
 
     Rasterizing needs memory for every instance, but their number is counted on the GPU, and reading
     it back would make the CPU wait. With a capacity, memory for `instances` of them is allocated

@@ -1,4 +1,4 @@
-"""The checks that every public op makes once, at its door: one line each on what is wrong."""
+"""Argument checks of the public ops. Error messages are one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which device to compute on."""
+"""Selects the device to compute on."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from snowsplat.util.errors import UserError
 
 
 def default_device(note: Callable[[str], None] | None = None) -> torch.device:
-    """The GPU, or the CPU where there is none of use.
+    """The GPU, or the CPU if there is no usable GPU.
 
     Args:
-        note: is given a line where there is a GPU that cannot be used.
+        note: called with a line of text if there is a GPU that cannot be used.
     """
     index = _current_index()
     why = availability.why_unusable(index)
@@ -29,37 +29,37 @@ def default_device(note: Callable[[str], None] | None = None) -> torch.device:
 def resolve_device(
     text: str | None = None, note: Callable[[str], None] | None = None
 ) -> torch.device:
-    """The device that a user means: "cpu", "cuda", "cuda:1"; with None, the best there is.
+    """The device for a user's choice: "cpu", "cuda", "cuda:1"; None: the best available one.
 
-    The environment variable SNOWSPLAT_DEVICE stands for a missing `text`.
+    If `text` is None, the environment variable SNOWSPLAT_DEVICE is used.
 
     Args:
-        note: is given a line where there is a GPU that cannot be used, and none was asked for.
+        note: called with a line of text if a GPU cannot be used and no device was requested.
 
     Raises:
-        UserError: a device that is not there, or cannot be used.
+        UserError: the device is unsupported, missing or cannot be used.
     """
-    asked, otherwise = f"--device {text}", "leave --device out to use the CPU"
+    source, remedy = f"--device {text}", "leave --device out to use the CPU"
     if text is None:
         text = os.environ.get("SNOWSPLAT_DEVICE", "")
         if not text:
             return default_device(note)
-        asked, otherwise = f"SNOWSPLAT_DEVICE={text}", "set it to cpu to use the CPU"
+        source, remedy = f"SNOWSPLAT_DEVICE={text}", "set it to cpu to use the CPU"
     try:
         device = torch.device(text)
     except RuntimeError:
         device = None
     if device is None or device.type not in ("cpu", "cuda"):
-        raise UserError(f"{asked}: this is no device for us; use cpu, cuda or cuda:1")
+        raise UserError(f"{source}: unsupported device; use cpu, cuda or cuda:1")
     if device.type == "cpu":
         return torch.device("cpu")
     index = _current_index() if device.index is None else device.index
     why = availability.why_unusable(index)
     if why is not None:
-        raise UserError(f"{asked}: {why}; {otherwise}")
+        raise UserError(f"{source}: {why}; {remedy}")
     return torch.device("cuda", index)
 
 
 def _current_index() -> int:
-    """What "cuda" means to torch; asking torch for it would start the driver."""
+    """The index of "cuda": torch's current device, or 0 if torch has not initialised the driver."""
     return torch.cuda.current_device() if torch.cuda.is_initialized() else 0

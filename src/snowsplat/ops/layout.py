@@ -1,7 +1,7 @@
-"""How a struct of parameters is laid out, packed for a kernel, and checked against the library.
+"""The layout of structs of parameters: packing for a kernel, and the check against the library.
 
 A struct is a dataclass that inherits `Params`; `native/params.h` has the same struct in C++. Every
-field has 8 bytes: a tensor goes as its data pointer, None as a null pointer, int and bool as int64,
+field has 8 bytes: a tensor is passed as data pointer, None as null pointer, int and bool as int64,
 float as double, a nested struct as its fields. `Layout.hash` is the number that `layout_of` in
 `native/layout.h` computes from the names, kinds and offsets of the fields.
 """
@@ -76,7 +76,7 @@ class Layout:
         """Writes the struct to the beginning of `buffer`, which has at least `size` bytes.
 
         Raises:
-            TypeError: the value of a field is not of its kind.
+            TypeError: the value of a field has the wrong type.
         """
         values = list(self.values(params))
         try:
@@ -121,7 +121,7 @@ def layout_of(params: type[Params]) -> Layout:
 
 
 def _leaves(params: type[Params], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """(dotted name, kind) of every field that is no struct, in order."""
+    """(dotted name, kind) of every field that is not a struct, in order."""
     for name, kind in _fields(params):
         if isinstance(kind, str):
             yield prefix + name, kind
@@ -143,7 +143,7 @@ def _describe(params: type[Params]) -> str:
 
 
 def _fields(params: type[Params]) -> Iterator[tuple[str, str | type[Params]]]:
-    """(name, kind) of the fields: p(ointer), i(nt64), d(ouble), or the struct that is nested."""
+    """(name, kind) of the fields: p(ointer), i(nt64), d(ouble), or the nested struct."""
     hints = get_type_hints(params)
     for field in fields(params):  # type: ignore[arg-type]  # every subclass is a dataclass
         yield field.name, _kind(hints[field.name])

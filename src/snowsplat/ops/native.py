@@ -23,12 +23,12 @@ from snowsplat.ops.layout import LARGEST_PARAMS, Params, layout_of
 from snowsplat.ops.params import ENTRIES
 from snowsplat.util.errors import UserError
 
-# Worst to best. The position of a name is the number that native/cpu/isa.cpp knows it by.
+# Worst to best. The index of a name is its number in native/cpu/isa.cpp.
 ISAS = ("baseline", "avx2", "avx512")
 
 _LIBRARIES = Path(__file__).resolve().parent.parent / "_lib"
 _lock = threading.RLock()
-# The functions that have been launched, and the structs that they take.
+# The functions launched so far, and their structs.
 _functions: dict[str, tuple[Callable[[Any], int], type[Params]]] = {}
 _int = ctypes.c_int64
 
@@ -51,7 +51,7 @@ def _open(isa: str) -> ctypes.CDLL:
 
 @functools.cache
 def available_isas() -> tuple[str, ...]:
-    """The instruction sets that are built and that this machine runs, worst first."""
+    """The instruction sets that are built and that this machine supports, worst first."""
     best = _open("baseline").best_isa()
     built = (isa for isa in ISAS if (_LIBRARIES / f"libsnowsplat_{isa}.so").exists())
     return tuple(isa for isa in built if ISAS.index(isa) <= best)
@@ -67,7 +67,7 @@ def _choose() -> str:
         )
     if forced not in available_isas():
         raise UserError(
-            f"SNOWSPLAT_ISA={forced} does not run here; this machine and this build have "
+            f"SNOWSPLAT_ISA={forced} is not supported here; this machine and this build have "
             f"{', '.join(available_isas())}"
         )
     return forced

@@ -1,7 +1,7 @@
 """The parameters of every native operation: the structs of `native/params.h`, field by field.
 
-What a field means, and the shapes of the tensors, is written there. `ENTRIES` says which operation
-takes which struct; the layouts are compared when the library is loaded.
+The meaning of the fields and the shapes of the tensors are documented there. `ENTRIES` has the
+struct of each operation; the layouts are compared when the library is loaded.
 """
 
 from __future__ import annotations

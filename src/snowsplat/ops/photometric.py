@@ -1,4 +1,4 @@
-"""`photometric_loss` and `ssim`: how far an image is from a photo."""
+"""`photometric_loss` and `ssim`: the difference between an image and a photo."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     storage, `planar.permute(1, 2, 0)`, avoids a copy. The gradient flows only to `image`; it is
     computed together with the value, in one pass over the images.
 
-    Raises ValueError where shapes, dtypes or devices do not fit.
+    Raises ValueError if shapes, dtypes or devices do not match.
     """
     weighted = _Photometric.apply(image, target, 1 - ssim_weight, -ssim_weight, "photometric_loss")
     return weighted + ssim_weight
@@ -52,7 +52,7 @@ def _planar(op: str, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Photometric(torch.autograd.Function):
-    """l1_weight · L1 + ssim_weight · SSIM; `op` is the name for error lines."""
+    """l1_weight · L1 + ssim_weight · SSIM; `op` is the name in error messages."""
 
     @staticmethod
     def forward(
@@ -85,7 +85,7 @@ class _Photometric(torch.autograd.Function):
             ),
         )
         ctx.grad = grad
-        l1, similarity = means  # tensors: reading them would wait for a GPU
+        l1, similarity = means  # tensors, because reading values would wait for a GPU
         return (l1_weight * l1 + ssim_weight * similarity).to(planes.dtype)
 
     @staticmethod

@@ -45,10 +45,10 @@ def project(
     sh_degree: int,
     near: float = 0.2,
 ) -> Splats2D:
-    """Projects N Gaussians to splats on a camera's image plane; invisible ones are left out.
+    """Projects N Gaussians to splats on a camera's image plane, without invisible ones.
 
-    On a GPU they are not left out, because that would require waiting: their rows are empty (zeros)
-    and have the id -1.
+    On a GPU all rows are returned, since removing rows would require waiting: rows of invisible
+    Gaussians are empty (zeros) and have the id -1.
 
     means (N, 3) in world units, log_scales (N, 3), quats (N, 4) wxyz of any length (zero: no
     rotation), opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, K, 3), of which degree `sh_degree`
@@ -60,7 +60,7 @@ def project(
     ellipse {α ≥ 1/255} reaches the pixel centres. Gradients flow to every tensor, including the
     camera's pose.
 
-    Raises ValueError where shapes, dtypes or devices do not fit.
+    Raises ValueError if shapes, dtypes or devices do not match.
     """
     pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
     camera = camera_params("project", pose, width, height, fx, fy, cx, cy, near)
@@ -116,7 +116,7 @@ def check_parameters(
     sh_rest: Tensor,
     sh_degree: int,
 ) -> None:
-    """Raises ValueError unless the six are parameters of the same Gaussians."""
+    """Raises ValueError unless the six tensors are parameters of the same Gaussians."""
     check_float(op, "means", means)
     count = means.shape[0] if means.dim() else None
     check_tensor(op, "means", means, (count, 3), means)

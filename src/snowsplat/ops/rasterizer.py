@@ -55,7 +55,7 @@ def rasterize(
     With `capacity` the CPU does not wait for a GPU to count instances. On a GPU gradients are
     summed with atomics, in no fixed order, unless `torch.use_deterministic_algorithms` is set.
 
-    Raises ValueError where shapes, dtypes or devices do not fit.
+    Raises ValueError if shapes, dtypes or devices do not match.
     """
     packed, channels = splats.packed, splats.channels
     check_float("rasterize", "splats", packed)
@@ -72,12 +72,12 @@ def rasterize(
 
 @torch.no_grad()
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
-    """(H, W) the number of splats that `rasterize` composites into each pixel: its cost.
+    """(H, W) the number of splats that `rasterize` composites into each pixel (its cost).
 
-    Splats fainter than 1/255 there do not count, nor do those behind the point where the pixel is
-    finished.
+    Splats fainter than 1/255 there, and splats behind the one that finished the pixel, are not
+    counted.
 
-    Raises ValueError where shapes or dtypes do not fit.
+    Raises ValueError if shapes or dtypes do not match.
     """
     check_float("count_blended", "splats", splats.packed)
     check_size("count_blended", width, height)
@@ -94,7 +94,7 @@ def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
 
 @dataclass
 class _Frame:
-    """The splats of a frame, sorted into tiles: what the forward and the backward pass read."""
+    """The splats of a frame, sorted into tiles: the input of the forward and the backward pass."""
 
     params: FrameParams
     tiles: int
@@ -301,7 +301,7 @@ def _grad_packed(
     """The gradient of the splats, of the shape of `packed`."""
     packed, stride = frame.params.packed, frame.params.stride
     grad_packed = scratch.empty(tuple(packed.shape), packed.dtype, packed.device)
-    slots = None  # the gradients of the instances, where they are summed in a fixed order
+    slots = None  # the gradients of the instances, if they are summed in a fixed order
     if frame.sums_in_order:
         slots = scratch.empty((frame.instances, SLOT_WIDTH), packed.dtype, packed.device)
     else:

@@ -1,12 +1,12 @@
-"""3D Gaussian Splatting in plain PyTorch: the readable reference of every op.
+"""3D Gaussian Splatting in plain PyTorch: the reference implementation of every op.
 
-Same names, arguments and results as `snowsplat.ops`, in any floating dtype, differentiable by
-autograd and hundreds of times slower. The native kernels are tested against these functions in
-float64. Read top to bottom, this file is the method:
+Names, arguments and results are those of `snowsplat.ops`. The functions work in any floating dtype,
+are differentiable by autograd, and are hundreds of times slower. The native kernels are tested
+against these functions in float64. From top to bottom, this file describes the method:
 
     project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
     rasterize       2D splats → image            α, T, C             ibid., §6 and eq. 2–3
-    count_blended   what that costs, by pixel
+    count_blended   its cost per pixel
     photometric_loss, ssim                       L1, D-SSIM          ibid., eq. 7; Wang et al. 2004
     neighbours      the initial size             ibid., §5.1
     adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
@@ -15,7 +15,8 @@ float64. Read top to bottom, this file is the method:
 [Zwicker et al. 2001]  EWA Volume Splatting. IEEE Visualization. (The J and Σ' of `_project_rows`.)
 [Zwicker et al. 2002]  EWA Splatting. IEEE TVCG 8(3). (The low-pass filter, here `LOW_PASS`.)
 
-Frames are OpenCV's: x right, y down, z forward; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) has its centre at
+(i + 0.5, j + 0.5).
 """
 
 from __future__ import annotations
@@ -30,16 +31,16 @@ from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.layout import TILE
 from snowsplat.ops.splats import Splats2D
 
-LOW_PASS = 0.3  # pixels²: every splat is blurred by it, so that none slips between pixel centres
-ALPHA_MIN = 1 / 255  # what changes an 8-bit image by less is not blended
+LOW_PASS = 0.3  # pixels²: blurs every splat, so that none falls between pixel centres
+ALPHA_MIN = 1 / 255  # smaller contributions do not change an 8-bit image and are skipped
 ALPHA_MAX = 0.99  # keeps 1 − α, hence the transmittance and its gradient, away from 0
-TRANSMITTANCE_MIN = 1e-4  # a pixel is finished when less light than this would come through
-JACOBIAN_MARGIN = 0.15  # of the image size: how far outside of it J still follows the centre
+TRANSMITTANCE_MIN = 1e-4  # a pixel is finished when its transmittance would be lower
+JACOBIAN_MARGIN = 0.15  # of the image size: J is clamped farther outside of the image
 QUAT_EPS = 1e-12
 
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 
-# Real spherical harmonics, by degree; with the signs that the scene files of the field assume.
+# Real spherical harmonics, by degree, with the sign convention of 3DGS scene files.
 C0 = 0.28209479177387814  # ½ √(1/π)
 C1 = 0.4886025119029199  # √(3/4π)
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
@@ -73,16 +74,16 @@ def project(
     sh_degree: int,
     near: float = 0.2,
 ) -> Splats2D:
-    """The splats that N Gaussians leave on a camera's image plane; the invisible are left out.
+    """Projects N Gaussians to splats on a camera's image plane, without invisible ones.
 
     means (N, 3) world, log_scales (N, 3), quats (N, 4) wxyz of any length (zero: no rotation),
     opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, K, 3), of which degree `sh_degree` uses the
     first (sh_degree + 1)² − 1; cam_from_world (3, 4); fx, fy, cx, cy in pixels; near > 0 in world
     units.
 
-    Visible is what lies beyond `near` and has an opacity ≥ 1/255, if the box around its ellipse
-    {α ≥ 1/255} reaches the pixel centres. A Gaussian whose 2D covariance overflows the dtype is not
-    visible.
+    A Gaussian is visible if it lies beyond `near`, has an opacity ≥ 1/255, and the box around its
+    ellipse {α ≥ 1/255} reaches the pixel centres. A Gaussian whose 2D covariance overflows the
+    dtype is not visible.
     """
     if sh_rest.shape[1] < (sh_degree + 1) ** 2 - 1:
         raise ValueError(
@@ -99,7 +100,7 @@ def project(
         last = torch.tensor([width - 0.5, height - 0.5]).to(means)
         touches = (splats.means2d + reach >= 0.5) & (splats.means2d - reach <= last)
         ids = ids[touches.all(dim=1)]  # comparisons with NaN are false: invisible
-    # Once more for the visible alone: no gradient, hence no NaN, comes from behind the camera.
+    # Recomputed for the visible rows only, so that no NaN gradient comes from behind the camera.
     splats, _ = _project_rows([p[ids] for p in parameters], *view)
     return Splats2D(splats.packed, ids.to(torch.int32), splats.channels)
 
@@ -115,7 +116,7 @@ def _project_rows(
     cy: float,
     sh_degree: int,
 ) -> tuple[Splats2D, Tensor]:
-    """Every row of `parameters` (in the order of `project`) to a splat, visible or not.
+    """Projects every row of `parameters` (in the order of `project`), visible or not.
 
     Also returns Σ'xx and Σ'yy (M, 2), NaN where det Σ' overflows.
     """
@@ -126,11 +127,11 @@ def _project_rows(
     x, y, z = (means @ W.T + t).unbind(dim=1)
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
 
-    # Σ = R S Sᵀ Rᵀ (eq. 6), kept as its factor R S. (M, 3, 3)
+    # Σ = R S Sᵀ Rᵀ (eq. 6), represented by its factor R S. (M, 3, 3)
     RS = _rotation_matrices(quats) * log_scales.exp()[:, None, :]
 
     # J, the affine approximation of the projection at the centre (Zwicker et al. 2001, eq. 29). Far
-    # outside of the image it grows without bound, so the ratios are held near the border. (M, 2, 3)
+    # outside of the image it is unbounded, so the ratios are clamped near the border. (M, 2, 3)
     x_margin, y_margin = JACOBIAN_MARGIN * width, JACOBIAN_MARGIN * height
     tx = (x / z).clamp(-(cx + x_margin) / fx, (width - cx + x_margin) / fx)
     ty = (y / z).clamp(-(cy + y_margin) / fy, (height - cy + y_margin) / fy)
@@ -150,7 +151,7 @@ def _project_rows(
     variances = torch.stack([xx, yy], dim=1)
     variances = torch.where(det.isfinite()[:, None], variances, torch.nan)
 
-    # Colour as seen from the camera, whose position in the world is −Wᵀ t.
+    # The view-dependent colour from the camera, whose position in the world is −Wᵀ t.
     directions = means + W.T @ t
     directions = directions / directions.norm(dim=1, keepdim=True)
     count = (sh_degree + 1) ** 2
@@ -206,7 +207,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def _half_extents(variances: Tensor, opacities: Tensor) -> Tensor:
-    """Half width and height, (M, 2) pixels, of the box around {α ≥ 1/255}; NaN where that is empty.
+    """Half width and height, (M, 2) pixels, of the box around {α ≥ 1/255}; NaN if it is empty.
 
     o exp(−½ dᵀ Σ'⁻¹ d) = 1/255 where dᵀ Σ'⁻¹ d = 2 ln(255 o): an ellipse, whose half width is
     √(2 ln(255 o) Σ'xx).
@@ -229,7 +230,7 @@ def rasterize(
     """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
 
     Returns image (H, W, C) of planar storage, alpha (H, W) and depth (H, W) or None. With T the
-    light that the splats in front let through, image = Σ T α c + T_end · background,
+    transmittance of the splats in front, image = Σ T α c + T_end · background,
     alpha = 1 − T_end, depth = Σ T α z (not divided by alpha). Conics must be positive definite.
     `capacity` is ignored: the memory always suffices.
     """
@@ -245,7 +246,10 @@ def rasterize(
         a, b, c = conics.unbind(dim=1)
         variances = torch.stack([c, a], dim=1) / (a * c - b * b)[:, None]  # Σ'xx, Σ'yy
         reach = _half_extents(variances, opacities).nan_to_num(nan=torch.inf)
-        low, high = means2d - reach - 1e-3, means2d + reach + 1e-3  # never one too few
+        low, high = (
+            means2d - reach - 1e-3,
+            means2d + reach + 1e-3,
+        )  # a margin, so that no pixel is missed
 
     bands = []
     for top in range(0, height, TILE):
@@ -269,7 +273,7 @@ def rasterize(
 
 
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
-    """(H, W) how many splats `rasterize` blends into each pixel."""
+    """(H, W) the number of splats that `rasterize` blends into each pixel."""
     order = torch.argsort(splats.depths.detach(), stable=True)
     means2d, conics, opacities = (
         values[order] for values in (splats.means2d, splats.conics, splats.opacities)
@@ -299,7 +303,7 @@ def _blend_weights(
     a, b, c = conics.unbind(dim=1)
     alpha = opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
     alpha = torch.where(alpha < ALPHA_MIN, 0, alpha.clamp(max=ALPHA_MAX))
-    # T only falls: a pixel is finished from the first splat on that would bring it too low.
+    # T only decreases: a pixel is finished from the first splat on that would make it too small.
     unfinished = torch.cumprod(1 - alpha, dim=1) >= TRANSMITTANCE_MIN
     alpha = torch.where(unfinished, alpha, 0)
     ones = alpha.new_ones(len(pixels), 1)
@@ -313,7 +317,7 @@ def _blend_weights(
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004) of images (H, W, C) in [0, 1]: 1 if they are equal.
 
-    The 11 × 11 Gaussian window with σ = 1.5 sums to 1 and sees zeros outside of the image. Returns
+    The 11 × 11 Gaussian window with σ = 1.5 sums to 1; the image is padded with zeros. Returns
     the mean over all pixels and channels, a scalar.
     """
     channels = image.shape[2]
@@ -346,7 +350,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 
 
 def _as_unit(target: Tensor, like: Tensor) -> Tensor:
-    """An 8-bit image as one in [0, 1] of the dtype of `like`; a floating image as it is."""
+    """An 8-bit image converted to [0, 1] in the dtype of `like`; a floating image unchanged."""
     return target.to(like) / 255 if target.dtype == torch.uint8 else target.to(like)
 
 
@@ -356,7 +360,7 @@ def _as_unit(target: Tensor, like: Tensor) -> Tensor:
 def neighbours(points: Tensor, k: int = 3) -> Tensor:
     """Distances (N, k), ascending, from each of points (N, 3) to its k nearest others.
 
-    A point at the same place is another (distance 0). Where there are fewer than k others: inf.
+    A different point at the same place counts, with distance 0. Missing neighbours are inf.
     """
     count = len(points)
     found = points.new_full((count, k), torch.inf)
@@ -365,7 +369,7 @@ def neighbours(points: Tensor, k: int = 3) -> Tensor:
         chunk = points[start : start + 1024]
         distances = torch.cdist(chunk, points, compute_mode="donot_use_mm_for_euclid_dist")
         rows = torch.arange(len(chunk))
-        distances[rows, rows + start] = torch.inf  # not itself
+        distances[rows, rows + start] = torch.inf  # not the point itself
         found[start : start + 1024, :available] = distances.topk(available, largest=False).values
     return found
 
@@ -383,10 +387,10 @@ def accumulate_screen_statistics(
     max_radii: Tensor | None = None,
     valid: Tensor | None = None,
 ) -> None:
-    """Adds one view to what density control (section 5.2) knows of the Gaussians that it sees.
+    """Adds one view to the statistics of the visible Gaussians for density control (section 5.2).
 
-    The gradient of the position (M, 2) is stated for a screen that spans [-1, 1] in x and y.
-    Nothing is added where it is not finite, or `valid` (1,) is False.
+    The gradient of the position (M, 2) is scaled to a screen that spans [-1, 1] in x and y.
+    Rows with a non-finite gradient are skipped; if `valid` (1,) is False, all rows are.
     """
     if valid is not None and not valid:
         return
@@ -428,7 +432,7 @@ def adam_step(
     valid: Tensor | None = None,
     nonfinite_rows: Tensor | None = None,
 ) -> None:
-    """Carries the gradient of the splats through `project` and takes one step of Adam, in place.
+    """Backpropagates the splats' gradient through `project` and takes one Adam step, in place.
 
     params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, shaped as for `project`. A
         `.grad` that is not None (of a regulariser) is added to the gradient.
@@ -437,11 +441,11 @@ def adam_step(
     lr: a rate for each name. step: counts from 1.
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
-    valid: (1,) bool; where it is False nothing changes.
+    valid: (1,) bool; False: changes nothing.
     nonfinite_rows: (6,) int32 counts, one per parameter. Values that the step would make infinite
         or NaN keep their value and moments, and the rows with such values are added to the counts.
 
-    Rows of sh_rest beyond `sh_degree` are left alone, moments too. The step is
+    Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
     p −= lr · m̂ / √(v̂ + eps²), where the paper has √v̂ + eps. The two agree for v̂ ≫ eps² and at
     m̂ = v̂ = 0, and this one is a single reciprocal square root.
     """

@@ -1,8 +1,8 @@
-"""Memory that is used again: `empty` hands out tensors from a pool of blocks.
+"""Reuses memory: `empty` returns tensors from a pool of blocks.
 
-Every frame needs the same few large arrays. Fresh memory from the operating system costs a page
-fault every 4 kB, in sum more than the sorting it is for, so a block goes back to the pool when the
-last tensor that uses it is gone, and serves the next frame. Large blocks ask for huge pages.
+Every frame needs the same few large arrays. New memory from the operating system causes a page
+fault every 4 kB, which takes longer than the sorting that uses it. Therefore a block returns to the
+pool when its last tensor is deleted, and the next frame uses it. Large blocks request huge pages.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from torch import Tensor
 _HUGE = 2 << 20  # bytes of a huge page
 _PAGE = 4096
 _KEEP = 24  # free blocks; more than a frame forward and backward needs
-# Blocks begin at different places of a page. Where a value and its moments lie a multiple of 4 kB
-# apart, a load has to wait for a store that only looks like the same address.
+# Blocks begin at different offsets in a page. If a value and its moments were a multiple of 4 kB
+# apart, loads would wait for stores whose addresses only have the same lower bits.
 _STAGGER = 17 * 64
 
 _free: list[np.ndarray] = []
@@ -34,7 +34,7 @@ class _Loan(np.ndarray):
     block: np.ndarray | None = None
 
     def __array_finalize__(self, source: Any) -> None:
-        self.block = None  # a view of a loan is not a loan
+        self.block = None  # a view of a loan is not a loan itself
 
     def __del__(self) -> None:
         if self.block is None:
@@ -42,14 +42,14 @@ class _Loan(np.ndarray):
         with _lock:
             _free.append(self.block)
             _free.sort(key=len)
-            # The smallest go first: they are the cheapest to make again.
+            # The smallest are freed first: they are the cheapest to allocate again.
             del _free[: max(0, len(_free) - _KEEP)]
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
     """An uninitialised contiguous tensor on `device` (default: CPU), 64-byte aligned.
 
-    On a GPU torch's own allocator does what this one is for.
+    On a GPU, torch's own allocator reuses memory.
     """
     if device is not None and device.type != "cpu":
         return torch.empty(shape, dtype=dtype, device=device)
@@ -72,7 +72,7 @@ def _take(size: int) -> np.ndarray:
         for i, block in enumerate(_free):
             if size <= len(block) <= 4 * size + _HUGE:
                 return _free.pop(i)
-    # A quarter more than asked for, so that a growing scene does not need a new block every frame.
+    # 25% more than requested, so that a growing scene does not need a new block every frame.
     return _make(size + size // 4)
 
 
@@ -90,10 +90,10 @@ def _make(size: int) -> np.ndarray:
 
 
 def take_rows(tensor: Tensor, index: Tensor) -> Tensor:
-    """`tensor[index]` along the first dimension, for tensors that stay: parameters, moments.
+    """`tensor[index]` along the first dimension, for long-lived tensors: parameters, moments.
 
-    In a block like those of this pool, whose huge pages and places suit them too, but of its own:
-    it goes back to the operating system, since the next one will be of another size.
+    The memory has huge pages and page offsets like the blocks of the pool, but does not belong to
+    the pool: it returns to the operating system, since the next size will be different.
     """
     if tensor.requires_grad or tensor.device.type != "cpu" or index.dtype == torch.bool:
         return tensor[index]

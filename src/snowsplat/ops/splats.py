@@ -25,7 +25,7 @@ COLORS = PACKED_HEADER
 
 
 def packed_width(channels: int) -> int:
-    """Columns of a packed row that carries `channels` colour or feature channels."""
+    """Columns of a packed row with `channels` colour or feature channels."""
     return -(-(COLORS + channels) // PACKED_STRIDE) * PACKED_STRIDE
 
 
@@ -41,7 +41,7 @@ class Splats2D:
               7   `radii`     3 σ of the major axis (information only, never has a gradient)
               8:8+C `colors`; the rest is padding (zero)
     ids:      (M,) int32: the Gaussian that each row came from; ascending, except for −1, which
-              marks an empty row that draws nothing. On a GPU `project` returns a row for every
+              marks an empty row, which is not drawn. On a GPU `project` returns a row for every
               Gaussian, because counting the visible ones would require waiting; on the CPU no row
               is empty. None: the rows are the Gaussians themselves (2D fitting).
     channels: C, at least 1.
@@ -121,7 +121,7 @@ class Splats2D:
         radii: Tensor | None = None,
         ids: Tensor | None = None,
     ) -> Splats2D:
-        """Packs separate tensors; gradients reach every argument but `radii` and `ids`.
+        """Packs separate tensors; gradients flow to every argument except `radii` and `ids`.
 
         means2d (M, 2), conics (M, 3), opacities (M,), depths (M,), colors (M, C), all of one
         floating dtype and device. `radii` (M,) defaults to 3 σ of the major axis of each conic.

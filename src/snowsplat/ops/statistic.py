@@ -21,15 +21,15 @@ def accumulate_screen_statistics(
     max_radii: Tensor | None = None,
     valid: Tensor | None = None,
 ) -> None:
-    """Adds one view to the statistics of the N Gaussians, in place, at the rows that it sees.
+    """Adds one view to the statistics of the N Gaussians, in place, for visible rows.
 
     With the gradient in `splats.packed.grad` and distinct `splats.ids`:
     norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|, views (N,) += 1, and
-    max_radii (N,) = max(max_radii, `splats.radii`) unless None. The factor states the gradient for
-    a screen that spans [-1, 1], as the paper's threshold is (section 5.2). Rows of id −1 and rows
-    whose gradient is not finite are skipped; if `valid`, (1,) bool, is False, all rows are.
+    max_radii (N,) = max(max_radii, `splats.radii`) unless None. The factor scales the gradient to
+    a screen that spans [-1, 1], to which the paper's threshold refers (section 5.2). Rows of id −1
+    and rows with a non-finite gradient are skipped; if `valid`, (1,) bool, is False, all rows are.
 
-    Raises ValueError where there is no gradient, no ids, or shapes or dtypes do not fit.
+    Raises ValueError if there are no gradients or ids, or shapes or dtypes do not match.
     """
     op = "accumulate_screen_statistics"
     packed, grad, ids = splats.packed, splats.packed.grad, splats.ids

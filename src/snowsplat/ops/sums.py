@@ -1,4 +1,4 @@
-"""`sum_of_rows`: the same bits every time."""
+"""`sum_of_rows`: a bit-identical sum."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from torch import Tensor
 
 
 def sum_of_rows(rows: Tensor) -> Tensor:
-    """(R, C) → (C,), the same to the bit whatever torch's number of threads.
+    """(R, C) → (C,), bit-identical for any number of threads of torch.
 
-    On the CPU one row after the other. On a GPU a sum of torch has one order of its own, and it is
-    cumsum that has none.
+    On the CPU, rows are added in order. On a GPU, torch's sum has a fixed order; cumsum has not.
     """
     if rows.is_cuda or len(rows) == 0:
         return rows.sum(0)

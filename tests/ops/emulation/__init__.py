@@ -1,8 +1,8 @@
-"""Runs the CUDA kernels on the CPU: each `.cu` file is compiled as C++, with a fibre per thread.
+"""Runs CUDA kernels on the CPU: each `.cu` file is compiled as C++, with a fibre per thread.
 
 The environment variable SNOWSPLAT_EMULATION=sanitized compiles with AddressSanitizer and
-UndefinedBehaviorSanitizer (Python then needs LD_PRELOAD; `make sanitized` knows how), and
-SNOWSPLAT_ORDER is the order in which the threads of a block run: see cuda_emulation.h.
+UndefinedBehaviorSanitizer (Python then needs LD_PRELOAD, see `make sanitized`), and
+SNOWSPLAT_ORDER sets the order in which the threads of a block run: see cuda_emulation.h.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _FLAGS = {
 
 @functools.cache
 def library(file: str) -> ctypes.CDLL:
-    """`native/cuda/<file>.cu`, or one beside this file, compiled for the CPU where it changed."""
+    """`native/cuda/<file>.cu`, or a file in this folder, compiled for the CPU if it has changed."""
     kind = os.environ.get("SNOWSPLAT_EMULATION", "")
     folder = _ROOT / "build" / "emulation" / (kind or "plain")
     folder.mkdir(parents=True, exist_ok=True)
@@ -42,7 +42,7 @@ def library(file: str) -> ctypes.CDLL:
         newest = max(path.stat().st_mtime for path in made_of)
         if not target.exists() or target.stat().st_mtime < newest:
             command = [os.environ.get("CXX", "c++"), "-std=c++17", *_FLAGS[kind]]
-            command += ["-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas"]  # of unrolling
+            command += ["-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas"]  # for unrolling
             command += ["-fPIC", "-shared", "-ffp-contract=fast"]
             command += ["-DSNOWSPLAT_EMULATION", f"-I{_HERE}", f"-I{_NATIVE}"]
             command += [str(_HERE / "block.cpp"), "-x", "c++", str(source), "-o", str(target)]
@@ -57,8 +57,8 @@ def execute(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
     """Runs a kernel on CPU tensors until it ends.
 
     Raises:
-        RuntimeError: a divergent barrier, and what else the emulation finds.
-        AssertionError: threads or parameters are not those of the kernel.
+        RuntimeError: a divergent barrier, or another fault that the emulation detects.
+        AssertionError: threads or parameters do not match the kernel.
     """
     loaded = library(kernel.file)
     built = getattr(loaded, f"{name}_threads")()

@@ -1,5 +1,5 @@
-// Runs the blocks of a kernel one after the other, each thread of a block a fibre: a stack of its
-// own, left at a barrier and taken up again when all have arrived. See cuda_emulation.h.
+// Runs the blocks of a kernel one after another. Each thread of a block is a fibre with its own stack,
+// which is suspended at a barrier and resumed when all threads have arrived. See cuda_emulation.h.
 #include <cstdlib>
 #include <cstring>
 #include <string>
@@ -30,9 +30,9 @@ struct Fibre {
   State state = State::kDone;
   Place place = {"", 0};
   unsigned mask = 0;                // the lanes it waits for
-  uint64_t value = 0;               // what it brings to an exchange
-  uint64_t values[kWarpSize] = {};  // what the lanes of its last exchange brought, if it led it
-  const uint64_t* found = nullptr;  // those of the one that led
+  uint64_t value = 0;               // its value in an exchange
+  uint64_t values[kWarpSize] = {};  // values of the lanes of its last exchange, if it is the leader
+  const uint64_t* found = nullptr;  // the values of the leader
 #if defined(__x86_64__)
   void* stack_pointer = nullptr;
 #else
@@ -49,8 +49,8 @@ struct SharedArray {
 std::vector<Fibre> fibres;
 std::vector<SharedArray> shared_arrays;
 std::vector<int> order;
-int running = -1;  // the fibre that runs, or −1: the scheduler does
-// Of block_sum. Two in turn: while one is read, the next may be filled.
+int running = -1;  // the running fibre, or −1: the scheduler
+// Sums of block_sum, used alternately: while one is read, the next may be written.
 int sums[2], sum_turn;
 void (*kernel_call)(void**);
 void** kernel_args;
@@ -96,7 +96,7 @@ snowsplat_switch_stack:
 void prepare(Fibre& f) {
   uintptr_t top = reinterpret_cast<uintptr_t>(f.stack + kStackBytes) & ~uintptr_t(15);
   void** sp = reinterpret_cast<void**>(top);
-  *--sp = nullptr;  // keeps the stack aligned as after a call
+  *--sp = nullptr;  // aligns the stack as after a call
   *--sp = reinterpret_cast<void*>(&run_thread);
   for (int k = 0; k < 6; k++) *--sp = nullptr;
   f.stack_pointer = sp;
@@ -167,7 +167,7 @@ void fail(const std::string& what) {
   if (error.empty()) error = "block " + std::to_string(block_index.x) + ": " + what;
 }
 
-// Lets a warp's lanes go on whose mask has arrived as a whole, at one place.
+// Resumes the lanes of a warp if all lanes of their mask have arrived at the same place.
 bool release_warps() {
   bool released = false;
   const int threads = int(fibres.size());
@@ -199,7 +199,7 @@ bool release_warps() {
   return released;
 }
 
-// Lets the block go on if all that still run are at the same barrier.
+// Resumes the block if all running threads are at the same barrier.
 bool release_block() {
   const Fibre* waiting = nullptr;
   for (const Fibre& f : fibres) {
@@ -310,7 +310,7 @@ const uint64_t* warp_exchange(unsigned mask, uint64_t value, Place at) {
 
 }  // namespace emulation
 
-// Runs a kernel; gives null, or what went wrong.
+// Runs a kernel; returns null or an error message.
 SNOW_EMULATION_EXPORT const char* emulate(void (*call)(void**), int64_t blocks, int64_t threads,
                                           void** args) {
   using namespace emulation;

@@ -1,12 +1,12 @@
-// CUDA's vocabulary for the C++ compiler, so that the .cu files run on a CPU, a block at a time, each
-// thread of the block a fibre (see block.cpp). Written for checking kernels, not for speed:
+// Implements CUDA's intrinsics for the C++ compiler, so that .cu files run on a CPU, one block at a
+// time, with a fibre for each thread (see block.cpp). For checking kernels; it is slow:
 //
 // - Threads of a block run one at a time, each until a barrier, a shuffle or a vote; SNOWSPLAT_ORDER
-//   (forward, backward or a seed of shuffles) says in which order, so that a missing barrier shows.
-// - A barrier that only a part of the threads reach, a lane of a mask that never comes, and threads
-//   that wait at different places are errors with their names and lines.
-// - A shared array is memory of its own, full of NaN when a block begins, so that AddressSanitizer
-//   sees what reaches beyond it, and the tests see what was read and never written.
+//   (forward, backward or a seed of shuffles) sets the order, so that missing barriers have effects.
+// - A barrier that only some threads reach, a lane of a mask that never arrives, and threads that wait
+//   at different places are errors with their names and lines.
+// - A shared array is a separate allocation, filled with NaN when a block begins, so that
+//   AddressSanitizer detects accesses out of bounds, and tests detect reads of unwritten memory.
 #pragma once
 
 #include <cmath>
@@ -28,7 +28,7 @@ namespace emulation {
 
 extern EmulatedIndex thread_index, block_index, block_size, grid_size;
 
-// A line of a kernel, where its threads wait for each other.
+// A line of a kernel at which threads wait for each other.
 struct Place {
   const char* file;
   int line;
@@ -40,16 +40,16 @@ inline Place here(const char* file = __builtin_FILE(), int line = __builtin_LINE
 
 // Memory that the threads of the running block share, the same for the same `site`.
 void* shared(const void* site, int64_t bytes);
-// Waits until all running threads of the block are here.
+// Waits until all running threads of the block have arrived.
 void block_barrier(Place);
-// The same, and gives the sum of the values.
+// The same; returns the sum of the values.
 int block_sum(int value, Place);
-// Waits until all lanes of `mask` are here, and gives the value that each brought (of ≤ 8 bytes).
+// Waits until all lanes of `mask` have arrived; returns the value of each lane (≤ 8 bytes).
 const uint64_t* warp_exchange(unsigned mask, uint64_t value, Place);
 
 template <class T, int64_t kCount, class Site>
 T* shared_array(Site) {
-  static_assert(std::is_trivially_destructible<T>::value, "nobody destroys it");
+  static_assert(std::is_trivially_destructible<T>::value, "it is never destroyed");
   static const char site = 0;
   return static_cast<T*>(shared(&site, int64_t(sizeof(T)) * kCount));
 }
@@ -168,7 +168,7 @@ inline void __threadfence() {}
 inline void __threadfence_block() {}
 inline void __nanosleep(unsigned) {}
 
-// Nothing runs at the same time as something else, so a plain change is atomic.
+// Nothing runs concurrently, so a plain update is atomic.
 template <class T>
 T atomicAdd(T* at, std::common_type_t<T> value) {
   const T before = *at;

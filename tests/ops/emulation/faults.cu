@@ -1,4 +1,4 @@
-// Kernels for testing the emulation itself: faults that it must find, and values that are known.
+// Kernels for testing the emulation: faults that it must detect, and known results.
 #include "cuda/device.h"
 
 using namespace snow;
@@ -12,7 +12,7 @@ struct FaultParams {
   SNOW_FIELDS(n, given, out, total)
 };
 
-// Threads below n wait at another place than the rest.
+// Threads below n wait at another place than the others.
 SNOW_KERNEL(two_barriers, 64, FaultParams<int32_t>) {
   if (threadIdx.x < p.n) {
     __syncthreads();
@@ -22,7 +22,7 @@ SNOW_KERNEL(two_barriers, 64, FaultParams<int32_t>) {
   p.out[threadIdx.x] = 1;
 }
 
-// Threads below n wait for the block, the rest for their warps.
+// Threads below n wait for the block, the others for their warps.
 SNOW_KERNEL(barrier_or_vote, 64, FaultParams<int32_t>) {
   if (threadIdx.x < p.n) {
     __syncthreads();
@@ -33,7 +33,7 @@ SNOW_KERNEL(barrier_or_vote, 64, FaultParams<int32_t>) {
   p.out[threadIdx.x] = 1;
 }
 
-// Lane n of each warp has left when the others wait for it.
+// Lane n of each warp has returned while the others wait for it.
 SNOW_KERNEL(absent_lane, 64, FaultParams<int32_t>) {
   if (lane_id() == p.n) return;
   p.out[threadIdx.x] = __shfl_sync(kAllLanes, int(threadIdx.x), 0);
@@ -54,7 +54,7 @@ SNOW_KERNEL(not_in_its_mask, 32, FaultParams<int32_t>) {
   p.out[threadIdx.x] = __ballot_sync(~(1u << p.n), 1) != 0;
 }
 
-// Right only if a thread runs after the one before it.
+// Correct only if each thread runs after the previous one.
 SNOW_KERNEL(missing_barrier, 64, FaultParams<int32_t>) {
   SNOW_SHARED(int32_t, row, 64);
   const int t = int(threadIdx.x);
@@ -76,7 +76,7 @@ SNOW_KERNEL(never_written, 32, FaultParams<float>) {
   __syncthreads();
   p.out[threadIdx.x] = row[threadIdx.x];
   __syncthreads();
-  row[threadIdx.x] = 2.f;  // must not be there in the next block
+  row[threadIdx.x] = 2.f;  // must not be visible in the next block
 }
 
 SNOW_KERNEL(beyond_shared, 32, FaultParams<int32_t>) {
@@ -105,7 +105,7 @@ SNOW_KERNEL(early_return, 64, FaultParams<int32_t>) {
   p.out[0] = sum;
 }
 
-// Each row of 32 of `out` is another exchange of `in`, whose lanes are all here.
+// Each row of 32 of `out` is another exchange of `in`, with all lanes.
 SNOW_KERNEL(exchanges, 32, FaultParams<int32_t>) {
   const int l = lane_id(), value = p.given[l];
   p.out[l] = __shfl_sync(kAllLanes, value, int(p.n));

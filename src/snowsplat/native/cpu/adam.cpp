@@ -17,10 +17,10 @@ constexpr int64_t kBlock = 2048;
 template <class T>
 struct AdamRows {
   T *value, *m, *v;
-  const T* extra;           // a gradient to add; or null
+  const T* extra;           // additional gradient; or null
   T rate;                   // lr / (1 − β₁ᵗ)
   int64_t stride;           // columns as stored
-  int32_t* nonfinite_rows;  // a count of skipped rows; or null
+  int32_t* nonfinite_rows;  // number of skipped rows; or null
 
   AdamRows(const AdamTensor<T>& t, int64_t columns, int32_t* count)
       : value(t.value), m(t.m), v(t.v), extra(t.extra), rate(T(t.rate)), stride(columns),
@@ -36,8 +36,8 @@ SNOW_INLINE bool all_finite(V a) {
   return __builtin_expect(V::bits(is_finite(a)) == V::bits(V::first(V::width)), 1);
 }
 
-// The step where it comes to finite numbers, and the lanes where it does not. Rare, so it is kept
-// out of line.
+// Takes the step in lanes where its results are finite; returns the other lanes. Rarely called, so
+// it is not inlined.
 template <class V>
 __attribute__((noinline, cold)) uint32_t step_where_finite(const AdamRule<V>& rule, const V& g,
                                                            V& m, V& v, V& p, const V& rate) {
@@ -147,7 +147,7 @@ SNOW_INLINE void prefetch_row(int64_t row, const AdamRows<T>* t, int rest_column
   }
 }
 
-// Returns −1 where an id is negative: those are rows of a GPU. Nothing changes then.
+// Returns −1 and changes nothing if an id is negative: such rows only come from a GPU.
 template <class V, class T = typename V::Scalar>
 int64_t step(const AdamStepParams<T>& p) {
   constexpr int W = V::width;
@@ -168,7 +168,7 @@ int64_t step(const AdamStepParams<T>& p) {
   const AdamRule<V> rule(p);
   const bool visible_only = p.visible_only != 0;
   const int degree = int(p.sh_degree), rest_columns = sh_columns(degree);
-  // Tasks are ranges of Gaussians, each with the splats that came from it: ids ascend.
+  // A task is a range of Gaussians and their splats, which are contiguous because ids ascend.
   const int64_t units = visible_only ? m : n;
   parallel_for((units + kBlock - 1) / kBlock, [&](int64_t block) {
     const int64_t begin = block * kBlock, end = std::min(begin + kBlock, units);

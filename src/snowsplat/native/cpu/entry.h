@@ -1,4 +1,4 @@
-// How Python reaches a kernel of this library.
+// Entry points of this library, called by Python.
 //
 //   SNOW_ENTRY(name, Params) { … }
 //

@@ -1,5 +1,5 @@
-// W Gaussians at a time, one per SIMD lane: reading their parameters from row-major tensors, and
-// carrying the gradient of their splats back to those parameters. Shared by project_bwd, which
+// W Gaussians at a time, one per SIMD lane: loads their parameters from row-major tensors, and
+// computes the gradients of these parameters from the gradient of their splats. Shared by project_bwd, which
 // writes the gradients, and adam_step, which applies them immediately.
 #pragma once
 

@@ -1,7 +1,7 @@
-// Which instruction set this library was built for, and which is the best one this machine runs.
+// The instruction set that this library was built for, and the best one that this machine supports.
 //
-// The loader (ops/native.py) asks the baseline library, which runs everywhere, before it touches
-// the others: merely loading a library may run its static constructors.
+// The loader (ops/native.py) calls the baseline library, which runs everywhere, before it loads
+// another one, because loading a library already runs its static constructors.
 #include <cstdint>
 
 #if defined(__x86_64__)
@@ -16,8 +16,8 @@ namespace {
 enum Isa : int64_t { kBaseline = 0, kAvx2 = 1, kAvx512 = 2 };
 
 #if defined(__x86_64__)
-// lzcnt decodes as bsr where it is missing: wrong results instead of a fault. Older compilers do
-// not know its name.
+// On processors without lzcnt, the instruction is executed as bsr: wrong results instead of a fault.
+// __builtin_cpu_supports of older compilers does not support its name.
 bool has_lzcnt() {
   unsigned a = 0, b = 0, c = 0, d = 0;
   return __get_cpuid(0x80000001u, &a, &b, &c, &d) && (c & (1u << 5));
@@ -26,7 +26,7 @@ bool has_lzcnt() {
 
 }  // namespace
 
-// What this library was built for.
+// The instruction set that this library was built for.
 SNOW_EXPORT int64_t built_isa() {
 #if defined(SNOWSPLAT_ISA_AVX512)
   return kAvx512;
@@ -37,8 +37,8 @@ SNOW_EXPORT int64_t built_isa() {
 #endif
 }
 
-// The best one that the processor has and the operating system saves on a task switch
-// (__builtin_cpu_supports looks at XCR0 for the wide registers).
+// The best instruction set of the processor whose registers the operating system saves on a task
+// switch (__builtin_cpu_supports checks XCR0 for the wide registers).
 SNOW_EXPORT int64_t best_isa() {
 #if defined(__x86_64__)
   __builtin_cpu_init();

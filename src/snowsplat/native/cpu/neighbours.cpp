@@ -2,7 +2,7 @@
 //
 // The tree is implicit: the points are reordered so that each node is a range, cut at its middle
 // along its widest axis, down to leaves of at most 16 points. Every query starts at the root and
-// prunes by the distance to the cutting planes.
+// prunes by the distance to the splitting planes.
 #include <algorithm>
 #include <cmath>
 #include <limits>

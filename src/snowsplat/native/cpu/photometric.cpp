@@ -17,11 +17,11 @@
 namespace snow {
 namespace {
 
-constexpr int kStrip = 256;  // columns of a task at most
+constexpr int kStrip = 256;  // most columns of a task
 constexpr int kMargin = 16;  // columns computed on each side for the second filter
 constexpr int kPad = 32;     // columns of buffer on each side
 constexpr int kRow = kStrip + 2 * kPad;
-constexpr int kSegment = 540;  // rows of a task, about
+constexpr int kSegment = 540;  // rows of a task, approximately
 
 int64_t strip_count(int64_t width) { return (width + kStrip - 1) / kStrip; }
 
@@ -38,7 +38,7 @@ SNOW_INLINE V load_pixels(const uint8_t* p, int64_t n) {
 }
 
 // row[x + k − 5 …], k = 0 … 10, for x a multiple of W: eleven loads, most of them across two cache
-// lines; at 16 lanes rather three aligned loads and shifts between registers.
+// lines; with 16 lanes, three aligned loads and shifts between registers are used instead.
 template <class V>
 struct Neighbourhood {
   const typename V::Scalar* at;

@@ -1,4 +1,4 @@
-// The thread pool: see pool.h for what it promises.
+// The thread pool: see pool.h for its guarantees.
 #include "cpu/pool.h"
 
 #include <pthread.h>
@@ -105,7 +105,7 @@ std::mutex pool_mutex;
 Pool* pool = nullptr;
 int wanted = 1;
 
-// A forked child has none of its parent's threads: forget the pool, start anew when needed.
+// A forked child has none of its parent's threads: discard the pool; a new one is created when needed.
 void after_fork_in_child() {
   new (&pool_mutex) std::mutex;
   pool = nullptr;

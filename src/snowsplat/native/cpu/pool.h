@@ -2,7 +2,7 @@
 //
 // parallel_for(tasks, body) calls body(task) once for each task in [0, tasks), on any thread in any
 // order; the result of a kernel must not depend on either. Idle workers sleep after a short spin, so
-// that waiting does not slow a busy machine. Denormals are flushed inside and the mode is restored.
+// that waiting does not slow down other processes. Denormals are flushed inside and the mode is restored.
 #pragma once
 
 #include <cstdint>

@@ -1,5 +1,5 @@
-// project: which Gaussians a camera sees (project_cull), their 2D splats (project_fwd), and the
-// gradient of the splats carried to the parameters and the pose (project_bwd).
+// project: the Gaussians that a camera sees (project_cull), their 2D splats (project_fwd), and the
+// gradients of the parameters and the pose from those of the splats (project_bwd).
 #include <cstring>
 #include <vector>
 
@@ -13,7 +13,7 @@ namespace {
 constexpr int64_t kBlock = 2048;  // Gaussians per task: independent of the number of threads
 
 // Bound on the half extents of the splat from its largest scale alone: λmax(Σ) = s², so
-// Σ'xx ≤ |J_x|² s² + 0.3 with |J_x|² = (fx/z)² (1 + tx²). Cheap, and never too small.
+// Σ'xx ≤ |J_x|² s² + 0.3 with |J_x|² = (fx/z)² (1 + tx²). It is cheap, and never too small.
 template <class V, class T>
 SNOW_INLINE typename V::Mask may_touch_image(const GaussianShape<V>& g, const PinholeCamera<T>& c) {
   const T* W = c.rotation;

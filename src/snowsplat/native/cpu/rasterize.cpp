@@ -2,15 +2,15 @@
 //
 // Pixels are in SIMD lanes: a block is W neighbouring pixels of one row (a whole row at W = 16), a
 // tile has 256/W blocks, numbered column-major: block = (x / W) · 16 + y. One vector test per
-// (tile, splat) finds the blocks its ellipse touches; the forward pass keeps these bits for the
-// backward.
+// (tile, splat) finds the blocks its ellipse touches; the forward pass stores these bits for the
+// backward pass.
 //
-// Forward   takes chunks of 64 splats and walks block by block, so that a block's transmittance and
+// Forward   processes chunks of 64 splats block by block, so that a block's transmittance and
 //           colour stay in registers over the chunk.
-// Backward  walks splat by splat, front to back again. With S = Σ of what lies behind (known at the
-//           start: S₀ = ∂L/∂C · C, since the whole pixel lies behind), the derivative with respect
+// Backward  processes splat by splat, front to back again. With S, the sum over the splats behind
+//           (known at the start: S₀ = ∂L/∂C · C, since all splats are behind), the derivative with respect
 //           to log α is w·(g·c) − α S/(1 − α): no division by T, no last index per pixel. A splat's
-//           sums stay in lanes over its blocks and are folded once, into a slot of its own: no
+//           sums stay in lanes over its blocks and are added once, into a separate slot: no
 //           atomics, so the result is the same for any number of threads.
 #include "cpu/entry.h"
 #include "cpu/pool.h"
@@ -48,14 +48,14 @@ struct Tile {
   static constexpr int kBlocks = kTile * kColumns;  // blocks of a tile
   static constexpr int kRowVectors = kTile / W;     // vectors that hold one value per row
 
-  int x, y, columns, rows;  // first pixel; how much of the tile lies inside the image
+  int x, y, columns, rows;  // first pixel; size of the part inside the image
 
   Tile(int64_t index, int64_t tiles_x, int64_t width, int64_t height) {
     x = int(index % tiles_x) * kTile, y = int(index / tiles_x) * kTile;
     columns = width - x < kTile ? int(width - x) : kTile;
     rows = height - y < kTile ? int(height - y) : kTile;
   }
-  // Lanes of a block that are pixels of the image.
+  // The number of lanes of a block that are pixels of the image.
   SNOW_INLINE int lanes(int block) const {
     const int n = columns - block / kTile * W;
     return block % kTile < rows ? (n < 0 ? 0 : n < W ? n : W) : 0;
@@ -101,7 +101,7 @@ struct RowTerms {
   }
 };
 
-// For each block, which of the chunk's splats touch it: the transpose of the splats' block bits.
+// For each block, the splats of the chunk that touch it: the transpose of the splats' block bits.
 template <class V>
 struct BlockLists {
   uint64_t list[Tile<V>::kBlocks] = {};
@@ -225,7 +225,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
         V weight = a * transmittance, next = transmittance - weight;
         const auto open = is_open(next);
         if (__builtin_expect(V::bits(open) != still, 0)) {
-          // Some lanes would fall below the least transmittance: they stop here, before this splat.
+          // Lanes whose transmittance would fall below the minimum stop here, before this splat.
           const auto stops = V::from_bits(still & ~V::bits(open));
           block[b].stopped = select(stops, transmittance, block[b].stopped);
           still = V::bits(open);
@@ -436,5 +436,5 @@ SNOW_ENTRY(background_bwd_f64, BackgroundBackwardParams<double>) { return backgr
 // Bytes of instance_blocks per instance.
 SNOW_ENTRY(rasterize_block_bytes, SizeQueryParams) { return (void)p, sizeof(Tile<VecF>::Bits); }
 SNOW_ENTRY(rasterize_block_bytes_f64, SizeQueryParams) { return (void)p, sizeof(Tile<VecD>::Bits); }
-// 1 where gradients are summed in slots, in a fixed order; 0 where they are added atomically.
+// 1: gradients are summed in slots, in a fixed order; 0: they are added atomically.
 SNOW_ENTRY(rasterize_sums_in_order, SizeQueryParams) { return (void)p, 1; }

@@ -1,7 +1,7 @@
 // From splats to a depth-sorted list of splats for each 16×16 tile:
 //   splats_prepare   records, tile rectangles and depth keys
 //   splats_sort      radix sort of the depth keys (stable, so equal depths keep row order)
-//   tiles_count      exactly which tiles each splat touches; counts per tile
+//   tiles_count      the exact set of tiles that each splat touches; counts per tile
 //   tiles_fill       a stable counting scatter by tile, in depth order
 // and back: splats_reduce sums the gradients of a splat's tiles. No result depends on the number of
 // threads.
@@ -17,7 +17,7 @@ namespace snow {
 namespace {
 
 constexpr int64_t kBlock = 2048;
-constexpr int64_t kSerialBelow = 8000;  // splats; under this one part is faster than several
+constexpr int64_t kSerialBelow = 8000;  // splats; below this, one part is faster than several
 
 int64_t part_count(int64_t m) { return m < kSerialBelow ? 1 : pool_size(); }
 
@@ -66,7 +66,7 @@ int64_t prepare(const SplatsPrepareParams<T>& p) {
   return 0;
 }
 
-// Least significant digit first, 11 bits per pass, over as many bits as the keys differ in.
+// Least significant digit first, 11 bits per pass, over the bits in which the keys differ.
 template <class T>
 int64_t radix_sort(const SplatsSortParams<T>& p) {
   using Key = DepthKey<T>;
@@ -141,7 +141,7 @@ struct TileSpan {
 };
 static_assert(sizeof(TileSpan) == 8, "layout of the scratch tensor");
 
-// Which of 16 tiles the splat touches: tile k of the 16 is at (k % width, k / width) from (x, y).
+// The tiles among 16 that the splat touches: tile k of the 16 is at (k % width, k / width) from (x, y).
 template <class V, class T = typename V::Scalar>
 struct TileTest {
   alignas(64) T column[kTile + 1][16], row[kTile + 1][16];
@@ -182,8 +182,8 @@ SNOW_INLINE void for_each_tile_of_large(const SplatRecord<T>& r, int64_t tiles_x
     }
 }
 
-// What tiles_count hands to tiles_fill, in one block of memory: the tiles of every splat, the first
-// slot of every part, and per part a count for every tile.
+// The data that tiles_count passes to tiles_fill, in one block of memory: the tiles of every splat,
+// the first slot of every part, and for each part a count per tile.
 struct TileWork {
   TileSpan* spans;
   uint32_t* part_slots;
@@ -205,7 +205,7 @@ struct SmallOffsets {  // tile offset of bit k in a span `width` wide
   }
 };
 
-// Returns the number of instances, in *required too. On the CPU memory is allocated after this.
+// Returns the number of instances, also in *required. On the CPU, memory is allocated after this.
 template <class V, class T = typename V::Scalar>
 int64_t count_tiles(const TilesCountParams<T>& p) {
   const int64_t m = p.n, tiles_x = p.binning.tiles_x, parts = p.binning.parts;

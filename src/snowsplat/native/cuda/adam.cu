@@ -1,14 +1,14 @@
 // adam_step: carries the gradient of the splats through the projection and applies Adam (adam.h)
-// immediately: the gradients of the parameters are never written to global memory. Its time is that
-// of the memory traffic: the gradients of a block's Gaussians are computed into shared memory, then
-// all threads go along each tensor and its moments together.
+// immediately: the gradients of the parameters are never written to global memory. The time is that
+// of the memory traffic. The gradients of a block's Gaussians are computed into shared memory; then all
+// threads process each tensor and its moments cooperatively.
 #include "adam.h"
 #include "cuda/gaussian_row.h"
 
 namespace snow {
 namespace {
 
-// Values of `splats` for a row without a splat: its gradient is 0, or it is not updated.
+// Values in `splats` for rows without a splat: the gradient is 0, or the row is not updated.
 constexpr int32_t kUnseen = -1, kLeaveAlone = -2;
 
 // The splat of each Gaussian, from the ids of splats without empty rows. splat_of holds −1 before.

@@ -3,14 +3,14 @@
 // (tests/ops/emulation).
 //
 //   SNOW_KERNEL(name, threads, Params) { … }             a kernel, and the threads of its blocks
-//   SNOW_KERNEL_OF(name, threads, blocks, Params) { … }  the same, with few enough registers that at
+//   SNOW_KERNEL_OF(name, threads, blocks, Params) { … }  the same, with registers limited so that at
 //                                                        least `blocks` fit on a multiprocessor
 //   SNOW_SHARED(type, name, count);                      an array in shared memory
 //
 // A kernel has one parameter, `p`: a struct (params.h, or in the same file where only the GPU has it).
 // Beside the kernel `name` there is a variable `name_layout`, the layout of its struct (layout.h),
 // which the loader compares with that of Python. Blocks and threads are one-dimensional; ops/cuda
-// decides how many blocks a kernel takes. Kernels use raw intrinsics and these headers only: NVRTC
+// determines the number of blocks. Kernels use raw intrinsics and these headers only: NVRTC
 // then compiles them quickly, and the emulation implements every intrinsic that they use.
 #pragma once
 

@@ -1,8 +1,8 @@
 // Rows of parameters in a block of threads, which processes as many Gaussians as it has threads. One
-// thread computes one Gaussian; loads and stores are cooperative: all threads go along the rows,
+// thread computes one Gaussian; loads and stores are cooperative: all threads copy the rows,
 // which are contiguous in a tensor, so that neighbouring threads access neighbouring addresses. In
-// between, the rows are in a tile in shared memory whose stride is odd, so that the threads that
-// access one column of it use different banks.
+// between, the rows are in a tile in shared memory with an odd stride, so that threads that access
+// the same column use different banks.
 #pragma once
 
 #include "cuda/device.h"
@@ -22,7 +22,7 @@ constexpr int kLogitColumn = kQuatColumn + 4;
 constexpr int kDcColumn = kLogitColumn + 1;
 constexpr int kRowColumns = kDcColumn + 3;
 
-// Calls f(row, column) for `columns` (> 0) columns of the block's rows, with arrays of kBatch each, so
+// Calls f(row, column) for `columns` (> 0) columns of the block's rows, in batches of kBatch, so
 // that loads do not wait for each other. Row kRowThreads means none.
 template <int kBatch, class F>
 SNOW_INLINE void for_each_number(int columns, const F& f) {

@@ -1,14 +1,14 @@
 // neighbours: the exact distances from each point to its k nearest others.
 //
-//   neighbours_codes    the place of each point on a space-filling curve (Morton 1966), 21 bits an axis
+//   neighbours_codes    the position of each point on a Morton curve (Morton 1966), 21 bits per axis
 //   (a sort)            so that consecutive points are near each other
 //   neighbours_chunks   the points in that order; the box of each chunk of 32
 //   neighbours_groups   the box of each group of 32 chunks
 //   neighbours_of_*     the search: one warp per chunk of queries, one lane per query
 //
-// A warp begins with its own chunk and the adjacent ones on the curve, which bounds the distances that
-// its lanes search for. It then goes through all groups and visits each chunk whose box is nearer to
-// one of its queries than the worst of the k best found so far. The order only affects the time: the
+// A warp begins with its own chunk and the adjacent ones on the curve, which bounds the distances of
+// its lanes. It then goes through all groups and visits each chunk whose box is nearer to
+// one of its queries than the k-th best distance so far. The order only affects the time: the
 // result is exact, even where all points fall into one cell of the curve.
 #include "cuda/device.h"
 
@@ -118,7 +118,7 @@ SNOW_INLINE Box<T> warp_box(const Box<T>& b) {
           {warp_max(b.high.x), warp_max(b.high.y), warp_max(b.high.z), T(0)}};
 }
 
-// Three bits apart: bit i of the lower 21 moves to bit 3i.
+// Spreads bits by three: bit i of the lower 21 moves to bit 3i.
 SNOW_INLINE uint64_t spread(uint64_t x) {
   x = (x | x << 32) & 0x001f00000000ffffull;
   x = (x | x << 16) & 0x001f0000ff0000ffull;
@@ -129,7 +129,7 @@ SNOW_INLINE uint64_t spread(uint64_t x) {
 }
 
 // Cells are cubes; low and high are the corners of the box of all points. Coordinates are halved, so
-// that no difference of them is infinite.
+// that differences do not overflow.
 template <class T>
 SNOW_INLINE void codes(int n, const T* points, const T* low, const T* high, uint64_t* out) {
   const int64_t i = thread_index();
@@ -174,8 +174,8 @@ SNOW_INLINE void groups(int chunk_count, const Box<T>* chunk_boxes, Box<T>* boxe
   if (lane_id() == 0 && i < chunk_count) boxes[i / kWarp] = box;
 }
 
-// The kBest smallest squared distances so far, ascending. For k < kBest the first ones are occupied from
-// the beginning by a distance below all others; in a lane without a query all are.
+// The kBest smallest squared distances so far, ascending. For k < kBest, the first entries are
+// filled initially with a distance below all others; in a lane without a query, all entries are.
 template <class T, int kBest>
 struct Best {
   T distances[kBest];

@@ -10,10 +10,9 @@
 //   photometric_means        adds the sums of the blocks in order: bit-identical in every run
 //
 // The maps go through global memory. Without them, a block would have to load its tile with a margin
-// of 10 and filter all of it: about half as much arithmetic again, and more than the 48 kB of shared
-// memory that a block has by default. Instead photometric.py processes few channels at a time if
-// images are large (for one of 1920×1080 the maps have 25 MB), which the caches of larger GPUs mostly
-// hold.
+// of 10 and filter all of it: about 50% more arithmetic, and more than the 48 kB of shared memory that a block has by default. Instead photometric.py limits the number of channels processed
+// at a time for large images (the maps of one channel of 1920×1080 have 25 MB, which mostly fit into the
+// caches of larger GPUs).
 #include "cuda/device.h"
 #include "ssim.h"
 

@@ -1,6 +1,6 @@
-// project: which Gaussians a camera sees (project_cull), their 2D splats (project_fwd), and the
-// gradient of the splats carried to the parameters and the pose (project_bwd). Unlike on the CPU
-// nothing is compacted: ids[i] is i, or −1 where a Gaussian is not visible, and its row is empty.
+// project: the Gaussians that a camera sees (project_cull), their 2D splats (project_fwd), and the
+// gradients of the parameters and the pose from those of the splats (project_bwd). Unlike on the CPU,
+// rows are not compacted: ids[i] is i, or −1 if a Gaussian is not visible, and its row is empty.
 #include "cuda/gaussian_row.h"
 
 namespace snow {

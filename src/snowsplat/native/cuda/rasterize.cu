@@ -6,13 +6,13 @@
 //           instance, one bit per warp, stores this for the backward pass.
 // Forward   A pixel's transmittance and colour stay in the registers of its thread. A tile ends when
 //           its last pixel is finished; tile_end stores where.
-// Backward  goes front to back again, with S = Σ of what lies behind (known at the start:
-//           S₀ = ∂L/∂C · C, since the whole pixel lies behind). The derivative with respect to
-//           log α is w·(g·c) − α S/(1 − α): no division by T, no last index a pixel, and no state
-//           from the forward pass but the image.
+// Backward  goes front to back again, with S, the sum over the splats behind (known at the start:
+//           S₀ = ∂L/∂C · C, since all splats are behind). The derivative with respect to
+//           log α is w·(g·c) − α S/(1 − α): no division by T, no last index per pixel, and no state
+//           of the forward pass except the image.
 //
-// The gradient of a splat is a sum over pixels, and adding numbers of different threads is what costs
-// most. It is done with one thread per splat, as in the bucketed backward pass of Mallick et al. 2024
+// The gradient of a splat is a sum over pixels, and the most expensive part is adding numbers of different
+// threads. This is done with one thread per splat, as in the bucketed backward pass of Mallick et al. 2024
 // ("Taming 3DGS"), but within a tile:
 //   1. One thread per pixel: w = T α and q = ∂L/∂(log α) of eight splats, into shared memory.
 //   2. One thread per splat and row of the rectangle: reads w and q of the row's eight pixels, and
@@ -52,7 +52,7 @@ struct Seat {
   int left, top;  // of the rectangle
   int x, y;
   bool inside;
-  int64_t plane, at;  // pixels of the image, and which of them this is
+  int64_t plane, at;  // number of pixels of the image, index of this one
 
   SNOW_INLINE Seat(int width, int height) {
     const int tiles_x = (width + kTile - 1) / kTile, tile = int(blockIdx.x);
@@ -125,7 +125,7 @@ struct Pixel {
   SNOW_INLINE T transmittance() const { return max(rest, -rest); }
 
   // Composites a splat; returns whether it contributes, its weight (0 if not), and α before and after
-  // it is capped. Both passes must take the same decisions, so every rounding is explicit (fma). In a
+  // clamping. Both passes must make the same decisions, so every rounding is explicit (fma). In a
   // finished pixel `next` is negative, so nothing more is composited.
   SNOW_INLINE bool blend(const Four<T>& shape, const Four<T>& look, T& uncapped, T& alpha,
                          T& weight) {
@@ -165,7 +165,7 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
   uint32_t base = f.tile_start[blockIdx.x], looked_at = base;
   bool warp_unfinished = __any_sync(kAllLanes, pixel.unfinished());
   for (; base < end; base += kForwardBatch) {
-    // Also waits until all threads are done with the last batch.
+    // Also waits until all threads have finished the last batch.
     if (!__syncthreads_or(pixel.unfinished())) break;
     const int count = end - base < kForwardBatch ? int(end - base) : kForwardBatch;
     if (thread < count) {
@@ -231,7 +231,7 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
   if (alpha) alpha[seat.at] = T(1) - rest;
 }
 
-constexpr int kGroup = kWarp / kRectHeight;  // splats that a warp takes at a time
+constexpr int kGroup = kWarp / kRectHeight;  // splats that a warp processes at a time
 constexpr int kSums = kGroupChannels + 6;
 // Strides chosen so that the numbers of one column are in different banks.
 constexpr int kPairStride = kWarp + 2, kSumStride = kSums + 1;
@@ -301,7 +301,7 @@ struct KeptSums {
   static constexpr int kHalf = Sums<C, T>::kHalf, kWays = kWarp / kGroup / 2;
   T kept[kWays][kHalf] = {};
 
-  // Adds what the lanes of a splat have summed, one row each; two of these lanes keep the result.
+  // Adds the sums of the lanes of a splat, one row each; two of these lanes store the result.
   SNOW_INLINE void keep(const Sums<C, T>& rows, int group) {
     const bool upper = lane_id() >= kWarp / 2;
     const int odd = int(threadIdx.x / kGroup % 2);
@@ -345,7 +345,7 @@ SNOW_INLINE T gradient_of(T sum, int moment, const Four<T>& shape, const Four<T>
   return factor * sum + (of_mean ? T(-kLn2) * shape.w * other : T(0));
 }
 
-// A pixel in the backward pass: what lies behind the splats that it has seen, and its gradients.
+// A pixel in the backward pass: the sum over the splats behind the current one, and its gradients.
 template <int C, class T>
 struct PixelGradient {
   Pixel<T> pixel;
@@ -387,7 +387,7 @@ struct PixelGradient {
 };
 
 // Steps 1 and 2 for the 32 instances from place `first` of the batch on: composites those that touch
-// the warp's rectangle and leaves the sums over its pixels in the warp's scratch.
+// the warp's rectangle and stores the sums over its pixels in the warp's scratch.
 template <int C, class T>
 SNOW_INLINE void sum_over_pixels(const Seat& seat, PixelGradient<C, T>& own, int count, int first,
                                  BackwardMemory<T>& memory) {
@@ -422,9 +422,9 @@ SNOW_INLINE void sum_over_pixels(const Seat& seat, PixelGradient<C, T>& own, int
   sums.store(list, listed, first, scratch.sums);
 }
 
-// Step 3 takes 16 threads per instance, one per number.
+// Step 3 uses 16 threads per instance, one per number.
 struct SumSeat {
-  int place, column;  // which of 16 instances, which number of it
+  int place, column;  // the instance of 16, the number within it
   int to;             // the column of the packed gradient that the number belongs to
 
   SNOW_INLINE SumSeat(int channels, const int64_t* columns)
@@ -520,8 +520,8 @@ SNOW_INLINE void background_row(const BackgroundBackwardParams<T>& p) {
 
 using namespace snow;
 
-// Blocks that a multiprocessor is to hold: the registers are limited accordingly. Of the forward pass,
-// compute capability 7.5 has no more than four by their threads; of the backward pass, four fit into
+// Minimum number of blocks per multiprocessor, which limits the registers. Compute capability 7.5 has
+// threads for at most four blocks of the forward pass; four blocks of the backward pass fit into
 // 100 KiB of shared memory.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
 #define SNOW_FORWARD_BLOCKS 4

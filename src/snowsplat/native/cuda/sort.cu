@@ -1,5 +1,5 @@
-// Prefix sums and a radix sort of any length, for the other kernels. No block waits for another: what
-// needs the results of all blocks is a separate kernel (see ops/cuda/sorting.py).
+// Prefix sums and a radix sort of any length, for the other kernels. No block waits for another: each
+// step that needs the results of all blocks is a separate kernel (see ops/cuda/sorting.py).
 //
 //   scan_sums, scan_of_sums, scan_apply   an exclusive prefix sum
 //   sort_count, sort_offsets, sort_scatter   one pass of the sort, by one digit of at most 8 bits
@@ -38,7 +38,7 @@ struct SortPassParams {
   SNOW_FIELDS(n, keys, values, keys_out, values_out, shift, bits, blocks, counts, totals, count)
 };
 
-// Between them: the sums of the counts of the blocks before.
+// Between sort_count and sort_scatter: the sums of the counts of the preceding blocks.
 struct SortOffsetsParams {
   int64_t n;         // blocks
   uint32_t* counts;  // (digits, n)
@@ -84,8 +84,7 @@ SNOW_INLINE void scan_blocks(int64_t n, uint64_t* sums, int64_t* total) {
   if (threadIdx.x == 0) *total = int64_t(carry);
 }
 
-// Sums that do not fit into 32 bits become the largest number that does, which is beyond any
-// allocated memory.
+// Sums that do not fit into 32 bits become 2³² − 1, which is larger than any allocated memory.
 SNOW_INLINE void apply_scan(int64_t n, const uint32_t* values, const uint64_t* sums,
                             uint32_t* out) {
   const ScanItems items = load_scan_items(n, values);
@@ -103,7 +102,7 @@ SNOW_INLINE void apply_scan(int64_t n, const uint32_t* values, const uint64_t* s
 constexpr int kDigitBits = 8, kDigits = 1 << kDigitBits;
 static_assert(kDigits == kThreads, "a thread for each digit");
 
-// Keys of a thread. A block keeps 16 kB of them in shared memory.
+// Keys per thread. A block has 16 kB of them in shared memory.
 template <class Key>
 constexpr int kSortItems = sizeof(Key) == 8 ? 8 : 16;
 
@@ -121,7 +120,7 @@ SNOW_INLINE Digit digit_at(int64_t shift, int64_t bits) {
   return {int(shift), (1u << int(bits)) - 1};
 }
 
-// How many of the n items there are: the number may be known only on the GPU.
+// The number of valid items among n, which may be known only on the GPU.
 SNOW_INLINE int64_t valid_items(int64_t n, const int64_t* count) {
   return count && *count < n ? *count : n;
 }
@@ -156,7 +155,7 @@ SNOW_INLINE void count_digits(const SortPassParams<Key>& p) {
       const int at = k * kThreads + int(threadIdx.x);
       const bool is_valid = at < left;
       const int digit = is_valid ? digit_of(p.keys[first + at]) : 0;
-      // One lane adds for all lanes with its digit: often most of them have the same.
+      // One lane adds for all lanes with the same digit: often most lanes have the same one.
       const uint32_t same = lanes_with(digit) & __ballot_sync(kAllLanes, is_valid);
       if (is_valid && (same & lanes_below()) == 0) atomicAdd(&histogram[digit], __popc(same));
     }
@@ -196,7 +195,7 @@ SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals)
 // digit. In this order the keys go to shared memory and from there out, so that neighbouring threads
 // write to neighbouring addresses; the values follow. Invalid items are at the end and have the last
 // digit, so they stay at the end.
-// A single block has no others to add: sort_offsets may be skipped, and its counts are the totals.
+// With a single block, sort_offsets may be skipped: its counts are the totals.
 template <class Key>
 SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const uint32_t* values,
                                Key* keys_out, uint32_t* values_out, Digit digit_of, int64_t blocks,
@@ -204,7 +203,7 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
   constexpr int kItems = kSortItems<Key>, kWarps = kThreads / kWarp, kAll = kThreads * kItems;
   constexpr int kWords = kAll * int(sizeof(Key) == 8 ? 2 : 1) / 2;
   SNOW_SHARED(uint16_t, tally, kWarps* kDigits);
-  SNOW_SHARED(uint32_t, run_start, kDigits);  // where a digit's keys go, less their place here
+  SNOW_SHARED(uint32_t, run_start, kDigits);  // where a digit's keys go, minus their place here
   SNOW_SHARED(uint64_t, staged, kWords);
   Key* const staged_keys = reinterpret_cast<Key*>(staged);
   uint32_t* const staged_values = reinterpret_cast<uint32_t*>(staged);

@@ -1,8 +1,8 @@
 // From splats to a depth-sorted list of splats for each 16×16 tile, and back:
-//   splats_prepare   depth keys; ops/cuda/tiling.py has them sorted
-//   tiles_count      which tiles each splat touches, in the order of depth
+//   splats_prepare   depth keys, which ops/cuda/tiling.py sorts
+//   tiles_count      the tiles that each splat touches, in the order of depth
 //   tiles_fill       the instances, pairs of a tile and a splat, in that order; then sorted by tile
-//   tiles_start      where the instances of each tile begin
+//   tiles_start      the first instance of each tile
 //   splats_reduce    sums the gradients of a splat's tiles in a fixed order
 // A splat touches the same tiles as on the CPU (native/cpu/tiles.cpp), except that the image is
 // extended to a multiple of the tile size. A splat that may touch many tiles is tested by a warp.
@@ -18,8 +18,8 @@ constexpr int kSmall = 32;               // tiles of a rectangle that one thread
 constexpr int kColumns = kPackedHeader;  // of a packed row: mean, conic, opacity, depth, radius
 constexpr int kRow = kColumns + 1;       // stride of the rows in shared memory: odd
 
-// tiles_count: for each splat, in the order of depth, its rectangle of tiles as pairs of 16 bits, how
-// many of them it touches, and which (as bits; for more than 32 tiles their number again).
+// tiles_count: for each splat, in the order of depth, its rectangle of tiles as pairs of 16 bits, the
+// number of tiles that it touches, and these tiles (as bits; above 32 tiles, the number again).
 template <class T>
 struct TilesCountKernelParams {
   int64_t n;                                   // splats
@@ -61,7 +61,7 @@ struct TilesStartParams {
   SNOW_FIELDS(n, keys, required, capacity, tile_start)
 };
 
-// tiles_gather: instance_splat[i] = slot_splat[instance_slot[i]] for the instances that there are.
+// tiles_gather: instance_splat[i] = slot_splat[instance_slot[i]] for the valid instances.
 struct TilesGatherParams {
   int64_t n;                      // instances that memory is allocated for
   const uint32_t* slot_splat;     // (n,)
@@ -86,12 +86,12 @@ SNOW_INLINE const T* stage_rows(const T* packed, int64_t stride, int row, T* sta
   return stage + lane_id() * kRow;
 }
 
-// Tiles x0 … x0 + width − 1, and so on; none: both sizes are 0.
+// Tiles x0 … x0 + width − 1, likewise y; empty: both sizes are 0.
 struct TileRectangle {
   int x0, y0, width, height;
 };
 
-// Of the ellipse in which α ≥ 1/255, within the image's tiles.
+// The rectangle of the ellipse in which α ≥ 1/255, within the tiles of the image.
 template <class T>
 SNOW_INLINE TileRectangle tile_rectangle(const T* row, int tiles_x, int tiles_y) {
   const T right = T(tiles_x * kTile - 1), bottom = T(tiles_y * kTile - 1);
@@ -156,7 +156,7 @@ SNOW_INLINE void count_tiles(const TilesCountKernelParams<T>& out) {
   const int64_t m = out.n;
   const int tiles_x = int(out.tiles_x), tiles_y = int(out.tiles_y);
   SNOW_SHARED(T, stage, kThreads * kRow);
-  SNOW_SHARED(int, large, kThreads);  // the threads whose splats wait for a warp
+  SNOW_SHARED(int, large, kThreads);  // the threads whose splats a warp has to process
   SNOW_SHARED(int, large_count, 1);
   if (threadIdx.x == 0) *large_count = 0;
   __syncthreads();
@@ -201,7 +201,7 @@ SNOW_INLINE void count_tiles(const TilesCountKernelParams<T>& out) {
   }
 }
 
-// Writes an instance, if there is memory for it.
+// Writes an instance if it is within the capacity.
 template <class T>
 SNOW_INLINE void set_instance(const TilesFillKernelParams<T>& p, int64_t at, int tile,
                               uint32_t splat) {
@@ -217,7 +217,7 @@ SNOW_INLINE uint32_t clamped(int64_t slot, int64_t capacity) {
   return uint32_t(slot < capacity ? slot : capacity);
 }
 
-// Writes exactly as many instances of a splat as were counted.
+// Writes exactly the counted number of instances of a splat.
 template <class T>
 SNOW_INLINE void fill_tiles(const TilesFillKernelParams<T>& p) {
   const int tiles_x = int(p.tiles_x), tiles_y = int(p.tiles_y);

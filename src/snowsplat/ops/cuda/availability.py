@@ -1,4 +1,4 @@
-"""Whether a GPU can be used, and if not, what would have to be done."""
+"""Checks whether a GPU can be used; if not, the reason and the remedy."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ import warnings
 
 import torch
 
-OLDEST = (7, 5)  # what kernels are built for: see CMakeLists.txt
+OLDEST = (7, 5)  # oldest architecture of the kernels: see CMakeLists.txt
 
-# Of the driver's cuInit: no GPU, and a library that is only there to be linked with.
+# Errors of cuInit: no GPU, and a stub library, which is only for linking.
 _NO_DEVICE, _STUB_LIBRARY = 100, 34
 
 
 @functools.cache
 def why_unusable(index: int = 0) -> str | None:
-    """Why the kernels cannot run on cuda:`index`, and what to do, without a full stop; or None."""
+    """Why the kernels cannot run on cuda:`index`, with the remedy, without a full stop; or None."""
     if torch.version.cuda is None:
-        return "this PyTorch is built without CUDA; install one with it (pytorch.org says how)"
+        return "this PyTorch is built without CUDA; install one with it (see pytorch.org)"
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         usable = torch.cuda.is_available()
     if not usable:
-        return _why_torch_does_not(torch.version.cuda, [str(w.message) for w in caught])
+        return _why_torch_cannot(torch.version.cuda, [str(w.message) for w in caught])
     count = torch.cuda.device_count()
     if index >= count:
         return f"there is no cuda:{index}; this machine has " + (
-            "cuda:0 alone" if count == 1 else f"cuda:0 to cuda:{count - 1}"
+            "only cuda:0" if count == 1 else f"cuda:0 to cuda:{count - 1}"
         )
     name, capability = torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index)
     shown = f"{name} (compute capability {capability[0]}.{capability[1]})"
     if capability < OLDEST:
-        return f"{shown} is too old; it takes {OLDEST[0]}.{OLDEST[1]}, which came in 2018, or newer"
+        return f"{shown} is too old; use one of {OLDEST[0]}.{OLDEST[1]} (2018) or newer"
     if not _torch_runs_on(capability):
         return (
             f"this PyTorch, for CUDA {torch.version.cuda}, has no kernels for {shown}; "
-            "install another PyTorch (pytorch.org says how)"
+            "install another PyTorch (see pytorch.org)"
         )
     try:
         importlib.import_module("cuda.bindings.driver")
@@ -49,13 +49,13 @@ def why_unusable(index: int = 0) -> str | None:
 
 
 def gpu_there() -> bool:
-    """Whether the machine has an NVIDIA GPU and a driver, be they of use or not."""
+    """Whether the machine has an NVIDIA GPU and a driver, usable or not."""
     found = _driver()
     return found is not None and found.error != _NO_DEVICE
 
 
 class _Driver:
-    """What the driver says of itself, asked directly: torch cannot be."""
+    """State and version of the driver, read directly because torch does not report them."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         version = ctypes.c_int(0)
@@ -73,23 +73,23 @@ def _driver() -> _Driver | None:
     return None if driver.error == _STUB_LIBRARY else driver
 
 
-def _why_torch_does_not(torch_cuda: str, said: list[str]) -> str:
+def _why_torch_cannot(torch_cuda: str, messages: list[str]) -> str:
     driver = _driver()
     if driver is None:
         return "there is no NVIDIA driver; install one if there is an NVIDIA GPU"
     if driver.error == _NO_DEVICE:
-        return "there is no NVIDIA GPU that the driver knows"
+        return "the driver finds no NVIDIA GPU"
     if driver.error:
         return (
             f"the NVIDIA driver fails (error {driver.error}); restart the machine or reinstall it"
         )
     if driver.cuda[0] < int(torch_cuda.split(".")[0]):
         return (
-            f"the NVIDIA driver is too old: it knows CUDA {driver.cuda[0]}.{driver.cuda[1]} and "
+            f"the NVIDIA driver is too old: it supports CUDA {driver.cuda[0]}.{driver.cuda[1]} and "
             f"this PyTorch needs {torch_cuda}; update the driver, or install a PyTorch for an "
-            "older CUDA (pytorch.org says how)"
+            "older CUDA (see pytorch.org)"
         )
-    reason = said[0].partition("(Triggered internally")[0] if said else ""
+    reason = messages[0].partition("(Triggered internally")[0] if messages else ""
     reason = " ".join(reason.split()) or "torch.cuda.is_available() is false"
     return f"PyTorch cannot use it: {reason}"
 

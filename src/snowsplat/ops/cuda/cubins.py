@@ -1,6 +1,6 @@
-"""The machine code of the kernels for a card: built with the wheel, or else compiled here and kept.
+"""The machine code of the kernels for a GPU: from the wheel, or compiled here and cached.
 
-A cubin runs on cards of its own compute capability, and of later ones of the same major version.
+A cubin runs on GPUs of its compute capability, and of later ones of the same major version.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _BUILT = Path(__file__).resolve().parents[2] / "_lib" / "cuda"
 
 
 def candidates(file: str, capability: Capability, cuda_major: int) -> Iterator[bytes]:
-    """What may run on this card, best first: cubins, then what is compiled for it on the spot.
+    """Code that may run on this GPU, best first: a built cubin, then code compiled for this GPU.
 
     Args:
         file: of the `Kernel`.
-        cuda_major: the newest CUDA that the driver knows; it loads nothing that a later one made.
+        cuda_major: newest CUDA version of the driver, which cannot load code of later versions.
 
     Raises:
-        UserError: none is built and there is no compiler.
+        UserError: there is no built cubin and no compiler.
     """
     major, minor = capability
     for lower in range(minor, -1, -1):
@@ -43,7 +43,7 @@ def candidates(file: str, capability: Capability, cuda_major: int) -> Iterator[b
 
 @functools.cache
 def _nvrtc(cuda_major: int) -> nvrtc.Nvrtc:
-    # Newest first: it knows the most cards.
+    # Newest first: it supports the most GPUs.
     return nvrtc.Nvrtc(nvrtc.find(range(min(cuda_major, 13), 11, -1)))
 
 
@@ -60,12 +60,10 @@ def _compiled_here(file: str, capability: Capability, cuda_major: int) -> bytes:
     number = 10 * capability[0] + capability[1]
     if number in compiler.architectures:
         target = f"sm_{number}"
-    else:  # a card newer than this compiler: PTX, which the driver translates
+    else:  # a GPU newer than this compiler: PTX, which the driver compiles
         older = [known for known in compiler.architectures if known < number]
         if not older:
-            raise UserError(
-                f"NVRTC {compiler.version} has no kernels for compute capability {shown}"
-            )
+            raise UserError(f"NVRTC {compiler.version} does not support compute capability {shown}")
         target = f"compute_{max(older)}"
     source = nvrtc.path_of(file)
     path = _cache_path(file, target, _key(compiler.version, target, source))
@@ -77,7 +75,7 @@ def _compiled_here(file: str, capability: Capability, cuda_major: int) -> bytes:
 
 
 def _key(version: tuple[int, int], target: str, source: Path) -> str:
-    """Another one for all that may give other code."""
+    """A hash of everything that affects the code."""
     digest = hashlib.sha256(repr((version, target, nvrtc.OPTIONS)).encode())
     for path in nvrtc.sources(source):
         content = path.read_bytes()
@@ -86,7 +84,7 @@ def _key(version: tuple[int, int], target: str, source: Path) -> str:
 
 
 def _cache_path(file: str, target: str, key: str) -> Path | None:
-    """By the custom of the system; None where there is no such place."""
+    """The file in the user's cache folder; None if there is no such folder."""
     try:
         base: str | Path
         if sys.platform == "win32":
@@ -94,12 +92,12 @@ def _cache_path(file: str, target: str, key: str) -> Path | None:
         else:
             named = os.environ.get("XDG_CACHE_HOME", "")
             base = named if os.path.isabs(named) else Path.home() / ".cache"
-    except RuntimeError:  # nobody's home
+    except RuntimeError:  # no home directory
         return None
     return Path(base, "snowsplat", "kernels", f"{file}-{target}-{key}")
 
 
-# A file is its SHA-256 and the code, so that a damaged one is known.
+# A file has the SHA-256 of the code and the code, so that damage is detected.
 
 
 def _read(path: Path | None) -> bytes | None:
@@ -116,7 +114,7 @@ def _read(path: Path | None) -> bytes | None:
 def _write(path: Path | None, code: bytes) -> None:
     if path is None:
         return
-    with contextlib.suppress(OSError):  # then it is compiled again the next time
+    with contextlib.suppress(OSError):  # then it is compiled again next time
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
             temporary.write_bytes(hashlib.sha256(code).digest() + code)

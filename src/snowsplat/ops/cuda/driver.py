@@ -22,20 +22,20 @@ from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.layout import LARGEST_PARAMS, Params, layout_of
 from snowsplat.util.errors import UserError
 
-# Errors of the driver. After code that is not for this card, other code may be.
+# Errors of the driver. After a code for another GPU, the next candidate is tried.
 _OUT_OF_MEMORY = 2
 _NOT_FOUND = 500
-_NO_CODE_FOR_IT = (200, 209, 218, 222)  # invalid image, no binary, invalid PTX, too new a PTX
+_INCOMPATIBLE_CODE = (200, 209, 218, 222)  # invalid image, no binary, invalid or too new PTX
 _OUTDATED = "the built kernels do not match the Python files: rebuild them (make native)"
 
 
 class _Buffer(threading.local):
-    """Where the driver reads the struct of a launch, which it copies before it returns."""
+    """The memory from which the driver copies the struct during a launch."""
 
     def __init__(self) -> None:
         self.struct = ctypes.create_string_buffer(LARGEST_PARAMS)
         self._pointer = ctypes.c_void_p(ctypes.addressof(self.struct))
-        #: Of an array of pointers to the parameters, of which there is one.
+        #: Address of an array with one pointer, to the struct.
         self.address = ctypes.addressof(self._pointer)
 
 
@@ -45,7 +45,7 @@ _lock = threading.Lock()
 
 
 def run(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
-    """Queues a kernel on torch's current stream of the device that has the tensors.
+    """Queues a kernel on torch's current stream of the device of the tensors.
 
     Raises:
         UserError: the GPU cannot be used, the kernels are outdated, or the driver reports an error.
@@ -80,7 +80,7 @@ def _gpu(index: int) -> _Gpu:
 
 @functools.cache
 def _bindings() -> Any:
-    # Imported when needed: on a CPU it may be missing.
+    # Imported when needed: without a GPU it may be missing.
     return importlib.import_module("cuda.bindings.driver")
 
 
@@ -96,7 +96,7 @@ class _Gpu:
         self._capability = torch.cuda.get_device_capability(index)
         self._check(self.cuda.cuInit(0))
         self._version = self._check(self.cuda.cuDriverGetVersion())
-        # The context that torch uses, too.
+        # The context that torch also uses.
         device = self._check(self.cuda.cuDeviceGet(index))
         self._context = self._check(self.cuda.cuDevicePrimaryCtxRetain(device))
         self.context = int(self._context)
@@ -106,7 +106,7 @@ class _Gpu:
 
     @contextlib.contextmanager
     def current(self) -> Iterator[None]:
-        """In the block, this thread's calls go to this device."""
+        """Within the block, calls of this thread use this device."""
         self._check(self.cuda.cuCtxPushCurrent(self._context))
         try:
             yield
@@ -144,9 +144,9 @@ class _Gpu:
         for code in cubins.candidates(file, self._capability, self._version // 1000):
             error, library = self.cuda.cuLibraryLoadData(code, None, None, 0, None, None, 0)
             if error == 0:
-                # Code for another card may be noticed only here.
+                # Code for another GPU may be rejected only here.
                 error, function = self._function(library, name)
-            if error not in _NO_CODE_FOR_IT:
+            if error not in _INCOMPATIBLE_CODE:
                 if error == 0:
                     self._libraries[file] = library
                 break
@@ -165,7 +165,7 @@ class _Gpu:
         return result[1] if len(result) > 1 else None
 
     def fail(self, error: Any, name: str) -> None:
-        """Raises UserError: the driver's error in one line."""
+        """Raises UserError with the driver's error in one line."""
         said, what = self.cuda.cuGetErrorName(error), self.cuda.cuGetErrorString(error)
         known = said[0] == 0 and what[0] == 0
         text = f"{said[1].decode()}, {what[1].decode()}" if known else f"error {int(error)}"

@@ -1,4 +1,4 @@
-"""`Kernel`: what is needed to launch one."""
+"""`Kernel`: the data needed to launch a kernel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Kernel:
 
     params: its struct of parameters.
     threads: of a block, as in its SNOW_KERNEL.
-    items: of the n items, how many a block processes.
+    items: number of items that a block processes.
     """
 
     file: str

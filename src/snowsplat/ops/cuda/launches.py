@@ -1,4 +1,4 @@
-"""The native functions on a GPU: the kernels that each consists of.
+"""The native functions on a GPU and their kernels.
 
 Most are one kernel of the same name and parameters; a few are a sequence of kernels. Each module
 (`projection`, `tiling`, …) declares its own:
@@ -46,7 +46,7 @@ def launch(name: str, params: Params) -> int:
 
 
 def launch_by(execute: Execute, name: str, params: Any) -> int:
-    """The same with `execute` in place of the GPU's driver."""
+    """As `launch`, with `execute` instead of the GPU's driver."""
 
     def run(kernel_name: str, blocks: int, kernel_params: Params) -> None:
         if blocks > 0:

@@ -1,4 +1,4 @@
-"""Compiles kernels with NVRTC, NVIDIA's compiler in a library, which needs neither toolkit nor GPU.
+"""Compiles kernels with NVRTC, NVIDIA's compiler library, which needs neither toolkit nor GPU.
 
 Imports nothing of snowsplat and no torch: the build of a wheel runs this file as a script, in an
 environment that has neither (see CMakeLists.txt).
@@ -17,13 +17,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-# Fast where it costs no accuracy that matters: tiny numbers are zero, as on the CPU. Divisions and
-# roots stay exact. Lambdas in kernels need no __device__ of their own.
+# Fast options without a relevant loss of accuracy: denormals are flushed to zero, as on the CPU.
+# Divisions and square roots stay exact. Lambdas in kernels need no __device__.
 OPTIONS = ("--std=c++17", "--ftz=true", "--device-as-default-execution-space")
 
 _NATIVE = Path(__file__).resolve().parents[2] / "native"
 
-# Where packages put the library, below a folder of sys.path, and what it is called.
+# Folders of the library in packages, relative to sys.path, and its file names.
 _FOLDERS = {
     12: ("nvidia/cuda_nvrtc/lib", "nvidia/cuda_nvrtc/bin", "torch/lib"),
     13: ("nvidia/cu13/lib", "nvidia/cu13/bin/x86_64", "nvidia/cu13/bin", "torch/lib"),
@@ -35,11 +35,11 @@ _NAMES = {
 
 
 class NotFound(Exception):
-    """There is no NVRTC here."""
+    """NVRTC is not installed."""
 
 
 class CompileError(Exception):
-    """A kernel does not compile; the text is the compiler's."""
+    """A kernel does not compile; the message is that of the compiler."""
 
 
 def path_of(file: str) -> Path:
@@ -48,9 +48,9 @@ def path_of(file: str) -> Path:
 
 
 def sources(path: Path) -> list[Path]:
-    """A source file and all that it includes, itself first.
+    """A source file and all files that it includes; the file itself is first.
 
-    Both sides of an #if count; what is not there (the emulation's header) is on the other side.
+    Both branches of an #if are followed; missing files (the header of the emulation) are ignored.
     """
     found = [path]
     for file in found:
@@ -66,7 +66,7 @@ def find(majors: Sequence[int] = (12, 13)) -> str:
     """The library's path, or its name if the loader knows it, of the first of these major versions.
 
     Raises:
-        NotFound: none of them is here.
+        NotFound: none of them is installed.
     """
     for major in majors:
         for entry in sys.path:
@@ -85,11 +85,11 @@ def find(majors: Sequence[int] = (12, 13)) -> str:
 
 
 class Nvrtc:
-    """One NVRTC: what it can do, and `compile`. May be used by several threads."""
+    """A loaded NVRTC library: its architectures, and `compile`. Thread-safe."""
 
     def __init__(self, library: str) -> None:
         if sys.platform == "win32" and os.path.isabs(library):
-            os.add_dll_directory(os.path.dirname(library))  # it loads a second one from there
+            os.add_dll_directory(os.path.dirname(library))  # it loads another library from there
         self._library = ctypes.CDLL(library)
         self._library.nvrtcGetErrorString.restype = ctypes.c_char_p
         major, minor = ctypes.c_int(), ctypes.c_int()
@@ -99,17 +99,17 @@ class Nvrtc:
         self._check(self._library.nvrtcGetNumSupportedArchs(ctypes.byref(count)))
         numbers = (ctypes.c_int * count.value)()
         self._check(self._library.nvrtcGetSupportedArchs(numbers))
-        self.architectures = tuple(numbers)  # 75, 80, …: it makes machine code for these
+        self.architectures = tuple(numbers)  # 75, 80, …: those with machine code
 
     def compile(self, source: Path, target: str, lineinfo: bool = False) -> tuple[bytes, str]:
         """The compiled file, and the compiler's warnings ("" for none).
 
         Args:
             target: "sm_90" for machine code (a cubin), "compute_90" for PTX.
-            lineinfo: profilers and checkers can then name lines of the source.
+            lineinfo: include source lines for profilers and sanitizers.
 
         Raises:
-            CompileError: with all that the compiler says.
+            CompileError: with the compiler's complete output.
         """
         options = [f"--gpu-architecture={target}", *OPTIONS, f"--include-path={_NATIVE}"]
         if lineinfo:

@@ -24,7 +24,7 @@ KERNELS: dict[str, Kernel] = {
 
 
 def _sums_in_order(run: Run, suffix: str, query: SizeQueryParams) -> int:
-    """Sums in a fixed order take memory and time; torch's setting requests them."""
+    """Sums in a fixed order need memory and time, so torch's setting has to request them."""
     return int(torch.are_deterministic_algorithms_enabled())
 
 

@@ -101,17 +101,17 @@ def _workspace_bytes(run: Run, suffix: str, query: SizeQueryParams) -> int:
 
 
 def _open_workspace(workspace: Tensor, n: int) -> tuple[Tensor, ...]:
-    """What tiles_count hands to tiles_fill.
+    """The data that tiles_count passes to tiles_fill.
 
-    The number of instances (1,) int64, and of each splat, nearest first, the corner and the size of
-    its rectangle of tiles, the tiles of it that the splat touches, and its first slot.
+    The number of instances (1,) int64, and for each splat, nearest first: the corner and the size
+    of its rectangle of tiles, the touched tiles in it, and the first slot.
     """
     required = workspace[: _HEAD // 2].view(torch.int64)
     return required, *workspace[_HEAD:].view(torch.int32).view(_ARRAYS, n)
 
 
 def _splats_sort(run: Run, suffix: str, p: SplatsSortParams) -> int:
-    bits = 8 * p.keys.element_size()  # an even number of passes, so they end in `order`
+    bits = 8 * p.keys.element_size()  # an even number of passes, so that the result is in `order`
     sort_pairs(run, p.n, p.keys, p.keys2, p.order, p.order2, (0, bits), rows=True)
     return 0
 
@@ -143,7 +143,7 @@ def _tiles_count(run: Run, suffix: str, p: TilesCountParams) -> int:
 def _tiles_fill(run: Run, suffix: str, p: TilesFillParams) -> int:
     binning, capacity = p.binning, p.capacity
     required, corners, sizes, touched, slots = _open_workspace(binning.workspace, p.n)
-    tiles = binning.tiles_x * binning.tiles_y  # also the key of instances that are in no tile
+    tiles = binning.tiles_x * binning.tiles_y  # also the key of instances without a tile
     bits = tiles.bit_length()
     narrow = bits <= 16
 
@@ -152,8 +152,8 @@ def _tiles_fill(run: Run, suffix: str, p: TilesFillParams) -> int:
 
     key = torch.int16 if narrow else torch.int32
     keys, keys2, spare = empty(key), empty(key), empty(torch.int32)
-    # The sort carries the splats; if slots are required it carries the slots, and the splats are
-    # looked up afterwards.
+    # The values of the sort are the splats. If slots are required, the values are the slots, and
+    # the splats are looked up afterwards.
     in_slots = p.instance_slot is not None
     carried = p.instance_splat if p.instance_slot is None else p.instance_slot
     pair = (carried, spare) if sort_passes(bits) % 2 == 0 else (spare, carried)
