@@ -1,8 +1,8 @@
 """Extreme scenes by hypothesis, and checks of the ops on each against the float64 reference.
 
 If the result of the reference changes a lot when its input changes by a few roundings, the exact
-result is undefined. The tolerance of each number is therefore a multiple of one rounding error, plus
-the change of the reference for such changes of its input.
+result is undefined. The tolerance of each number is therefore a multiple of one rounding error,
+plus the change of the reference for such changes of its input.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ class Compared:
         return Compared(self.value[rows], self.spread[rows])
 
     def in_rows(self) -> Compared:
-        """Uses the spread of the row for each number, since few input changes affect all numbers."""
+        """Uses the spread of the row for each number: few input changes affect all."""
         return Compared(self.value, _of_rows(self.spread))
 
     def check(
@@ -379,7 +379,7 @@ def check_statistics(variant: Variant, extreme: Extreme, splats: Splats2D, grad:
 
 
 def check_harm(variant: Variant, extreme: Extreme, value: float, picks: Sequence[int]) -> None:
-    """Non-finite Gaussians do not change the bits of the others; ``picks``: Gaussians and parameters."""
+    """Non-finite Gaussians do not change the others' bits; ``picks``: Gaussians, parameters."""
     results = []
     count = len(extreme.gaussians)
     healthy = torch.ones(count, dtype=torch.bool)

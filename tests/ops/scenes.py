@@ -146,7 +146,7 @@ def random_scene(
 ) -> Scene:
     """Gaussians in the view and slightly beyond, with σ of about `pixels` pixels.
 
-    Some lie behind the camera, some outside of the image and some are too transparent to be visible.
+    Some lie behind the camera, some outside of the image, and some are too transparent.
     """
     g = generator(seed)
     view, pose = view_of(width, height, sh_degree=sh_degree), tilted_pose()

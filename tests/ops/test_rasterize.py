@@ -318,7 +318,7 @@ def test_native_agrees_with_the_reference_at_any_size(
 
 @pytest.mark.slow
 def test_native_agrees_with_the_reference_on_a_long_strip(native: Variant) -> None:
-    """Pixel coordinates of five digits, where float32 has a resolution of a thousandth of a pixel."""
+    """Pixel coordinates of five digits, where float32 resolves a thousandth of a pixel."""
     splats = random_splats(4, 400, 16384, 3, pixels=30.0)
     compare(native, splats, 16384, 3)
 
@@ -327,7 +327,7 @@ def test_native_agrees_with_the_reference_on_a_long_strip(native: Variant) -> No
 def test_native_agrees_with_the_reference_when_splats_are_many(
     native: Variant, opacity: tuple[float, float]
 ) -> None:
-    """Hundreds per tile: faint splats that are all blended, and opaque ones, most of them skipped."""
+    """Hundreds per tile: faint splats, all blended, and opaque ones, most of them skipped."""
     compare(native, random_splats(11, 500, 20, 18, pixels=5.0, opacity=opacity), 20, 18)
 
 
@@ -368,7 +368,7 @@ def test_native_agrees_with_the_reference_with_sums_in_order(
 
 @pytest.mark.parametrize("in_order", [False, True])
 def test_capacity(native: Variant, in_order: bool, request: pytest.FixtureRequest) -> None:
-    """A sufficient capacity has no effect; otherwise only some splats are drawn, within the memory."""
+    """A sufficient capacity has no effect; otherwise only some splats are drawn."""
     if in_order:
         request.getfixturevalue("sums_in_order")
     splats = random_splats(6, 200, 40, 33)

@@ -72,7 +72,7 @@ def unsigned(keys: Tensor) -> list[int]:
 def sort(
     run: Run, keys: Tensor, bits: tuple[int, int], count: int | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The sorted keys and the numbers they had, in memory with a margin that must stay unchanged."""
+    """The sorted keys and the numbers they had, in memory with a margin that stays unchanged."""
     n = len(keys)
     dtypes = (keys.dtype, keys.dtype, torch.int32, torch.int32)
     a, b, c, d = (torch.full((n + 8,), 99, dtype=dtype) for dtype in dtypes)
@@ -182,7 +182,7 @@ def bin_splats(
     capacity: int = -1,
     with_slots: bool = True,
 ) -> Binned:
-    """As `rasterize` does, in memory with a margin that must stay unchanged."""
+    """As `rasterize` does, in memory with a margin that stays unchanged."""
     suffix = "" if native.dtype == torch.float32 else "_f64"
     packed = packed.to(native.dtype).contiguous()
     m, stride = packed.shape
