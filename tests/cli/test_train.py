@@ -366,7 +366,7 @@ def test_output_folders_with_other_files(refused, run, dataset, tmp_path):
         (["--minutes", 1, "--densify-interval", 0], "--densify-interval: 0 is too small"),
         (["--initial-points", 0], "--initial-points: 0 is too small"),
         (["--seed", 2**62], "--seed: 4611686018427387904 is too large"),
-        (["--minutes", 1, "--iterations", 100], "leave one out"),
+        (["--minutes", 1, "--iterations", 100], "cannot be combined"),
         (["--background", "black", "-w"], "different colors"),
         (["-s", "elsewhere"], "twice"),
         (["--test-list", "absent.txt"], "absent.txt"),

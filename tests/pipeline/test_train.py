@@ -84,7 +84,7 @@ def test_ctrl_c_and_resume_give_the_same_scene(dataset, tmp_path):
 
 
 def test_options_that_contradict_each_other():
-    with pytest.raises(UserError, match="`minutes` and `iterations` exclude each other"):
+    with pytest.raises(UserError, match="`minutes` and `iterations` cannot be combined"):
         options(5, minutes=1.0)
     with pytest.raises(SettingError, match="^minutes: 0 is not"):
         TrainOptions(minutes=0.0)

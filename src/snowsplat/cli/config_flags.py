@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from snowsplat.cli.flags import flag
 
-RECIPE = "the recipe's"
+RECIPE = "set by the recipe"
 
 
 @dataclass
@@ -15,14 +15,14 @@ class ConfigFlags:
     """One flag per setting. None: the recipe determines the setting."""
 
     iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
-    """Training steps, one photo each."""
+    """Number of training steps; each uses one photo."""
     max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
-    """Largest number of Gaussians; determines memory and time. 0: no limit."""
+    """Maximum number of Gaussians, which determines memory and time; 0: no limit."""
     checkpoint_every: Annotated[int | None, flag("N", default="none")] = None
     """Steps between checkpoints. With --resume the result is the same as without interruption."""
     seed: Annotated[int | None, flag("N", default="0")] = None
-    """Seed of all random choices. The same seed gives a bit-identical scene, on the CPU and, with
-    --deterministic, on a GPU."""
+    """Seed of all random choices. The same seed produces a bit-identical scene on the CPU; on a GPU
+    with --deterministic."""
     test_iterations: Annotated[tuple[int, ...] | None, flag("[N ...]", default=RECIPE)] = None
     """Steps after which to evaluate the held-out photos, in addition to the last one; -1: none."""
     background: Annotated[
@@ -40,32 +40,32 @@ class ConfigFlags:
     grad_threshold: Annotated[
         float | None, flag("F", "--densify-grad-threshold", default=RECIPE)
     ] = None
-    """Densify where the view-space gradient is larger. Raise it for fewer Gaussians."""
+    """Densify Gaussians whose view-space gradient is larger; a larger value adds fewer."""
     densify_interval: Annotated[
         int | None, flag("N", "--densification-interval", default=RECIPE)
     ] = None
-    """Steps between densifications. Raise it for fewer Gaussians."""
+    """Number of steps between densifications; a larger value adds fewer Gaussians."""
     densify_from: Annotated[
         int | float | None, flag("N|F", "--densify-from-iter", default=RECIPE)
     ] = None
-    """First step that may densify; with a decimal point (0.1), that fraction of all steps."""
+    """First step of densification; with a decimal point (0.1): a fraction of all steps."""
     densify_until: Annotated[
         int | float | None, flag("N|F", "--densify-until-iter", default=RECIPE)
     ] = None
-    """Last step that may densify; with a decimal point (0.5), that fraction of all steps."""
+    """Last step of densification; with a decimal point (0.5): a fraction of all steps."""
     opacity_reset_interval: Annotated[int | None, flag("N", default=RECIPE)] = None
-    """Steps between resets of the opacity; 0: none."""
+    """Number of steps between opacity resets; 0: no resets."""
     percent_dense: Annotated[float | None, flag("F", default=RECIPE)] = None
-    """Gaussians smaller than this fraction of the scene extent are cloned, larger ones split."""
+    """Gaussians smaller than this fraction of the scene extent are cloned, larger are split."""
 
     lr_means: Annotated[float | None, flag("F", "--position-lr-init", default=RECIPE)] = None
-    """Learning rate of the positions at the first step, in scene extents."""
+    """Learning rate of the positions at the first step, in units of the scene extent."""
     lr_means_final: Annotated[float | None, flag("F", "--position-lr-final", default=RECIPE)] = None
-    """Learning rate of the positions at the last step."""
+    """Learning rate of the positions at step --position-lr-max-steps and later."""
     lr_means_steps: Annotated[
         int | float | None, flag("N|F", "--position-lr-max-steps", default=RECIPE)
     ] = None
-    """The step at which the learning rate of the positions reaches its last value."""
+    """Step at which the learning rate of the positions reaches its final value."""
     lr_log_scales: Annotated[float | None, flag("F", "--scaling-lr", default=RECIPE)] = None
     """Learning rate of the scales."""
     lr_quats: Annotated[float | None, flag("F", "--rotation-lr", default=RECIPE)] = None

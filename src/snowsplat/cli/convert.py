@@ -17,7 +17,7 @@ Box = tuple[float, float, float, float, float, float]
 
 @dataclass
 class Convert:
-    """Write a scene in another format; crop, decimate, rotate it, or merge it with others.
+    """Write a scene in another format; crop, decimate, rotate or merge scenes.
 
     Examples:
       snowsplat convert out/garden garden.spz
@@ -25,17 +25,18 @@ class Convert:
       snowsplat convert garden.ply table.glb --crop -1 -1 -1 1 0.5 1 --rotate 0 90 0
       snowsplat convert house.ply tree.spz both.ply
 
-    The ending of FILE selects the format:
+    The suffix of FILE selects the format:
       .ply              lossless; read by every program for Gaussian splats
-      .compressed.ply   a quarter of that size, for SuperSplat
-      .spz              an eighth, for Niantic's and many other programs
-      .sog              a tenth, for PlayCanvas' web viewers
-      .glb              lossless, as glTF
+      .compressed.ply   a quarter of the size of .ply; for SuperSplat
+      .spz              an eighth of the size; for Niantic's and many other programs
+      .sog              a tenth of the size; for PlayCanvas' web viewers
+      .glb              glTF, lossless
       .splat            without view-dependent color
-      .html             a page with a viewer, to send by mail
+      .html             a single web page with a viewer, for example to send by mail
 
-    Several scenes are merged. Then, in this order: --crop, --rotate, --scale, --translate,
-    --decimate, --sh-degree. Coordinates are those of a PLY: x right, y down, z forward.
+    Several scenes are merged. Then the edits are applied in this order: --crop, --rotate, --scale,
+    --translate, --decimate, --sh-degree. Coordinates are those of PLY files: x right, y down, z
+    forward.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE [MORE …] FILE")] = ()
@@ -52,7 +53,7 @@ class Convert:
     scale: Annotated[float, flag("F", default="1")] = 1.0
     """Scale by this factor about the origin."""
     translate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)
-    """Move by this offset."""
+    """Translate by this offset."""
     overwrite: Annotated[bool, switch()] = False
     """Replace FILE if it exists."""
 

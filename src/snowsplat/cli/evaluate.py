@@ -32,7 +32,7 @@ class Evaluate(SceneFlags):
     split: Annotated[Literal["test", "train"], flag("{test,train}", default="test")] = "test"
     """test: the held-out photos; train: the photos that the scene was trained on."""
     lpips: Annotated[Path | None, flag("FILE", default="not measured")] = None
-    """Weights for LPIPS: of AlexNet or VGG16 and of the linear heads, safetensors or torch."""
+    """Weights for LPIPS (AlexNet or VGG16, and the linear layers): a safetensors or torch file."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

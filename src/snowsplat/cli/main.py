@@ -27,31 +27,29 @@ from snowsplat.util.safe_json import printable
 SUBCOMMANDS = {
     "make": "Make a scene from photos or a video: camera poses, training, images, in one command.",
     "sfm": "Estimate the camera poses of photos or of a video: the dataset that training needs.",
-    "train": "Train a scene from photos with known camera poses (COLMAP, or transforms.json).",
+    "train": "Train a scene from photos with known camera poses (COLMAP or transforms.json).",
     "evaluate": "Measure a scene on the held-out photos: PSNR, SSIM and, with weights, LPIPS.",
-    "render": "Render a scene from the cameras of its photos, beside the photos; or a video of it.",
-    "view": "Fly through a finished scene in the browser; Ctrl-C ends it.",
-    "watch": "Show the scene of a training in the browser, with its cameras and photos.",
-    "convert": (
-        "Write a scene in another format; crop, decimate, rotate it, or merge it with others."
-    ),
+    "render": "Render a scene from the camera poses of its photos, or along a path as a video.",
+    "view": "Fly through a finished scene in the browser; Ctrl-C stops the viewer.",
+    "watch": "Show a running or finished training in the browser, with its cameras and photos.",
+    "convert": "Write a scene in another format; crop, decimate, rotate or merge scenes.",
     "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }
 
 # Former names of subcommands, still accepted but not listed.
 _FORMER_NAMES = {"capture": "sfm"}
 
-DESCRIPTION = """3D Gaussian Splatting on any computer: photos become a scene, shown in real time.
+DESCRIPTION = """3D Gaussian Splatting on any computer: make scenes from photos, view them in real time.
 
-  snowsplat make PHOTOS                     photos or a video -> a scene: the next steps in one
-  snowsplat sfm PHOTOS -o DATASET           photos or a video -> photos with known cameras
-  snowsplat train DATASET -o OUT --eval     photos with known cameras -> a scene in OUT
+  snowsplat make PHOTOS                     photos or a video -> a scene (sfm, train and render)
+  snowsplat sfm PHOTOS -o DATASET           photos or a video -> photos with camera poses
+  snowsplat train DATASET -o OUT --eval     photos with camera poses -> a scene in OUT
   snowsplat evaluate OUT                    PSNR and SSIM on the held-out photos
-  snowsplat render OUT                      images of the scene next to the photos
+  snowsplat render OUT                      images of the scene, and videos
   snowsplat view FILE|OUT                   fly through a scene in the browser
-  snowsplat watch OUT                       a scene with its photos, also during training
+  snowsplat watch OUT                       show a running or finished training in the browser
   snowsplat convert SCENE [MORE …] FILE     another format; crop, decimate, rotate, merge
-  snowsplat info PATH                       contents of a scene, a dataset, an output folder
+  snowsplat info PATH                       describe a scene, a dataset or an output folder
 
 Each subcommand has its own help: snowsplat train --help
 

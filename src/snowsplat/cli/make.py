@@ -34,7 +34,7 @@ class Make:
       snowsplat make photos/                   the scene is photos_scene/photos.ply
       snowsplat make walk.mp4 -o walk          the scene is walk/walk.ply
       snowsplat make photos/ --quality best    slower, for larger photos and more Gaussians
-      snowsplat make photos/ --minutes 5       the best scene that 5 minutes allow here
+      snowsplat make photos/ --minutes 5       the best scene in 5 minutes on this computer
 
     OUT/capture contains the photos, their cameras and a report. OUT/scene contains the training,
     and in scene/test/ours_N the held-out photos and the same views rendered. If the command is
@@ -44,22 +44,22 @@ class Make:
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
     """Folders of photos (JPEG, PNG, WebP, TIFF, HEIC), photos, and videos."""
     output: Annotated[Path | None, flag("OUT", "-o", default="./INPUT_scene")] = None
-    """Folder for everything that is made."""
+    """Output folder; created if missing."""
     quality: Annotated[
         Literal["draft", "normal", "best"] | None,
-        flag("{draft,normal,best}", default="normal, or what the minutes allow"),
+        flag("{draft,normal,best}", default="normal; --minutes: what fits"),
     ] = None
     """draft: a quick preview; best: takes several times as long as normal. With --minutes, this is
     the effort to find the camera poses; the training uses the rest of the time."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
-    """Finish within this time. Only the stages of this run count. An interrupted training resumes
-    with the time that it had left."""
+    """Finish within this time. Stages that an earlier run has finished are not counted. An
+    interrupted training resumes with its remaining time."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to train on."""
-    memory: Annotated[str | None, flag("BYTES", default="what is available")] = None
-    """Memory for the training, like 4GB: see train --help."""
+    memory: Annotated[str | None, flag("BYTES", default="available memory")] = None
+    """Memory limit of the training, for example 4GB: see train --help."""
     overwrite: Annotated[bool, switch()] = False
     """Replace a scene in OUT that was made from other photos."""
     view: Annotated[bool, switch()] = False
@@ -67,8 +67,8 @@ class Make:
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
     """Port of the page: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the URL, which is
-    printed, contains a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL contains
+    a secret token."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Render(SceneFlags):
-    """Render a scene from the cameras of its photos, beside the photos; or a video of it.
+    """Render a scene from the camera poses of its photos, or along a path as a video.
 
     Examples:
       snowsplat render out/garden
@@ -36,7 +36,7 @@ class Render(SceneFlags):
     split: Annotated[Literal["all", "test", "train"], flag("{all,test,train}", default="all")] = (
         "all"
     )
-    """The held-out photos, those of the training, or both."""
+    """test: the held-out photos; train: the training photos; all: both."""
     skip_train: Annotated[bool, switch()] = False
     """The same as --split test."""
     skip_test: Annotated[bool, switch()] = False

@@ -54,13 +54,14 @@ class Sfm:
     quality: Annotated[
         Literal["draft", "normal", "best"], flag("{draft,normal,best}", default="normal")
     ] = "normal"
-    """Effort to find points that photos have in common; best takes several times as long."""
+    """Effort for finding and matching features; best takes several times as long as normal."""
     camera_model: Annotated[str | None, flag("MODEL", "--camera")] = None
     """Lens model, by its name in COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, PINHOLE …"""
     mapper: Annotated[
         Literal["incremental", "global"], flag("{incremental,global}", default="incremental")
     ] = "incremental"
-    """Estimate the poses one after the other, or all at once (faster for many photos)."""
+    """incremental: estimate the poses one after the other; global: all at once, faster for many
+    photos."""
     skip_matching: Annotated[bool, switch()] = False
     """With -s: use the COLMAP model in LOCATION/distorted/sparse/0 and only undistort."""
 

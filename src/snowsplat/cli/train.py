@@ -17,16 +17,16 @@ from snowsplat.util.errors import UserError
 
 @dataclass
 class Train(TrainFlags):
-    """Train a scene from photos with known camera poses (COLMAP, or transforms.json).
+    """Train a scene from photos with known camera poses (COLMAP or transforms.json).
 
     Examples:
       snowsplat train garden -o out                   3000 steps, some minutes on a laptop
       snowsplat train garden -o out --eval            hold out every 8th photo and evaluate on them
       snowsplat train garden -o out -r 4              photos at a quarter of their size: faster
-      snowsplat train garden -o out --minutes 5       the best scene that 5 minutes allow here
+      snowsplat train garden -o out --minutes 5       the best scene in 5 minutes on this computer
       snowsplat train garden -o out --recipe paper    the 30,000 steps of the paper
       snowsplat train garden -o out --checkpoint-every 1000     save every 1000 steps
-      snowsplat train -o out --resume                 continue after Ctrl-C, a crash, a power cut
+      snowsplat train -o out --resume                 continue after an interruption or a crash
 
     The scene is OUT/point_cloud/iteration_N/point_cloud.ply. Ctrl-C saves the current scene and a
     checkpoint. The flags of the reference implementation are accepted (-s -m -i -r -w --eval …).
@@ -37,7 +37,7 @@ class Train(TrainFlags):
         if self.output is None:
             raise UserError("train needs a folder for the result; add -o OUT")
         if self.resume and self.overwrite:
-            raise UserError("--resume and --overwrite exclude each other; leave one out")
+            raise UserError("--resume and --overwrite cannot be combined; use one of them")
         dataset, options = self.dataset_path(), self.options()
         OutputFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
         if dataset is None and not self.resume:

@@ -28,14 +28,16 @@ class JobFlags:
     recipe: Annotated[
         Recipe | None, flag(f"{{{','.join(get_args(Recipe))}}}", default="default")
     ] = None
-    """The origin of all other settings. default: a few thousand quick steps; paper: the schedule
-    of the paper, 30,000 steps; mcmc: 30,000 steps with a fixed number of Gaussians."""
+    """Named configuration: the defaults of the other settings. default: 3000 fast steps; paper: the
+    schedule of the paper, 30,000 steps; mcmc: 30,000 steps with a fixed maximum number of
+    Gaussians."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
     """Finish within this time, including evaluation and saving. The number of steps, the size of
     the photos and the number of Gaussians are chosen to fit, unless they are given. With --resume:
     the time for the remaining steps."""
     eval: Annotated[bool, switch()] = False
-    """Hold out every 8th photo (or the test split of the dataset) and evaluate on it at the end."""
+    """Hold out every 8th photo (or the test split of the dataset) and evaluate on these photos at
+    the end."""
     test_list: Annotated[Path | None, flag("FILE")] = None
     """Text file with the names of the photos to hold out, one per line. Implies --eval."""
     images: Annotated[str | None, flag("NAME", "-i", default="images")] = None
@@ -48,18 +50,20 @@ class JobFlags:
     """Sets --lr-sh-dc F and --lr-sh-rest F/20, as in the reference implementation."""
 
     view: Annotated[bool, switch()] = False
-    """Show the training in the browser: the scene, curves, pause. Ctrl-C closes the page."""
+    """Show the training in the browser: the scene, curves, a pause button. Ctrl-C closes it."""
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
     """Port of the page: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the URL, which is
-    printed, contains a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL contains
+    a secret token."""
 
-    memory: Annotated[str | None, flag("BYTES", default="what is available")] = None
-    """Memory for the training, like 4GB: of the GPU or, on the CPU, in addition to what Python and
-    its libraries take. To fit, photos are decoded again for each use, and Gaussians are fewer."""
+    memory: Annotated[str | None, flag("BYTES", default="available memory")] = None
+    """Memory limit of the training, for example 4GB: memory of the GPU or, on the CPU, memory in
+    addition to that of Python and its libraries. If needed, photos are decoded again for each use,
+    and the number of Gaussians is reduced."""
     resume: Annotated[bool, switch()] = False
-    """Continue from the newest checkpoint in OUT. The result is as without interruption."""
+    """Continue from the newest checkpoint in OUT. The result is that of an uninterrupted
+    training."""
     overwrite: Annotated[bool, switch()] = False
     """Replace a training that is in OUT."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
@@ -67,7 +71,7 @@ class JobFlags:
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads. The result does not depend on it."""
     deterministic: Annotated[bool, switch()] = False
-    """On a GPU: bit-identical results in every run; takes more time and memory."""
+    """On a GPU: bit-identical results in every run, with more time and memory."""
     save_iterations: Annotated[tuple[int, ...], flag("[N ...]")] = ()
     """Steps after which to save the scene, in addition to the last one."""
     source_path: Annotated[Path | None, flag("DATASET", "-s")] = None
@@ -104,7 +108,7 @@ class TrainFlags(ConfigFlags, JobFlags):
     def _settings(self) -> dict[str, Any]:
         settings = self.config_settings()
         if self.white_background and settings.setdefault("background", "white") != "white":
-            raise UserError("-w and --background name different colors; leave one out")
+            raise UserError("-w and --background set different colors; use one of them")
         if self.feature_lr is not None:
             settings = {
                 "lr_sh_dc": self.feature_lr,

@@ -19,15 +19,15 @@ from snowsplat.util.errors import UserError
 
 @dataclass
 class View:
-    """Fly through a finished scene in the browser; Ctrl-C ends it.
+    """Fly through a finished scene in the browser; Ctrl-C stops the viewer.
 
     Examples:
       snowsplat view out/garden
       snowsplat view garden.spz
       snowsplat view out/garden --no-browser --port 8080
 
-    By default, only this computer can open the page; its URL contains a secret token. The first
-    view is that of the first photo of the training. Drag to turn, scroll to zoom, W A S D to fly;
+    By default, only this computer can open the page; its URL contains a secret token. The initial
+    view is that of the first training photo. Drag to rotate, scroll to zoom, press W A S D to fly;
     the page lists all controls.
     """
 

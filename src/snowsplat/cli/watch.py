@@ -13,7 +13,7 @@ from snowsplat.cli.scene_flags import SceneFlags
 
 @dataclass
 class Watch(SceneFlags):
-    """Show the scene of a training in the browser, with its cameras and photos.
+    """Show a running or finished training in the browser, with its cameras and photos.
 
     Examples:
       snowsplat watch out/garden
@@ -26,8 +26,8 @@ class Watch(SceneFlags):
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
     """Port of the page: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the URL, which is
-    printed, contains a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL contains
+    a secret token."""
 
     def run(self) -> int:
         """Runs until Ctrl-C; returns the exit code, 0."""

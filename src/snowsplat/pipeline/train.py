@@ -73,7 +73,7 @@ class TrainOptions:
         if self.minutes is None:
             return
         if self.iterations is not None:
-            raise UserError("`minutes` and `iterations` exclude each other; leave one out")
+            raise UserError("`minutes` and `iterations` cannot be combined; set one of them")
         check_minutes(self.minutes)
 
     @property
