@@ -161,7 +161,7 @@ class ImageLoader:
 
     def _submit_queued(self) -> None:
         """Start decoding as much of the queue as threads and budget allow. Needs the lock."""
-        if self._submitting:  # add_done_callback below calls back at once if the image is ready
+        if self._submitting:  # if an image is ready, add_done_callback calls `_finished` at once
             return
         self._submitting = True
         while self._queue and len(self._running) < 2 * self._threads:
@@ -199,8 +199,8 @@ def available_memory(device: torch.device | None = None) -> int:
     """Bytes of memory that this process can still allocate.
 
     Args:
-        device: a CUDA device for its free memory. Otherwise it is the memory of the computer,
-            without swapping, limited by the control group of the process (container).
+        device: for a CUDA device, the result is its free memory; otherwise the free memory of the
+            computer without swap space, limited by the control group (container) of the process.
     """
     if device is not None and device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]

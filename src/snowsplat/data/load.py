@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 # Values of ``resolution`` that divide the image size; any other value is a width.
 _DIVISORS = (1, 2, 4, 8)
-# Smallest width and height of a scaled image in pixels. A resolution below this is a mistake.
+# Smallest width and height of a scaled image in pixels. A smaller size is rejected as a mistake.
 _SMALLEST_SIDE = 16
 # The largest ratio between the size of a camera and the size of its image file.
 _LARGEST_FACTOR = 16
@@ -51,7 +51,8 @@ def load_dataset(
     Raises:
         UserError: ``path`` is not a dataset; a file is damaged; a camera has lens distortion; an
             image is missing, damaged, or does not have the size of its camera.
-        SettingError: ``images`` is not the folder of the images, or ``resolution`` is invalid.
+        SettingError: ``images`` is not the folder of the images, or ``resolution`` or ``hold_out``
+            is invalid.
     """
     return read_files(
         path, images=images, resolution=resolution, hold_out=hold_out, test_list=test_list
@@ -63,7 +64,7 @@ class DatasetFiles:
     """The files of a dataset, read and checked: they become a `Dataset` at any resolution.
 
     Attributes:
-        images: each with the header of its file, and the result of `_file_sizes`.
+        images: each image, the header of its file, and the result of `_file_sizes`.
         test_names: names of the views to hold out.
     """
 
@@ -153,7 +154,7 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
 
 
 def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> list[PosedImage]:
-    """The same images from ``images_2`` …, if the resolution matches and all images are there."""
+    """The same images from ``images_2`` …, if the resolution matches and all images exist there."""
     if resolution not in _DIVISORS[1:]:
         return posed
     smaller = []
@@ -290,7 +291,7 @@ def _test_names(
     if hold_out is None:
         return set()
     if hold_out < 1:
-        raise UserError(f"holding out every {hold_out}th image makes no sense; use 2 or more")
+        raise SettingError("hold_out", f"{hold_out} is not valid; use 2 or more")
     if any(image.split == "test" for image in posed):
         return {image.name for image in posed if image.split == "test"}
     return set(names[::hold_out])

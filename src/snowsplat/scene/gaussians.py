@@ -116,7 +116,7 @@ class Gaussians:
     # Sets of Gaussians
 
     def finite_rows(self) -> Tensor:
-        """(N,) bool: Gaussians all of whose parameters are finite."""
+        """(N,) bool: whether all parameters of a Gaussian are finite."""
         finite = torch.ones(len(self), dtype=torch.bool, device=self.means.device)
         for parameter in self.parameters().values():
             values = parameter if parameter.ndim > 1 else parameter[:, None]
@@ -142,7 +142,7 @@ class Gaussians:
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """The rows of all ``parts`` in order. There is at least one part; SH degrees are equal."""
+        """The rows of all ``parts`` in order; needs at least one part, and equal SH degrees."""
         columns = zip(*(part.parameters().values() for part in parts), strict=True)
         return Gaussians(*(torch.cat(column) for column in columns))
 

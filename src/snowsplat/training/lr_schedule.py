@@ -1,4 +1,4 @@
-"""`LearningRates`: Adam's learning rates, and the schedule of the one of the positions."""
+"""`LearningRates`: the learning rates of Adam, and the schedule of the rate of the positions."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ class LearningRates:
     """Adam's learning rate for each parameter; the defaults are the paper's.
 
     Attributes:
-        means: at the first step, in units of the scene's extent.
-        means_final: at ``means_steps`` and after it; log-linear between the two.
-        means_steps: an int is that step, a float that fraction of all iterations.
+        means: rate of the positions at the first step, in units of the scene extent.
+        means_final: rate of the positions at step ``means_steps`` and later; log-linear before it.
+        means_steps: a step (int), or a fraction of all iterations (float).
         log_scales, quats, opacity_logits, sh_dc, sh_rest: constant.
     """
 
@@ -34,7 +34,7 @@ class LearningRates:
         return replace(self, **{name: factor * getattr(self, name) for name in rates})
 
     def at(self, step: int, schedule: Schedule, extent: float) -> dict[str, float]:
-        """Learning rate by parameter at ``step``; that of the means in world units.
+        """The learning rate of each parameter at ``step``; for the means in world units.
 
         means(t) = extent · means^(1 − t) · means_final^t, t = step / means_steps, at most 1.
         """

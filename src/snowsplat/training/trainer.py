@@ -29,8 +29,9 @@ from snowsplat.util.process import interrupts_between_steps, single_threaded
 #: Photos are decoded by other threads this many views ahead of their step.
 LOOKAHEAD = 16
 
-#: One random generator for each kind of choice, so that more choices of one kind do not change the
-#: others. The names and their order are part of the checkpoint format and of what a seed means.
+#: One random generator for each kind of random choice, so that additional choices of one kind do
+#: not change the others. The names are part of the checkpoint format. The position of a name
+#: determines the seed of its generator, so the order must not change.
 GENERATORS = ("start", "views", "background", "density")
 
 #: Background colours by name; "random" is drawn in each step.
@@ -60,8 +61,8 @@ class Trainer:
         trainer.run()
         trainer.gaussians
 
-    Between two steps, `state_tensors` is the complete state: a trainer that loads it continues
-    bitwise as this one would have. ``schedule`` may be stretched between two steps.
+    Between two steps, `state_tensors` is the complete state: a trainer that loads it produces
+    bit-identical results. ``schedule`` may be stretched between two steps.
 
     Attributes:
         gaussians: the scene after ``step`` steps, on ``device``.
@@ -78,8 +79,8 @@ class Trainer:
     ) -> None:
         """
         Args:
-            schedule: of a resumed training; default: ``config.iterations`` steps.
-            device: to train on; default: the CPU.
+            schedule: the schedule of a resumed training; default: ``config.iterations`` steps.
+            device: the device to train on; default: the CPU.
 
         Raises:
             UserError: the dataset has no training views, or points that cannot be represented.
@@ -159,8 +160,8 @@ class Trainer:
         """
         self.within_step = True
         with single_threaded():
-            # The refinement that ends an iteration of the paper is done at the beginning of the
-            # next one: a scene that was just cloned or reset is never evaluated or saved.
+            # In the paper, a step ends with density control. Here it runs at the beginning of the
+            # next step, so that a scene is never evaluated or saved directly after it.
             if self.step > 0:
                 self.gaussians = self._density.after_step(
                     self.step, self.gaussians, self._optimizer
@@ -183,7 +184,7 @@ class Trainer:
         """Rasterize, compare with the photo, and update the Gaussians."""
         sh_degree = self.config.sh_degree_at(step)
         splats = project(self.gaussians, camera, sh_degree)
-        with torch.enable_grad():  # from the splats on; the optimiser differentiates the projection
+        with torch.enable_grad():  # without `project`, which the optimiser differentiates
             image = self._runner.rasterize(splats, camera, background)
             loss = view_loss(image, photo, background, self.config.ssim_weight)
         gradient = self._runner.backward(loss, splats, camera, sh_degree)
@@ -191,7 +192,7 @@ class Trainer:
         self._optimizer.step(self.gaussians, gradient, step)
 
     def evaluate(self) -> Evaluation:
-        """Metrics of the test views in the current state; a random background counts as black."""
+        """Metrics of the test views in the current state; a random background is set to black."""
         background = (0.0, 0.0, 0.0) if self._background is None else self._background.tolist()
         with single_threaded():
             return evaluate_views(self.gaussians, self.dataset.test, background=background)
@@ -224,14 +225,17 @@ class Trainer:
         self._images.prefetch([self.dataset.train[i] for i in self._order], downscale)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """Everything the next steps depend on besides dataset, config and schedule. Not copied."""
+        """What the next steps depend on, in addition to dataset, config and schedule.
+
+        The tensors are not copied.
+        """
         parts = {
             "gaussians": self.gaussians.parameters(),
             "optimizer": self._optimizer.state_tensors(),
             "density": self._density.state_tensors(),
             "random": {name: random.get_state() for name, random in self._generators.items()},
         }
-        tensors = {f"{part}.{key}": t for part, of in parts.items() for key, t in of.items()}
+        tensors = {f"{part}.{key}": t for part, named in parts.items() for key, t in named.items()}
         order = torch.tensor(self._order, dtype=torch.int64)
         return tensors | {"step": torch.tensor(self.step), "order": order}
 
@@ -244,8 +248,8 @@ class Trainer:
         """
         check_state(self.state_tensors(), tensors, len(self.dataset.train))
 
-        def part(of: str) -> dict[str, Tensor]:
-            return {n[len(of) :]: t for n, t in tensors.items() if n.startswith(of)}
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {n[len(prefix) :]: t for n, t in tensors.items() if n.startswith(prefix)}
 
         self.gaussians = Gaussians(**part("gaussians.")).clone().to(self.device)
         self._optimizer.load_state(part("optimizer."))
@@ -254,7 +258,7 @@ class Trainer:
         for name, random in self._generators.items():
             try:
                 random.set_state(tensors[f"random.{name}"])
-            except RuntimeError:  # torch checks that the state is possible
+            except RuntimeError:  # torch has checked the state
                 raise UserError(
                     f"the checkpoint: random state {name!r} is damaged; resume from an earlier one"
                 ) from None

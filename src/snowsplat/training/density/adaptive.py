@@ -20,9 +20,9 @@ from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.training.view_gradient import ViewGradient
 
-#: φ of the paper, determined by experiment: a split divides the scale by it.
+#: φ of the paper, determined by experiment: a split divides the scale by this factor.
 SPLIT_SHRINK = 1.6
-#: Opacity after a reset, at most.
+#: Largest opacity after a reset.
 RESET_OPACITY = 0.01
 #: A scene needs about this many steps to recover from an opacity reset.
 RESET_RECOVERY = 500
@@ -33,25 +33,27 @@ class AdaptiveDensity:
     """Settings of adaptive density control; the defaults are the paper's.
 
     Attributes:
-        densify_from, densify_until: first and last step that may densify (float: fraction of all
+        densify_from, densify_until: first and last step of densification (float: fraction of all
             steps).
-        densify_interval: steps between two densifications.
-        grad_threshold: τ_pos: Gaussians are densified whose view-space position gradient, the mean
-            over views of its norm, is larger.
-        percent_dense: Gaussians up to this scale, in extents, are cloned; larger ones are split.
-        prune_opacity: Gaussians of a lower opacity are removed.
-        prune_world_size: Gaussians of a larger scale, in extents, are removed; 0 disables it. It
-            destroys forward-facing scenes, whose extent is small compared to their depth.
-        prune_screen_size: Gaussians of a larger 3σ radius, in pixels, are removed; 0 disables it.
-            Pruning by either size begins after the first opacity reset.
+        densify_interval: number of steps between two densifications.
+        grad_threshold: τ_pos: a Gaussian is densified if the norm of its view-space position
+            gradient, averaged over the views, is larger.
+        percent_dense: Gaussians up to this scale, in units of the scene extent, are cloned; larger
+            ones are split.
+        prune_opacity: Gaussians with a lower opacity are removed.
+        prune_world_size: Gaussians with a larger scale, in units of the scene extent, are removed;
+            0 disables this. Use 0 for forward-facing scenes: their extent is small compared to
+            their depth, so that most of the Gaussians would be removed.
+        prune_screen_size: Gaussians with a larger 3σ radius, in pixels, are removed; 0 disables
+            this. Pruning by either size begins after the first opacity reset.
         opacity_reset_interval: steps between opacity resets; 0 disables them. The last one is at
             least 500 steps before densification ends.
         reset_random_start: if training started from random points, also reset opacity at
             ``densify_from``, unless fewer than 500 steps are left. Most random points lie in empty
             space, where they learn the colour of the background instead of becoming transparent:
-            without the reset, 100,000 of them can end as a cloud of that colour.
-        max_gaussians: limit of the number of Gaussians; 0 is no limit. If it is reached, those of
-            the largest gradients are densified.
+            without the reset, 100,000 of them can remain as a cloud of that colour.
+        max_gaussians: maximum number of Gaussians; 0: no limit. If it would be exceeded, only the
+            Gaussians with the largest gradients are densified.
     """
 
     densify_from: When = 500
@@ -94,7 +96,7 @@ class AdaptiveDensityControl:
     """State of adaptive density control.
 
     Attributes:
-        first_reset: whether step ``first`` resets opacity as well.
+        first_reset: whether opacity is also reset at step ``first``.
         grad_sum: (N,) sum over views of |∂L/∂mean2d|, with the image spanning [-1, 1].
         views: (N,) number of views in that sum: those in which the Gaussian was visible.
         max_radii: (N,) largest 3σ radius in these views, in pixels.
@@ -111,23 +113,23 @@ class AdaptiveDensityControl:
 
     @property
     def first(self) -> int:
-        """The first step that may densify."""
+        """The first step of densification."""
         return self.schedule.step_of(self.settings.densify_from)
 
     @property
     def last(self) -> int:
-        """The last step that may densify."""
+        """The last step of densification."""
         return min(self.schedule.step_of(self.settings.densify_until), self.schedule.iterations)
 
     def after_backward(self, step: int, gaussians: Gaussians, gradient: ViewGradient) -> None:
-        """Accumulate the statistics of the Gaussians that this view sees."""
+        """Accumulate the statistics of the Gaussians that are visible in this view."""
         if step > self.last:
             return
         max_radii = self.max_radii if self.settings.prune_screen_size > 0 else None
         gradient.add_statistics(self.grad_sum, self.views, max_radii)
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
-        """Densify, prune and reset opacity, at the steps that do."""
+        """Densify, prune or reset opacity, if the settings require it at ``step``."""
         if self.first <= step <= self.last and step % self.settings.densify_interval == 0:
             check_parameters(step, gaussians)
             gaussians = self._refine(step, gaussians, optimizer)
@@ -150,9 +152,9 @@ class AdaptiveDensityControl:
         alive = gaussians.opacities >= settings.prune_opacity
         dense = self._densified(grads, alive)
         split = dense & (size > settings.percent_dense)
-        # A split Gaussian is replaced by two children; every other survivor stays as it is, and a
-        # cloned one gets a copy. Children and copies start without momentum: that is what moves a
-        # copy away from its original.
+        # A split Gaussian is replaced by two children. A cloned Gaussian remains and gets a copy.
+        # Children and copies start with zero moments; because its moments differ, a copy moves away
+        # from its original.
         kept = alive & ~split
         large = torch.zeros_like(alive)
         after_first_reset = 0 < settings.opacity_reset_interval < step
@@ -181,11 +183,11 @@ class AdaptiveDensityControl:
         return gaussians
 
     def _densified(self, grads: Tensor, alive: Tensor) -> Tensor:
-        """(N,) bool: rows to clone or split. Each adds one Gaussian; the limit bounds their number.
+        """(N,) bool: rows to clone or split; each adds one Gaussian, up to ``max_gaussians``.
 
         Args:
             grads: (N,) mean norm of the view-space position gradient.
-            alive: (N,) bool: rows that are not pruned for their opacity.
+            alive: (N,) bool: rows that are not pruned because of their opacity.
         """
         dense = alive & (grads > self.settings.grad_threshold)
         if self.settings.max_gaussians > 0:
@@ -202,7 +204,7 @@ class AdaptiveDensityControl:
         return (rotation_from_quat(gaussians.quats[parents]) @ offsets[:, :, None])[:, :, 0]
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """The statistics, by name. Not copied."""
+        """The statistics, by name. The tensors are not copied."""
         return {"grad_sum": self.grad_sum, "views": self.views, "max_radii": self.max_radii}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:

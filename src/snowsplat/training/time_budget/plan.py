@@ -1,6 +1,6 @@
 """Plans a training for a given time on this machine: photo size, number of Gaussians, steps.
 
-First the number of steps increases with the time, then the size of the photos, then the number of
+With more time, the number of steps increases first, then the size of the photos, then the number of
 Gaussians: see "Training in a given time" in docs/performance.md.
 """
 
@@ -19,40 +19,41 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.time_budget.step_cost import Work
 from snowsplat.training.trainer import Trainer
 
-#: Larger photos are not worth having fewer steps than this,
-_ENOUGH_STEPS = 1000
-#: or fewer steps per photo than this.
-_ENOUGH_STEPS_PER_PHOTO = 10
-#: The longer side of the photos, in pixels.
-_SMALLEST_SIDE = 400
-_LARGEST_SIDE = 1600
-#: If there is time for more steps than this, the limit of Gaussians may increase,
-_STEPS_TO_SPARE = 4500
-#: by this factor at most.
-_LARGEST_RISE = 2.0
-#: A short training densifies at least this often in its first half,
-_DENSIFICATIONS = 15
-#: but with at least this many steps between.
-_FEWEST_BETWEEN = 25
-#: Seconds before the first step: setting up, and decoding the first photos.
-_SETTING_UP = 0.5
+# The size of the photos is reduced until there is time for both of these:
+#: Minimum number of steps.
+_MIN_STEPS = 1000
+#: Minimum number of steps per photo.
+_MIN_STEPS_PER_PHOTO = 10
+#: Minimum and maximum of the longer side of the photos, in pixels.
+_MIN_SIDE = 400
+_MAX_SIDE = 1600
+#: The limit of the number of Gaussians is raised if there is time for more steps than this.
+_STEPS_FOR_MORE_GAUSSIANS = 4500
+#: Maximum factor by which this limit is raised.
+_MAX_RISE = 2.0
+#: Minimum number of densifications in the first half of a short training, if the interval allows.
+_MIN_DENSIFICATIONS = 15
+#: Minimum interval between densifications, in steps.
+_MIN_DENSIFY_INTERVAL = 25
+#: Seconds before the first step: preparation, and decoding the first photos.
+_SETUP_SECONDS = 0.5
 
-# The speed of the machine is measured by a small training:
-#: It ends after this many seconds,
+# A small training, the sample, measures the speed of the machine.
+#: Maximum duration of the sample, in seconds.
 _SAMPLE_SECONDS = 0.7
-#: or this many steps.
+#: Maximum number of steps.
 _SAMPLE_STEPS = 100
-#: The first steps are run in any case.
-_FEWEST_SAMPLE_STEPS = 3
-#: It uses this many photos, so that decoding them takes little time.
+#: Minimum number of steps, even if they take longer than `_SAMPLE_SECONDS`.
+_MIN_SAMPLE_STEPS = 3
+#: Number of photos; few, so that decoding takes little time.
 _SAMPLE_PHOTOS = 2
-#: It uses this many points at most, which limits its memory.
+#: Maximum number of points, which limits the memory.
 _SAMPLE_POINTS = 20_000
-#: Photos of more pixels than this are halved for it.
+#: Photos with more pixels than this are reduced to half the size.
 _SAMPLE_PIXELS = 500_000
-#: A trained scene is slower than one of initial points by this factor, because more splats overlap
-#: (fox, fern: 1.5 to 1.9).
-_TRAINED = 1.5
+#: Time of a step of a trained scene, relative to the initial points: more splats overlap (measured
+#: with fox and fern: 1.5 to 1.9).
+_TRAINED_SLOWDOWN = 1.5
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Plan:
         width, height: of a photo at that resolution, in pixels.
         config: the configuration with the number of steps and the limit of Gaussians.
         slowness: ratio of the seconds of a step on this machine to `Work.seconds`.
-        seconds: mean of a step.
+        seconds: mean time of a step.
     """
 
     resolution: int | None
@@ -76,7 +77,7 @@ class Plan:
 
     def __str__(self) -> str:
         cap = self.config.density.max_gaussians
-        gaussians = f"at most {cap:,} Gaussians" if cap else "no limit of Gaussians"
+        gaussians = f"at most {cap:,} Gaussians" if cap else "any number of Gaussians"
         return (
             f"{self.width}x{self.height}, {gaussians}, about {_rounded(self.config.iterations):,} "
             "steps"
@@ -96,15 +97,15 @@ def make_plan(
     """The best training of ``dataset`` (at full resolution) that fits into ``seconds``.
 
     Args:
-        config: of the recipe; its ``iterations`` are replaced.
+        config: the configuration of the recipe; ``iterations`` is replaced.
         slowness: from `measure_slowness`.
         resize: whether the photos may be reduced.
-        more_gaussians: whether the limit of Gaussians may increase.
+        more_gaussians: whether the limit of the number of Gaussians may be raised.
         more_often: whether a short training may densify more often.
     """
     camera = max((view.camera for view in dataset.train), key=lambda c: c.width * c.height)
     longer = max(camera.width, camera.height)
-    enough = max(_ENOUGH_STEPS, _ENOUGH_STEPS_PER_PHOTO * len(dataset.train))
+    enough = max(_MIN_STEPS, _MIN_STEPS_PER_PHOTO * len(dataset.train))
 
     def plan(side: int, rise: float = 1.0) -> Plan:
         width = camera.width if side >= longer else max(1, round(camera.width * side / longer))
@@ -113,23 +114,23 @@ def make_plan(
         work = Work(sized, width * height, len(dataset.test))
         initial = config.initial_points if dataset.points is None else len(dataset.points)
         initial = min(initial, sized.density.max_gaussians or initial)
-        steps, mean = _steps(work, seconds - _SETTING_UP, slowness, initial)
+        steps, mean = _steps(work, seconds - _SETUP_SECONDS, slowness, initial)
         if more_often:
             sized = _densified_in(sized, steps)
             work = replace(work, config=sized)
-            steps, mean = _steps(work, seconds - _SETTING_UP, slowness, initial)
+            steps, mean = _steps(work, seconds - _SETUP_SECONDS, slowness, initial)
         resolution = None if width == camera.width else width
         return Plan(resolution, width, height, replace(sized, iterations=steps), slowness, mean)
 
     side = longer
     if resize:
-        side = min(longer, _LARGEST_SIDE)
-        smallest = min(longer, _SMALLEST_SIDE)
+        side = min(longer, _MAX_SIDE)
+        smallest = min(longer, _MIN_SIDE)
         while side > smallest and plan(side).config.iterations < enough:
             side = max(smallest, min(side - 8, round(0.97 * side)))
     best = plan(side)
-    if more_gaussians and best.config.iterations > _STEPS_TO_SPARE:
-        rise = min(_LARGEST_RISE, best.config.iterations / _STEPS_TO_SPARE)
+    if more_gaussians and best.config.iterations > _STEPS_FOR_MORE_GAUSSIANS:
+        rise = min(_MAX_RISE, best.config.iterations / _STEPS_FOR_MORE_GAUSSIANS)
         best = plan(side, rise)
     return best
 
@@ -144,13 +145,13 @@ def measure_slowness(
     """Ratio of the seconds of a training step on this machine to `Work.seconds`.
 
     Args:
-        device: to train on; default: the CPU.
-        resize: see `make_plan`, which limits the size of the photos then. Steps on larger ones
-            would take time and memory that the training does not.
+        device: the device to train on; default: the CPU.
+        resize: whether `make_plan` may reduce the photos. Then larger photos than its maximum are
+            reduced here, too, because they would need more time and memory than the training.
     """
     views = dataset.train[:_SAMPLE_PHOTOS]
     if resize:
-        views = [_no_larger(view) for view in views]
+        views = [_at_most_max_side(view) for view in views]
     camera = views[0].camera
     downscale = 1 if camera.width * camera.height < _SAMPLE_PIXELS else 2
     points = dataset.points
@@ -173,19 +174,20 @@ def measure_slowness(
     end = time.monotonic() + _SAMPLE_SECONDS
     ratios: list[float] = []
     while trainer.step < _SAMPLE_STEPS and (
-        len(ratios) < _FEWEST_SAMPLE_STEPS or time.monotonic() < end
+        len(ratios) < _MIN_SAMPLE_STEPS or time.monotonic() < end
     ):
         before = time.monotonic()
         trainer.step_once()
         modelled = work.seconds(downscale, len(trainer.gaussians))
         ratios.append((time.monotonic() - before) / modelled)
-    return _TRAINED * statistics.median(ratios[1:])  # the first step waits for its photo
+    # The first step is not counted: it waits for its photo.
+    return _TRAINED_SLOWDOWN * statistics.median(ratios[1:])
 
 
-def _no_larger(view: View) -> View:
-    """The view, reduced to the largest size that a plan may have."""
+def _at_most_max_side(view: View) -> View:
+    """The view, reduced to `_MAX_SIDE` if it is larger."""
     camera, mask = view.camera, view.mask
-    scale = _LARGEST_SIDE / max(camera.width, camera.height)
+    scale = _MAX_SIDE / max(camera.width, camera.height)
     if scale >= 1.0:
         return view
     width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
@@ -198,7 +200,7 @@ def _no_larger(view: View) -> View:
 
 
 def _capped(config: TrainConfig, pixels: int, rise: float) -> TrainConfig:
-    """With a limit of Gaussians that is ``rise`` times higher, for photos of ``pixels``."""
+    """``config`` for photos of ``pixels``, with ``rise`` times the maximum number of Gaussians."""
     cap = config.density.max_gaussians
     if rise > 1.0 and cap:
         config = replace(config, density=changed(config, max_gaussians=round(rise * cap)).density)
@@ -206,8 +208,8 @@ def _capped(config: TrainConfig, pixels: int, rise: float) -> TrainConfig:
 
 
 def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:
-    """With more frequent densification if there are few ``steps``."""
-    interval = max(_FEWEST_BETWEEN, steps // (2 * _DENSIFICATIONS))
+    """``config`` with more frequent densification if there are few ``steps``."""
+    interval = max(_MIN_DENSIFY_INTERVAL, steps // (2 * _MIN_DENSIFICATIONS))
     density = config.density
     begin = density.densify_from
     return changed(
@@ -230,6 +232,6 @@ def _steps(work: Work, seconds: float, slowness: float, gaussians: int) -> tuple
 
 
 def _rounded(count: int) -> int:
-    """To two significant digits."""
+    """``count``, rounded to two significant digits."""
     digits = max(0, len(str(count)) - 2)
     return round(count / 10**digits) * 10**digits
