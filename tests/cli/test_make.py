@@ -184,7 +184,7 @@ def test_output_folders_with_other_files(refused, dataset, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("mine")
-    assert "holds other files" in refused("make", dataset / "images", "-o", out)
+    assert "contains other files" in refused("make", dataset / "images", "-o", out)
     assert "is a file" in refused("make", dataset / "images", "-o", out / "thesis.txt")
     assert files(out) == {"thesis.txt"}
 

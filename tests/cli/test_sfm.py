@@ -113,7 +113,7 @@ def test_photos_in_place(captured, photos, run, refused, tmp_path):
     # The original photos are never replaced, not even by a subset of them.
     for inputs in (sorted((place / "input").iterdir())[:5], [photos]):
         line = refused("sfm", *inputs, "-o", place, "--overwrite", *QUICK)
-        assert f"{place / 'input'}: holds the original photos" in line
+        assert f"{place / 'input'}: contains the original photos" in line
     assert times(place / "input") == before
 
     # An existing model is only undistorted.
@@ -132,11 +132,11 @@ def test_a_folder_with_other_files_stays_unchanged(captured, refused, photos, tm
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "mine.txt").write_text("mine")
-    assert "holds other files (mine.txt)" in refused("sfm", photos, "-o", taken)
+    assert "contains other files (mine.txt)" in refused("sfm", photos, "-o", taken)
     assert "is a file" in refused("sfm", photos, "-o", taken / "mine.txt")
     before = times(captured)
     line = refused("sfm", *sorted(photos.iterdir())[:3], "-o", captured)
-    assert "holds a dataset made from" in line
+    assert "contains a dataset made from" in line
     assert times(captured) == before
     assert [path.name for path in taken.iterdir()] == ["mine.txt"]
 

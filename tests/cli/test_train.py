@@ -332,8 +332,8 @@ def test_output_folders_with_other_files(refused, run, dataset, tmp_path):
     out.unlink()
     out.mkdir()
     (out / "thesis.txt").write_text("mine")
-    assert "holds other files" in refused("train", dataset, "-o", out, *QUICK)
-    assert "holds other files" in refused("train", dataset, "-o", out, *QUICK, "--overwrite")
+    assert "contains other files" in refused("train", dataset, "-o", out, *QUICK)
+    assert "contains other files" in refused("train", dataset, "-o", out, *QUICK, "--overwrite")
     assert files(out) == {"thesis.txt"}
     (out / "thesis.txt").unlink()
     assert run("train", dataset, "-o", out, *QUICK, "--checkpoint-every", 10).code == 0

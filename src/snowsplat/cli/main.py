@@ -39,7 +39,7 @@ SUBCOMMANDS = {
 # Former names of subcommands, still accepted but not listed.
 _FORMER_NAMES = {"capture": "sfm"}
 
-DESCRIPTION = """3D Gaussian Splatting on any computer: make scenes from photos, view them in real time.
+DESCRIPTION = """3D Gaussian Splatting on any computer: photos -> a scene, rendered in real time.
 
   snowsplat make PHOTOS                     photos or a video -> a scene (sfm, train and render)
   snowsplat sfm PHOTOS -o DATASET           photos or a video -> photos with camera poses

@@ -1,19 +1,21 @@
 """SOG files: the parameters of a scene as pixels of lossless images, in a zip file (`.sog`).
 
-`meta.json` lists the images and describes how their bytes are decoded; the i-th pixel of each, row
-by row, belongs to the i-th Gaussian. Version 2, which is the one written, has these images:
+`meta.json` lists the images and describes how their bytes are decoded. In each image except the
+palette, the i-th pixel, row by row, belongs to the i-th Gaussian. `write_sog` writes version 2,
+which has these images:
 
-- means_l, means_u: low and high bytes of 16 bits per axis, evenly between mins and maxs, of
-  sign(x) · log(1 + |x|);
-- scales: logarithms of the standard deviations, by a codebook of 256 levels;
-- quats: the three entries that are not the largest, ±1/√2 in one byte each; alpha is 252 + the
-  index (wxyz) of the largest;
-- sh0: the constant SH coefficients by a codebook; alpha is the opacity;
-- shN_labels, shN_centroids (above SH degree 0): the 16-bit index of a palette entry, and the
-  palette: 64 entries per row, one pixel per coefficient, by a codebook.
+- means_l, means_u: sign(x) · log(1 + |x|) of each axis, quantised to 16 bits between mins and maxs:
+  the low and the high byte;
+- scales: logarithms of the standard deviations, as indices into a codebook of 256 values;
+- quats: the three entries that are not the largest, from −1/√2 to 1/√2 in one byte each; alpha is
+  252 + the index (wxyz) of the largest entry;
+- sh0: the constant SH coefficients, as indices into a codebook; alpha is the opacity;
+- shN_labels (above SH degree 0): the 16-bit index of a palette entry;
+- shN_centroids: the palette: 64 entries per row, one pixel per SH coefficient, as indices into a
+  codebook.
 
-Version 1 has even steps between mins and maxs instead of codebooks. It is usually a folder, of
-which the `meta.json` is opened. The frame is that of the PLY files. Specification:
+Version 1 has evenly spaced levels between mins and maxs instead of codebooks. Usually it is a
+folder; its path is that of `meta.json`. The frame is that of the PLY files. Specification:
 developer.playcanvas.com, "The SOG Format".
 """
 
@@ -90,11 +92,11 @@ class _Layout:
 
 def _layout(meta: dict[str, Any]) -> _Layout:
     try:
-        first = "version" not in meta or meta["version"] == 1
-        if not first and meta["version"] != 2:
+        version_1 = "version" not in meta or meta["version"] == 1
+        if not version_1 and meta["version"] != 2:
             raise Damaged(f"SOG version {str(meta['version'])[:20]}; supported are 1 and 2")
         means, scales, sh0, rest = meta["means"], meta["scales"], meta["sh0"], meta.get("shN")
-        count = means["shape"][0] if first else meta["count"]
+        count = means["shape"][0] if version_1 else meta["count"]
         if not isinstance(count, int) or count < 0:
             raise Damaged("its meta.json has no valid count")
         files = dict(zip(("means_l", "means_u"), means["files"], strict=True))
@@ -104,16 +106,16 @@ def _layout(meta: dict[str, Any]) -> _Layout:
             files |= dict(zip(("centroids", "labels"), rest["files"], strict=True))
         if not all(isinstance(name, str) for name in files.values()):
             raise TypeError
-        if first:
-            color = _even(sh0, 4)
-            tables = _even(scales, 3), color[:, :3], color[:, 3]
-            rest_table = None if rest is None else _even(rest, 1)[:, 0]
+        if version_1:
+            color = _even_levels(sh0, 4)
+            tables = _even_levels(scales, 3), color[:, :3], color[:, 3]
+            rest_table = None if rest is None else _even_levels(rest, 1)[:, 0]
         else:
-            tables = _codes(scales), _codes(sh0), packing.opacity_logits(np.arange(256))
-            rest_table = None if rest is None else _codes(rest)[:, 0]
+            tables = _codebook(scales), _codebook(sh0), packing.opacity_logits(np.arange(256))
+            rest_table = None if rest is None else _codebook(rest)[:, 0]
         low, high = _numbers(means["mins"], 3), _numbers(means["maxs"], 3)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
-        raise Damaged("its meta.json is not that of a SOG scene") from None
+        raise Damaged("its meta.json does not describe a SOG scene") from None
     return _Layout(count, files, low, high, *tables, rest_table)
 
 
@@ -124,14 +126,14 @@ def _numbers(values: Any, count: int) -> np.ndarray:
     return numbers
 
 
-def _even(entry: dict[str, Any], channels: int) -> np.ndarray:
-    """(256, channels) even steps between mins and maxs."""
+def _even_levels(entry: dict[str, Any], channels: int) -> np.ndarray:
+    """(256, channels) evenly spaced levels between mins and maxs."""
     low, high = _numbers(entry["mins"], channels), _numbers(entry["maxs"], channels)
     return low + (high - low) * _STEPS[:, None]
 
 
-def _codes(entry: dict[str, Any]) -> np.ndarray:
-    """(256, 3) a codebook, the same for each channel; missing entries are NaN."""
+def _codebook(entry: dict[str, Any]) -> np.ndarray:
+    """(256, 3) the codebook, repeated for each channel; missing entries are NaN."""
     book = np.full(LEVELS, np.nan)
     values = np.array(entry["codebook"], np.float64)  # null becomes NaN
     book[: len(values)] = values
@@ -166,14 +168,14 @@ def _decode(files: Bundle, layout: _Layout) -> tuple[np.ndarray, ...]:
 
 
 def _decode_rest(files: Bundle, layout: _Layout, labels: np.ndarray | None) -> np.ndarray:
-    """(N, K, 3)."""
+    """(N, K, 3) float32 SH coefficients of degree 1 and higher."""
     if labels is None or layout.rest is None:
         return np.zeros((layout.count, 0, 3), np.float32)
     index = labels[:, 0] + 256 * labels[:, 1].astype(np.int64)
     used = int(index.max(initial=0)) // _PALETTE_COLUMNS + 1  # rows of the palette
     image = files.image(layout.files["centroids"], 1, _PALETTE_LIMIT * SH_REST_COUNTS[-1])
-    k, over = divmod(image.shape[1], _PALETTE_COLUMNS)  # the width determines the degree
-    if over or k not in SH_REST_COUNTS[1:] or len(image) < used:
+    k, remainder = divmod(image.shape[1], _PALETTE_COLUMNS)  # the width determines the degree
+    if remainder or k not in SH_REST_COUNTS[1:] or len(image) < used:
         raise Damaged(
             f"its palette of {image.shape[1]}×{len(image)} pixels does not match an SH degree"
         )
@@ -185,7 +187,7 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
     """Write a zip file of version 2 with the Gaussians in Morton order, atomically.
 
     Raises:
-        UserError: too many Gaussians for an image.
+        UserError: more Gaussians than an image can have pixels.
         OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
@@ -231,8 +233,8 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
             **_named("shN_centroids", "shN_labels"),
         }
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
-        # Stored, since WebP is compressed already. ZipInfo has a fixed date, so that equal scenes
-        # result in equal files.
+        # Not compressed again, because WebP is compressed. ZipInfo has a fixed date, so that equal
+        # scenes result in equal files.
         bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
         for name, pixels in images.items():
             bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))

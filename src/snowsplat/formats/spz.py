@@ -1,6 +1,6 @@
 """`.spz` files of Niantic: about 20 bytes per Gaussian and one per SH value, then compressed.
 
-The file has a header and then the columns, each for all Gaussians:
+The file has a header and then these columns, each of which contains all Gaussians:
 
 =========  =======  ======================================================================
 position   9 bytes  3 signed 24-bit fixed-point numbers with ``fractional_bits``;
@@ -43,14 +43,14 @@ __all__ = ["is_spz", "read_spz", "spz_version", "write_spz"]
 
 logger = logging.getLogger(__name__)
 
-#: An extension that selects another frame by a number: 1 is the first of these; numbers beyond
-#: them have y and z swapped.
+#: The type of an extension that selects the frame by a number. 0 is the default frame, n is the
+#: n-th frame of `_FRAMES`. Larger numbers have the y and z axes swapped and are not supported.
 _FRAME_EXTENSION = 0xADBE0003
 _FRAMES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 _COLOR_STEP = 0.15 * 255
 # SH bytes are rounded to multiples of these (degree 1, higher degrees), so that they compress
-# better. Niantic's implementation uses 8 and 16, which lowers the PSNR of a trained scene by more
-# than 1 dB; these values lower it by 0.1 dB, and the file is 1.5 times as large.
+# better. Niantic's implementation uses 8 and 16, which lower the PSNR of a trained scene by more
+# than 1 dB. 2 and 4 lower it by 0.1 dB, and the file is 1.5 times as large.
 _SH_STEPS = (2, 4)
 
 
@@ -102,7 +102,7 @@ def spz_version(path: Path) -> str:
 
 
 def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
-    """The factors that convert the axes of the file to ours."""
+    """1 or −1 for each axis: the factors that convert the frame of the file to that of PLY."""
     start = 0
     while start + 8 <= len(extensions):
         kind, size = struct.unpack_from("<II", extensions, start)
@@ -110,8 +110,8 @@ def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
             (number,) = struct.unpack_from("<I", extensions, start + 8)
             if number > len(_FRAMES):
                 raise UserError(
-                    f"{path}: coordinate system {number} of .spz, with swapped y and z axes, is "
-                    "not supported; export the file with the default one, RUB"
+                    f"{path}: SPZ coordinate system {number} (swapped y and z axes) is not "
+                    "supported; export the file with the default coordinate system RUB"
                 )
             axes = _FRAMES[number - 1] if number else "RUB"
             return 1 if "R" in axes else -1, 1 if "D" in axes else -1, 1 if "F" in axes else -1
@@ -122,7 +122,7 @@ def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
 def _unpack_positions(position: np.ndarray, header: Header) -> np.ndarray:
     if header.version == 1:
         return position.view("<f2").astype(np.float32)
-    # Placed in the upper three bytes of an int32 and shifted down, which extends the sign.
+    # Three bytes become the upper bytes of an int32; the arithmetic shift then extends the sign.
     words = np.zeros((len(position), 3, 4), np.uint8)
     words[:, :, 1:] = position.reshape(-1, 3, 3)
     fixed = words.view("<i4")[:, :, 0] >> 8
@@ -145,10 +145,13 @@ def _unpack_rotations(rotation: np.ndarray) -> np.ndarray:
 
 @np.errstate(all="ignore")  # values that are too large are clamped
 def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> None:
-    """Write version 3, which all readers support, or 4, which is smaller and faster; atomically.
+    """Write a scene, atomically.
+
+    Args:
+        version: 3, which all readers support, or 4, which is smaller and faster to read and write.
 
     Raises:
-        ValueError: another version.
+        ValueError: ``version`` is not 3 or 4.
         OSError: the folder is missing or not writable, or the disk is full.
     """
     if version not in (3, 4):
@@ -173,10 +176,11 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
 
 
 def _fractional_bits(means: np.ndarray) -> int:
-    """Usually 12; more for a small scene, fewer for one that would not fit in 24 bits.
+    """Usually 12; more for a small scene, fewer for a scene that would not fit in 24 bits.
 
-    A step is at most 2⁻¹⁵ of the distance from the origin within which 99% of the Gaussians lie,
-    or 2⁻¹² of it if a few Gaussians lie so far away that no number of bits suits all of them.
+    Let d be the distance from the origin within which 99% of the Gaussians lie. A quantisation step
+    is at most 2⁻¹⁵ d. If a few Gaussians are too far away for that, it is at most 2⁻¹² d, and the
+    positions of these Gaussians are clamped if necessary.
     """
     if not len(means):
         return 12

@@ -148,7 +148,7 @@ def _check_free(out: Path) -> None:
     if out.is_dir():
         remove_temporaries(out, (RECORD,))
     if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
-        raise UserError(f"{out}: holds other files; name a new or an empty folder")
+        raise UserError(f"{out}: contains other files; use a new or an empty folder")
 
 
 @dataclass

@@ -127,7 +127,7 @@ class OutputFolder:
             raise UserError(f"{self.path}: is a file; name a folder for the output")
         others = (entry for entry in self.path.iterdir() if not is_temporary(entry, _FILES))
         if any(others) and not self.is_one():
-            raise UserError(f"{self.path}: holds other files; name a new or an empty folder")
+            raise UserError(f"{self.path}: contains other files; use a new or an empty folder")
         if self.is_one() and not resume and not overwrite:
             raise UserError(
                 f"{self.path}: holds a training already; use `resume` to continue it, "

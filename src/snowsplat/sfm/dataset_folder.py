@@ -62,7 +62,7 @@ class Watcher(Protocol):
     """Receives the progress of the stages."""
 
     def begin(self, stage: str) -> Report:
-        """Called when a stage begins, also a finished one; returns its progress callback."""
+        """Called when a stage begins, or is skipped as finished; returns its progress callback."""
 
     def end(self, stage: str, outcome: Outcome) -> None:
         """Called when the stage has finished."""
@@ -87,12 +87,12 @@ def make_dataset(
         overwrite: replace a dataset in ``folder`` that was made from other inputs.
 
     Returns:
-        the outcome of each stage, as JSON values: "photos" is a `Gathered`, "poses" an
-        `SfmResult`, "images" an `Undistorted`; "report" has the name of the file.
+        the outcome of each stage. The results are JSON values: of a `Gathered` for "photos", an
+        `SfmResult` for "poses", an `Undistorted` for "images"; the file name for "report".
 
     Raises:
-        UserError: the photos cannot be used, ``folder`` holds other files, or no poses were found
-            (what this run created is then removed); or the disk is full.
+        UserError: the photos cannot be used, ``folder`` contains other files, or no poses were
+            found; then the files that this run created are removed. Or the disk is full.
         OSError: a file cannot be read or written.
     """
     sources = find_inputs(inputs)
@@ -180,7 +180,7 @@ def _run(
 def _gather(
     inputs: Sequence[Path], folder: Path, options: GatherOptions, report: Report, in_place: bool
 ) -> dict[str, Any]:
-    """Gather into a temporary folder first, then replace an older `input/` as one."""
+    """Gather into a temporary folder, then replace the older `input/` by it."""
     masks = Path("distorted") / "masks"
     if in_place:
         shutil.rmtree(folder / masks, ignore_errors=True)
@@ -217,7 +217,7 @@ def _undistort(
     return asdict(made) | {"scene_from_sfm": scene_from_sfm.to_json()}
 
 
-# What the folder may hold
+# Checks of the folder
 
 
 def _check_free(
@@ -230,20 +230,20 @@ def _check_free(
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise UserError(f"{folder}: is a file; name a folder for the dataset")
+        raise UserError(f"{folder}: is a file; use a folder for the dataset")
     remove_temporaries(folder, (RECORD, REPORT))
     record = folder / RECORD
     if record.is_file():
         before = Stages(record, STAGES).about.get("inputs")
         if not in_place and _were_in_place(before, folder):
             raise UserError(
-                f"{folder / 'input'}: holds the original photos of this dataset, not copies; "
-                "name another folder"
+                f"{folder / 'input'}: contains the original photos of this dataset, not copies; "
+                "use another folder"
             )
         if before != [str(path.absolute()) for path in inputs] and not overwrite:
             what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
-                f"{folder}: holds a dataset made from {what}; name another folder, or set "
+                f"{folder}: contains a dataset made from {what}; use another folder, or set "
                 "`overwrite`"
             )
         return
@@ -253,34 +253,34 @@ def _check_free(
     others = sorted(entry.name for entry in folder.iterdir() if entry.name not in allowed)
     if others:
         raise UserError(
-            f"{folder}: holds other files ({', '.join(others[:3])}"
-            f"{', …' if len(others) > 3 else ''}); name a new or an empty folder"
+            f"{folder}: contains other files ({', '.join(others[:3])}"
+            f"{', …' if len(others) > 3 else ''}); use a new or an empty folder"
         )
 
 
 def _were_in_place(inputs: Any, folder: Path) -> bool:
     """Whether one of the recorded ``inputs`` is the ``input`` folder of the dataset itself."""
     names = inputs if isinstance(inputs, list) else []
-    there = (folder / "input").resolve()
-    return any(isinstance(name, str) and Path(name).resolve() == there for name in names)
+    own = (folder / "input").resolve()
+    return any(isinstance(name, str) and Path(name).resolve() == own for name in names)
 
 
 @contextmanager
 def _remove_on_failure(folder: Path) -> Iterator[None]:
-    """Remove what was created in a new folder if the inputs turn out to be unusable.
+    """If the inputs are unusable, remove the files that this run has created.
 
-    After Ctrl-C, or if the disk is full, finished stages are kept, so that the same command can
-    resume.
+    After Ctrl-C, or if the disk is full, the files of finished stages remain, so that the same
+    command can resume.
     """
     existed = folder.exists()
-    there = {entry.name for entry in folder.iterdir()} if existed else set()
+    before = {entry.name for entry in folder.iterdir()} if existed else set()
     try:
         yield
     except BaseException as error:
         record = folder / RECORD
-        worth = record.is_file() and Stages(record, STAGES).is_finished("photos")
-        if RECORD not in there and (isinstance(error, UserError) or not worth):
-            for name in {"input", ".new", *_OURS} - there:
+        resumable = record.is_file() and Stages(record, STAGES).is_finished("photos")
+        if RECORD not in before and (isinstance(error, UserError) or not resumable):
+            for name in {"input", ".new", *_OURS} - before:
                 _remove(folder / name)
             if not existed and folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
@@ -302,7 +302,7 @@ def _remove(path: Path) -> None:
 
 
 def _fingerprint(files: Sequence[Path]) -> str:
-    """A hash of names, sizes and times: changes if a photo is added, removed or edited."""
+    """A hash of file names, sizes and times; it changes if a photo is added, removed or edited."""
     entries = []
     for file in files:
         status = file.stat()

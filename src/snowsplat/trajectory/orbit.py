@@ -23,7 +23,7 @@ from snowsplat.util.errors import UserError
 
 # Cameras surround the focus if no gap between the azimuths of neighbours is wider than this.
 _WIDEST_GAP = math.radians(110)
-# Largest elevation. Closer to the vertical, the image would rotate quickly.
+# Largest elevation. Near the vertical, the image would rotate quickly.
 _STEEPEST = math.radians(80)
 # Cameras look in one direction if the mean of their unit forward vectors is at least this long.
 # This corresponds to about 60° on each side of the mean.
@@ -59,8 +59,8 @@ def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> lis
     level = from_focus - heights[:, None] * up
     east, north = _level_axes(level, up)
     azimuths = torch.atan2(level @ north, level @ east)
-    gaps, middle = _widest_gap(azimuths)
-    if gaps < _WIDEST_GAP:
+    gap, middle = _widest_gap(azimuths)
+    if gap < _WIDEST_GAP:
         radii = level.norm(dim=1)
         low, high = torch.quantile(radii, _OUTERMOST)
         # On a circle the mean square of a coordinate is half the squared radius.
@@ -107,7 +107,8 @@ def spiral_path(cameras: Sequence[Camera], frames: int, distance: float) -> list
     forward = rotations_of(cameras)[:, 2].mean(0)
     if float(forward.norm()) < _ONE_DIRECTION:
         raise UserError(
-            "a spiral needs cameras that look in one direction; these do not: use an ellipse"
+            "a spiral needs cameras that look in one direction, but these cameras do not; use an "
+            "ellipse"
         )
     up, focus = up_of(cameras), focus_of(cameras, distance)
     positions = positions_of(cameras)
@@ -117,8 +118,8 @@ def spiral_path(cameras: Sequence[Camera], frames: int, distance: float) -> list
     radii = torch.quantile(offsets, 0.8, dim=0).clamp_min(0.02 * distance)
 
     def spiral(t: Tensor) -> Tensor:
-        # With two and a half turns, the direction at the end is that at the start, so the closed
-        # path has no corner.
+        # After two and a half turns, the direction at the end equals that at the start, so the
+        # closed path has no corner.
         out, angle = (math.pi * t).sin(), 5 * math.pi * t
         along = 0.5 * (2 * math.pi * t).sin()
         offset = torch.stack([out * angle.cos(), -out * angle.sin(), along], 1)
@@ -130,14 +131,14 @@ def spiral_path(cameras: Sequence[Camera], frames: int, distance: float) -> list
 def orbit_path(
     points: Tensor, weights: Tensor, frames: int, width: int, height: int
 ) -> list[Camera]:
-    """A horizontal circle around a scene without known cameras; −y is up.
+    """A horizontal circle around a scene whose cameras are not known; −y is up.
 
     Args:
         points: (P, 3) means of the Gaussians.
         weights: (P,) their opacities.
         frames: number of frames.
-        width: of the images, pixels.
-        height: of the images, pixels.
+        width: width of the images in pixels.
+        height: height of the images in pixels.
 
     Raises:
         UserError: there are no points.
@@ -146,7 +147,7 @@ def orbit_path(
         raise UserError("the scene has no Gaussians to orbit")
     points, weights = points.detach().to(torch.float64), weights.detach().to(torch.float64)
     focus = torch.stack([_weighted_median(column, weights) for column in points.T])
-    # At this distance, half of the scene fills half of the image.
+    # At this distance, half of the Gaussians fill half of the image.
     radius = 3.0 * (float(_weighted_median((points - focus).norm(dim=1), weights)) or 1.0)
     elevation = math.radians(15)
     focal = 1.2 * min(width, height)
@@ -163,7 +164,7 @@ def orbit_path(
 
 
 def _looking_at(focus: Tensor, up: Tensor, path: _Path, lens: Camera, frames: int) -> list[Camera]:
-    """Cameras at equal distances along a closed path that look at the focus."""
+    """Cameras that look at the focus, at equal distances along a closed path."""
     t = torch.linspace(0, 1, _SAMPLES_PER_FRAME * max(frames, 50) + 1, dtype=torch.float64)
     length = torch.cat([t.new_zeros(1), path(t).diff(dim=0).norm(dim=1).cumsum(0)])
     wanted = torch.arange(frames, dtype=torch.float64) / frames * length[-1]
@@ -203,7 +204,7 @@ def _widest_gap(azimuths: Tensor) -> tuple[float, float]:
 
 
 def _range(angles: Tensor) -> tuple[float, float]:
-    """The middle and half the width of the range of angles, without 10% at each end."""
+    """The middle and half the width of the range between the 10% and the 90% quantile."""
     low, high = torch.quantile(angles, _OUTERMOST).tolist()
     return (low + high) / 2, max((high - low) / 2, _LEAST_SWING)
 

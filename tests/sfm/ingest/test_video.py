@@ -108,7 +108,7 @@ def test_a_damaged_video_is_read_as_far_as_possible_with_a_warning(tmp_path, cap
         made = extract(path, tmp_path / "f", 10)
     assert 3 <= len(made.kept) <= 10
     assert made.read < 58
-    assert "a.avi: is damaged or truncated" in caplog.text
+    assert "a.avi: the video is damaged or truncated" in caplog.text
 
 
 def test_colours(tmp_path):

@@ -1,11 +1,11 @@
-"""Photos -> poses, in several attempts of growing effort.
+"""Photos -> poses, in up to four attempts with increasing effort.
 
-An attempt that finds poses for 90% of the usable photos (those with detail and matches) is the
-last. Otherwise the next one follows, unless the matches show that no attempt can succeed:
+The attempts end when one of them finds poses for 90% of the usable photos (those with detail and
+matches), or when the matches show that no further attempt can succeed:
 
     1  features, pairs and mapper as configured
-    2  the same features, more pairs, weaker matches accepted
-    3  twice the features, from larger photos; about 4 times the work of the first
+    2  the same features, more pairs; weaker matches are accepted
+    3  twice as many features, from larger photos; about 4 times the work of the first attempt
     4  the other mapper, with the existing matches
 
 The result is the model with the most registered photos.
@@ -38,7 +38,7 @@ from snowsplat.sfm.colmap.result import names_in, result_of
 from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 
-_ENOUGH = 0.9  # of the usable photos
+_ENOUGH = 0.9  # fraction of the usable photos that have to be registered
 _MAX_ERROR = 4.0  # pixels at the size at which features are detected
 
 
@@ -65,7 +65,7 @@ class Attempt:
 
 
 class Reconstruction:
-    """All attempts on one set of photos. `run` makes them and writes the best result."""
+    """The attempts for one set of photos. `run` makes them and writes the best result."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class Reconstruction:
             before = models[0].num_reg_images()
             models = mapping.extend(models)
             added = models[0].num_reg_images() - before
-            weak = f", {added} of them by weak matches" if added else ""
+            weak = f", {added} of them with weak matches" if added else ""
         attempt = Attempt(matched, models)
         self.attempts.append(attempt)
         effort = matched.effort

@@ -1,9 +1,9 @@
 """Video -> frames: the sharpest frame of each time window, without repeated views.
 
-Decoding is the expensive part, so frames are decoded in a single pass. It keeps the sharpest frame
-of the current window, and writes it when the window ends. The length of the video is found first,
-from the times of the packets: the length in the header is missing in streams recorded by browsers,
-and wrong in truncated files.
+Decoding is the expensive part, so all frames are decoded in a single pass. It keeps the sharpest
+frame of the current window in memory, and writes this frame when the window ends. The length of the
+video is computed before, from the times of the packets, because the length in the header is missing
+in streams recorded by browsers and wrong in truncated files.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def _write(best: _SharpestFrame, clip: Clip, folder: Path, number: int, size: in
 def _log_summary(clip: Clip, frames: Frames) -> None:
     if frames.read < 0.97 * clip.promised:
         logger.warning(
-            "%s: is damaged or truncated; %d of its %d frames could be decoded",
+            "%s: the video is damaged or truncated; %d of its %d frames could be decoded",
             shown(clip.path),
             frames.read,
             clip.promised,
@@ -175,8 +175,8 @@ def _log_summary(clip: Clip, frames: Frames) -> None:
     same = sum(reason == SAME_VIEW for _, reason in frames.skipped)
     useless = len(frames.skipped) - same
     window = clip.seconds / max(1, len(frames.kept) + len(frames.skipped))
-    line = f"{clip.path.name}: {frames.read} frames in {clip.seconds:.1f} s decoded, "
-    line += f"{len(frames.kept)} selected: the sharpest of each {window:.2f} s"
+    line = f"{clip.path.name}: decoded {frames.read} frames ({clip.seconds:.1f} s of video), "
+    line += f"selected {len(frames.kept)}: the sharpest of each {window:.2f} s"
     line += f"; {same} skipped because the camera did not move" if same else ""
     line += f"; {useless} skipped because they are black, white or blurred" if useless else ""
     logger.info("%s", line)
