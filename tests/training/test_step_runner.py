@@ -143,6 +143,22 @@ def test_an_invalid_step_changes_neither_statistics_nor_parameters_nor_moments()
     for gradient, changed in zip(steps.gradients, [False, True], strict=True):
         gradient.add_statistics(*sums)
         adam.step(gaussians, gradient, 1)
-        assert bool(sums.any()) == changed
+        assert sums.any(dim=1).tolist() == 3 * [changed]
         assert torch.equal(gaussians.opacity_logits, GAUSSIANS.opacity_logits) != changed
         assert bool(adam.exp_avg["opacity_logits"].any()) == changed
+
+
+def test_a_gradient_is_valid_and_counts_nothing_by_default() -> None:
+    """On images of 8 x 6 pixels, with a gradient of (1, 1) per pixel: |(8/2, 6/2)| = 5."""
+    gaussians = GAUSSIANS.clone()
+    adam = Adam(gaussians, LearningRates(), schedule=Schedule(10), extent=1.0)
+    splats = splats_with_gradient_one()
+    splats.packed.requires_grad_().sum().backward()
+    gradient = ViewGradient(splats, CAMERA, 0)
+    norm_sum, views, max_radii = torch.zeros(3, 4)
+    gradient.add_statistics(norm_sum, views, max_radii)
+    adam.step(gaussians, gradient, 1)
+    assert norm_sum.tolist() == 4 * [5.0]
+    assert views.tolist() == 4 * [1.0]
+    assert torch.equal(max_radii, splats.radii)
+    assert not torch.equal(gaussians.opacity_logits, GAUSSIANS.opacity_logits)

@@ -13,6 +13,7 @@ from PIL import Image
 from snowsplat import ops
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
+from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.ops import reference
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
@@ -21,6 +22,7 @@ from snowsplat.scene.render import render
 from snowsplat.training import checkpoint
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
+from snowsplat.training.losses import view_loss
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.trainer import Progress, Trainer
@@ -283,6 +285,97 @@ def test_every_view_once_an_epoch(dataset, monkeypatch):
     assert not torch.equal(positions[:7], positions[7:])
 
 
+def test_photos_are_decoded_ahead_in_order_at_the_resolution_of_their_step(dataset, monkeypatch):
+    """The order is extended before steps 1, 6 and 13; the resolution changes at 4 and 9."""
+    trainer = Trainer(dataset, replace(CALM, coarse_to_fine=(3, 8)))
+    prefetch, get = trainer._images.prefetch, trainer._images.get
+    expected: list[tuple[View, int]] = []  # the photos that were announced and not yet requested
+    calls = []
+
+    def recorded_prefetch(order, downscale=None):
+        expected[:] = [(view, downscale) for view in order]
+        calls.append(step)
+        prefetch(order, downscale)
+
+    def recorded_get(view, downscale):
+        assert expected.pop(0) == (view, downscale)
+        return get(view, downscale)
+
+    monkeypatch.setattr(trainer._images, "prefetch", recorded_prefetch)
+    monkeypatch.setattr(trainer._images, "get", recorded_get)
+    for step in range(1, 15):
+        trainer._next_view(step)
+    assert calls == [1, 4, 6, 9, 13]
+
+
+def test_the_loss_of_a_step(dataset):
+    """Over the background, at the SH degree of the step."""
+    alone = replace(dataset, train=dataset.train[:1])
+    trainer = Trainer(alone, replace(CALM, background="white", ssim_weight=0.3))
+    trainer.gaussians.sh_rest[:] = 0.2  # of degree 1 to 3, not in use before step 100
+    [view], white = alone.train, torch.ones(3)
+    image = render(trainer.gaussians, view.camera, white, sh_degree=0).image
+    expected = view_loss(image, trainer._images.get(view), white, 0.3)
+    assert trainer.step_once() == pytest.approx(float(expected), rel=1e-6)
+
+
+@pytest.mark.parametrize(("background", "color"), [("black", 0.0), ("white", 1.0), ("random", 0.0)])
+def test_the_background_of_an_evaluation(dataset, background, color):
+    trainer = Trainer(dataset, replace(CALM, background=background))
+    expected = evaluate_views(trainer.gaussians, dataset.test, background=3 * (color,))
+    assert trainer.evaluate() == expected
+
+
+def test_a_fixed_background_is_put_behind_transparent_photos_once(dataset, tmp_path):
+    """A photo over a background is (H, W, 3) uint8; with random ones, its alpha is needed."""
+    Image.new("RGBA", (WIDTH, HEIGHT), (200, 100, 0, 0)).save(tmp_path / "a.png")
+    source = ImageSource(tmp_path / "a.png", WIDTH, HEIGHT)
+    alone = replace(dataset, train=[replace(dataset.train[0], image=source)])
+    photo = Trainer(alone, replace(CALM, background="white"))._next_view(1)[2]
+    assert photo.alpha is None
+    assert (photo.rgb == 255).all()
+    assert Trainer(alone, replace(CALM, background="random"))._next_view(1)[2].alpha is not None
+
+
+def test_the_cap_by_the_size_of_the_photos_uses_their_median(dataset):
+    views = [
+        replace(view, camera=replace(view.camera, width=width))
+        for view, width in zip(dataset.train, (70, 10, 40, 20, 60, 30, 50), strict=True)
+    ]
+    trainer = Trainer(replace(dataset, train=views), replace(CALM, gaussians_per_pixel=0.01))
+    assert trainer.config.density.max_gaussians == 40 * HEIGHT // 100
+
+
+def test_the_memory_for_images(dataset):
+    assert Trainer(dataset, replace(CALM, image_memory=12345))._images.budget_bytes == 12345
+    assert Trainer(dataset, CALM)._images.budget_bytes > 1_000_000
+
+
+def test_the_generators_of_a_seed(dataset):
+    """What a seed means: a change would give other scenes for the same seed."""
+    seeds = {
+        n: g.initial_seed() for n, g in Trainer(dataset, replace(CALM, seed=5))._generators.items()
+    }
+    assert seeds == {"start": 20, "views": 21, "background": 22, "density": 23}
+
+
+def test_cameras_and_random_backgrounds_are_on_the_device(dataset, monkeypatch):
+    devices = []
+    to = Camera.to
+    monkeypatch.setattr(
+        Camera, "to", lambda self, device: devices.append(device) or to(self, device)
+    )
+    cpu = torch.device("cpu")
+    trainer = Trainer(dataset, BUSY, device=cpu)
+    assert devices == 7 * [cpu]
+    trainer.device = torch.device("meta")
+    assert trainer._next_background().device.type == "meta"
+
+
+def test_a_step_without_evaluation_reports_no_metrics():
+    assert Progress(1, 0.5, 40, 60, 1).metrics is None
+
+
 def test_reports_and_evaluations(dataset):
     reports: list[Progress] = []
     config = replace(BUSY, iterations=20, test_iterations=(5, 20))
@@ -315,10 +408,21 @@ def test_ctrl_c_waits_for_the_end_of_the_step(dataset, monkeypatch):
 def test_divergence_names_the_step(dataset):
     trainer = Trainer(dataset, CALM)
     trainer.run(until=3)
+    assert trainer.within_step is False
     trainer.gaussians.sh_dc[:] = torch.inf
     with pytest.raises(UserError, match=r"^step 4, .*sh_dc \(40 rows\)"):
         trainer.run()
     assert trainer.step == 3
+    assert trainer.within_step is True
+
+
+def test_divergence_in_the_last_step_names_it(dataset):
+    trainer = Trainer(dataset, CALM)
+    assert trainer.within_step is False
+    trainer.run(until=2)
+    trainer._runner._nonfinite_rows[0] = 5  # what `adam_step` does
+    with pytest.raises(UserError, match=r"^step 2: .*means \(5 rows\), skipped; use lower"):
+        trainer.run(until=2)
 
 
 def test_a_dataset_without_training_views(dataset):

@@ -163,4 +163,9 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "near, far = [*beside.tolist(), 0.0], [*beyond.tolist(), 0.0, 0.0]",
         "near, far = [*beside.tolist(), 1.0], [*beyond.tolist(), 0.0, 0.0]",
     ): "the last factor is never used",
+    (
+        "training/trainer.py",
+        "LOOKAHEAD = 16",
+        "LOOKAHEAD = 17",
+    ): "how far ahead photos are decoded; their order is the same",
 }
