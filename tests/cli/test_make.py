@@ -98,7 +98,7 @@ def test_from_photos_to_files_and_repeated_stages(
     # A file is missing: that stage and the later ones are repeated.
     shutil.rmtree(out / "scene/test")
     again = run(*command)
-    assert "pictures: done again (its files are missing)" in again.out
+    assert "pictures: repeated (its files are missing)" in again.out
     assert state(out).keys() == before.keys()
     assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_120/point_cloud.ply"]
 
@@ -106,7 +106,7 @@ def test_from_photos_to_files_and_repeated_stages(
     monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=60))
     again = run(*command)
     assert again.code == 0, again.err
-    assert "scene: done again (changed: iterations)" in again.out
+    assert "scene: repeated (changed: iterations)" in again.out
     assert again.out.count("done before") == 4
     assert (out / "scene/test/ours_60").is_dir()
     assert not (out / "scene/test/ours_120").exists()

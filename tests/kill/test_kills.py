@@ -100,7 +100,7 @@ def test_damaged_checkpoints_are_not_overwritten(zygote, dataset, tmp_path):
     before = {name: (out / name).read_bytes() for name in names_in(out)}
     ended = zygote.run([*command, "--resume"])
     assert ended.code == 2
-    assert "holds checkpoints but no complete checkpoint to resume" in ended.text
+    assert "contains checkpoints but no complete checkpoint to resume" in ended.text
     assert {name: (out / name).read_bytes() for name in names_in(out)} == before
 
 

@@ -29,13 +29,14 @@ if TYPE_CHECKING:
 STAGES = ("scene", "pictures")  # the dataset has a record of its own
 RECORD = "make.json"
 HOLD_OUT = 8
-# The part of a preset that concerns the training.
+# The fields of a preset that affect the training.
 _OF_TRAINING = ("side", "iterations", "max_gaussians", "densify_interval")
 # Time between checkpoints in seconds: a kill loses at most this much work.
 _CHECKPOINT_SECONDS = 15.0
-# The shortest training that is useful: in seconds, and as a share of the given time.
-_SHORTEST, _SHORTEST_SHARE = 15.0, 0.15
-# About the time to render one of the held-out views.
+# Minimum time of a training: in seconds, and as a share of the given time.
+_MIN_SECONDS = 15.0
+_MIN_SHARE = 0.15
+# Approximate time to render one held-out view, in seconds.
 _RENDER_SECONDS = 0.3
 
 
@@ -44,11 +45,12 @@ class MakeOptions:
     """How to make a scene.
 
     Attributes:
-        quality: None: "normal", or what ``minutes`` allow. Together with ``minutes`` it determines
-            the effort to find the camera poses; the training uses the rest of the time.
-        minutes: finish within this time. Only the stages of this run count. An interrupted training
-            resumes with the time that it had left.
-        memory: for the training, see `TrainOptions`.
+        quality: default: "normal" or, with ``minutes``, chosen for that time. With ``minutes`` it
+            determines only the effort to estimate the camera poses; the training uses the rest of
+            the time.
+        minutes: finish within this time. Stages that an earlier run has finished are not counted.
+            An interrupted training resumes with its remaining time.
+        memory: memory limit of the training, see `TrainOptions`.
         compute: device and threads.
 
     Raises:
@@ -74,7 +76,8 @@ class MakeResult:
         folder: the output folder of the training.
         dataset_report: the HTML page about the camera poses.
         renders, photos: folders with the rendered test views and the held-out photos.
-        psnr, ssim, views: the mean figures on the held-out photos, and their number.
+        psnr, ssim: means over the held-out photos; PSNR in dB.
+        views: number of held-out photos.
         seconds: duration of this run.
     """
 
@@ -90,13 +93,13 @@ class MakeResult:
 
 
 def scene_name(inputs: Sequence[Path]) -> str:
-    """The name of a scene: that of the first input.
+    """The name of a scene: the name of the first input, without its suffix.
 
     Raises:
         UserError: no inputs.
     """
     if not inputs:
-        raise UserError("make needs photos; name a folder of photos, or a video")
+        raise UserError("make needs photos; add a folder of photos, or a video")
     first = inputs[0].absolute()
     return (first.stem if first.is_file() else first.resolve().name) or "scene"
 
@@ -119,7 +122,7 @@ def make(
         inputs: folders of photos, photos and videos; or one of them.
         output: default: NAME_scene in the current folder, NAME being that of the first input. It
             contains capture/ (the dataset), scene/ (the training) and NAME.ply (the scene).
-        overwrite: replace a scene of other photos that is in ``output``.
+        overwrite: replace an existing scene in ``output`` that was made from other photos.
         page: shows the training in the browser.
 
     Returns:
@@ -142,9 +145,9 @@ def make(
 
 
 def _check_free(out: Path) -> None:
-    """Raises: UserError: ``out`` is a file, or contains something else."""
+    """Raises UserError if ``out`` is a file, or a folder that `make` has not created."""
     if out.exists() and not out.is_dir():
-        raise UserError(f"{out}: is a file; name a folder for the output")
+        raise UserError(f"{out}: is a file; use a folder for the output")
     if out.is_dir():
         remove_temporaries(out, (RECORD,))
     if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
@@ -174,7 +177,7 @@ class _Job:
         self.stages = Stages(self.out / RECORD, STAGES)
         with self._removed_if_empty(existed):
             self.quality = self._quality(kinds.count("photo"), kinds.count("video"))
-            self.stages.save()  # from here on the folder is recognised as one of `make`
+            self.stages.save()  # from now on, the folder is recognised as an output of `make`
             self._make_dataset()
             return self._make_scene()
 
@@ -190,7 +193,10 @@ class _Job:
                     self.out.rmdir()
 
     def _quality(self, photos: int, videos: int) -> Quality:
-        """As requested, or what the time allows; decided once, since the poses depend on it."""
+        """The requested quality, or one chosen for the time, which later runs must not change.
+
+        The poses depend on it, so it is recorded.
+        """
         quality, minutes = self.options.quality, self.options.minutes
         if quality is not None or minutes is None:
             return quality or "normal"
@@ -247,7 +253,7 @@ class _Job:
 
     @property
     def file(self) -> Path:
-        """The scene. An old one remains until the new one is ready."""
+        """The scene file. An old file is replaced when the new scene is finished."""
         return self.out / f"{self.name}.ply"
 
     def _elapsed(self) -> float:
@@ -261,7 +267,7 @@ class _Job:
         work: Callable[[], dict[str, Any]],
     ) -> Outcome:
         def on_change(reason: str) -> None:
-            self.observer.note(f"{name}: done again ({reason})")
+            self.observer.note(f"{name}: repeated ({reason})")
 
         self.observer.begin(name)
         outcome = self.stages.run(name, settings, outputs, work, on_change)
@@ -311,7 +317,7 @@ class _Job:
         """The time for the training: what is left of ``given`` seconds, at least the minimum."""
         photos = sum(path.is_file() for path in (self.dataset / "images").rglob("*"))
         left = given - self._elapsed() - _RENDER_SECONDS * -(-photos // HOLD_OUT)
-        shortest = max(_SHORTEST, _SHORTEST_SHARE * given)
+        shortest = max(_MIN_SECONDS, _MIN_SHARE * given)
         if left < shortest:
             self.observer.note(
                 f"{duration(given)} is too short: finding the camera poses took "

@@ -124,7 +124,7 @@ class OutputFolder:
         if not self.path.exists():
             return
         if not self.path.is_dir():
-            raise UserError(f"{self.path}: is a file; name a folder for the output")
+            raise UserError(f"{self.path}: is a file; use a folder for the output")
         others = (entry for entry in self.path.iterdir() if not is_temporary(entry, _FILES))
         if any(others) and not self.is_one():
             raise UserError(f"{self.path}: contains other files; use a new or an empty folder")

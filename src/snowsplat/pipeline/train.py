@@ -31,13 +31,13 @@ _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How to train. None leaves a value to the recipe or, on `resume`, to the checkpoint.
+    """How to train. None means the value of the recipe or, on `resume`, of the checkpoint.
 
         TrainOptions(hold_out=8, settings={"iterations": 7000, "max_gaussians": 200_000})
 
     Attributes:
-        recipe: the origin of all settings, by name.
-        settings: changed settings by name, see `snowsplat.training.config.changed`.
+        recipe: name of the recipe, which defines the defaults of all settings.
+        settings: names and values of changed settings, see `snowsplat.training.config.changed`.
         images: name of the folder of photos in the dataset; default: "images".
         resolution: 1, 2, 4 or 8 divide the size of the photos; any other number is a width in
             pixels; default: unchanged.
@@ -84,7 +84,7 @@ class TrainOptions:
     def dataset_settings(
         self, dataset: Path | str | None, before: DatasetSettings | None = None
     ) -> DatasetSettings:
-        """How to read the dataset: as ``before``, with the changes of these options."""
+        """How to read the dataset: ``before`` with the changes of these options."""
         changes: dict[str, Any] = {
             "path": None if dataset is None else str(Path(dataset).absolute()),
             "images": self.images,
@@ -113,7 +113,7 @@ def train(
         dataset: a folder of photos and cameras, see `snowsplat.data.load_dataset`.
         output: the folder for the result, see `snowsplat.pipeline.output_folder`; created if
             missing.
-        overwrite: replace a training that is in ``output``.
+        overwrite: replace an existing training in ``output``.
         page: shows the training in the browser.
 
     Returns:
@@ -123,7 +123,7 @@ def train(
         UserError: an unusable dataset, setting, device or folder; too little memory; a loss or
             parameters that are not finite. A new folder is removed if it contains no results.
         TrainingStopped: Ctrl-C. Scene and checkpoint are saved; `resume` continues.
-        KeyboardInterrupt: Ctrl-C before the first step; nothing is left.
+        KeyboardInterrupt: Ctrl-C before the first step; nothing is saved.
     """
     started = time.monotonic()
     options = options or TrainOptions()
@@ -144,8 +144,8 @@ def resume(
 
     Args:
         output: the folder of the training.
-        options: may change iterations, test_iterations and checkpoint_every of the settings, and
-            what does not affect the result; anything else must be as it was.
+        options: may change the settings iterations, test_iterations and checkpoint_every, and
+            options that do not affect the result. All other options must be unchanged.
         dataset: where the photos are now, if they were moved. If there is no checkpoint yet, the
             training starts from this dataset.
 
@@ -226,7 +226,7 @@ class _Job:
             return self.train(path)
         options, meta = self.options, CheckpointMeta.of(start)
         budget, schedule = None, None
-        if options.iterations is None:  # otherwise it replaces both
+        if options.iterations is None:  # otherwise `iterations` replaces both
             budget = TimeBudget.of(options.minutes, meta.time, self.started)
             schedule = meta.schedule
         settings = _resumed_dataset(options, path, start, meta)
@@ -235,7 +235,7 @@ class _Job:
         memory = self._memory(dataset, config, _gaussians_in(start))
         trainer = Trainer(dataset, memory.plan.config, schedule, self.device)
         trainer.load_state(start.tensors)
-        start.tensors.clear()  # copied by now: a second copy is not part of the planned memory
+        start.tensors.clear()  # the trainer has copied them; the memory plan has no second copy
         self.out.write_config(settings, memory.plan.config)
         self.observer.note(_described(dataset))
         iterations = trainer.schedule.iterations
@@ -271,7 +271,7 @@ class _Job:
         return run.run()
 
     def _newest_checkpoint(self, path: Path | str | None) -> Checkpoint | None:
-        """None if there is nothing yet: the training starts at step 0."""
+        """The newest checkpoint; None if there is none, so that training starts at step 0."""
         from snowsplat.training import checkpoint
 
         out = self.out
@@ -280,14 +280,14 @@ class _Job:
             return newest
         if path is None:
             raise UserError(
-                f"{out.path}: holds no complete checkpoint to resume; name the dataset to start "
+                f"{out.path}: contains no complete checkpoint to resume; add the dataset to start "
                 "from step 0"
             )
         if out.scenes() or checkpoint.exists(out.checkpoints):
             what = "a scene" if out.scenes() else "checkpoints"
             raise UserError(
-                f"{out.path}: holds {what} but no complete checkpoint to resume; use `overwrite` "
-                "instead of `resume` to start from step 0"
+                f"{out.path}: contains {what} but no complete checkpoint to resume; use "
+                "`overwrite` instead of `resume` to start from step 0"
             )
         self.observer.note(f"{out.path}: no checkpoint yet; starting at step 0")
         return None
@@ -296,7 +296,10 @@ class _Job:
 def _resumed_dataset(
     options: TrainOptions, path: Path | str | None, start: Checkpoint, meta: CheckpointMeta
 ) -> DatasetSettings:
-    """As in the checkpoint; only the place of the dataset and of the test list may have changed."""
+    """The settings of the checkpoint, with new paths of the dataset and of the test list.
+
+    Raises UserError if another setting has changed.
+    """
 
     def relevant(settings: DatasetSettings) -> tuple[Any, ...]:
         resolution = max(1, settings.resolution)  # -1 is full resolution too
@@ -310,12 +313,17 @@ def _resumed_dataset(
 
 
 def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMeta) -> TrainConfig:
-    """As in the checkpoint; only changes that leave the finished steps as they are."""
+    """The configuration of the checkpoint, with changes that do not affect the finished steps.
+
+    Raises UserError if another setting has changed.
+    """
     from snowsplat.training.config import changed, config_from_json
 
     config = config_from_json(meta.training)
     if options.recipe not in (None, meta.recipe):
-        raise UserError(f"{start.path}: was made with the recipe {meta.recipe}; leave `recipe` out")
+        raise UserError(
+            f"{start.path}: was made with the recipe {meta.recipe}; resume without `recipe`"
+        )
     resumed = changed(config, **options.settings)
     same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
     if same != config:
@@ -323,7 +331,7 @@ def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMe
     # A training with a time budget may have exceeded its first plan.
     if options.iterations is not None and resumed.iterations < start.step:
         raise UserError(
-            f"{start.path}: is of step {start.step}, beyond `iterations` {resumed.iterations}; "
+            f"{start.path}: is from step {start.step}, after `iterations` {resumed.iterations}; "
             "use a larger number"
         )
     return resumed

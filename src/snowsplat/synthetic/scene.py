@@ -2,8 +2,8 @@
 
 The lamp does not move and most surfaces are matt, so the radiance of a point does not depend on the
 viewing direction. Direct light with soft shadows and ambient light with occlusion are computed once
-(`light`) and multiplied into the textures. A ray then costs an intersection and a texture look-up.
-Only gloss depends on the viewing direction: it needs one reflected ray.
+(`light`) and multiplied into the textures. Then a ray needs only an intersection and a texture
+look-up. Only gloss depends on the viewing direction and needs one reflected ray.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from snowsplat.synthetic.light import Lamp, irradiance
 from snowsplat.synthetic.shapes import Shape
 
 _LEVELS = 5  # each texture is stored at 1, 1/2 … 1/16 of its size
-_BLOCK = 1 << 14  # rays per batch, which fits the processor's cache
+_BLOCK = 1 << 14  # rays per batch; a batch fits into the processor's cache
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Scene:
         self._gloss = np.array([item.gloss for item in objects], np.float32)
         blockers = [
             item.shape for item in objects if math.isfinite(item.shape.radius) and not item.emissive
-        ]  # infinite shapes are rooms: their walls do not shade what is inside
+        ]  # infinite shapes are rooms, whose walls cast no shadow on the objects inside
         textures: list[np.ndarray] = []
         texels, wraps, firsts = [], [], []
         for item in objects:
@@ -82,7 +82,7 @@ class Scene:
             origins: (3, 1) or (3, R) float32, metres.
             directions: (3, R) float32, of length 1.
             spread: width of a ray at distance 1, which selects the texture level.
-            mirrored: follow one reflection at glossy objects.
+            mirrored: whether to trace one reflected ray at glossy objects.
         """
         result = np.zeros_like(directions)
         for start in range(0, directions.shape[1], _BLOCK):
@@ -111,7 +111,7 @@ class Scene:
             face, uv[:, own], normals[:, own] = self._shapes[i].surface(positions[:, own])
             texture[own] = self._first_texture[i] + face
         cosine = np.maximum(-(directions * normals).sum(axis=0), np.float32(0.02))
-        # A slanted surface is shortened in one of two directions: use the geometric mean.
+        # The footprint on a slanted surface is longer in one direction: use the geometric mean.
         footprint = nearest * np.float32(spread) / np.sqrt(cosine)
         colours = self._look_up(texture, uv, footprint)
         colours[:, owner < 0] = 0
@@ -128,7 +128,7 @@ class Scene:
         return colours
 
     def _candidates(self, origins: np.ndarray, directions: np.ndarray) -> list[int]:
-        """Indices of shapes that rays may hit: their ball touches the cone of the rays."""
+        """Indices of shapes whose bounding sphere intersects the cone of the rays."""
         if origins.shape[1] > 1:
             return list(range(len(self._shapes)))
         axis = directions.mean(axis=1, keepdims=True)

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 _Kind = TypeVar("_Kind")
 
-# Upper estimates of the memory of JSON values in CPython, in bytes per occurrence of a character.
+# Upper bounds of the memory of JSON values in CPython: bytes per occurrence of each character.
 _BYTES_OF = {b"{": 240, b"[": 72, b",": 48, b":": 48, b'"': 28}
 # Memory that is always allowed for JSON values, in bytes.
 _ALWAYS_ALLOWED = 48 << 20
@@ -46,7 +46,7 @@ def parse_json(data: bytes) -> Any:
     need too much is rejected before it is parsed.
 
     Raises:
-        ValueError: not JSON, nested too deeply, or too many values. There are no other errors.
+        ValueError: not JSON, nested too deeply, or too many values. No other error is raised.
     """
     needed = sum(data.count(sign) * size for sign, size in _BYTES_OF.items())
     if needed > _ALWAYS_ALLOWED + _RATIO * len(data):
@@ -106,7 +106,7 @@ def printable(text: str) -> str:
     """A text that is safe for HTML pages and terminals.
 
     File names may contain invalid bytes and control characters. Control characters are invalid in
-    XML, and terminals execute them. They are replaced by U+FFFD, and invalid bytes by "?".
+    XML, and terminals interpret them. They are replaced by U+FFFD, and invalid bytes by "?".
     """
     text = text.encode("utf-8", "replace").decode("utf-8")
     return "".join(c if c in "\n\t" or c.isprintable() else "\ufffd" for c in text)
@@ -118,7 +118,7 @@ def quoted(value: object) -> str:
 
 
 def from_json(kind: type[_Kind], values: Any) -> _Kind:
-    """A dataclass from JSON values, whose types must match the declared types of the fields.
+    """A dataclass from JSON values. The values must have the declared types of the fields.
 
     Lists are accepted for tuples, and integers for floats. Fields with a default may be missing.
 

@@ -1,17 +1,18 @@
-"""Limits access to the live viewer, the messages of browsers, and the work they may cause.
+"""Checks the requests and messages of browsers to the live viewer; limits their number and cost.
 
 viser accepts every connection, trusts all messages and processes any number of them, in the process
-that trains. So its server is started by `Guard.serve`, which adds these checks:
+that trains. Therefore `Guard.serve` starts its server with additional checks:
 
-- A request needs an own Host and Origin. If other machines can connect, its path must begin with a
-  secret token.
+- The Host and Origin headers of a request must be those of this server. If other machines can
+  connect, the path must begin with a secret token.
 - The numbers of connections, page downloads and browsers are limited.
 - Messages must be of the three types that the page sends, with finite numbers. A connection that
-  sends more than a page can is closed. One that does not read is not read from.
+  sends more messages than a page can send is closed. If a client does not read its data, no further
+  messages of it are read.
 - While this process trains, the server may use a fifth of a core.
 
-All of this runs in the thread of viser's server, also what the training sends
-(`call_in_server_thread`): viser's buffers are not safe against other threads while browsers connect
+These checks run in the thread of viser's server. The data of the training is sent in the same
+thread (`call_in_server_thread`), because viser's buffers are not thread-safe while browsers connect
 or disconnect.
 """
 
@@ -40,30 +41,32 @@ from websockets.typing import Data
 
 from snowsplat.viewer.hosts import is_loopback, is_own_host, is_own_page
 
-_WAITING = 96  # connections without a valid request, at most; a new one replaces the oldest
-_PAGES = 16  # connections that download the page, at most
-_BROWSERS = 16  # connected browsers, at most
-_REQUEST = 16 << 10  # bytes of a request, at most
-_MESSAGE = 64 << 10  # bytes of a message, at most
-_PIECE = 4 << 10  # bytes that are processed before the limits are checked again
+# Maximum values:
+_WAITING = 96  # connections without a valid request; a new connection replaces the oldest one
+_PAGES = 16  # connections that download the page
+_BROWSERS = 16  # connected browsers
+_REQUEST = 16 << 10  # bytes of a request
+_MESSAGE = 64 << 10  # bytes of a message
 _RATE = 100.0  # messages per second; a page sends 50 while its camera moves
-_BURST = 1000.0  # messages at once, which were waiting while the training blocked the process
-_FRAMES = 16  # of a message, at most; browsers send short messages in one frame
-_SHARE = 0.2  # of a core that the server may use
-_TICK = 0.05  # seconds between two measurements of its use
-_LONGEST_REST = 1.0  # seconds that the server is paused at once, at most
+_BURST = 1000.0  # messages at once, which have waited while the training blocked the process
+_FRAMES = 16  # WebSocket frames of a message; browsers send short messages in one frame
+_SHARE = 0.2  # share of a core that the server uses
+_LONGEST_PAUSE = 1.0  # seconds that the server is paused at once
+
+_PIECE = 4 << 10  # bytes that are processed before the limits are checked again
+_TICK = 0.05  # seconds between two measurements of the server's processor time
 
 _PROTOCOL = f"viser-v{viser.__version__}"
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",  # the address may contain the token
+    "Referrer-Policy": "no-referrer",  # the URL may contain the token
     "Cross-Origin-Resource-Policy": "same-origin",
     "Content-Security-Policy": "frame-ancestors 'self'",
 }
 _log = logging.getLogger(__name__)
-# websockets logs a traceback for every malformed request; these are not useful.
-_unheard = logging.getLogger(f"{__name__}.connections")
-_unheard.setLevel(logging.CRITICAL + 1)
+# websockets logs a traceback for every malformed request. This logger discards them.
+_discard = logging.getLogger(f"{__name__}.connections")
+_discard.setLevel(logging.CRITICAL + 1)
 
 _Answer = Callable[[ServerConnection, Request], Response | None]
 _listen = websockets.asyncio.server.serve
@@ -80,10 +83,10 @@ class Guard:
         """
         if token is None and not is_loopback(host):
             raise ValueError(f"{host}: a server that other machines can reach needs a token")
-        self.serves = False  # viser has started its server through `serve`
-        self.is_open = False  # the scene is complete, browsers may connect
+        self.serves = False  # whether viser has started its server through `serve`
+        self.is_open = False  # whether the scene is complete, so that browsers may connect
         self._host, self._token = host, token
-        self._waiting: dict[_Connection, None] = {}  # in order of their start
+        self._waiting: dict[_Connection, None] = {}  # oldest first
         self._pages: set[_Connection] = set()
         self._browsers: set[_Connection] = set()
         root = Path(viser.__file__).parent / "client" / "build"
@@ -91,7 +94,7 @@ class Guard:
         self._paths = {"/", *(f"/{path.relative_to(root).as_posix()}" for path in files)}
 
     def serve(self, handler: Any, host: str, port: int, **options: Any) -> Any:
-        """Used instead of `websockets.asyncio.server.serve`."""
+        """Replaces `websockets.asyncio.server.serve`: adds the checks to its options."""
         self.serves = True
         answer = options["process_request"]
         options |= {
@@ -99,14 +102,14 @@ class Guard:
             "create_connection": functools.partial(_Connection, self),
             "max_size": _MESSAGE,
             "server_header": "snowsplat",
-            "logger": _unheard,
+            "logger": _discard,
         }
         return _listen(handler, host, port, **options)
 
     def _answer(
         self, answer: _Answer, connection: ServerConnection, request: Request
     ) -> Response | None:
-        """Viser's response to a request; None: accepts the WebSocket of a browser."""
+        """The response to a request: of viser or a rejection; None accepts a WebSocket."""
         assert isinstance(connection, _Connection)
         response = self._refusal(connection, request) or answer(connection, request)
         if response is None:
@@ -162,7 +165,7 @@ class Guard:
         return f"/{rest}" if hmac.compare_digest(_bytes(given), ours) else None
 
     def connected(self, connection: _Connection) -> None:
-        """Called when a connection was made."""
+        """Called when a connection is made."""
         self._waiting[connection] = None
         if len(self._waiting) > _WAITING:
             oldest = next(iter(self._waiting))
@@ -170,7 +173,7 @@ class Guard:
             oldest.transport.abort()
 
     def disconnected(self, connection: _Connection) -> None:
-        """Called when a connection was closed."""
+        """Called when a connection is closed."""
         self._waiting.pop(connection, None)
         self._pages.discard(connection)
         self._browsers.discard(connection)
@@ -188,7 +191,7 @@ class _Connection(ServerConnection):
         self._guard = guard
         self._refused = False
         self._head = 0  # bytes of the request received so far
-        self._budget = _BURST  # frames that may still be received
+        self._budget = _BURST  # number of frames that may be received now
         self._counted = self.loop.time()  # when the budget was updated
         self._frames = 0  # of the current message
 
@@ -201,7 +204,7 @@ class _Connection(ServerConnection):
         self._guard.disconnected(self)
 
     def data_received(self, data: bytes) -> None:
-        for start in range(0, len(data), _PIECE):  # limits the work for data that is rejected
+        for start in range(0, len(data), _PIECE):  # limits the work before data is rejected
             if self._refused:
                 return
             piece = data[start : start + _PIECE]
@@ -213,13 +216,13 @@ class _Connection(ServerConnection):
             super().data_received(piece)
 
     def process_event(self, event: Any) -> None:
-        if isinstance(event, Frame) and not self._may(event):
+        if isinstance(event, Frame) and not self._is_within_limits(event):
             self._refuse()
         if not self._refused:
             super().process_event(event)
 
-    def _may(self, frame: Frame) -> bool:
-        """Whether the frame is within the limits of a page."""
+    def _is_within_limits(self, frame: Frame) -> bool:
+        """Whether a page could send this frame now; counts it."""
         now = self.loop.time()
         self._budget = min(_BURST, self._budget + _RATE * (now - self._counted)) - 1.0
         self._counted = now
@@ -233,7 +236,7 @@ class _Connection(ServerConnection):
 
     async def recv(self, decode: bool | None = None) -> Data:  # type: ignore[override]
         while True:
-            await self.drain()  # a client that does not read its data may not request more
+            await self.drain()  # waits until the client has read its data
             data = await super().recv(decode)
             if is_valid_message(data):
                 return data
@@ -320,20 +323,20 @@ class Governor:
         call_in_server_thread(server, self._begin)
 
     def _begin(self) -> None:
-        self._loop.set_exception_handler(_note)
+        self._loop.set_exception_handler(_log_error)
         self._measure()
 
     def _measure(self) -> None:
         used = time.thread_time() - self._used - self._uncounted
-        rest = used / _SHARE - (time.monotonic() - self._seen)
-        if self._seen and rest > 0.0 and self._training():
-            time.sleep(min(rest, _LONGEST_REST))
+        pause = used / _SHARE - (time.monotonic() - self._seen)
+        if self._seen and pause > 0.0 and self._training():
+            time.sleep(min(pause, _LONGEST_PAUSE))
         self._used, self._seen, self._uncounted = time.thread_time(), time.monotonic(), 0.0
         self._loop.call_later(_TICK, self._measure)
 
     @contextlib.contextmanager
     def uncounted(self) -> Iterator[None]:
-        """Work inside the with block was requested by the training, so it is not counted."""
+        """A context for work that the training requests: its time is not counted."""
         before = time.thread_time()
         try:
             yield
@@ -342,10 +345,10 @@ class Governor:
 
 
 def call_in_server_thread(server: viser.ViserServer, run: Callable[[], None]) -> None:
-    """Call ``run`` in the thread of the server, soon; does nothing if it has stopped."""
+    """Schedule a call of ``run`` in the server's thread; does nothing if the server has stopped."""
     with contextlib.suppress(RuntimeError):
         server.get_event_loop().call_soon_threadsafe(run)
 
 
-def _note(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+def _log_error(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     _log.debug("%s", context.get("message"), exc_info=context.get("exception"))

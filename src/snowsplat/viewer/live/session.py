@@ -1,7 +1,7 @@
-"""State of the browsers and of the training, and the choice of the next image.
+"""The state of the browsers and of the training, and the choice of the next image to render.
 
-Browsers change it from the server's thread; the training thread reads it between two steps. This
-module neither renders nor sends, and does not depend on viser.
+The server's thread changes this state when browsers send messages; the training thread reads it
+between two steps. This module does not render or send images, and does not depend on viser.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from snowsplat.scene.camera import Camera
 from snowsplat.viewer.live.display import DisplaySettings, Pose, fit
 
 STILL = 0.2  # seconds without motion after which a camera counts as still
-_JOURNEY = 2.0  # seconds that a browser may need to arrive at a photo
-_MOVING_SECONDS = 0.05  # to render an image of a moving camera, at most: its size is reduced
-_SMALLEST = 160  # pixels: longer side of such an image, at least
+_MOVE_SECONDS = 2.0  # maximum time until a browser is at the pose of a photo
+_MOVING_SECONDS = 0.05  # maximum time to render while the camera moves; the size is reduced to it
+_SMALLEST = 160  # pixels: minimum of the longer side of such a reduced image
 # Images are "requested" if a user moved the camera or changed a setting, and "idle" if only the
 # scene has changed.
-IDLE_SHARE = 0.05  # of the training's time for idle images
-_IDLE_SECONDS = 1.0  # between two idle images, at least
+IDLE_SHARE = 0.05  # maximum share of the time of a training for idle images
+_IDLE_SECONDS = 1.0  # minimum time between two idle images
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,10 @@ class PhotoView:
     """The view at the position of a photo.
 
     Attributes:
-        index: of the photo among those of the viewer.
-        camera: of the photo.
+        index: index of the photo in the viewer's list.
+        camera: camera of the photo.
         photo: (3, H, W) uint8.
-        pose: to which the browser was moved.
+        pose: pose to which the browser was moved.
     """
 
     index: int
@@ -49,9 +49,9 @@ class Due:
     """An image to render for a browser.
 
     Attributes:
-        kind: "moving": small and fast; "still": full size; "idle": full size, and only the scene
-            has changed.
-        version: of the visitor's state when this was requested.
+        kind: "moving": small, because the camera moves; "still": full size; "idle": full size,
+            because only the scene has changed.
+        version: `Visitor.version` when the image was requested.
     """
 
     visitor: Visitor
@@ -71,13 +71,13 @@ class Visitor:
     pose: Pose | None = None
     display: DisplaySettings = field(default_factory=DisplaySettings)
     photo_view: PhotoView | None = None
-    arrived: bool = False  # at the photo's pose; moving away from there leaves the photo
-    sent: float = 0.0  # time when it was moved to the photo
+    arrived: bool = False  # is at the pose of the photo; further motion ends the photo view
+    sent: float = 0.0  # time when the browser was moved to the photo
     longest: int = 1280  # pixels of the longer side of a full-size image
-    sending: bool = False  # its last image is being sent
-    version: int = 0  # incremented with each change of the above
+    sending: bool = False  # the last image is being sent
+    version: int = 0  # incremented with each change of the attributes above
     changed: float = 0.0  # time of the last change
-    # The last image that it got.
+    # The last image that was sent:
     shown_version: int = -1
     shown_full: bool = False
     shown_scene: int = -1
@@ -126,10 +126,10 @@ class Session:
         self._visitors: dict[int, Visitor] = {}
         self._paused = False
         self._steps = 0  # single steps that are allowed while paused
-        self.training = False  # a training runs, or is paused
-        self.share = 0.5  # of the time, for requested images during training
-        self._free_at = {"requested": 0.0, "idle": 0.0}  # when the training has had its share
-        self.busy = False  # there are browsers, or it is paused: the check after each step
+        self.training = False  # whether a training is running or paused
+        self.share = 0.5  # maximum share of the time for requested images during training
+        self._free_at = {"requested": 0.0, "idle": 0.0}  # time at which the next image is allowed
+        self.busy = False  # whether a browser is connected or the training is paused
 
     # From the browsers
 
@@ -147,7 +147,7 @@ class Session:
             self._notify()
 
     def change(self, visitor: Visitor, **changes: object) -> None:
-        """Set attributes of a visitor, so that a new image is due."""
+        """Set attributes of a visitor; this requests a new image."""
         with self._changed:
             for name, value in changes.items():
                 setattr(visitor, name, value)
@@ -156,13 +156,13 @@ class Session:
             self._notify()
 
     def move(self, visitor: Visitor, pose: Pose) -> None:
-        """Set the pose of a browser; leaves the photo if it moves away from it."""
+        """Set the pose of a browser; motion away from the photo ends the photo view."""
         photo_view, arrived = visitor.photo_view, visitor.arrived
         if photo_view is not None:
             if pose.is_near(photo_view.pose):
                 arrived = True
-            # Poses that were under way when the browser was moved to a photo do not leave it.
-            elif arrived or self._clock() - visitor.sent > _JOURNEY:
+            # Poses that the browser sent before it was moved to the photo are ignored here.
+            elif arrived or self._clock() - visitor.sent > _MOVE_SECONDS:
                 photo_view = None
         self.change(visitor, pose=pose, photo_view=photo_view, arrived=arrived)
 
@@ -205,7 +205,7 @@ class Session:
         return len(self._visitors)
 
     def may_step(self) -> bool:
-        """Whether the training may make a step; uses up one single step if paused."""
+        """Whether the training may run a step; if paused, this consumes one of the single steps."""
         with self._changed:
             if self._paused and self._steps:
                 self._steps -= 1
@@ -218,11 +218,11 @@ class Session:
             return visitor in self._visitors.values()
 
     def next_due(self, scene: int, training: bool) -> Due | None:
-        """The most urgent image; None if there is none, or if it is the training's turn.
+        """The next image to render; None if there is none, or if the training has to run first.
 
         Args:
-            scene: a number that changes when the scene does.
-            training: whether the training waits to continue.
+            scene: a number that changes when the scene changes.
+            training: whether a training is waiting to continue.
         """
         now = self._clock()
         with self._changed:
@@ -242,7 +242,7 @@ class Session:
         self.charge(_budget_of(due), seconds)
 
     def send_to(self, visitor: Visitor) -> None:
-        """Record that an image is being sent: no other is due until `sent`."""
+        """Record that an image is being sent: there is no other image for it until `sent`."""
         with self._changed:
             visitor.sending = True
 
@@ -254,11 +254,11 @@ class Session:
             self._notify()
 
     def may_spend(self, budget: Literal["requested", "idle"]) -> bool:
-        """Whether the training has had its share of the time since the last image."""
+        """Whether an image may be rendered: the training has used its share since the last one."""
         return self._clock() >= self._free_at[budget]
 
     def charge(self, budget: Literal["requested", "idle"], seconds: float) -> None:
-        """Reserve time for the training, so that images get no more than their share.
+        """Reserve time for the training, so that images do not exceed their share of the time.
 
         Requested images also delay the next idle image.
         """

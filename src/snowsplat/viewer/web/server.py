@@ -1,8 +1,9 @@
 """A small web server for one page: a few files in memory, for one user.
 
-It only serves the files that it was given: names are looked up in a table, never opened. Its
-address contains a secret token. Requests with an unknown Host header are rejected, so a web page
-elsewhere cannot reach the server through its own domain name (DNS rebinding).
+It serves only the files that are passed to it: a requested name is looked up in a table, and no
+file is opened. The URL contains a secret token. Requests with an unknown Host header are rejected,
+so a page of another site cannot reach the server through the domain name of that site (DNS
+rebinding).
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ _BLOCK = 1 << 18  # bytes sent at once
 # Seconds after which a connection is closed:
 _IDLE_SECONDS = 60.0  # without a request
 _REQUEST_SECONDS = 10.0  # with an incomplete request
-_SEND_SECONDS = 60.0  # if it does not receive a block
-_REQUEST = 16 << 10  # bytes of a request, at most
-# Open connections, at most. A new connection replaces the oldest one that has not made a valid
-# request; if there is none, the new connection is closed.
+_SEND_SECONDS = 60.0  # if the client does not receive a block
+_REQUEST = 16 << 10  # maximum size of a request, bytes
+# Maximum number of open connections. A new connection replaces the oldest one that has not made a
+# valid request; if there is none, the new connection is closed.
 _CONNECTIONS = 256
 # The request line and headers, exactly as in the protocol: other parsers might disagree about where
 # a request with unusual line ends or characters ends.
@@ -62,7 +63,7 @@ class ServedFile:
 
 
 class StaticServer:
-    """Serves ``files`` by name ("" is the page itself) until `close`; starts at once.
+    """Serves ``files`` by name ("" is the page itself) from its creation until `close`.
 
     Every response has the additional ``headers``.
 
@@ -105,7 +106,7 @@ class StaticServer:
         """Stop the server; running downloads are aborted."""
         self._server.shutdown()
         self._server.server_close()
-        self._server.hang_up()
+        self._server.close_connections()
 
     def __enter__(self) -> StaticServer:
         return self
@@ -117,7 +118,8 @@ class StaticServer:
 class _Server(socketserver.ThreadingTCPServer):
     daemon_threads = True
     block_on_close = False
-    allow_reuse_address = sys.platform != "win32"  # on Windows it allows to share a used port
+    # On Windows, this would allow two servers to listen on the same port.
+    allow_reuse_address = sys.platform != "win32"
     request_queue_size = 64
 
     prefix: str
@@ -127,40 +129,40 @@ class _Server(socketserver.ThreadingTCPServer):
 
     def __init__(self, *args: Any) -> None:
         self._lock = threading.Lock()
-        self._strangers: dict[socket.socket, None] = {}  # no valid request yet; oldest first
-        self._known: set[socket.socket] = set()  # have made a valid request
+        self._unverified: dict[socket.socket, None] = {}  # no valid request yet; oldest first
+        self._verified: set[socket.socket] = set()  # have made a valid request
         super().__init__(*args)
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         """Whether a new connection is accepted."""
         with self._lock:
-            if len(self._strangers) + len(self._known) >= _CONNECTIONS:
-                if not self._strangers:
+            if len(self._unverified) + len(self._verified) >= _CONNECTIONS:
+                if not self._unverified:
                     return False
-                oldest = next(iter(self._strangers))
-                del self._strangers[oldest]
-                _hang_up(oldest)  # its thread ends when it notices
-            self._strangers[request] = None
+                oldest = next(iter(self._unverified))
+                del self._unverified[oldest]
+                _shut_down(oldest)  # its next read fails, which ends its thread
+            self._unverified[request] = None
             return True
 
-    def know(self, request: socket.socket) -> None:
+    def mark_verified(self, request: socket.socket) -> None:
         """Record that a connection has made a valid request."""
         with self._lock:
-            if request in self._strangers:
-                del self._strangers[request]
-                self._known.add(request)
+            if request in self._unverified:
+                del self._unverified[request]
+                self._verified.add(request)
 
     def shutdown_request(self, request: Any) -> None:
         with self._lock:
-            self._strangers.pop(request, None)
-            self._known.discard(request)
+            self._unverified.pop(request, None)
+            self._verified.discard(request)
         super().shutdown_request(request)
 
-    def hang_up(self) -> None:
+    def close_connections(self) -> None:
         """Close all connections."""
         with self._lock:
-            for request in (*self._strangers, *self._known):
-                _hang_up(request)
+            for request in (*self._unverified, *self._verified):
+                _shut_down(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         # A browser that disconnects during a download is not an error.
@@ -169,7 +171,7 @@ class _Server(socketserver.ThreadingTCPServer):
             _log.error("web server of the viewer: %s: %s", type(error).__name__, error)
 
 
-def _hang_up(connection: socket.socket) -> None:
+def _shut_down(connection: socket.socket) -> None:
     with contextlib.suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
 
@@ -210,7 +212,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._received = b""
 
     def handle_one_request(self) -> None:
-        """Like the base class, but requires a complete request in time, of limited size."""
+        """Like the base class, but limits the size of a request and the time to receive it."""
         head = self._receive()
         self.close_connection = True
         if not head:
@@ -229,7 +231,10 @@ class _Handler(BaseHTTPRequestHandler):
         self._send_empty(status, {"Connection": "close"})
 
     def _receive(self) -> bytes | None:
-        """The next request up to its empty line, or a too long part; None if none arrives."""
+        """The next request up to its empty line; None if none arrives.
+
+        If a request is too long, the part of it that has been received.
+        """
         started: float | None = time.monotonic() if self._received else None
         while (end := self._received.find(b"\r\n\r\n")) < 0:
             if len(self._received) > _REQUEST:
@@ -276,7 +281,7 @@ class _Handler(BaseHTTPRequestHandler):
         if file is None:
             self._send_empty(HTTPStatus.NOT_FOUND)
             return
-        self._ours.know(self.connection)
+        self._ours.mark_verified(self.connection)
         common = {"ETag": file.etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
         if file.etag in (self.headers.get("If-None-Match") or ""):
             self._send_empty(HTTPStatus.NOT_MODIFIED, common)
@@ -302,7 +307,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _refusal(self) -> HTTPStatus | None:
         """The status with which a request is rejected; None accepts it."""
         hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
-        # A body, or what another parser takes for one, could be read as a second request.
+        # A body, or data that another parser regards as a body, could be read as a second request.
         bodies = (
             self.headers.get_all("Content-Length", []),
             self.headers.get_all("Transfer-Encoding", []),
@@ -318,7 +323,7 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def _file(self) -> ServedFile | None:
-        """The file at the requested path, without decoding: all names are plain ASCII."""
+        """The file at the requested path. Nothing is decoded, since all names are plain ASCII."""
         path = self.path.partition("?")[0]
         prefix = self._ours.prefix
         start, name = path[: len(prefix)], path[len(prefix) :]
@@ -327,10 +332,10 @@ class _Handler(BaseHTTPRequestHandler):
         return self._ours.files.get(name)
 
     def _range(self, file: ServedFile) -> tuple[int, int] | None:
-        """First requested byte and the one after the last; None: the whole file.
+        """The first requested byte, and the byte after the last; None: the complete file.
 
-        A range outside of the file is empty. Multiple and malformed ranges are answered with the
-        whole file, as the protocol allows.
+        A range outside of the file is empty. For multiple or malformed ranges, the complete file is
+        sent, as the protocol allows.
         """
         match = _RANGE.fullmatch(self.headers.get("Range", "").replace(" ", ""))
         if match is None or match[0] == "bytes=-":
@@ -356,7 +361,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         always = {
             "X-Content-Type-Options": "nosniff",
-            "Referrer-Policy": "no-referrer",  # the address contains the token
+            "Referrer-Policy": "no-referrer",  # the URL contains the token
             "Cross-Origin-Resource-Policy": "same-origin",
         }
         for name, value in {**always, **self._ours.headers, **headers}.items():
