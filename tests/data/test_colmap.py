@@ -195,7 +195,11 @@ def test_a_count_larger_than_the_file_allocates_nothing(dataset_copy, file, coun
     path = folder / "sparse/0" / file
     count += struct.unpack("<Q", path.read_bytes()[:8])[0]
     path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
-    with pytest.raises(UserError, match=f"{file}: damaged"):
+    kind = {"points3D.bin": "points"}.get(file, file.removesuffix(".bin"))
+    problem = f"{file}: damaged: it promises {count} {kind}, more than fit into it"
+    if kind == "points" and count < 100:  # they would fit if no point had a track
+        problem = f"{file}: damaged: it is truncated"
+    with pytest.raises(UserError, match=problem):
         load_dataset(folder)
 
 
@@ -218,6 +222,47 @@ def test_a_text_file_shorter_than_its_comment_promises(dataset_copy, caplog):
     with caplog.at_level(logging.WARNING):
         assert len(load_dataset(folder).points) == 20
     assert "20 points, but its comment promises 60" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ("1 PINHOLE 32 24 30 30 16", "damaged: 3 parameters for camera model PINHOLE"),
+        ("1 PINHOLE 32 24 30 30 16 12 0", "damaged: 5 parameters for camera model PINHOLE"),
+        ("1 SIMPLE_PINHOLE 32 24 30 30 16 12", "4 parameters for camera model SIMPLE_PINHOLE"),
+        ("1 FULL_OPENCV 32 24 30 30 16 12", "4 parameters for camera model FULL_OPENCV"),
+        ("1 PINHOLE 32 0 30 30 16 12", "damaged: a camera has the size 32x0"),
+        ("1 PINHOLE 32", "damaged: not a camera: line '1 PINHOLE 32'"),
+        ("1 PINHOLE 32 24 a b c d", "damaged: not a camera: line '1 PINHOLE 32 24 a b c d'"),
+        ("1 NEW_MODEL 32 24 30 30 16 12", "NEW_MODEL.*sfm"),
+    ],
+)
+def test_lines_that_are_not_cameras(dataset_copy, camera, message):
+    folder = dataset_copy("colmap-txt")
+    (folder / "sparse/0/cameras.txt").write_text(camera + "\n")
+    with pytest.raises(UserError, match=message):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize("block", [1, 2, 3, 4, 7, 100])
+def test_words_of_observations_are_counted_in_blocks(tmp_path, monkeypatch, block):
+    """A word may continue in the next block."""
+    monkeypatch.setattr("snowsplat.data.colmap.text._CHARACTERS_PER_BLOCK", block)
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 32 24 30 30 16 12\n")
+    (tmp_path / "points3D.txt").write_text("")
+    for observations, valid in (
+        ("12 3.25 -1 400.5\t7  8", True),
+        ("12.5 3 -1", True),
+        ("12 3.25 -1 400", False),
+        ("1 2", False),
+        ("", True),
+    ):
+        (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 a.png\n{observations}\n")
+        if valid:
+            assert [image.name for image in read_model(tmp_path).images] == ["a.png"]
+        else:
+            with pytest.raises(UserError, match=r"line after image a\.png should hold"):
+                read_model(tmp_path)
 
 
 def test_an_image_with_an_unknown_camera(dataset_copy):

@@ -1,5 +1,6 @@
 """Decoding, scaling, alpha, and the cache of the loader: same pixels, within the budget."""
 
+import os
 import threading
 
 import numpy as np
@@ -223,3 +224,88 @@ def test_other_downscale_factors_are_rejected(views):
 
 def test_available_memory_is_plausible():
     assert 1 << 20 < available_memory() < 1 << 46
+
+
+def test_an_image_that_a_thread_decodes_is_awaited(views, monkeypatch):
+    """`get` does not decode it a second time."""
+    started, release = threading.Event(), threading.Event()
+    decoded = []
+
+    def slow(source, background=None):
+        decoded.append(source.path.name)
+        if len(decoded) == 1:
+            started.set()
+            release.wait(10)
+        return load_image(source, background)
+
+    monkeypatch.setattr("snowsplat.data.image_loader.load_image", slow)
+    with ImageLoader(views) as loader:
+        loader.prefetch(views[:1])
+        assert started.wait(10)
+        timer = threading.Timer(0.05, release.set)
+        timer.start()
+        assert torch.equal(loader.get(views[0]).rgb, stored(views[0]))
+        timer.join()
+    assert decoded == ["0.png"]
+
+
+def test_images_decoded_ahead_are_removed_if_nothing_else_is_cached(tmp_path):
+    """Their estimated size may be too small: 3 pixels divided by 4 are 0, but become 1."""
+    pixels = np.full((3, 3, 3), 9, np.uint8)
+    views = [make_view(tmp_path / f"{i}.png", pixels) for i in range(3)]
+    with ImageLoader(views, budget_bytes=0, threads=3) as loader:
+        loader.prefetch(views, 4)
+        for _ in range(1000):
+            with loader._lock:
+                if not loader._running:
+                    break
+            threading.Event().wait(0.01)
+        assert loader.cached_bytes == 3
+
+
+def test_thirty_two_bit_grey_is_scaled_like_sixteen_bits_and_clamped(tmp_path):
+    pixels = np.array([[-65536, -1, 0, 255, 256, 65535, 65536, 1 << 30]], np.int32)
+    Image.fromarray(pixels).save(tmp_path / "a.tif")
+    planes = load_image(ImageSource(tmp_path / "a.tif", 8, 1))
+    assert planes[:, 0].tolist() == [[0, 0, 0, 0, 1, 255, 255, 255]] * 3
+
+
+V2 = "/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"
+V1 = tuple(f"/sys/fs/cgroup/memory/memory.{name}_in_bytes" for name in ("limit", "usage"))
+MEMINFO = {"/proc/meminfo": "MemTotal: 90 kB\nMemFree: 10 kB\nMemAvailable:  50 kB\n"}
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (MEMINFO, 50 * 1024),
+        ({**MEMINFO, V2[0]: "9000\n", V2[1]: "2000\n"}, 7000),
+        ({**MEMINFO, V1[0]: "9000\n", V1[1]: "2000\n"}, 7000),
+        ({**MEMINFO, V2[0]: "2000\n", V2[1]: "9000\n"}, 0),
+        ({**MEMINFO, V2[0]: "max\n", V2[1]: "9000\n"}, 50 * 1024),
+        ({**MEMINFO, V1[0]: "9223372036854771712\n", V1[1]: "9000\n"}, 50 * 1024),
+        ({**MEMINFO, V2[0]: "6000", V2[1]: "0", V1[0]: "5000", V1[1]: "0"}, 5000),
+        ({"/proc/meminfo": "MemFree: 10 kB\n"}, 3 * 4096 // 2),
+        ({}, 3 * 4096 // 2),
+    ],
+)
+def test_available_memory_is_limited_by_the_control_group(monkeypatch, files, expected):
+    """Names and units as in proc(5) and in the kernel's documentation of cgroups 1 and 2."""
+
+    class FakePath:
+        def __init__(self, path):
+            self.path = path
+
+        def read_text(self, encoding=None):
+            if self.path not in files:
+                raise FileNotFoundError(self.path)
+            return files[self.path]
+
+    system = {"SC_PHYS_PAGES": 3, "SC_PAGE_SIZE": 4096}
+    monkeypatch.setattr("snowsplat.data.image_loader.Path", FakePath)
+    monkeypatch.setattr(os, "sysconf_names", dict.fromkeys(system, 0), raising=False)
+    monkeypatch.setattr(os, "sysconf", system.__getitem__, raising=False)
+    assert available_memory() == expected
+    if not files:  # a system that reports nothing
+        monkeypatch.delattr(os, "sysconf")
+        assert available_memory() == 4 << 30

@@ -95,6 +95,14 @@ def test_invalid_resolutions(pristine, resolution):
         load_dataset(pristine["colmap-bin"], resolution=resolution)
 
 
+def test_the_smallest_side_of_a_smaller_image_is_16(pristine):
+    small = load_dataset(pristine["colmap-bin"], resolution=21).train[0].camera
+    assert (small.width, small.height) == (21, 16)
+    for resolution, size in ((20, "20x15"), (2, "16x12"), (16, "16x12"), (8, "4x3")):
+        with pytest.raises(UserError, match=f"{resolution} makes images of {size} pixels"):
+            load_dataset(pristine["colmap-bin"], resolution=resolution)
+
+
 @pytest.fixture(scope="module")
 def large_source(tmp_path_factory):
     return write_toy_dataset(tmp_path_factory.mktemp("large"), "colmap-bin", 3, 75, 64)
@@ -185,6 +193,21 @@ def test_exif_orientation_is_applied_only_if_the_size_proves_it(dataset_copy):
     assert image.shape == (24, 32, 3)
     assert image[:11].min() > 150
     assert image[13:].max() < 50
+
+
+def test_a_mask_has_the_orientation_of_its_image(dataset_copy):
+    folder = dataset_copy("colmap-bin")
+    pixels = np.zeros((32, 24, 3), np.uint8)
+    pixels[:, :12] = 255  # the left half, as stored; rotated clockwise, the upper half
+    (folder / "masks").mkdir()
+    for name in ("images/view_01.png", "masks/view_01.png"):
+        jpeg_with_orientation(folder / "upright.jpg", pixels, 6)
+        (folder / "upright.jpg").replace(folder / name)
+    view = next(v for v in load_dataset(folder).train if v.name == "view_01.png")
+    with ImageLoader([view]) as loader:
+        mask = loader.get(view).mask
+    assert mask[:11].all()
+    assert not mask[13:].any()
 
 
 def test_masks_beside_the_images(dataset_copy):

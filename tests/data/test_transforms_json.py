@@ -237,7 +237,7 @@ def test_masks(scene, tmp_path):
         ("[" * 100_000, "not a complete JSON file"),
         ("[1]", "no list of frames"),
         ('{"frames": 3}', "no list of frames"),
-        ('{"frames": []}', "it has no frames"),
+        ('{"frames": []}', "transforms.json: it has no frames; check where the images are$"),
         ('{"frames": [{}]}', "frame 0: no file_path"),
         ('{"frames": [4]}', "frame 0: no file_path"),
     ],
@@ -279,3 +279,38 @@ def test_a_folder_of_smaller_copies_takes_the_place_of_images(scene):
     dataset = load_dataset(folder, images="photos", hold_out=None)
     assert [view.image.path.parent.name for view in dataset.train] == ["photos", "photos"]
     assert len({view.image.path for view in dataset.train}) == 2
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        {"fl_x": "wide"},
+        {"fl_x": 0},
+        {"h": 0, "w": 4},
+        {"camera_angle_x": 4, "fl_x": None},
+        {"k1": 0.1},
+        {"camera_model": "FISHEYE"},
+        {"mask_path": "missing.png"},
+        {"mask_path": "../outside.png"},
+        {"transform_matrix": [1]},
+        {"transform_matrix": [[0] * 4] * 4},
+        {"transform_matrix": np.diag([-1, 1, 1, 1]).tolist()},
+    ],
+)
+def test_errors_name_the_file_and_the_frame(scene, frame):
+    folder = scene({"fl_x": 50}, [{}, frame])
+    with pytest.raises(UserError) as error:
+        load_dataset(folder)
+    assert str(error.value).startswith(f"{folder}/transforms.json: frame 1: ")
+
+
+@pytest.mark.parametrize("upper", [False, True])
+def test_images_without_a_suffix_are_found(tmp_path, upper):
+    suffixes = ["png", "jpg", "jpeg", "webp", "tif", "tiff", "bmp", "ppm"]
+    frames = [{"file_path": f"of_{suffix}", "transform_matrix": UPRIGHT} for suffix in suffixes]
+    for suffix in suffixes:
+        name = f"of_{suffix}.{suffix.upper() if upper else suffix}"
+        Image.new("RGB", (4, 3)).save(tmp_path / name)
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 5, "frames": frames}))
+    dataset = load_dataset(tmp_path, hold_out=None)
+    assert [view.image.path.suffix[1:].lower() for view in dataset.train] == sorted(suffixes)

