@@ -105,7 +105,7 @@ def test_the_newest_scene_of_an_output_folder(run, refused, ply, tmp_path):
     assert run("convert", tmp_path / "made", tmp_path / "c.spz").code == 0
     assert len(read_gaussians(tmp_path / "c.spz")) == 7
     (tmp_path / "empty").mkdir()
-    assert "holds no scene" in refused("convert", tmp_path / "empty", tmp_path / "d.spz")
+    assert "contains no scene" in refused("convert", tmp_path / "empty", tmp_path / "d.spz")
 
 
 def test_an_existing_file(run, refused, ply, tmp_path):

@@ -134,7 +134,7 @@ def test_errors(refused, trained, tmp_path):
         assert "config.json: damaged" in refused("evaluate", damaged)
     shutil.rmtree(damaged / "point_cloud")
     shutil.copy(trained / "config.json", damaged)
-    assert "holds no scene" in refused("evaluate", damaged)
+    assert "contains no scene" in refused("evaluate", damaged)
 
 
 def test_info(run, refused, trained, dataset, tmp_path):

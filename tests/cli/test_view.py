@@ -132,10 +132,10 @@ def test_scenes_of_other_formats(served, out, tmp_path):
 def test_errors(refused, out, tmp_path):
     assert "needs a scene" in refused("view")
     assert "no such file" in refused("view", tmp_path / "absent")
-    assert "holds no scene" in refused("view", tmp_path)
+    assert "contains no scene" in refused("view", tmp_path)
     assert "leave it out" in refused("view", scene(out), "--iteration", 3)
     write_gaussians(tmp_path / "empty.ply", read_gaussians(scene(out)).map(lambda t: t[:0]))
-    assert "holds no Gaussians" in refused("view", tmp_path / "empty.ply")
+    assert "contains no Gaussians" in refused("view", tmp_path / "empty.ply")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert f"--port: {port} is in use" in refused("view", out, "--port", port)

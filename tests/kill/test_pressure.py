@@ -333,7 +333,7 @@ def test_view_of_a_missing_scene(zygote, place, trained):
     """The only subcommand that writes nothing: a folder without a scene is a one-line error."""
     shutil.copytree(trained, place / "trained")
     shutil.rmtree(place / "trained" / "point_cloud")
-    refused(zygote.run(["view", place / "trained", "--no-browser"]), "holds no scene")
+    refused(zygote.run(["view", place / "trained", "--no-browser"]), "contains no scene")
 
 
 def test_zygote_has_the_result_of_the_command(zygote, trained, tmp_path):

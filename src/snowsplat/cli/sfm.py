@@ -100,7 +100,7 @@ class Sfm:
                 )
             return (self.source_path / "input",), self.output or self.source_path
         if not self.inputs:
-            raise UserError("sfm needs photos; name a folder of photos, or a video")
+            raise UserError("sfm needs photos; add a folder of photos, or a video")
         if self.output is None:
             raise UserError("sfm needs a folder for the result; add -o DATASET")
         if self.skip_matching:

@@ -53,7 +53,7 @@ class View:
 
         scene = load_viewable(self.path, self.iteration)
         if not len(scene.gaussians):
-            raise UserError(f"{scene.file}: holds no Gaussians; there is nothing to see")
+            raise UserError(f"{scene.file}: contains no Gaussians; there is nothing to see")
         title = f"{self.path.resolve().name} - snowsplat"
         files, headers = site(title, scene.gaussians, scene.cameras, scene.background)
         with StaticServer(files, headers, self.host, self.port) as server:

@@ -39,7 +39,7 @@ def read_arrays(path: Path | str) -> GaussianArrays:
     """Read a scene file of any known format, in the PLY frame (x right, y down, z forward).
 
     Raises:
-        UserError: the file is missing, damaged, of an unknown format, or holds no Gaussians.
+        UserError: the file is missing, damaged, of an unknown format, or contains no Gaussians.
     """
     path = Path(path)
     format = format_for_reading(path)

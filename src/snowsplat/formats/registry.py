@@ -136,7 +136,7 @@ def format_for_reading(path: Path | str) -> Format:
     path = Path(path)
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
-            raise UserError(f"{path}: is a pipe or a device; name a file")
+            raise UserError(f"{path}: is a pipe or a device; use a file")
         with open(path, "rb") as file:
             head = file.read(_HEAD_BYTES)
     except OSError as error:

@@ -118,7 +118,7 @@ def convert(
     """
     target, edits = Path(target), edits or Edits()
     if target.is_dir():
-        raise UserError(f"{target}: is a folder; name a file to write")
+        raise UserError(f"{target}: is a folder; use a file name")
     if target.exists() and not overwrite:
         raise UserError(f"{target}: exists; use `overwrite` to replace it")
     format = format_for_writing(target)

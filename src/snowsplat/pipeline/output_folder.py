@@ -130,8 +130,8 @@ class OutputFolder:
             raise UserError(f"{self.path}: contains other files; use a new or an empty folder")
         if self.is_one() and not resume and not overwrite:
             raise UserError(
-                f"{self.path}: holds a training already; use `resume` to continue it, "
-                "`overwrite` to replace it, or name another folder"
+                f"{self.path}: already contains a training; use `resume` to continue it, "
+                "`overwrite` to replace it, or use another folder"
             )
 
     def begin(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
@@ -234,11 +234,13 @@ class OutputFolder:
             raise UserError(f"{self.path}: no such folder; give the output folder of a training")
         scenes = self.scenes()
         if not scenes:
-            raise UserError(f"{self.path}: holds no scene (no point_cloud/iteration_N in it)")
+            raise UserError(f"{self.path}: contains no scene (no point_cloud/iteration_N in it)")
         chosen = scenes[-1] if iteration is None else iteration
         if chosen not in scenes:
             there = ", ".join(map(str, scenes))
-            raise UserError(f"{self.path}: holds no scene of iteration {chosen}; there are {there}")
+            raise UserError(
+                f"{self.path}: contains no scene of iteration {chosen}; there are {there}"
+            )
         return chosen, read_gaussians(self.scene_path(chosen))
 
     def write_metrics(self, iteration: int, split: str, evaluation: Evaluation) -> None:

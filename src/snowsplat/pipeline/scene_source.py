@@ -99,7 +99,7 @@ def scene_file(path: Path) -> Path:
     folder = training_folder(path)
     scenes = folder.scenes()
     if not scenes:
-        raise UserError(f"{path}: holds no scene (no point_cloud/iteration_N in it)")
+        raise UserError(f"{path}: contains no scene (no point_cloud/iteration_N in it)")
     return folder.scene_path(scenes[-1])
 
 

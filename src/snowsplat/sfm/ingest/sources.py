@@ -58,7 +58,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
     """
     if not inputs:
-        raise UserError("inputs: none given; name a folder of photos, photos or a video")
+        raise UserError("inputs: none given; add a folder of photos, photos or a video")
     found: list[Source] = []
     left_out: list[tuple[str, str]] = []
     unused: list[Path] = []
@@ -205,13 +205,13 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
     if is_video(path):
         return "video"
     if suffix in PHOTO_SUFFIXES:
-        raise UserError(f"{shown(path)}: not a photo, despite its extension; name another file")
+        raise UserError(f"{shown(path)}: not a photo, despite its extension; use another file")
     if suffix in VIDEO_SUFFIXES:
         raise UserError(
             f"{shown(path)}: not a readable video, it may be truncated or damaged; copy it again, "
-            "or name another file"
+            "or use another file"
         )
-    raise UserError(f"{shown(path)}: neither a photo nor a video; name another file")
+    raise UserError(f"{shown(path)}: neither a photo nor a video; use another file")
 
 
 def _is_photo(head: bytes) -> bool:

@@ -77,7 +77,7 @@ class Plan:
 
     def __str__(self) -> str:
         cap = self.config.density.max_gaussians
-        gaussians = f"at most {cap:,} Gaussians" if cap else "any number of Gaussians"
+        gaussians = f"at most {cap:,} Gaussians" if cap else "no limit on the number of Gaussians"
         return (
             f"{self.width}x{self.height}, {gaussians}, about {_rounded(self.config.iterations):,} "
             "steps"
