@@ -224,8 +224,8 @@ def test_resume_rejects_other_settings(refused, run, dataset, tmp_path):
     assert run("train", dataset, "-o", out, *QUICK, "--checkpoint-every", 30).code == 0
     assert "other settings" in refused("train", "-o", out, "--resume", "--seed", 5)
     assert "recipe" in refused("train", "-o", out, "--resume", "--recipe", "paper")
-    assert "beyond" in refused("train", "-o", out, "--resume", "--iterations", 10)
-    assert "exclude" in refused("train", dataset, "-o", out, "--resume", "--overwrite")
+    assert "after --iterations 10" in refused("train", "-o", out, "--resume", "--iterations", 10)
+    assert "cannot be combined" in refused("train", dataset, "-o", out, "--resume", "--overwrite")
     # Other photos, or another split, which would test on photos that were trained on.
     (tmp_path / "tests.txt").write_text("view_04\n")
     for flags in (["-r", 2], ["--eval"], ["--test-list", tmp_path / "tests.txt"], ["-i", "more"]):
