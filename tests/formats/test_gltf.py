@@ -83,7 +83,9 @@ def test_a_real_scene(tmp_path, shared, psnr):
 def test_the_layout_is_that_of_the_specification(seed, tmp_path):
     document, binary, scene = seed
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
-    (primitive,) = document["meshes"][0]["primitives"]
+    assert document["scenes"][document["scene"]] == {"nodes": [0]}
+    assert document["nodes"] == [{"mesh": 0, "name": "splats"}]
+    ((primitive,),) = [mesh["primitives"] for mesh in document["meshes"]]
     assert primitive["mode"] == 0
     extension = primitive["extensions"]["KHR_gaussian_splatting"]
     assert extension == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}

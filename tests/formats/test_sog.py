@@ -15,6 +15,7 @@ from PIL import Image
 
 from snowsplat.formats import read_gaussians, sog, write_gaussians
 from snowsplat.formats.codebooks import palette_for
+from snowsplat.formats.sog_container import Bundle
 from snowsplat.scene.geometry import morton_order
 
 from . import json_damage
@@ -234,6 +235,28 @@ def test_decompression_bombs(tmp_path, files, one_line):
     assert "not valid JSON" in one_line(bundle(tmp_path / "a.sog", files | {"meta.json": deep}))
     path = bundle(tmp_path / "a.sog", files, zipfile.ZIP_LZMA)
     assert "compression method" in one_line(path)
+
+
+def test_the_number_of_members_is_limited(tmp_path, one_line):
+    """More than 1000 are refused before the directory of the zip file is read."""
+    names = {f"{number}": b"" for number in range(1001)}
+    assert "implausible number of members" in one_line(bundle(tmp_path / "a.sog", names))
+    del names["0"]
+    assert "without 'meta.json'" in one_line(bundle(tmp_path / "a.sog", names))
+
+
+def test_the_size_of_a_folder_is_that_of_its_files(tmp_path, files):
+    """Of those that exist, each once; a zip file has its own size."""
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    names = [name for name in files if name != "meta.json"]
+    with Bundle(tmp_path / "meta.json") as folder:
+        total = sum(map(len, files.values()))
+        assert folder.bytes_with([*names, names[0], "missing.webp"]) == total
+        assert folder.bytes_with(names[1:]) == total - len(files[names[0]])
+    path = bundle(tmp_path / "a.sog", files)
+    with Bundle(path) as packed:
+        assert packed.bytes_with(names) == path.stat().st_size
 
 
 def test_a_member_with_a_false_size(tmp_path, files, one_line):
