@@ -383,7 +383,7 @@ def test_the_number_of_connections_is_limited(local):
                 assert status(get(local.url)) == 200
         own = len(os.listdir("/proc/self/fd")) - descriptors - len(clients)
         assert own <= _WAITING + _PAGES + _BROWSERS + 100  # it takes up to 100 at a time
-        assert threading.active_count() == threads
+        assert threading.active_count() <= threads  # none per connection
         with Visitor(local.url) as visitor:
             visitor.send_camera()
             wait(lambda: len(local.server.get_clients()) == 1)
