@@ -100,6 +100,7 @@ def _child(run: dict) -> None:
     log = os.open(run["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     if run.get("columns"):
         log = _terminal(log, run["columns"])
+        os.environ.pop("COLUMNS", None)  # set by pytest-xdist; would replace the terminal's width
     os.dup2(null, 0)
     os.dup2(log, 1)
     os.dup2(log, 2)
