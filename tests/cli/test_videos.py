@@ -94,6 +94,6 @@ def test_errors(refused, trained, tmp_path):
     assert "a video takes --depth color" in refused(*video, "--depth", "16bit")
     assert "above 0" in refused(*video, "--seconds", 0)
     assert "make the video shorter" in refused(*video, "--seconds", 1e9)
-    assert "name a camera path with --path" in refused("render", trained, "--size", "64x48")
+    assert "add a camera path with --path" in refused("render", trained, "--size", "64x48")
     assert "no such folder" in refused("render", tmp_path / "absent", "--path", "ellipse")
     assert "--threads: 0 is too small" in refused(*video, "--threads", 0)

@@ -39,7 +39,7 @@ class Info:
     def run(self) -> int:
         """Returns the exit code, 0."""
         if self.path is None:
-            raise UserError("info needs a file or folder; name one")
+            raise UserError("info needs a file or folder; add one")
         from snowsplat.pipeline.describe import describe
 
         facts = describe(self.path)

@@ -71,7 +71,7 @@ class Render(SceneFlags):
             return 0
         for name in ("seconds", "fps", "size", "side_by_side", "video"):
             if getattr(self, name):
-                raise UserError(f"`{name}` is for videos; name a camera path with --path")
+                raise UserError(f"`{name}` is for videos; add a camera path with --path")
         splits: list[Split] = []
         if self.split != "train" and not self.skip_test:
             splits.append("test")

@@ -41,9 +41,7 @@ class Train(TrainFlags):
         dataset, options = self.dataset_path(), self.options()
         OutputFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
         if dataset is None and not self.resume:
-            raise UserError(
-                "train needs a dataset; name the folder of the photos and their cameras"
-            )
+            raise UserError("train needs a dataset; add the folder of the photos and their cameras")
         page = PageFlags(self.port, self.host).page(self.view)
         with TerminalObserver(self.quiet) as observer, page or nullcontext():
             try:

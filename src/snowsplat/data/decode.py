@@ -136,7 +136,7 @@ def load_mask(source: ImageSource) -> Tensor:
     Transparent pixels count as black.
 
     Raises:
-        UserError: as `load_image`.
+        UserError: see `load_image`.
     """
     planes = load_image(source, background=(0.0, 0.0, 0.0))
     return planes.amax(0) >= 128

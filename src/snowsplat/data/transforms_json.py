@@ -64,7 +64,7 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
     """Read posed images that are on disk, points, and a description.
 
     Args:
-        files: from `find_transforms`.
+        files: the result of `find_transforms`.
         images: a folder to use instead of ``images``, for example ``images_4``.
 
     Raises:
@@ -219,7 +219,7 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
 
     Args:
         where: the start of error messages.
-        values: the entries of the frame and, for those that it lacks, of the file.
+        values: the entries of the frame and, for those that it does not have, of the file.
         image: the image file, which provides the size if ``values`` has none.
     """
     distortion = {key: _number(where, values, key) for key in _DISTORTION}

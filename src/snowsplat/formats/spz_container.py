@@ -90,7 +90,7 @@ def unpack(path: Path, data: bytes) -> Contents:
     """The columns of the file content ``data``.
 
     Raises:
-        UserError: as `read_header`, or the file is damaged or truncated.
+        UserError: see `read_header`; or the file is damaged or truncated.
     """
     try:
         return _unpack(path, data)

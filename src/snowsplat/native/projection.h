@@ -123,8 +123,9 @@ SNOW_INLINE void project_gaussian(const GaussianShape<Real>& g, const PinholeCam
   p.cov_xx = U[0] * U[0] + U[1] * U[1] + U[2] * U[2] + Real(kDilation);
   p.cov_xy = U[0] * U[3] + U[1] * U[4] + U[2] * U[5];
   p.cov_yy = U[3] * U[3] + U[4] * U[4] + U[5] * U[5] + Real(kDilation);
-  // det Σ' = |U₀ × U₁|² + d (U₀·U₀ + U₁·U₁) + d², with d the dilation. As xx·yy − xy² it would
-  // cancel for long thin splats: 19% wrong at a σ of 1000 pixels in float, then NaN.
+  // det Σ' = |U₀ × U₁|² + d (U₀·U₀ + U₁·U₁) + d², with d the dilation. The formula
+  // xx·yy − xy² loses precision for long thin splats: in float, the error is 19% at σ = 1000
+  // pixels, and larger splats give NaN.
   Real* n = p.normal;
   n[0] = U[1] * U[5] - U[2] * U[4];
   n[1] = U[2] * U[3] - U[0] * U[5];
@@ -160,8 +161,8 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
   const Real two(2.f), half(0.5f);
   grad.opacity_logit = d.opacity * p.opacity * (Real(1.f) - p.opacity);
 
-  // V = K U with the conic K = Σ'⁻¹, by (v·v) u − (u·v) v = v × (u × v): the product itself would
-  // cancel for long thin splats, as the determinant would.
+  // V = K U with the conic K = Σ'⁻¹, by (v·v) u − (u·v) v = v × (u × v). Computing K U
+  // directly loses precision for long thin splats, as the determinant does.
   const Real dilation(kDilation);
   const Real *U = p.U, *n = p.normal;
   Real V[6];
@@ -199,11 +200,12 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
   const Real u = p.x * iz, v = p.y * iz;
   const auto free_x = (u >= Real(cam.min_tx)) & (Real(cam.max_tx) >= u);
   const auto free_y = (v >= Real(cam.min_ty)) & (Real(cam.max_ty) >= v);
-  // With respect to u = x/z and v = y/z: through the mean, and through J if it is not clamped.
+  // The derivatives with respect to u = x/z and v = y/z: through the mean, and through J where u
+  // and v are not clamped.
   const Real zero(0.f);
   const Real du = fx * d.mean2d[0] - select(free_x, dj02 * fx * iz, zero);
   const Real dv = fy * d.mean2d[1] - select(free_y, dj12 * fy * iz, zero);
-  // With respect to 1/z at fixed u, v.
+  // The derivative with respect to 1/z at fixed u, v.
   const Real diz = dj00 * fx + dj11 * fy - dj02 * fx * p.tx - dj12 * fy * p.ty;
   const Real dx = du * iz, dy = dv * iz;
   const Real dz = d.depth - iz * (du * u + dv * v + diz * iz);

@@ -48,8 +48,8 @@ def adam_step(
     params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, shaped as for `project`,
         contiguous. A `.grad` that is not None (of a regulariser) is added to the gradient.
     exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
-    ids, packed_grad: `splats.ids` (M,), ascending, and `splats.packed.grad` (M, 16). On a GPU as
-        `project` returned them, with ids of -1, or without those rows.
+    ids, packed_grad: `splats.ids` (M,), ascending, and `splats.packed.grad` (M, 16). On a GPU, rows
+        with id -1 may be present or removed.
     lr: the learning rate of each parameter. step: counts from 1 (bias correction).
     visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
         gradient is 0 (plus `.grad`), and their moments decay.
@@ -73,7 +73,7 @@ def adam_step(
     ):
         missing = [name for name in PARAMETERS if name not in given]
         if missing:
-            raise ValueError(f"adam_step: {what} lacks {', '.join(missing)}")
+            raise ValueError(f"adam_step: {what} has no {', '.join(missing)}")
     tensors = [params[name] for name in PARAMETERS]
     check_parameters(
         "adam_step", **dict(zip(PARAMETERS, tensors, strict=True)), sh_degree=sh_degree

@@ -49,8 +49,8 @@ def rasterize(
     transmittance of the splats in front and α = min(0.99, o exp(−½ dᵀ conic d)):
     image = Σ T α c + T_end · background, alpha = 1 − T_end, depth = Σ T α z (not divided by alpha).
     Splats fainter than 1/255 are skipped; a pixel is finished when the next splat would leave
-    T < 1e-4 (Kerbl et al. 2023, section 6). Gradients flow to every column of
-    `splats.packed` but the radii, and to `background`.
+    T < 1e-4 (Kerbl et al. 2023, section 6). Gradients flow to `background` and to every column of
+    `splats.packed` except the radii.
 
     With `capacity` the CPU does not wait for a GPU to count instances. On a GPU gradients are
     summed with atomics, in no fixed order, unless `torch.use_deterministic_algorithms` is set.
@@ -99,7 +99,7 @@ class _Frame:
     params: FrameParams
     tiles: int
     instances: int
-    """Instances that memory is allocated for."""
+    """Number of instances for which memory is allocated."""
     sums_in_order: bool
     """Gradients are summed in slots, in a fixed order; else they are added atomically."""
     instance_slot: Tensor | None
@@ -111,7 +111,7 @@ def _bin_splats(
 ) -> _Frame:
     """Sorts the splats by depth, counts the tiles that each touches, and lists them by tile.
 
-    columns: (4,) the columns of `packed` that are the channels at first; -1 for none.
+    columns: (4,) the columns of `packed` for the first group of channels; -1: unused.
     """
     n, stride = packed.shape
     device = packed.device
@@ -252,7 +252,8 @@ class _Rasterize(torch.autograd.Function):
         packed = packed.detach().contiguous()
         groups = _channel_groups(channels, with_depth, packed.device)
         count = channels + with_depth
-        background = torch.cat([background.detach(), packed.new_zeros(1)])  # of the depth: 0
+        # the background of the depth is 0
+        background = torch.cat([background.detach(), packed.new_zeros(1)])
         planes = scratch.empty((count, height, width), packed.dtype, packed.device)
         alpha = scratch.empty((height, width), packed.dtype, packed.device)
         frame = _bin_splats(packed, width, height, groups[0][1], capacity)

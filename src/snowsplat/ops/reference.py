@@ -5,10 +5,11 @@ are differentiable by autograd, and are hundreds of times slower. The native ker
 against these functions in float64. From top to bottom, this file describes the method:
 
     project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
-    rasterize       2D splats → image            α, T, C             ibid., §6 and eq. 2–3
+    rasterize       2D splats → image            α, T, C             Kerbl et al. 2023, §6, eq. 2–3
     count_blended   its cost per pixel
-    photometric_loss, ssim                       L1, D-SSIM          ibid., eq. 7; Wang et al. 2004
-    neighbours      the initial size             ibid., §5.1
+    photometric_loss, ssim                       L1, D-SSIM          Kerbl et al. 2023, eq. 7;
+                                                                     Wang et al. 2004
+    neighbours      the initial size             Kerbl et al. 2023, §5.1
     adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
 
 [Kerbl et al. 2023]    3D Gaussian Splatting for Real-Time Radiance Field Rendering. ACM TOG 42(4).
@@ -33,7 +34,7 @@ from snowsplat.ops.splats import Splats2D
 
 LOW_PASS = 0.3  # pixels²: blurs every splat, so that none falls between pixel centres
 ALPHA_MIN = 1 / 255  # smaller contributions do not change an 8-bit image and are skipped
-ALPHA_MAX = 0.99  # keeps 1 − α, hence the transmittance and its gradient, away from 0
+ALPHA_MAX = 0.99  # so that 1 − α, and with it the transmittance, is never 0
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished when its transmittance would be lower
 JACOBIAN_MARGIN = 0.15  # of the image size: J is clamped farther outside of the image
 QUAT_EPS = 1e-12
@@ -96,9 +97,9 @@ def project(
         depths = means @ cam_from_world[2, :3] + cam_from_world[2, 3]
         ids = torch.nonzero(depths > near)[:, 0]
         splats, variances = _project_rows([p[ids] for p in parameters], *view)
-        reach = _half_extents(variances, splats.opacities)
+        half_extent = _half_extents(variances, splats.opacities)
         last = torch.tensor([width - 0.5, height - 0.5]).to(means)
-        touches = (splats.means2d + reach >= 0.5) & (splats.means2d - reach <= last)
+        touches = (splats.means2d + half_extent >= 0.5) & (splats.means2d - half_extent <= last)
         ids = ids[touches.all(dim=1)]  # comparisons with NaN are false: invisible
     # Recomputed for the visible rows only, so that no NaN gradient comes from behind the camera.
     splats, _ = _project_rows([p[ids] for p in parameters], *view)
@@ -142,7 +143,8 @@ def _project_rows(
     # Σ' = J W Σ Wᵀ Jᵀ (eq. 5) plus the low-pass filter, with U = J W R S so that Σ' = U Uᵀ + 0.3 I.
     u0, u1 = (J @ W @ RS).unbind(dim=1)  # (M, 3) each
     xx, xy, yy = (u0 * u0).sum(dim=1), (u0 * u1).sum(dim=1), (u1 * u1).sum(dim=1)
-    # det Σ' = |u0 × u1|² + 0.3 (xx + yy) + 0.3². Multiplied out, it would cancel for thin splats.
+    # det Σ' = |u0 × u1|² + 0.3 (xx + yy) + 0.3². The expanded form xx·yy − xy² loses precision for
+    # thin splats.
     cross = torch.linalg.cross(u0, u1)
     det = (cross * cross).sum(dim=1) + LOW_PASS * (xx + yy) + LOW_PASS**2
     xx, yy = xx + LOW_PASS, yy + LOW_PASS
@@ -245,11 +247,9 @@ def rasterize(
     with torch.no_grad():
         a, b, c = conics.unbind(dim=1)
         variances = torch.stack([c, a], dim=1) / (a * c - b * b)[:, None]  # Σ'xx, Σ'yy
-        reach = _half_extents(variances, opacities).nan_to_num(nan=torch.inf)
-        low, high = (
-            means2d - reach - 1e-3,
-            means2d + reach + 1e-3,
-        )  # a margin, so that no pixel is missed
+        half_extent = _half_extents(variances, opacities).nan_to_num(nan=torch.inf)
+        # a margin of 1e-3, so that no pixel is missed
+        low, high = means2d - half_extent - 1e-3, means2d + half_extent + 1e-3
 
     bands = []
     for top in range(0, height, TILE):
@@ -468,19 +468,19 @@ def adam_step(
         m = beta1 * exp_avg[name] + (1 - beta1) * grad
         v = beta2 * exp_avg_sq[name] + (1 - beta2) * grad * grad
         m_hat, v_hat = m / (1 - beta1**step), v / (1 - beta2**step)
-        stepped = p - lr[name] * m_hat / (v_hat + eps**2).sqrt()
+        new_value = p - lr[name] * m_hat / (v_hat + eps**2).sqrt()
 
-        taken = torch.ones_like(p, dtype=torch.bool)
+        updated = torch.ones_like(p, dtype=torch.bool)
         if visible_only:
-            taken[:] = False
-            taken[rows] = True
+            updated[:] = False
+            updated[rows] = True
         if name == "sh_rest":
-            taken[:, (sh_degree + 1) ** 2 - 1 :] = False
-        broken = taken & ~(v.isfinite() & stepped.isfinite())
+            updated[:, (sh_degree + 1) ** 2 - 1 :] = False
+        nonfinite = updated & ~(v.isfinite() & new_value.isfinite())
         if nonfinite_rows is not None:
-            rows_of = broken.reshape(len(p), -1) if broken.numel() else broken.new_zeros(0, 1)
+            rows_of = nonfinite.reshape(len(p), -1) if p.numel() else nonfinite.new_zeros(0, 1)
             nonfinite_rows[i] += rows_of.any(dim=1).sum()
-        taken &= ~broken
-        p.copy_(torch.where(taken, stepped, p))
-        exp_avg[name].copy_(torch.where(taken, m, exp_avg[name]))
-        exp_avg_sq[name].copy_(torch.where(taken, v, exp_avg_sq[name]))
+        updated &= ~nonfinite
+        p.copy_(torch.where(updated, new_value, p))
+        exp_avg[name].copy_(torch.where(updated, m, exp_avg[name]))
+        exp_avg_sq[name].copy_(torch.where(updated, v, exp_avg_sq[name]))

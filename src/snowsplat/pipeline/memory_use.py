@@ -21,7 +21,7 @@ class MemoryUse:
 
     Attributes:
         device: the device whose memory is planned.
-        plan: with the configuration that fits.
+        plan: the memory plan, with the configuration that fits.
         before: resident bytes of the process before the training: Python and its libraries.
     """
 

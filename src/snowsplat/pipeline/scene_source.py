@@ -48,9 +48,9 @@ def load_trained(
     """Load a scene from the output folder of `train`, `make` or the reference implementation.
 
     Args:
-        iteration: default: the last one.
+        iteration: the iteration to load; default: the last one.
         dataset: where the photos are, if they were moved.
-        resolution: as of `TrainOptions`; default: as trained.
+        resolution: see `TrainOptions`; default: as trained.
         compute: the device for the Gaussians; default: a GPU if there is one.
 
     Raises:
@@ -136,7 +136,7 @@ class ViewableScene:
 
     Attributes:
         file: the scene file.
-        cameras: of its photos; empty if unknown.
+        cameras: the cameras of its photos; empty if unknown.
     """
 
     file: Path
@@ -149,7 +149,7 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
     """Load a scene file of any format, or a scene of an output folder.
 
     Args:
-        iteration: of an output folder; default: the last one.
+        iteration: an iteration of an output folder; default: the last one.
 
     Raises:
         UserError: missing or damaged; ``iteration`` with a file.

@@ -153,8 +153,8 @@ def resume(
         As `train`.
 
     Raises:
-        UserError: as `train`; no checkpoint, and no ``dataset`` to start from; other settings.
-        TrainingStopped, KeyboardInterrupt: as `train`.
+        UserError: see `train`; no checkpoint, and no ``dataset`` to start from; other settings.
+        TrainingStopped, KeyboardInterrupt: see `train`.
     """
     started = time.monotonic()
     options = options or TrainOptions()

@@ -138,7 +138,7 @@ def render_video(
         scene: the output folder of a training, or a scene file.
         target: an .mp4 file; default: OUT/videos/PATH.mp4, or SCENE_PATH.mp4 beside a scene file.
             A video of the depth has _depth in its name.
-        iteration: of an output folder; default: the last one.
+        iteration: an iteration of an output folder; default: the last one.
 
     Returns:
         The files.
@@ -237,7 +237,7 @@ def cameras_along(
     else:
         raise SettingError(
             "path",
-            f"{path} needs the cameras of a training; name its output folder, or use ellipse or a "
+            f"{path} needs the cameras of a training; use its output folder, or ellipse or a "
             "file of cameras",
         )
     width, height = size.of(cameras[0])
@@ -250,7 +250,7 @@ class Video:
 
     Attributes:
         cameras: one per frame, all of one even size.
-        file: of the video in color; that of the depth has _depth in its name.
+        file: the file of the video in color; that of the depth has _depth in its name.
         depth: render a video of the depth too.
         side_by_side: one video instead, with color on the left and depth on the right.
     """

@@ -65,7 +65,7 @@ def write_synthetic_photos(
     Equal arguments produce equal photos. Existing photos are kept.
 
     Args:
-        seed: of the scene and of the path.
+        seed: seed of the scene and of the path.
         distortion: k1, k2, p1, p2 of COLMAP's model OPENCV.
         report: progress callback.
     """

@@ -24,8 +24,8 @@ class TrainConfig:
 
     Attributes:
         iterations: number of steps, one view each.
-        seed: of every random choice. On a CPU, the same seed results in a bit-identical scene, for
-            any number of threads.
+        seed: seed of every random choice. On a CPU, the same seed results in a bit-identical scene,
+            for any number of threads.
         background: the colour behind the scene; "random" draws one per step, which prevents fog in
             datasets with a transparent background.
         sh_degree: final degree of the spherical harmonics, 0 to 3.
@@ -33,9 +33,9 @@ class TrainConfig:
             ``sh_degree`` from the first step.
         ssim_weight: λ of (1 − λ) · L1 + λ · D-SSIM.
         initial_points: number of random points for a dataset without points.
-        initial_opacity: of every Gaussian at initialisation.
-        initial_scale: of every Gaussian at initialisation, in units of the mean distance to its
-            three nearest neighbours.
+        initial_opacity: the opacity of every Gaussian at initialisation.
+        initial_scale: the scale of every Gaussian at initialisation, in units of the mean distance
+            to its three nearest neighbours.
         learning_rates: see `LearningRates`.
         density: settings of density control, one of `DENSITY_CONTROLS`.
         gaussians_per_pixel: limits the number of Gaussians by the size of the photos, in addition

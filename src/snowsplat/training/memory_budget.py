@@ -68,7 +68,7 @@ class MemoryPlan:
     """The result of `plan_memory`.
 
     Attributes:
-        config: with settings that keep the training within its memory.
+        config: the configuration, with settings that keep the training within its memory.
         scene: bytes for Gaussians.
         images: bytes for renderings and their gradients.
         photos: bytes for photos that stay decoded.

@@ -35,7 +35,7 @@ class Adam:
     ) -> None:
         """
         Args:
-            extent: of the scene, in world units; scales the learning rate of the means.
+            extent: extent of the scene, in world units; scales the learning rate of the means.
             visible_only: a step leaves the Gaussians that its view does not see unchanged.
         """
         self.rates = rates

@@ -21,9 +21,9 @@ class ViewGradient:
     An invalid step changes nothing, and no caller has to handle it.
 
     Attributes:
-        splats: from `scene.render.project`; the gradient is ``splats.packed.grad``.
-        camera: of the view, at the resolution of the step. Through it the gradient continues from
-            the splats to the parameters of the Gaussians.
+        splats: the splats from `scene.render.project`; the gradient is ``splats.packed.grad``.
+        camera: the camera of the view, at the resolution of the step. Through it the gradient
+            continues from the splats to the parameters of the Gaussians.
         sh_degree: degree of the spherical harmonics used by this step.
         valid: (1,) bool on the device; None is True.
         nonfinite_rows: (6,) int32 on the device, see `ops.adam_step`; None disables counting.

@@ -237,7 +237,7 @@ def header_of(elements: Sequence[tuple[str, int, list[tuple[str, str]]]]) -> byt
     """The header of a little-endian file.
 
     Args:
-        elements: for each element its name, its count, and pairs (PLY type, name).
+        elements: one tuple per element: its name, its count, and pairs (PLY type, name).
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     for name, count, properties in elements:

@@ -32,7 +32,7 @@ def read_json(path: Path) -> Any:
 
     Raises:
         OSError: the file is missing or cannot be read.
-        ValueError: as `parse_json`, or ``path`` is a pipe or a device.
+        ValueError: see `parse_json`; or ``path`` is a pipe or a device.
     """
     if path.exists() and not path.is_file():  # reading a pipe may never end
         raise ValueError("not a file")

@@ -90,13 +90,13 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
     ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
     (
         "ops/reference.py",
-        "low, high = means2d - reach - 1e-3, means2d + reach + 1e-3  # never one too few",
-        "low, high = means2d - reach - 0.0009375, means2d + reach + 1e-3  # never one too few",
+        "low, high = means2d - half_extent - 1e-3, means2d + half_extent + 1e-3",
+        "low, high = means2d - half_extent - 0.0009375, means2d + half_extent + 1e-3",
     ): "any margin above the rounding does",
     (
         "ops/reference.py",
-        "low, high = means2d - reach - 1e-3, means2d + reach + 1e-3  # never one too few",
-        "low, high = means2d - reach - 1e-3, means2d + reach + 1.001  # never one too few",
+        "low, high = means2d - half_extent - 1e-3, means2d + half_extent + 1e-3",
+        "low, high = means2d - half_extent - 1e-3, means2d + half_extent + 1.001",
     ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
     (
         "data/colmap/binary.py",
@@ -130,8 +130,8 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
     ): "any small number avoids the division by 0",
     (
         "ops/reference.py",
-        "rows_of = broken.reshape(len(p), -1) if broken.numel() else broken.new_zeros(0, 1)",
-        "rows_of = broken.reshape(len(p), -1) if broken.numel() else broken.new_zeros(1, 1)",
+        "rows_of = nonfinite.reshape(len(p), -1) if p.numel() else nonfinite.new_zeros(0, 1)",
+        "rows_of = nonfinite.reshape(len(p), -1) if p.numel() else nonfinite.new_zeros(1, 1)",
     ): "a row without values is not counted either way",
     (
         "formats/glb.py",

@@ -66,7 +66,8 @@ int64_t prepare(const SplatsPrepareParams<T>& p) {
   return 0;
 }
 
-// Least significant digit first, 11 bits per pass, over the bits in which the keys differ.
+// Least significant digit first, 11 bits per pass, over the bits of
+// (largest key − smallest key).
 template <class T>
 int64_t radix_sort(const SplatsSortParams<T>& p) {
   using Key = DepthKey<T>;
@@ -134,7 +135,7 @@ int64_t radix_sort(const SplatsSortParams<T>& p) {
 }
 
 // The tiles of one splat: a rectangle, and for small ones (≤ 16 tiles) the exact subset as bits,
-// row-major in a rectangle `width` tiles wide. Large ones are tested again in fill_tiles.
+// row-major in a rectangle `width` tiles wide. For larger splats, `fill_tiles` repeats the tests.
 struct TileSpan {
   uint16_t x0, y0, bits;
   uint8_t width, large;
@@ -205,7 +206,8 @@ struct SmallOffsets {  // tile offset of bit k in a span `width` wide
   }
 };
 
-// Returns the number of instances, also in *required. On the CPU, memory is allocated after this.
+// Returns the number of instances, also in *required. On the CPU, the caller allocates the memory
+// of the instances after this call.
 template <class V, class T = typename V::Scalar>
 int64_t count_tiles(const TilesCountParams<T>& p) {
   const int64_t m = p.n, tiles_x = p.binning.tiles_x, parts = p.binning.parts;

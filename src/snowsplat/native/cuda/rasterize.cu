@@ -5,9 +5,9 @@
 //           warp's rectangle, exactly, and the warp composites only those that touch it. A byte per
 //           instance, one bit per warp, stores this for the backward pass.
 // Forward   A pixel's transmittance and colour stay in the registers of its thread. A tile ends when
-//           its last pixel is finished; tile_end stores where.
-// Backward  goes front to back again, with S, the sum over the splats behind (known at the start:
-//           S₀ = ∂L/∂C · C, since all splats are behind). The derivative with respect to
+//           its last pixel is finished; tile_end stores the end of the visited instances.
+// Backward  goes front to back again, with S = ∂L/∂C · (contribution of the splats behind), known
+//           at the start: S₀ = ∂L/∂C · C, since all splats are behind. The derivative with respect to
 //           log α is w·(g·c) − α S/(1 − α): no division by T, no last index per pixel, and no state
 //           of the forward pass except the image.
 //
@@ -52,7 +52,7 @@ struct Seat {
   int left, top;  // of the rectangle
   int x, y;
   bool inside;
-  int64_t plane, at;  // number of pixels of the image, index of this one
+  int64_t plane, at;  // `plane`: number of pixels of the image; `at`: index of this pixel
 
   SNOW_INLINE Seat(int width, int height) {
     const int tiles_x = (width + kTile - 1) / kTile, tile = int(blockIdx.x);
@@ -76,7 +76,7 @@ struct Batch {
   Two<T> look_on[kSize];  // colours 2 and 3
 };
 
-// Loads the splat of an instance into a place of the batch.
+// Loads the splat of an instance into entry `place` of the batch.
 template <int C, int kSize, class T>
 SNOW_INLINE SplatTerms<T> load(const FrameParams<T>& f, uint32_t instance, Batch<T, kSize>& batch,
                                int place) {
@@ -97,11 +97,11 @@ SNOW_INLINE SplatTerms<T> load(const FrameParams<T>& f, uint32_t instance, Batch
   return s;
 }
 
-// The places in the batch of the instances that touch a warp's rectangle, in order.
+// The batch indices of the instances that touch a warp's rectangle, in order.
 using Touching = uint8_t[kWarp];
 
-// Lists the places of the lanes that touch, and returns their number. The warp has to synchronize
-// before it is called again.
+// Lists the batch indices of the lanes whose splat touches the rectangle, and returns their number.
+// The warp has to synchronize before it is called again.
 SNOW_INLINE int list_touching(Touching& list, unsigned lanes, int place) {
   const int lane = lane_id();
   if (lanes >> lane & 1) list[__popc(lanes & ((1u << lane) - 1))] = uint8_t(place);
@@ -124,9 +124,9 @@ struct Pixel {
   SNOW_INLINE bool unfinished() const { return rest > T(0); }
   SNOW_INLINE T transmittance() const { return max(rest, -rest); }
 
-  // Composites a splat; returns whether it contributes, its weight (0 if not), and α before and after
-  // clamping. Both passes must make the same decisions, so every rounding is explicit (fma). In a
-  // finished pixel `next` is negative, so nothing more is composited.
+  // Composites a splat; returns whether it contributes, its weight (0 if not), and α before and
+  // after the limit 0.99. Both passes must make the same decisions, so every rounding is explicit
+  // (fma). In a finished pixel `next` is negative, so nothing more is composited.
   SNOW_INLINE bool blend(const Four<T>& shape, const Four<T>& look, T& uncapped, T& alpha,
                          T& weight) {
     const T dx = x - shape.x, dy = y - shape.y;
@@ -236,7 +236,7 @@ constexpr int kSums = kGroupChannels + 6;
 // Strides chosen so that the numbers of one column are in different banks.
 constexpr int kPairStride = kWarp + 2, kSumStride = kSums + 1;
 
-// Scratch of a warp, used for two purposes in turn.
+// Scratch of a warp, reused: steps 1 and 2, then step 3.
 template <class T>
 union WarpScratch {
   Two<T> pairs[kGroup * kPairStride];       // steps 1 and 2: w and q, of each splat and pixel
@@ -294,8 +294,8 @@ struct Sums {
   }
 };
 
-// The sums of up to 32 splats that a warp has processed. A lane has half of the sums of two of them:
-// the upper half of the warp has the second half.
+// The sums of up to 32 splats that a warp has processed. Each lane stores half of the sums of two
+// splats; the upper half-warp stores the second half.
 template <int C, class T>
 struct KeptSums {
   static constexpr int kHalf = Sums<C, T>::kHalf, kWays = kWarp / kGroup / 2;
@@ -331,8 +331,9 @@ struct KeptSums {
   }
 };
 
-// The gradient from the sums of an instance, one thread each, as in splat_terms_vjp: a multiple of the
-// sum itself, and for the two of the mean also of the other one. All threads of a warp take part.
+// The gradient from the sums of an instance, one thread each, as in splat_terms_vjp: a multiple of
+// the sum itself. The two gradients of the mean also depend on the other sum. All threads of a warp
+// take part.
 template <int C, class T>
 SNOW_INLINE T gradient_of(T sum, int moment, const Four<T>& shape, const Four<T>& look) {
   const T other = __shfl_sync(kAllLanes, sum, moment == 1 ? C + 2 : C + 1, kSlotWidth);
@@ -422,7 +423,7 @@ SNOW_INLINE void sum_over_pixels(const Seat& seat, PixelGradient<C, T>& own, int
   sums.store(list, listed, first, scratch.sums);
 }
 
-// Step 3 uses 16 threads per instance, one per number.
+// Step 3 uses 16 threads per instance, one per sum.
 struct SumSeat {
   int place, column;  // the instance of 16, the number within it
   int to;             // the column of the packed gradient that the number belongs to

@@ -26,7 +26,7 @@ def candidates(file: str, capability: Capability, cuda_major: int) -> Iterator[b
     """Code that may run on this GPU, best first: a built cubin, then code compiled for this GPU.
 
     Args:
-        file: of the `Kernel`.
+        file: the file of the `Kernel`.
         cuda_major: newest CUDA version of the driver, which cannot load code of later versions.
 
     Raises:

@@ -13,7 +13,7 @@ class Kernel:
     """A kernel in `native/cuda/<file>.cu`; the one for float64 has the suffix `_f64`.
 
     params: its struct of parameters.
-    threads: of a block, as in its SNOW_KERNEL.
+    threads: number of threads of a block, as in its SNOW_KERNEL.
     items: number of items that a block processes.
     """
 

@@ -109,7 +109,7 @@ class Nvrtc:
             lineinfo: include source lines for profilers and sanitizers.
 
         Raises:
-            CompileError: with the compiler's complete output.
+            CompileError: the code does not compile; contains the compiler's complete output.
         """
         options = [f"--gpu-architecture={target}", *OPTIONS, f"--include-path={_NATIVE}"]
         if lineinfo:

@@ -44,7 +44,7 @@ class GatherOptions:
     """Frames and sizes to use. At most one of ``fps`` and ``frames`` may be set."""
 
     fps: float | None = None  # frames per second to use of each video
-    frames: int | None = None  # number of frames to use of each video, at most
+    frames: int | None = None  # maximum number of frames to use of each video
     size: int | None = None  # resize to this longest side in pixels, if larger; None: keep
 
 

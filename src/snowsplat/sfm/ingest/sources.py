@@ -92,7 +92,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
         unused += masks.unused
         for relative in videos:
             if photos:
-                reason = "is a video beside photos; name it as an input to use its frames"
+                reason = "is a video beside photos; add it as an input to use its frames"
                 left_out.append((shown(path / relative), reason))
             else:
                 stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
@@ -230,7 +230,7 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
         if any(Path(file).suffix.lower() in _RAW_SUFFIXES for file in _files_below(path)):
             return UserError(f"{names}: only raw photos; save them as JPEG or PNG first")
     return UserError(
-        f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; name the folder "
+        f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "
         "that contains them"
     )
 

@@ -92,10 +92,10 @@ class DensityConfig(Protocol):
 
         Args:
             count: number of Gaussians.
-            extent: of the scene, in world units.
+            extent: extent of the scene, in world units.
             random_init: whether training starts from random points, not those of a dataset.
-            generator: on the CPU.
-            device: of the Gaussians; default: the CPU.
+            generator: a random generator on the CPU.
+            device: the device of the Gaussians; default: the CPU.
         """
         ...
 

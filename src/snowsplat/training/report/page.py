@@ -46,11 +46,11 @@ class Trained:
     """The content of the page.
 
     Attributes:
-        name: of the scene.
-        step: the last one.
-        background: of the views, RGB in 0..1.
-        evaluation: of the held-out views; without any, some training views are evaluated.
-        settings: by name, as JSON values.
+        name: name of the scene.
+        step: the last step.
+        background: background colour of the views, RGB in 0..1.
+        evaluation: metrics of the held-out views; without any, some training views are evaluated.
+        settings: the settings by name, as JSON values.
         peak_bytes: peak memory; 0 if unknown.
     """
 

@@ -38,7 +38,7 @@ class Pace:
     ) -> None:
         """
         Args:
-            seconds: from now to the end, including evaluation of the test photos and saving.
+            seconds: time from now to the end, including evaluation of the test photos and saving.
             slowness: see `StepCost`.
             clock: returns the time in seconds.
         """

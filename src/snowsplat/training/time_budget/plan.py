@@ -98,7 +98,7 @@ def make_plan(
 
     Args:
         config: the configuration of the recipe; ``iterations`` is replaced.
-        slowness: from `measure_slowness`.
+        slowness: the result of `measure_slowness`.
         resize: whether the photos may be reduced.
         more_gaussians: whether the limit of the number of Gaussians may be raised.
         more_often: whether a short training may densify more often.

@@ -38,8 +38,8 @@ class Work:
     """What the time of a training depends on.
 
     Attributes:
-        config: for its coarse-to-fine stages and its densification.
-        pixels: of a photo at full resolution, the mean.
+        config: the configuration; its coarse-to-fine stages and its densification are used.
+        pixels: mean number of pixels of a photo at full resolution.
         held_out: number of test photos, which are evaluated at the end.
     """
 

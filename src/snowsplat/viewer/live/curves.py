@@ -20,8 +20,8 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded
 from snowsplat.viewer.live.display import fit
 
-_POINTS = 512  # of a curve, at most; then neighbouring points are merged
-_VIEWS = 4  # whose PSNR is averaged
+_POINTS = 512  # maximum number of points per curve; beyond it, neighbours are merged
+_VIEWS = 4  # number of views whose PSNR is averaged
 _LONGEST = 480  # pixels: longer side of these views
 
 

@@ -31,9 +31,9 @@ from snowsplat.viewer.live.session import PhotoView, Session, Visitor
 FRUSTUMS = "/photos"
 _TRAIN_COLOR = (70, 130, 230)
 _TEST_COLOR = (240, 150, 40)
-_LENGTH = 0.6  # of a frustum, relative to the distance of neighbouring cameras
-_LONGEST = 0.06  # of a frustum, relative to the extent of the scene, at most
-_MOST = 400  # frustums
+_LENGTH = 0.6  # length of a frustum, relative to the distance of neighbouring cameras
+_LONGEST = 0.06  # maximum length of a frustum, relative to the extent of the scene
+_MOST = 400  # maximum number of frustums
 _SMALL = 96  # pixels: longer side of the thumbnails in frustums
 _READING = 0.2  # share of the time for reading thumbnails while a training runs
 
@@ -57,9 +57,9 @@ class Photos:
     ) -> None:
         """
         Args:
-            extent: of the scene, world units.
-            centre: (3,) of the scene, around which a browser rotates.
-            background: (3,) behind transparent photos, 0..1.
+            extent: extent of the scene, in world units.
+            centre: (3,) centre of the scene, around which a browser rotates.
+            background: (3,) colour behind transparent photos, 0..1.
         """
         self.views = [*train, *test]
         self._server, self._session = server, session

@@ -33,8 +33,8 @@ class RunningServer:
     """A server and its address.
 
     Attributes:
-        url: for browsers on this machine; if a host name was given, also on other machines.
-        others: for other machines, if they can connect at another address.
+        url: the URL for browsers on this machine; if a host name was given, also on other machines.
+        others: the URL for other machines, if they can connect at another address.
     """
 
     server: viser.ViserServer

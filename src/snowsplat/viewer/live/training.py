@@ -39,7 +39,7 @@ class TrainingViewer:
         Args:
             step: number of finished steps.
             steps: total number of steps.
-            loss: of this step.
+            loss: the loss of this step.
 
         Returns:
             Seconds for which it was paused.
