@@ -103,9 +103,9 @@ def kernels_in(cubin: bytes) -> dict[str, Built]:
         if not section.startswith(".nv.info."):
             continue
         name = section.removeprefix(".nv.info.")
-        found = list(attributes(content))
-        (threads,) = (struct.unpack("<III", c)[0] for a, c in found if a == MAX_THREADS)
-        sizes = [struct.unpack("<IHHI", c)[3] >> 18 for a, c in found if a == PARAMETER]
+        listed = list(attributes(content))
+        (threads,) = (struct.unpack("<III", c)[0] for a, c in listed if a == MAX_THREADS)
+        sizes = [struct.unpack("<IHHI", c)[3] >> 18 for a, c in listed if a == PARAMETER]
         found[name] = Built(threads, sizes, local[name])
     return found
 

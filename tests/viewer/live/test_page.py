@@ -184,7 +184,7 @@ def test_the_view_at_a_photo(training, page):
     page.wait_for("document.body.innerText.includes('At view_02.png')")
     wait(lambda: differ(scene(page), photo) > 1)
     page.drag(200, 600, 320, 640)
-    page.wait_for("document.body.innerText.includes('photo_view where its photo was taken')")
+    page.wait_for("document.body.innerText.includes('click one to view the scene')")
     press(page, "Resume")
 
 
