@@ -21,14 +21,23 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 _HERE = Path(__file__).parent
 #: Marks set by the folder of a test, and by the fixtures that it uses.
-_OF_FOLDERS = {"kill": "kill", "fuzz": "slow"}
+#: Tests of `cli`, `pipeline` and `viewer` train, serve or render; those of the parser are quick.
+_OF_FOLDERS = {
+    "kill": "kill",
+    "fuzz": "slow",
+    "cli": "slow",
+    "pipeline": "slow",
+    "viewer": "slow",
+}
+_QUICK = {"cli/test_main.py"}
 _OF_FIXTURES = {"recorder": "build", "start": "slow"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        folder = item.path.relative_to(_HERE).parts[0]
-        if folder in _OF_FOLDERS:
+        path = item.path.relative_to(_HERE)
+        folder = path.parts[0]
+        if folder in _OF_FOLDERS and path.as_posix() not in _QUICK:
             item.add_marker(_OF_FOLDERS[folder])
         for fixture in _OF_FIXTURES.keys() & getattr(item, "fixturenames", ()):
             item.add_marker(_OF_FIXTURES[fixture])

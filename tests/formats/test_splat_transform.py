@@ -11,6 +11,8 @@ from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 
+pytestmark = pytest.mark.slow  # each test starts Node
+
 
 def assert_same(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
     assert len(a) == len(b)
