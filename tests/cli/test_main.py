@@ -42,6 +42,17 @@ def test_help_lists_the_subcommands_and_each_has_help(run):
         assert "None" not in own.out  # tyro's text for a missing default
 
 
+def test_help_texts_are_wrapped_to_the_width_of_the_terminal(run, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for name in module.SUBCOMMANDS:
+        lines = run(name, "--help").out.splitlines()[1:]  # without the usage, which tyro wraps
+        assert max(map(len, lines)) <= 80, name
+    own = run("train", "--help").out
+    paragraph = own[own.index("--recipe") : own.index("--minutes")]
+    lines = [line.strip("│ ") for line in paragraph.splitlines()[1:-1]]
+    assert all(len(line) > 40 for line in lines[:-2]), lines  # no line breaks of the docstring
+
+
 def imported_by(*arguments: object) -> set[str]:
     """The names of the heavy modules and of the subcommands that a command imports."""
     code = (

@@ -12,60 +12,66 @@ RECIPE = "set by the recipe"
 
 @dataclass
 class ConfigFlags:
-    """One flag per setting. None: the recipe determines the setting."""
+    """One flag for each setting. If a flag is None, the recipe determines the setting."""
 
     iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Number of training steps; each uses one photo."""
     max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Maximum number of Gaussians, which determines memory and time; 0: no limit."""
     checkpoint_every: Annotated[int | None, flag("N", default="none")] = None
-    """Steps between checkpoints. With --resume the result is the same as without interruption."""
+    """Save a checkpoint every N steps. --resume can continue from it."""
     seed: Annotated[int | None, flag("N", default="0")] = None
-    """Seed of all random choices. The same seed produces a bit-identical scene on the CPU; on a GPU
-    with --deterministic."""
+    """Seed of all random choices. On the CPU, the same seed produces a bit-identical scene; on a
+    GPU, this requires --deterministic."""
     test_iterations: Annotated[tuple[int, ...] | None, flag("[N ...]", default=RECIPE)] = None
-    """Steps after which to evaluate the held-out photos, in addition to the last one; -1: none."""
+    """Steps after which to evaluate the scene on the held-out photos, in addition to the last step;
+    -1: only after the last step."""
     background: Annotated[
         Literal["black", "white", "random"] | None,
         flag("{black,white,random}", default="black"),
     ] = None
-    """Color behind the scene, and behind transparent photos."""
+    """Color of the background of the scene and of transparent photos."""
 
     sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
-    """Degree of the view-dependent color. A lower degree takes less memory."""
+    """Degree of the spherical harmonics (view-dependent color). A lower degree needs less
+    memory."""
     ssim_weight: Annotated[float | None, flag("F", "--lambda-dssim", default=RECIPE)] = None
-    """Weight of 1 - SSIM in the loss; the rest is the mean absolute difference."""
+    """Weight of 1 - SSIM in the loss. The mean absolute difference has the weight 1 - F."""
     initial_points: Annotated[int | None, flag("N", default=RECIPE)] = None
-    """Number of random Gaussians to start from if the dataset has no points."""
+    """Number of Gaussians at random positions to start from, if the dataset has no points."""
     grad_threshold: Annotated[
         float | None, flag("F", "--densify-grad-threshold", default=RECIPE)
     ] = None
-    """Densify Gaussians whose view-space gradient is larger; a larger value adds fewer."""
+    """Clone or split Gaussians whose view-space gradient exceeds this threshold. With a larger
+    value, fewer Gaussians are added."""
     densify_interval: Annotated[
         int | None, flag("N", "--densification-interval", default=RECIPE)
     ] = None
-    """Number of steps between densifications; a larger value adds fewer Gaussians."""
+    """Number of steps between densifications. With a larger value, fewer Gaussians are added."""
     densify_from: Annotated[
         int | float | None, flag("N|F", "--densify-from-iter", default=RECIPE)
     ] = None
-    """First step of densification; with a decimal point (0.1): a fraction of all steps."""
+    """First step of densification. A value with a decimal point (0.1) is a fraction of all
+    steps."""
     densify_until: Annotated[
         int | float | None, flag("N|F", "--densify-until-iter", default=RECIPE)
     ] = None
-    """Last step of densification; with a decimal point (0.5): a fraction of all steps."""
+    """Last step of densification. A value with a decimal point (0.5) is a fraction of all steps."""
     opacity_reset_interval: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Number of steps between opacity resets; 0: no resets."""
     percent_dense: Annotated[float | None, flag("F", default=RECIPE)] = None
-    """Gaussians smaller than this fraction of the scene extent are cloned, larger are split."""
+    """Densification clones Gaussians smaller than this fraction of the scene extent, and splits
+    larger ones."""
 
     lr_means: Annotated[float | None, flag("F", "--position-lr-init", default=RECIPE)] = None
     """Learning rate of the positions at the first step, in units of the scene extent."""
     lr_means_final: Annotated[float | None, flag("F", "--position-lr-final", default=RECIPE)] = None
-    """Learning rate of the positions at step --position-lr-max-steps and later."""
+    """Learning rate of the positions from step --position-lr-max-steps on, in the same units."""
     lr_means_steps: Annotated[
         int | float | None, flag("N|F", "--position-lr-max-steps", default=RECIPE)
     ] = None
-    """Step at which the learning rate of the positions reaches its final value."""
+    """Step at which the learning rate of the positions reaches its final value. A value with a
+    decimal point (1.0) is a fraction of all steps."""
     lr_log_scales: Annotated[float | None, flag("F", "--scaling-lr", default=RECIPE)] = None
     """Learning rate of the scales."""
     lr_quats: Annotated[float | None, flag("F", "--rotation-lr", default=RECIPE)] = None

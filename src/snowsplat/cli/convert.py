@@ -17,7 +17,7 @@ Box = tuple[float, float, float, float, float, float]
 
 @dataclass
 class Convert:
-    """Write a scene in another format; crop, decimate, rotate or merge scenes.
+    """Write a scene in another file format; crop, decimate, transform or merge scenes.
 
     Examples:
       snowsplat convert out/garden garden.spz
@@ -27,35 +27,37 @@ class Convert:
 
     The suffix of FILE selects the format:
       .ply              lossless; read by every program for Gaussian splats
-      .compressed.ply   a quarter of the size of .ply; for SuperSplat
-      .spz              an eighth of the size; for Niantic's and many other programs
-      .sog              a tenth of the size; for PlayCanvas' web viewers
-      .glb              glTF, lossless
-      .splat            without view-dependent color
-      .html             a single web page with a viewer, for example to send by mail
+      .compressed.ply   1/4 of the size of .ply; for SuperSplat
+      .spz              1/8 of the size; for the programs of Niantic and many others
+      .sog              1/10 of the size; for the web viewers of PlayCanvas
+      .glb              glTF; lossless except for rounding
+      .splat            1/8 of the size; no view-dependent color
+      .html             a web page that contains the scene and a viewer
 
-    Several scenes are merged. Then the edits are applied in this order: --crop, --rotate, --scale,
-    --translate, --decimate, --sh-degree. Coordinates are those of PLY files: x right, y down, z
-    forward.
+    Notes:
+      If there are several scenes, they are merged first. Then the edits are
+      applied in this order: --crop, --rotate, --scale, --translate, --decimate,
+      --sh-degree. Coordinates are in the frame of PLY files: x right, y down, z
+      forward.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE [MORE …] FILE")] = ()
-    """Scenes, then the file to write. A scene is a file of any format or the output folder of a
-    training, whose last scene is used."""
+    """One or more scenes, followed by the file to write. A scene is a file of any format, or an
+    output folder, of which the last scene is used."""
     sh_degree: Annotated[int | None, flag("N", default="that of the scene")] = None
-    """Keep the view-dependent color up to this degree, 0 to 3."""
+    """Reduce the spherical harmonics (view-dependent color) to this degree, 0 to 3."""
     crop: Annotated[Box | None, flag("X0 Y0 Z0 X1 Y1 Z1", default="all")] = None
-    """Keep only the Gaussians in this box."""
+    """Keep only the Gaussians whose centers are in this box."""
     decimate: Annotated[str | None, flag("N|P%", default="all")] = None
-    """Number or percentage of Gaussians to keep: the largest and most opaque."""
+    """Number or percentage of Gaussians to keep. The largest and most opaque ones are kept."""
     rotate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)
-    """Rotate by degrees about x, then about y, then about z."""
+    """Rotate by these angles in degrees, first about x, then about y, then about z."""
     scale: Annotated[float, flag("F", default="1")] = 1.0
     """Scale by this factor about the origin."""
     translate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)
     """Translate by this offset."""
     overwrite: Annotated[bool, switch()] = False
-    """Replace FILE if it exists."""
+    """Replace FILE if it exists already."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

@@ -15,24 +15,29 @@ if TYPE_CHECKING:
 
 @dataclass
 class Evaluate(SceneFlags):
-    """Measure a scene on the held-out photos: PSNR, SSIM and, with weights, LPIPS.
+    """Compare a scene with the held-out photos: PSNR, SSIM and, with weights, LPIPS.
 
     Examples:
       snowsplat evaluate out/garden
       snowsplat evaluate out/garden --split train
       snowsplat evaluate out/garden --lpips lpips_vgg.safetensors
 
-    The metrics of each view and their means are printed and written to OUT/metrics.json. Renders
-    are clamped to 0..1 and not rounded to 8 bits. To create the weights file for LPIPS, run this
-    once where the package lpips is installed:
-      weights = {name: w.clone() for name, w in lpips.LPIPS(net="vgg").state_dict().items()}
+    Notes:
+      The metrics of each view and their means are printed, and written to
+      OUT/metrics.json. The values of renders are clamped to 0..1, but not rounded
+      to 8 bits.
+
+    To create the file of weights for LPIPS, run this where lpips is installed:
+      weights = lpips.LPIPS(net="vgg").state_dict()
+      weights = {name: weight.clone() for name, weight in weights.items()}
       safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
     """
 
     split: Annotated[Literal["test", "train"], flag("{test,train}", default="test")] = "test"
-    """test: the held-out photos; train: the photos that the scene was trained on."""
+    """test: the held-out photos; train: the training photos."""
     lpips: Annotated[Path | None, flag("FILE", default="not measured")] = None
-    """Weights for LPIPS (AlexNet or VGG16, and the linear layers): a safetensors or torch file."""
+    """File with the weights for LPIPS (of AlexNet or VGG16, and of the linear layers), in the
+    format of safetensors or torch."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

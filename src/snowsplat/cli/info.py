@@ -25,16 +25,18 @@ class Info:
       snowsplat info out/garden/point_cloud/iteration_3000/point_cloud.ply
       snowsplat info garden
 
-    Prints the format and size of a file and what it contains: the number of Gaussians or points,
-    the bounds of the scene, percentiles of opacity and scale; for a folder also its photos, scenes,
-    checkpoints and metrics. A checkpoint is verified.
+    Notes:
+      For a file, this command prints the format, the size, the number of
+      Gaussians or points, the bounds of the scene, and percentiles of opacity and
+      scale. For a folder, it also prints the photos, scenes, checkpoints and
+      metrics. For a checkpoint, it also checks that the file is not damaged.
     """
 
     # Not `Path | None`, to check which tyro would import another package for a tenth of a second.
     path: Annotated[Optional[Path], tyro.conf.Positional, flag("FILE|OUT|DATASET")] = None  # noqa: UP045
-    """A scene of any format, a checkpoint, the output folder of `train` or `make`, or a dataset."""
+    """A scene file of any format, a checkpoint, an output folder of train or make, or a dataset."""
     json: Annotated[bool, switch()] = False
-    """Print JSON, for programs."""
+    """Print JSON, which other programs can read."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

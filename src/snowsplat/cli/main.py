@@ -19,37 +19,40 @@ from typing import Annotated, Any, Union
 import tyro
 
 from snowsplat.cli.flags import with_flags
+from snowsplat.cli.help_text import join_lines_of_field_docstrings
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import printable
 
 #: The subcommands with the first line of their docstrings. The subcommand ``train`` is the
 #: dataclass ``Train`` in the module ``snowsplat.cli.train``, which is imported when it is called.
 SUBCOMMANDS = {
-    "make": "Make a scene from photos or a video: camera poses, training, images, in one command.",
-    "sfm": "Estimate the camera poses of photos or of a video: the dataset that training needs.",
+    "make": "Make a scene from photos or a video: sfm, train and render in one command.",
+    "sfm": "Estimate the camera poses of photos or a video, and create a dataset.",
     "train": "Train a scene from photos with known camera poses (COLMAP or transforms.json).",
-    "evaluate": "Measure a scene on the held-out photos: PSNR, SSIM and, with weights, LPIPS.",
-    "render": "Render a scene from the camera poses of its photos, or along a path as a video.",
-    "view": "Fly through a finished scene in the browser; Ctrl-C stops the viewer.",
+    "evaluate": "Compare a scene with the held-out photos: PSNR, SSIM and, with weights, LPIPS.",
+    "render": "Render images at the camera poses of the photos, or a video.",
+    "view": "Show a finished scene in the browser.",
     "watch": "Show a running or finished training in the browser, with its cameras and photos.",
-    "convert": "Write a scene in another format; crop, decimate, rotate or merge scenes.",
+    "convert": "Write a scene in another file format; crop, decimate, transform or merge scenes.",
     "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }
 
 # Former names of subcommands, still accepted but not listed.
 _FORMER_NAMES = {"capture": "sfm"}
 
-DESCRIPTION = """3D Gaussian Splatting on any computer: photos -> a scene, rendered in real time.
+DESCRIPTION = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
 
-  snowsplat make PHOTOS                     photos or a video -> a scene (sfm, train and render)
-  snowsplat sfm PHOTOS -o DATASET           photos or a video -> photos with camera poses
-  snowsplat train DATASET -o OUT --eval     photos with camera poses -> a scene in OUT
-  snowsplat evaluate OUT                    PSNR and SSIM on the held-out photos
-  snowsplat render OUT                      images of the scene, and videos
-  snowsplat view FILE|OUT                   fly through a scene in the browser
-  snowsplat watch OUT                       show a running or finished training in the browser
-  snowsplat convert SCENE [MORE …] FILE     another format; crop, decimate, rotate, merge
-  snowsplat info PATH                       describe a scene, a dataset or an output folder
+  snowsplat make PHOTOS                   photos or a video -> a scene
+  snowsplat sfm PHOTOS -o DATASET         photos or a video -> a dataset
+  snowsplat train DATASET -o OUT --eval   a dataset -> a scene in OUT
+  snowsplat evaluate OUT                  PSNR and SSIM on the held-out photos
+  snowsplat render OUT                    images and videos of the scene
+  snowsplat view FILE|OUT                 show a finished scene in the browser
+  snowsplat watch OUT                     show the training in the browser
+  snowsplat convert SCENE [MORE …] FILE   another format; crop, decimate, merge
+  snowsplat info PATH                     describe a file or a folder
+
+A dataset is a folder of photos with their camera poses.
 
 Each subcommand has its own help: snowsplat train --help
 
@@ -123,7 +126,11 @@ def _choices(called: str) -> list[Any]:
     choices = []
     for name, summary in SUBCOMMANDS.items():
         load = load_all or name == called
-        kind = load_subcommand(name) if load else make_dataclass(name.capitalize(), [])
+        if load:
+            kind = load_subcommand(name)
+            join_lines_of_field_docstrings(kind)
+        else:
+            kind = make_dataclass(name.capitalize(), [])
         text = inspect.cleandoc(kind.__doc__ or "") if name == called else summary
         choices.append(Annotated[kind, tyro.conf.subcommand(name, description=text)])
     return choices

@@ -28,47 +28,51 @@ _RESUMED_FLAGS = ("output", "quality", "minutes", "threads", "device", "memory",
 
 @dataclass
 class Make:
-    """Make a scene from photos or a video: camera poses, training, images, in one command.
+    """Make a scene from photos or a video: sfm, train and render in one command.
 
     Examples:
       snowsplat make photos/                   the scene is photos_scene/photos.ply
       snowsplat make walk.mp4 -o walk          the scene is walk/walk.ply
-      snowsplat make photos/ --quality best    slower, for larger photos and more Gaussians
-      snowsplat make photos/ --minutes 5       the best scene in 5 minutes on this computer
+      snowsplat make photos/ --quality best    slower: larger photos, more Gaussians
+      snowsplat make photos/ --minutes 5       finish within 5 minutes
 
-    OUT/capture contains the photos, their cameras and a report. OUT/scene contains the training,
-    and in scene/test/ours_N the held-out photos and the same views rendered. If the command is
-    interrupted, rerun it to resume. Finished stages are repeated only if photos or settings change.
+    Notes:
+      OUT/capture contains the photos, their cameras and a report. OUT/scene is
+      the output folder of the training. OUT/scene/test/ours_N contains the
+      held-out photos and renders of the same views.
+      If the command is interrupted, run it again to resume. Finished stages are
+      repeated only if the photos or the settings change.
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
-    """Folders of photos (JPEG, PNG, WebP, TIFF, HEIC), photos, and videos."""
+    """One or more photos (JPEG, PNG, WebP, TIFF, HEIC), folders of photos, or videos."""
     output: Annotated[Path | None, flag("OUT", "-o", default="./INPUT_scene")] = None
-    """Output folder; created if missing."""
+    """Output folder. It is created if it does not exist."""
     quality: Annotated[
         Literal["draft", "normal", "best"] | None,
-        flag("{draft,normal,best}", default="normal; --minutes: what fits"),
+        flag("{draft,normal,best}", default="normal; with --minutes, chosen for this time"),
     ] = None
-    """draft: a quick preview; best: takes several times as long as normal. With --minutes, this is
-    the effort to find the camera poses; the training uses the rest of the time."""
+    """draft: a quick preview; best: takes several times as long as normal. With --minutes, the
+    quality determines only the effort to estimate the camera poses; the training uses the remaining
+    time."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
-    """Finish within this time. Stages that an earlier run has finished are not counted. An
-    interrupted training resumes with its remaining time."""
+    """Finish within this time. If an earlier run was interrupted, the time of its finished stages
+    is not counted, and its training resumes with the time that remained."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to train on."""
-    memory: Annotated[str | None, flag("BYTES", default="available memory")] = None
-    """Memory limit of the training, for example 4GB: see train --help."""
+    memory: Annotated[str | None, flag("BYTES", default="no limit")] = None
+    """Memory limit of the training, for example 4GB. See snowsplat train --help."""
     overwrite: Annotated[bool, switch()] = False
-    """Replace a scene in OUT that was made from other photos."""
+    """Replace the scene in OUT even if it was made from other photos."""
     view: Annotated[bool, switch()] = False
-    """Show the training in the browser, then the finished scene, until Ctrl-C."""
+    """Show the training in the browser, and afterwards the finished scene until Ctrl-C."""
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
     """Port of the page: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL contains
-    a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL then
+    contains a secret token."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Render(SceneFlags):
-    """Render a scene from the camera poses of its photos, or along a path as a video.
+    """Render images at the camera poses of the photos, or a video.
 
     Examples:
       snowsplat render out/garden
@@ -27,10 +27,13 @@ class Render(SceneFlags):
       snowsplat render out/garden --path keys.json --side-by-side
       snowsplat render garden.ply --path ellipse --video garden.mp4
 
-    The images are written to OUT/test/ours_N/renders (held-out photos) and OUT/train/ours_N/renders
-    as 00000.png … in the order of the names of the photos; copies of the photos to gt/ beside it.
-    Videos are written to OUT/videos. A video along an ellipse or through a list of cameras needs
-    only a scene file.
+    Notes:
+      Images are written to OUT/test/ours_N/renders (for held-out photos) and
+      OUT/train/ours_N/renders (for training photos) as 00000.png …, in the order
+      of the names of the photos. Copies of the photos are written to the folder
+      gt next to renders. Videos are written to OUT/videos.
+      For a video along an ellipse or through the cameras of a file, a scene file
+      in place of OUT is sufficient.
     """
 
     split: Annotated[Literal["all", "test", "train"], flag("{all,test,train}", default="all")] = (
@@ -44,25 +47,27 @@ class Render(SceneFlags):
     depth: Annotated[
         Literal["none", "16bit", "color"], flag("{none,16bit,color}", default="none")
     ] = "none"
-    """Also write the depth, to depth/00000.png …: as 16-bit gray values, whose unit is in
-    world_units_per_step.json, or in colors from near (yellow) to far (violet). With --path, color
-    renders a second video."""
+    """Also write the depth, to depth/00000.png … 16bit: gray values, whose unit is written to
+    world_units_per_step.json; color: colors from yellow (near) to violet (far). With --path, color
+    writes a second video."""
 
-    path: Annotated[str | None, flag("{training,ellipse,spiral,FILE}", default="images")] = None
-    """Render a video along this camera path. training: along the cameras of the photos, smoothed;
-    ellipse: around what they show; spiral: in front of a scene whose cameras look in one direction;
-    FILE: through the cameras of a file like OUT/cameras.json, a loop if its first and last camera
-    are equal."""
+    path: Annotated[str | None, flag("{training,ellipse,spiral,FILE}", default="render images")] = (
+        None
+    )
+    """Render a video along this camera path. training: a smooth curve along the cameras of the
+    photos; ellipse: around the point that these cameras look at; spiral: for scenes whose cameras
+    look in one direction; FILE: a smooth curve through the cameras in a file with the format of
+    OUT/cameras.json, as a loop if the first and the last camera are equal."""
     seconds: Annotated[float | None, flag("F", default="10")] = None
-    """Length of the video."""
+    """Length of the video in seconds."""
     fps: Annotated[float | None, flag("F", default="30")] = None
-    """Frames per second."""
+    """Frames per second of the video."""
     size: Annotated[str | None, flag("WxH|W", default="that of the photos")] = None
-    """Size of the video in pixels, or its width."""
+    """Width and height of the video in pixels, or only its width."""
     side_by_side: Annotated[bool, switch()] = False
-    """One video with color on the left and depth on the right."""
+    """Write one video with color on the left and depth on the right."""
     video: Annotated[Path | None, flag("FILE.mp4", "--film", default="in OUT/videos")] = None
-    """File of the video."""
+    """File to which the video is written."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

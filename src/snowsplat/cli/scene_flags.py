@@ -1,4 +1,4 @@
-"""The flags of the subcommands that take the output folder of a training."""
+"""The flags of the subcommands whose input is the output folder of a training run."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ class SceneFlags:
     """The base class of these subcommands."""
 
     output: Annotated[Path | None, tyro.conf.Positional, flag("OUT")] = None
-    """Output folder of a training with snowsplat or with the reference implementation."""
+    """Output folder of snowsplat train or make, or of the reference implementation."""
     model_path: Annotated[Path | None, flag("OUT", "-m", "-o")] = None
-    """The same as OUT; the spelling of the reference implementation."""
-    iteration: Annotated[int | None, flag("N", default="the last")] = None
-    """The step after which the scene was saved, if OUT has several."""
+    """The same as OUT. This is the flag of the reference implementation."""
+    iteration: Annotated[int | None, flag("N", default="the last step")] = None
+    """If OUT contains several scenes, the step after which the scene was saved."""
     dataset: Annotated[
         Path | None, flag("DATASET", "-s", "--source-path", "--capture", default="as trained")
     ] = None
-    """The folder of photos and cameras, if it was moved after the training."""
+    """Folder of the dataset, if it was moved after the training."""
     resolution: Annotated[int | None, flag("N", "-r", default="as trained")] = None
-    """1, 2, 4 or 8 divide the size of the photos; any other number is a width in pixels."""
+    """With 1, 2, 4 or 8, the width and height of the photos are divided by this number. Any other
+    number is the new width in pixels."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None

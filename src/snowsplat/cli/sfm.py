@@ -19,58 +19,63 @@ if TYPE_CHECKING:
 
 @dataclass
 class Sfm:
-    """Estimate the camera poses of photos or of a video: the dataset that training needs.
+    """Estimate the camera poses of photos or a video, and create a dataset.
 
     Examples:
-      snowsplat sfm photos/ -o garden           a folder of photos
-      snowsplat sfm walk.mp4 -o garden          a video: the sharpest frames are used
+      snowsplat sfm photos/ -o garden       a folder of photos
+      snowsplat sfm walk.mp4 -o garden      a video: the sharpest frames are used
       snowsplat sfm walk.mp4 -o garden --frames 120
       snowsplat sfm a.mp4 b.mp4 details/ -o garden
-      snowsplat sfm -s garden --resize          photos in garden/input, as for convert.py
-      snowsplat train garden -o out             the next step
+      snowsplat sfm -s garden --resize      photos in garden/input, as in convert.py
+      snowsplat train garden -o out         the next step
 
-    Masks are read from PHOTOS/masks/IMG.jpg.png or IMG.png (black pixels are ignored) or from the
-    transparency of the photos. DATASET/capture_report.html shows the cameras and lists the photos
-    that were not used. If the command is interrupted, rerun it to resume.
+    Notes:
+      The mask of PHOTOS/IMG.jpg is PHOTOS/masks/IMG.jpg.png or
+      PHOTOS/masks/IMG.png (black pixels are ignored), or the transparency of the
+      photo.
+      DATASET/capture_report.html shows the cameras and lists unused photos.
+      If the command is interrupted, run it again to resume.
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
-    """Folders of photos (JPEG, PNG, WebP, TIFF, HEIC), photos, and videos."""
+    """One or more photos (JPEG, PNG, WebP, TIFF, HEIC), folders of photos, or videos."""
     output: Annotated[Path | None, flag("DATASET", "-o")] = None
-    """Folder for the dataset; created if missing."""
+    """Folder for the dataset. It is created if it does not exist."""
     source_path: Annotated[Path | None, flag("LOCATION", "-s")] = None
-    """As in convert.py of the reference implementation: LOCATION/input contains the photos, and
-    LOCATION becomes the dataset."""
+    """Use the photos in LOCATION/input, and write the dataset to LOCATION, like convert.py of the
+    reference implementation."""
 
-    fps: Annotated[float | None, flag("F", default="2.5, fewer of a long video")] = None
-    """Frames to use per second of video."""
-    frames: Annotated[int | None, flag("N", default="as --fps determines")] = None
-    """Frames to use per video."""
+    fps: Annotated[float | None, flag("F", default="2.5; lower for long videos")] = None
+    """Number of frames to use per second of video."""
+    frames: Annotated[int | None, flag("N", default="determined by --fps")] = None
+    """Number of frames to use per video."""
     size: Annotated[int | None, flag("PIXELS", default="unchanged")] = None
-    """Scale photos and frames down to this length of their longer side."""
+    """Scale photos and frames down so that their longer side has this many pixels."""
     resize: Annotated[bool, switch()] = False
-    """Also write images_2, images_4 and images_8: a half, a quarter, an eighth of the size."""
+    """Also write the photos at 1/2, 1/4 and 1/8 of their width and height, to images_2, images_4
+    and images_8."""
 
     quality: Annotated[
         Literal["draft", "normal", "best"], flag("{draft,normal,best}", default="normal")
     ] = "normal"
-    """Effort for finding and matching features; best takes several times as long as normal."""
+    """Effort to detect and match features. best takes several times as long as normal."""
     camera_model: Annotated[str | None, flag("MODEL", "--camera")] = None
-    """Lens model, by its name in COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, PINHOLE …"""
+    """Camera model, by its name in COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, PINHOLE …"""
     mapper: Annotated[
         Literal["incremental", "global"], flag("{incremental,global}", default="incremental")
     ] = "incremental"
-    """incremental: estimate the poses one after the other; global: all at once, faster for many
-    photos."""
+    """incremental: estimate the camera poses one after the other; global: estimate all poses at
+    once, which is faster for many photos."""
     skip_matching: Annotated[bool, switch()] = False
-    """With -s: use the COLMAP model in LOCATION/distorted/sparse/0 and only undistort."""
+    """With -s, do not estimate camera poses; use the COLMAP model in LOCATION/distorted/sparse/0
+    and only undistort the photos."""
 
     threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of threads."""
+    """Number of CPU threads."""
     overwrite: Annotated[bool, switch()] = False
-    """Replace a dataset in DATASET that was made from other photos."""
+    """Replace the dataset in DATASET even if it was made from other photos."""
     quiet: Annotated[bool, switch("-q")] = False
-    """Print only the result, no progress."""
+    """Print only the result and no progress."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

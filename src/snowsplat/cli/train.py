@@ -20,16 +20,18 @@ class Train(TrainFlags):
     """Train a scene from photos with known camera poses (COLMAP or transforms.json).
 
     Examples:
-      snowsplat train garden -o out                   3000 steps, some minutes on a laptop
-      snowsplat train garden -o out --eval            hold out every 8th photo and evaluate on them
-      snowsplat train garden -o out -r 4              photos at a quarter of their size: faster
-      snowsplat train garden -o out --minutes 5       the best scene in 5 minutes on this computer
-      snowsplat train garden -o out --recipe paper    the 30,000 steps of the paper
-      snowsplat train garden -o out --checkpoint-every 1000     save every 1000 steps
-      snowsplat train -o out --resume                 continue after an interruption or a crash
+      snowsplat train garden -o out                  3000 steps, in some minutes
+      snowsplat train garden -o out --eval           hold out every 8th photo
+      snowsplat train garden -o out -r 4             faster: 1/4 of the width
+      snowsplat train garden -o out --minutes 5      finish within 5 minutes
+      snowsplat train garden -o out --recipe paper   the 30,000 steps of the paper
+      snowsplat train garden -o out --checkpoint-every 1000
+      snowsplat train -o out --resume                continue from a checkpoint
 
-    The scene is OUT/point_cloud/iteration_N/point_cloud.ply. Ctrl-C saves the current scene and a
-    checkpoint. The flags of the reference implementation are accepted (-s -m -i -r -w --eval …).
+    Notes:
+      The scene is written to OUT/point_cloud/iteration_N/point_cloud.ply.
+      Ctrl-C stops the training and saves the current scene and a checkpoint.
+      The flags of the reference implementation are accepted (-s -m -i -r -w …).
     """
 
     def run(self) -> int:

@@ -1,4 +1,4 @@
-"""The flags of `snowsplat train` beside the settings of its configuration."""
+"""The flags of `snowsplat train` that are not settings of the configuration."""
 
 from __future__ import annotations
 
@@ -21,63 +21,67 @@ class JobFlags:
     """What to train on, for how long, and where the result goes."""
 
     dataset: Annotated[Path | None, tyro.conf.Positional, flag("DATASET")] = None
-    """Folder of photos and cameras: images/ and sparse/0/ of COLMAP, or transforms.json."""
+    """Folder with photos and their cameras: images/ and a COLMAP model in sparse/0/, or
+    transforms.json."""
     output: Annotated[Path | None, flag("OUT", "-o", "-m", "--model-path")] = None
-    """Folder for the result; created if missing."""
+    """Output folder. It is created if it does not exist."""
 
     recipe: Annotated[
         Recipe | None, flag(f"{{{','.join(get_args(Recipe))}}}", default="default")
     ] = None
-    """Named configuration: the defaults of the other settings. default: 3000 fast steps; paper: the
-    schedule of the paper, 30,000 steps; mcmc: 30,000 steps with a fixed maximum number of
+    """Named configuration, which determines the defaults of the other settings. default: 3000 fast
+    steps; paper: the 30,000 steps of the paper; mcmc: 30,000 steps with a fixed maximum number of
     Gaussians."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
     """Finish within this time, including evaluation and saving. The number of steps, the size of
-    the photos and the number of Gaussians are chosen to fit, unless they are given. With --resume:
-    the time for the remaining steps."""
+    the photos and the maximum number of Gaussians are chosen for this time, unless flags set them.
+    With --resume, this is the time for the remaining steps."""
     eval: Annotated[bool, switch()] = False
-    """Hold out every 8th photo (or the test split of the dataset) and evaluate on these photos at
-    the end."""
+    """Hold out every 8th photo (or the test split of the dataset), and evaluate the scene on these
+    photos at the end."""
     test_list: Annotated[Path | None, flag("FILE")] = None
     """Text file with the names of the photos to hold out, one per line. Implies --eval."""
     images: Annotated[str | None, flag("NAME", "-i", default="images")] = None
-    """Name of the folder of photos in the dataset."""
+    """Name of the folder with the photos, in the folder of the dataset."""
     resolution: Annotated[int | None, flag("N", "-r", default="unchanged")] = None
-    """1, 2, 4 or 8 divide the size of the photos; any other number is a width in pixels."""
+    """With 1, 2, 4 or 8, the width and height of the photos are divided by this number. Any other
+    number is the new width in pixels."""
     white_background: Annotated[bool, switch("-w")] = False
     """The same as --background white."""
     feature_lr: Annotated[float | None, flag("F", default=RECIPE)] = None
-    """Sets --lr-sh-dc F and --lr-sh-rest F/20, as in the reference implementation."""
+    """Set --lr-sh-dc to F and --lr-sh-rest to F/20, as in the reference implementation."""
 
     view: Annotated[bool, switch()] = False
-    """Show the training in the browser: the scene, curves, a pause button. Ctrl-C closes it."""
+    """Show the training in the browser: the scene, curves of loss and PSNR, and a button to pause.
+    After the training, the page stays open until Ctrl-C."""
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
     """Port of the page: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL contains
-    a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL then
+    contains a secret token."""
 
-    memory: Annotated[str | None, flag("BYTES", default="available memory")] = None
-    """Memory limit of the training, for example 4GB: memory of the GPU or, on the CPU, memory in
-    addition to that of Python and its libraries. If needed, photos are decoded again for each use,
-    and the number of Gaussians is reduced."""
+    memory: Annotated[str | None, flag("BYTES", default="no limit")] = None
+    """Memory limit of the training, for example 4GB. On a GPU, this is memory of the GPU; on the
+    CPU, it is memory in addition to that of Python and its libraries. To stay within the limit,
+    photos are decoded each time they are used, and the maximum number of Gaussians is reduced."""
     resume: Annotated[bool, switch()] = False
-    """Continue from the newest checkpoint in OUT. The result is that of an uninterrupted
-    training."""
+    """Continue from the newest checkpoint in OUT. The result is the same as without the
+    interruption."""
     overwrite: Annotated[bool, switch()] = False
-    """Replace a training that is in OUT."""
+    """Replace the results of an earlier training in OUT."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
-    """Device to compute on."""
+    """Device to train on."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads. The result does not depend on it."""
+    """Number of CPU threads. The result does not depend on this number."""
     deterministic: Annotated[bool, switch()] = False
-    """On a GPU: bit-identical results in every run, with more time and memory."""
+    """On a GPU, make the results of repeated runs bit-identical. This needs more time and
+    memory."""
     save_iterations: Annotated[tuple[int, ...], flag("[N ...]")] = ()
-    """Steps after which to save the scene, in addition to the last one."""
+    """Steps after which to save the scene, in addition to the last step."""
     source_path: Annotated[Path | None, flag("DATASET", "-s")] = None
-    """The same as DATASET; the spelling of the reference implementation."""
+    """The same as DATASET. This is the flag of the reference implementation."""
     quiet: Annotated[bool, switch("-q")] = False
-    """Print only the result, no progress."""
+    """Print only the result and no progress."""
 
 
 @dataclass

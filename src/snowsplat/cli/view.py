@@ -19,28 +19,30 @@ from snowsplat.util.errors import UserError
 
 @dataclass
 class View:
-    """Fly through a finished scene in the browser; Ctrl-C stops the viewer.
+    """Show a finished scene in the browser.
 
     Examples:
       snowsplat view out/garden
       snowsplat view garden.spz
       snowsplat view out/garden --no-browser --port 8080
 
-    By default, only this computer can open the page; its URL contains a secret token. The initial
-    view is that of the first training photo. Drag to rotate, scroll to zoom, press W A S D to fly;
-    the page lists all controls.
+    Notes:
+      Drag the mouse to rotate, scroll to zoom, press W A S D to fly. The page
+      lists all controls. The initial view is that of the first training photo.
+      By default, the page can be opened only on this computer. Its URL contains a
+      secret token. Ctrl-C stops the viewer.
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
     """A scene file of any format, or the output folder of train or make."""
-    iteration: Annotated[int | None, flag("N", default="the last")] = None
-    """The step after which the scene was saved, if OUT has several."""
+    iteration: Annotated[int | None, flag("N", default="the last step")] = None
+    """If OUT contains several scenes, the step after which the scene was saved."""
     host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this computer only")] = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 accepts connections from the network."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network."""
     port: Annotated[int, flag("N", default="a free one")] = 0
     """Port to listen on."""
     no_browser: Annotated[bool, switch()] = False
-    """Print the address without opening a browser."""
+    """Print the URL, but do not open a browser."""
 
     def run(self) -> int:
         """Returns the exit code: 0, also after Ctrl-C, the usual end."""

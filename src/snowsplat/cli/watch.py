@@ -19,15 +19,17 @@ class Watch(SceneFlags):
       snowsplat watch out/garden
       snowsplat watch out/garden --port 9000
 
-    While the training runs, the page shows the newest scene or checkpoint that it has saved (see
-    train --checkpoint-every). OUT is the folder of `train` or of `make`. Ctrl-C closes the page.
+    Notes:
+      While the training is running, the page shows the newest scene or checkpoint
+      that has been saved (see --checkpoint-every of snowsplat train).
+      Ctrl-C closes the page.
     """
 
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
     """Port of the page: http://localhost:N."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL contains
-    a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL then
+    contains a secret token."""
 
     def run(self) -> int:
         """Runs until Ctrl-C; returns the exit code, 0."""
