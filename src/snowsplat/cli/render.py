@@ -99,7 +99,7 @@ class Render(SceneFlags):
         elif self.output is not None and self.model_path is not None:
             scene = None
         if scene is None:
-            raise UserError("render needs one output folder of a training, or one scene file")
+            raise UserError("render needs one output folder of a training run, or one scene file")
         options = VideoOptions(
             path=path,
             seconds=10.0 if self.seconds is None else self.seconds,

@@ -41,7 +41,7 @@ class SceneFlags:
     def output_path(self) -> Path:
         """The output folder. Raises: UserError: none named, or two."""
         if (self.output is None) == (self.model_path is None):
-            raise UserError("use exactly one output folder of a training")
+            raise UserError("use exactly one output folder of a training run")
         return self.output or self.model_path or Path()
 
     def compute(self) -> Compute:

@@ -1,4 +1,4 @@
-"""`StepProgress`: the steps of a training, as a bar in a terminal or as lines in a file."""
+"""`StepProgress`: the steps of a training run, as a bar in a terminal or as lines in a file."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class View:
     def run(self) -> int:
         """Returns the exit code: 0, also after Ctrl-C, the usual end."""
         if self.path is None:
-            raise UserError("view needs a scene; add a file or the output folder of a training")
+            raise UserError("view needs a scene; add a file or the output folder of a training run")
         from snowsplat.pipeline.scene_source import load_viewable
         from snowsplat.viewer.hosts import ANY_HOST
         from snowsplat.viewer.web.scene import site

@@ -1,4 +1,4 @@
-"""`snowsplat watch`: the output folder of a training in the browser, finished or running."""
+"""`snowsplat watch`: the output folder of a training run in the browser, finished or running."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`CheckpointMeta`: what a checkpoint stores about its training, beside the tensors."""
+"""`CheckpointMeta`: the data about the training run that a checkpoint contains with the tensors."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class CheckpointMeta:
         capture: how the dataset was read.
         recipe: the origin of the configuration.
         training: the configuration, see `config_to_json`.
-        time: see `TimeBudget.as_json`; only of a training with a time budget.
-        schedule: only of a training with a time budget, which may change it.
+        time: see `TimeBudget.as_json`; None without a time budget.
+        schedule: the schedule, which a time budget may change; None without a time budget.
     """
 
     capture: DatasetSettings
@@ -40,14 +40,16 @@ class CheckpointMeta:
         """The checked value of a checkpoint.
 
         Raises:
-            UserError: not the checkpoint of a training, or damaged.
+            UserError: not the checkpoint of a training run, or damaged.
         """
         try:
             meta = from_json(CheckpointMeta, start.meta)
             if meta.time is not None and meta.time.keys() != {"seconds", "spent"}:
                 raise ValueError("no time")
         except ValueError as error:
-            raise UserError(f"{start.path}: not the checkpoint of a training ({error})") from None
+            raise UserError(
+                f"{start.path}: not the checkpoint of a training run ({error})"
+            ) from None
         return meta
 
     def as_json(self) -> dict[str, Any]:

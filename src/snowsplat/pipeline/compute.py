@@ -18,12 +18,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Compute:
-    """What to compute on.
+    """The device and the number of threads for a computation.
 
     Attributes:
         device: "cpu", "cuda" or "cuda:1"; None: a GPU if a usable one is present.
-        threads: on the CPU; None: all cores. Results do not depend on it.
-        deterministic: on a GPU, sum in a fixed order: bitwise repeatable, slower, more memory.
+        threads: number of CPU threads; None: all cores. Results do not depend on this number.
+        deterministic: on a GPU, compute sums in a fixed order. Results are then bit-identical in
+            every run, but this needs more time and memory.
 
     Raises:
         UserError: fewer than 1 thread.

@@ -1,4 +1,4 @@
-"""`convert`: scene files into another format, edited and merged."""
+"""`convert`: merge and edit scenes, and write the result in another format."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ class Edits:
     forward.
 
     Attributes:
-        crop: keep the Gaussians in this box: x, y, z of the lower corner, then of the higher one.
-        rotate: degrees about x, then about y, then about z.
-        scale: factor, about the origin.
-        translate: offset.
-        decimate: number of Gaussians to keep, or a percentage such as "50%": the largest and most
-            opaque.
-        sh_degree: 0 to 3, of the view-dependent color that is kept.
+        crop: keep the Gaussians whose centers are in this box, given as x, y, z of the lower corner
+            and x, y, z of the upper corner.
+        rotate: angles in degrees of the rotations about x, then about y, then about z.
+        scale: scale by this factor about the origin.
+        translate: translate by this offset.
+        decimate: number of Gaussians to keep, or a percentage such as "50%". The largest and most
+            opaque ones are kept.
+        sh_degree: reduce the spherical harmonics to this degree, 0 to 3.
 
     Raises:
         UserError: a value out of its range.
@@ -82,7 +83,7 @@ class Edits:
         return scene
 
     def movement(self) -> Similarity | None:
-        """From the old frame to the new one; None if nothing moves: all values stay as they are."""
+        """The transform of these edits, from the old frame to the new one; None: no transform."""
         if not any(self.rotate) and self.scale == 1 and not any(self.translate):
             return None
         rotation = torch.eye(3, dtype=torch.float64)
@@ -101,12 +102,12 @@ def convert(
     *,
     overwrite: bool = False,
 ) -> Format:
-    """Merge scenes, edit the result, and write it in the format of the target's ending.
+    """Merge scenes, edit the result, and write it to ``target``.
 
     Args:
         sources: scene files of any format, or output folders, whose last scene is used.
-        target: the file to write; its ending selects the format.
-        edits: default: none.
+        target: the file to write; its suffix selects the format.
+        edits: changes to the merged scene; default: none.
         overwrite: replace ``target``.
 
     Returns:

@@ -29,8 +29,8 @@ def evaluate(
         evaluate(load_trained("out/garden")).psnr
 
     Args:
-        split: "test": the held-out photos; "train": those that the scene was trained on.
-        lpips: a weights file, see `snowsplat.evaluation.lpips`; None: LPIPS is not measured.
+        split: "test": the held-out photos; "train": the training photos.
+        lpips: a file of weights, see `snowsplat.evaluation.lpips`; None: LPIPS is not measured.
         on_view: called after each view.
 
     Returns:

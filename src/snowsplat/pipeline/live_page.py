@@ -1,4 +1,4 @@
-"""`LivePage`: a page that shows a training, or its output folder, in the browser."""
+"""`LivePage`: a page that shows a training run, or its output folder, in the browser."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class LivePage:
         return viewer
 
     def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
-        """As `open`, for a training. The training then calls `after_step` after each step."""
+        """As `open`, for a training run. The training then calls `after_step` after each step."""
         from snowsplat.viewer.live.curves import SampledPsnr
         from snowsplat.viewer.live.training import TrainingViewer
 

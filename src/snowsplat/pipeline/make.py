@@ -1,4 +1,4 @@
-"""`make`: photos or a video become a scene: camera poses, training, rendered test views."""
+"""`make`: make a scene from photos or a video: camera poses, training, rendered test views."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ HOLD_OUT = 8
 _OF_TRAINING = ("side", "iterations", "max_gaussians", "densify_interval")
 # Time between checkpoints in seconds: a kill loses at most this much work.
 _CHECKPOINT_SECONDS = 15.0
-# Minimum time of a training: in seconds, and as a share of the given time.
+# Minimum time of a training run: in seconds, and as a share of the given time.
 _MIN_SECONDS = 15.0
 _MIN_SHARE = 0.15
 # Approximate time to render one held-out view, in seconds.
@@ -42,15 +42,15 @@ _RENDER_SECONDS = 0.3
 
 @dataclass(frozen=True)
 class MakeOptions:
-    """How to make a scene.
+    """Options of `make`.
 
     Attributes:
         quality: default: "normal" or, with ``minutes``, chosen for that time. With ``minutes`` it
             determines only the effort to estimate the camera poses; the training uses the rest of
             the time.
         minutes: finish within this time. Stages that an earlier run has finished are not counted.
-            An interrupted training resumes with its remaining time.
-        memory: memory limit of the training, see `TrainOptions`.
+            An interrupted training resumes with the time that remained.
+        memory: memory limit of the training; see `TrainOptions`.
         compute: device and threads.
 
     Raises:
@@ -115,13 +115,14 @@ def make(
 ) -> MakeResult:
     """Make a scene from folders of photos, photos and videos.
 
-    Finished stages are recorded in ``output``: after an interruption the same call resumes. A stage
-    is repeated if its photos or settings have changed.
+    Finished stages are recorded in ``output``, so that the same call resumes after an interruption.
+    A stage is repeated if its photos or settings have changed.
 
     Args:
-        inputs: folders of photos, photos and videos; or one of them.
-        output: default: NAME_scene in the current folder, NAME being that of the first input. It
-            contains capture/ (the dataset), scene/ (the training) and NAME.ply (the scene).
+        inputs: one or more photos, folders of photos, or videos.
+        output: the output folder; default: NAME_scene in the current folder, where NAME is the name
+            of the first input without its suffix. It contains capture/ (the dataset), scene/ (the
+            output folder of the training) and NAME.ply (the scene).
         overwrite: replace an existing scene in ``output`` that was made from other photos.
         page: shows the training in the browser.
 
@@ -129,9 +130,9 @@ def make(
         The files of the scene and its quality on the held-out photos.
 
     Raises:
-        UserError: unusable photos or settings; poses that cannot be found; a folder with other
-            files; see also `snowsplat.pipeline.train.train`.
-        TrainingStopped, KeyboardInterrupt: Ctrl-C; finished stages and checkpoints remain.
+        UserError: photos or settings are unusable; the camera poses cannot be estimated;
+            ``output`` contains other files; see also `snowsplat.pipeline.train.train`.
+        TrainingStopped, KeyboardInterrupt: Ctrl-C. Finished stages and checkpoints are kept.
     """
     started = time.monotonic()
     options = options or MakeOptions()

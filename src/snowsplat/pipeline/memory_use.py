@@ -1,4 +1,4 @@
-"""The memory of one training: the plan made before it starts, and what it took."""
+"""The memory of a training run: the plan before it starts, and the memory that it has used."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MemoryUse:
-    """The memory of one training.
+    """The memory plan of a training run, and the memory that it uses.
 
     Attributes:
         device: the device whose memory is planned.
@@ -39,11 +39,11 @@ class MemoryUse:
         before: int,
         present: int = 0,
     ) -> MemoryUse:
-        """Plan the memory of a training.
+        """Plan the memory of a training run.
 
         Args:
-            budget: bytes, or a text such as "4GB"; None: what is available.
-            present: number of Gaussians of a training that is resumed.
+            budget: bytes, or a text such as "4GB"; None: no limit.
+            present: number of Gaussians of the run that is resumed; 0 for a new run.
 
         Raises:
             UserError: ``budget`` is not a number of bytes, or is too small.

@@ -31,7 +31,7 @@ class Observer:
         """The stage has finished, now or in an earlier run."""
 
     def steps_begin(self, step: int, iterations: int) -> None:
-        """A training begins after ``step`` of ``iterations`` steps."""
+        """A training run begins after ``step`` of ``iterations`` steps."""
 
     def step(self, progress: Progress) -> None:
         """A training step is finished."""

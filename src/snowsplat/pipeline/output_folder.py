@@ -1,4 +1,4 @@
-"""`OutputFolder`: the output folder of a training, in the layout of the reference implementation.
+"""`OutputFolder`: the files of a training run, in the layout of the reference implementation.
 
     OUT/cfg_args                                   settings, in the spelling of the reference
     OUT/cameras.json                               all cameras
@@ -53,7 +53,7 @@ _FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
 
 @dataclass(frozen=True)
 class DatasetSettings:
-    """How the dataset of a training is read: the arguments of `load_dataset`."""
+    """How the dataset of a training run is read: the arguments of `load_dataset`."""
 
     path: str
     images: str = "images"
@@ -109,16 +109,16 @@ class OutputFolder:
         return self.path / "videos"
 
     def is_one(self) -> bool:
-        """Whether a training of snowsplat or of the reference has written here."""
+        """Whether a training run of snowsplat or of the reference has written here."""
         return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))
 
-    # Before a training
+    # Before a training run
 
     def check_free(self, *, resume: bool, overwrite: bool) -> None:
-        """Check that a training may write here; writes nothing.
+        """Check that a training run may write here; writes nothing.
 
         Raises:
-            UserError: a file, a folder with other files, or a training that is to be neither
+            UserError: a file, a folder with other files, or a training run that is to be neither
                 resumed nor overwritten.
         """
         if not self.path.exists():
@@ -130,7 +130,7 @@ class OutputFolder:
             raise UserError(f"{self.path}: contains other files; use a new or an empty folder")
         if self.is_one() and not resume and not overwrite:
             raise UserError(
-                f"{self.path}: already contains a training; use `resume` to continue it, "
+                f"{self.path}: already contains a training run; use `resume` to continue it, "
                 "`overwrite` to replace it, or use another folder"
             )
 
@@ -231,7 +231,9 @@ class OutputFolder:
         from snowsplat.formats import read_gaussians
 
         if not self.path.is_dir():
-            raise UserError(f"{self.path}: no such folder; give the output folder of a training")
+            raise UserError(
+                f"{self.path}: no such folder; give the output folder of a training run"
+            )
         scenes = self.scenes()
         if not scenes:
             raise UserError(f"{self.path}: contains no scene (no point_cloud/iteration_N in it)")
@@ -273,7 +275,7 @@ class OutputFolder:
                 white = bool(values.get("white_background"))
             else:
                 raise UserError(
-                    f"{self.path}: not the output folder of a training (no config.json)"
+                    f"{self.path}: not the output folder of a training run (no config.json)"
                 )
         except (KeyError, TypeError, ValueError, SyntaxError, OverflowError):
             where = ours if ours.is_file() else theirs

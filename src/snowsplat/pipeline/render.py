@@ -1,4 +1,4 @@
-"""`render_images`: a trained scene from the cameras of its photos, beside the photos."""
+"""`render_images`: renders of a scene from the cameras of its photos, and copies of the photos."""
 
 from __future__ import annotations
 
@@ -27,8 +27,9 @@ def render_images(
     """Render the views of a scene into OUT/SPLIT/ours_N.
 
     Files are numbered in the order of the names of the photos: renders/00000.png, the photo
-    gt/00000.png, and depth/00000.png. Depth is either the mean camera z as 16-bit gray values, one
-    step being the world units in depth/world_units_per_step.json, or colored from near to far.
+    gt/00000.png, and depth/00000.png. The depth is the mean camera z. It is written either as
+    16-bit gray values, whose unit in world units is in depth/world_units_per_step.json, or in
+    colors from near to far.
 
     Returns:
         The folders renders/ and the number of images in each.

@@ -1,4 +1,4 @@
-"""Where a scene comes from: the output folder of a training, or a file; and its cameras."""
+"""Loading a scene and its cameras from the output folder of a training run, or from a file."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def load_trained(
 
     Args:
         iteration: the iteration to load; default: the last one.
-        dataset: where the photos are, if they were moved.
+        dataset: the folder of the dataset, if it was moved after the training.
         resolution: see `TrainOptions`; default: as trained.
         compute: the device for the Gaussians; default: a GPU if there is one.
 
@@ -76,14 +76,14 @@ def load_dataset_of(
 
 
 def existing_folder(path: Path) -> OutputFolder:
-    """As `training_folder`. Raises: UserError: no such folder."""
+    """As `training_folder`. Raises: UserError: ``path`` is not a folder."""
     if not path.is_dir():
-        raise UserError(f"{path}: no such folder; give the output folder of a training")
+        raise UserError(f"{path}: no such folder; give the output folder of a training run")
     return training_folder(path)
 
 
 def training_folder(path: Path) -> OutputFolder:
-    """The output folder at ``path``: that of `train`, or the one inside that of `make`."""
+    """The output folder of training: ``path`` or, if `make` created ``path``, a folder in it."""
     folder, made = OutputFolder(path), OutputFolder(path / SCENE)
     return made if made.scenes() and not folder.scenes() else folder
 
@@ -104,7 +104,8 @@ def scene_file(path: Path) -> Path:
 
 
 def folder_around(scene: Path) -> OutputFolder:
-    """The output folder of the training that a scene file comes from; else one without scenes.
+    """The output folder of the training that wrote a scene file; if there is none, one without
+    scenes.
 
     That is OUT of OUT/point_cloud/iteration_N/point_cloud.ply, and OUT/scene of OUT/NAME.ply, the
     copy that `make` writes.
@@ -152,7 +153,7 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
         iteration: an iteration of an output folder; default: the last one.
 
     Raises:
-        UserError: missing or damaged; ``iteration`` with a file.
+        UserError: the scene is missing or damaged, or ``iteration`` is set and ``path`` is a file.
     """
     from snowsplat.formats import read_gaussians
 

@@ -1,4 +1,4 @@
-"""`TimeBudget`: the time of a training: how much is left, and the plan and the pace that fit it."""
+"""`TimeBudget`: the time of a training run: what is left of it, and the plan and pace for it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def check_minutes(minutes: float) -> None:
 
 @dataclass
 class TimeBudget:
-    """The time of one training, from the start of the command to its end.
+    """The time of one training run, from the start of the command to its end.
 
     Attributes:
         seconds: in total, including earlier runs.
@@ -43,10 +43,10 @@ class TimeBudget:
     def of(
         cls, minutes: float | None, before: dict[str, Any] | None, started: float
     ) -> TimeBudget | None:
-        """The budget of a training.
+        """The budget of a training run.
 
         Args:
-            minutes: the requested time; for a resumed training, the time for the rest of it.
+            minutes: the requested time; if a run is resumed, the time for the remaining steps.
             before: the value of `as_json` in the checkpoint that is resumed.
 
         Returns:

@@ -1,4 +1,4 @@
-"""`train` and `resume`: a posed dataset becomes a scene in an output folder."""
+"""`train` and `resume`: train a scene from a dataset and write it to an output folder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How to train. None means the value of the recipe or, on `resume`, of the checkpoint.
+    """Options of the training. None selects the value of the recipe or, in `resume`, that of the
+    checkpoint.
 
         TrainOptions(hold_out=8, settings={"iterations": 7000, "max_gaussians": 200_000})
 
@@ -39,18 +40,20 @@ class TrainOptions:
         recipe: name of the recipe, which defines the defaults of all settings.
         settings: names and values of changed settings, see `snowsplat.training.config.changed`.
         images: name of the folder of photos in the dataset; default: "images".
-        resolution: 1, 2, 4 or 8 divide the size of the photos; any other number is a width in
-            pixels; default: unchanged.
+        resolution: 1, 2, 4 or 8: divide width and height of the photos by this number; any other
+            number: the new width in pixels; default: unchanged.
         hold_out: hold out every ``hold_out``-th photo for testing, if the dataset has no split of
             its own; default: none.
         test_list: a text file with the names of the photos to hold out; replaces ``hold_out``.
-        minutes: finish within this time. The number of steps, the size of the photos and the number
-            of Gaussians are chosen to fit, unless they are set here. On `resume`: the time for the
-            remaining steps.
-        memory: bytes, or a text such as "4GB", for the training: of the GPU or, on the CPU, in
-            addition to what Python and its libraries take. Default: what is available.
-        save_iterations: steps after which to save the scene, in addition to the last one.
-        checkpoint_seconds: time between checkpoints, if ``settings`` has no checkpoint_every.
+        minutes: finish within this time. The number of steps, the size of the photos and the
+            maximum number of Gaussians are chosen for this time, unless other options set them. In
+            `resume`, this is the time for the remaining steps.
+        memory: memory limit of the training, in bytes or as a text such as "4GB". On a GPU, this is
+            memory of the GPU; on the CPU, it is memory in addition to that of Python and its
+            libraries. Default: no limit.
+        save_iterations: steps after which to save the scene, in addition to the last step.
+        checkpoint_seconds: time between checkpoints, if ``settings`` does not contain
+            checkpoint_every; default: no checkpoints.
         compute: device, threads, determinism.
 
     Raises:
@@ -107,17 +110,17 @@ def train(
     observer: Observer = SILENT,
     page: LivePage | None = None,
 ) -> TrainResult:
-    """Train the scene of a posed dataset.
+    """Train a scene from a dataset.
 
     Args:
-        dataset: a folder of photos and cameras, see `snowsplat.data.load_dataset`.
-        output: the folder for the result, see `snowsplat.pipeline.output_folder`; created if
-            missing.
-        overwrite: replace an existing training in ``output``.
+        dataset: a folder with photos and their cameras, see `snowsplat.data.load_dataset`.
+        output: the output folder, see `snowsplat.pipeline.output_folder`. It is created if it does
+            not exist.
+        overwrite: replace the results of an earlier training run in ``output``.
         page: shows the training in the browser.
 
     Returns:
-        The files of the scene, and the numbers of the training.
+        The files of the scene, and statistics of the training run.
 
     Raises:
         UserError: an unusable dataset, setting, device or folder; too little memory; a loss or
@@ -140,12 +143,13 @@ def resume(
     observer: Observer = SILENT,
     page: LivePage | None = None,
 ) -> TrainResult:
-    """Continue a training from its newest checkpoint; the result is as without interruption.
+    """Continue a training run from its newest checkpoint. The result is the same as without the
+    interruption.
 
     Args:
         output: the folder of the training.
-        options: may change the settings iterations, test_iterations and checkpoint_every, and
-            options that do not affect the result. All other options must be unchanged.
+        options: these may change the settings iterations, test_iterations and checkpoint_every, and
+            options that do not affect the result. All other options must be the same as before.
         dataset: where the photos are now, if they were moved. If there is no checkpoint yet, the
             training starts from this dataset.
 
@@ -153,7 +157,8 @@ def resume(
         As `train`.
 
     Raises:
-        UserError: see `train`; no checkpoint, and no ``dataset`` to start from; other settings.
+        UserError: see `train`; there is no checkpoint and no ``dataset`` to start from; settings
+            have changed.
         TrainingStopped, KeyboardInterrupt: see `train`.
     """
     started = time.monotonic()
@@ -328,7 +333,7 @@ def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMe
     same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
     if same != config:
         raise _other_settings(start)
-    # A training with a time budget may have exceeded its first plan.
+    # A training run with a time budget may have exceeded its first plan.
     if options.iterations is not None and resumed.iterations < start.step:
         raise UserError(
             f"{start.path}: is from step {start.step}, after `iterations` {resumed.iterations}; "

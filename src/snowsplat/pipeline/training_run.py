@@ -1,4 +1,4 @@
-"""`TrainingRun`: the steps of one training and the files written in between."""
+"""`TrainingRun`: the steps of one training run and the files written in between."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class TrainResult:
 
 
 class TrainingStopped(KeyboardInterrupt):
-    """Ctrl-C during a training.
+    """Ctrl-C during a training run.
 
     Attributes:
         scene: the scene file that was saved, together with a checkpoint; None if a second Ctrl-C
@@ -68,11 +68,11 @@ class TrainingStopped(KeyboardInterrupt):
 
 @dataclass
 class TrainingRun:
-    """One training, to its end or to Ctrl-C.
+    """One training run, to its end or to Ctrl-C.
 
     Attributes:
         settings, recipe: as they are written to checkpoints.
-        budget, pace: of a training with a time budget.
+        budget, pace: of a training run with a time budget.
         save_iterations: steps after which the scene is written too.
         checkpoint_seconds: between checkpoints, where the configuration names no steps.
         page: shows the training in the browser.

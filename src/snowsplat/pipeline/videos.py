@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
 
-#: The camera paths that are computed from the cameras of a training.
+#: The camera paths that are computed from the cameras of a training run.
 CAMERA_PATHS = ("training", "ellipse", "spiral")
 
 _LONGEST_SIDE = 1920  # of a video without a requested size
@@ -45,7 +45,7 @@ class VideoSize:
         """Parse "1280x720", "1280" or None.
 
         Raises:
-            UserError: anything else, or too small or large.
+            UserError: ``text`` is not a size, or the size is too small or too large.
         """
         if text is None:
             return cls()
@@ -76,17 +76,18 @@ class VideoSize:
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """What a video shows.
+    """Options of a video: camera path, length, size, depth.
 
     Attributes:
-        path: "training": along the cameras of the photos, smoothed; "ellipse": around what they
-            show; "spiral": in front of a scene whose cameras look in one direction; or a file of
-            key cameras in the format of cameras.json.
-        seconds: length.
+        path: the camera path. "training": a smooth curve along the cameras of the photos;
+            "ellipse": around the point that these cameras look at; "spiral": for scenes whose
+            cameras look in one direction; or a file of key cameras in the format of cameras.json.
+        seconds: length of the video.
         fps: frames per second.
-        size: such as "1280x720" or "1280"; None: that of the photos.
-        depth: render a second video of the depth in colors.
-        side_by_side: one video instead, with color on the left and depth on the right.
+        size: width and height such as "1280x720", or the width, "1280"; None: the size of the
+            photos.
+        depth: render a second video that shows the depth in colors.
+        side_by_side: render only one video, with color on the left and depth on the right.
 
     Raises:
         UserError: an unusable length, rate or size.
@@ -118,7 +119,7 @@ class VideoOptions:
 
     @property
     def name(self) -> str:
-        """The name of the file, without its ending."""
+        """The name of the file, without its suffix."""
         name = self.path if Path(self.path).suffix == "" else Path(self.path).stem
         return f"{name}_side_by_side" if self.side_by_side else name
 
@@ -135,7 +136,7 @@ def render_video(
     """Render a video of a scene; the photos are not needed.
 
     Args:
-        scene: the output folder of a training, or a scene file.
+        scene: the output folder of a training run, or a scene file.
         target: an .mp4 file; default: OUT/videos/PATH.mp4, or SCENE_PATH.mp4 beside a scene file.
             A video of the depth has _depth in its name.
         iteration: an iteration of an output folder; default: the last one.
@@ -145,7 +146,7 @@ def render_video(
 
     Raises:
         UserError: a missing or damaged scene or camera file; a camera path that needs the cameras
-            of a training.
+            of a training run.
         KeyboardInterrupt: Ctrl-C; no file is left.
     """
     options = options or VideoOptions()
@@ -209,7 +210,7 @@ def cameras_along(
         trained: names and cameras of the photos; None for a scene file without its training.
 
     Raises:
-        UserError: no such path or file, or one that needs the cameras of a training.
+        UserError: no such path or file, or one that needs the cameras of a training run.
     """
     from snowsplat import trajectory
     from snowsplat.scene.camera_json import read_cameras
@@ -237,7 +238,7 @@ def cameras_along(
     else:
         raise SettingError(
             "path",
-            f"{path} needs the cameras of a training; use its output folder, or ellipse or a "
+            f"{path} needs the cameras of a training run; use its output folder, or ellipse or a "
             "file of cameras",
         )
     width, height = size.of(cameras[0])
@@ -302,7 +303,7 @@ class Video:
         return [file for file, _ in files]
 
     def _files(self) -> list[tuple[Path, int]]:
-        """Each video, and the number of images beside each other in it."""
+        """The file of each video, and the number of images that are side by side in it."""
         if self.side_by_side:
             return [(self.file, 2)]
         depth = self.file.with_name(f"{self.file.stem}_depth{self.file.suffix}")
@@ -320,7 +321,7 @@ class Video:
         return [np.concatenate([color, shown], axis=1)] if self.side_by_side else [color, shown]
 
     def _depth_range(self) -> tuple[float, float]:
-        """One range for the whole video, which avoids flicker."""
+        """One range of depths for the whole video, so that its colors do not flicker."""
         from snowsplat.pipeline import image_files
 
         if not (self.depth or self.side_by_side):

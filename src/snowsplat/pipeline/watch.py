@@ -1,4 +1,4 @@
-"""`watch`: the newest scene of an output folder in the browser, also while it is trained."""
+"""`watch`: shows the newest scene of an output folder in the browser, also during training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _NOTHING = [
     "Nothing is saved yet.",
-    "A training with --checkpoint-every N saves as it runs; the scene appears here.",
+    "With --checkpoint-every N, training saves the scene every N steps; it then appears here.",
 ]
 
 
@@ -34,12 +34,12 @@ def watch(
     compute: Compute | None = None,
     observer: Observer = SILENT,
 ) -> None:
-    """Show the newest scene or checkpoint of a training, with its cameras and photos, until Ctrl-C.
+    """Show the newest scene or checkpoint of a training run until Ctrl-C, with cameras and photos.
 
     Args:
         output: the folder of `train` or `make`.
-        iteration: show this one only.
-        dataset, resolution, compute: as of `load_trained`.
+        iteration: show only the scene of this iteration; default: the newest.
+        dataset, resolution, compute: as in `load_trained`.
 
     Raises:
         UserError: scene, settings or dataset are missing or damaged; an unusable device.
@@ -53,7 +53,7 @@ def watch(
 
 
 def watched_folder(path: Path) -> OutputFolder:
-    """As `existing_folder`; also if the training inside the folder of `make` has no scene yet."""
+    """As `existing_folder`; also finds the training run of `make` if it has no scene yet."""
     folder = existing_folder(path)
     made = OutputFolder(folder.path / SCENE)
     return made if made.is_one() and not folder.is_one() else folder
@@ -74,7 +74,7 @@ class NewestScene:
         """The newest scene or checkpoint; the previous one if a newer one cannot be read.
 
         Raises:
-            UserError: the first one cannot be read.
+            UserError: the first scene or checkpoint cannot be read.
         """
         from snowsplat.viewer.live.viewer import Scene
 
@@ -117,4 +117,4 @@ class NewestScene:
         try:
             return Gaussians(**own)
         except (TypeError, ValueError):
-            raise UserError(f"{path}: not the checkpoint of a training") from None
+            raise UserError(f"{path}: not the checkpoint of a training run") from None
