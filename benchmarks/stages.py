@@ -37,9 +37,12 @@ class Worker:
 
     def __init__(self, isa: str, source: Path | None = None) -> None:
         environment = os.environ | {"SNOWSPLAT_ISA": isa}
+        script = Path(__file__).with_name("worker.py")
         if source is not None:
             environment["PYTHONPATH"] = str(source.resolve())
-        script = Path(__file__).with_name("worker.py")
+            # Another checkout may have other names inside, which its own worker knows.
+            own = source.resolve().parent / "benchmarks" / "worker.py"
+            script = own if own.is_file() else script
         self._process = subprocess.Popen(
             [sys.executable, str(script)],
             env=environment,
@@ -189,22 +192,24 @@ def _paired(flags: argparse.Namespace, size: str, isa: str) -> list[Measured]:
     results: list[Measured] = []
     with Worker(isa) as a, Worker(other, source) as b:
         for threads in flags.threads:
-            rounds: dict[str, list[float]] = {}
+            least: dict[str, dict[str, list[float]]] = {"a": {}, "b": {}}
             for i in range(flags.repeats):
-                order = ("a", "b") if i % 2 == 0 else ("b", "a")
-                sides = {"a": a, "b": b}
-                least = {}
-                for side in order:
-                    found = sides[side].ask(size, threads, 3, visible_only=flags.visible_only)
-                    least[side] = {name: min(times) for name, times in found[clock].items()}
-                for name in least["a"].keys() & least["b"].keys():
-                    ratio = least["b"][name] / least["a"][name] if least["a"][name] > 0 else 1.0
-                    rounds.setdefault(name, []).append(ratio)
-            print(f"\n{size} x{threads}: {clock} time of {label} / {isa} (A is {isa}), by rounds")
-            print(_row("ratio", [f"{'median':>8}{'quartiles':>16}"]))
-            for name in _ordered(rounds):
+                for side, worker in sorted({"a": a, "b": b}.items(), reverse=i % 2 == 1):
+                    found = worker.ask(size, threads, 3, visible_only=flags.visible_only)
+                    for name, times in found[clock].items():
+                        least[side].setdefault(name, []).append(min(times))
+            rounds: dict[str, list[float]] = {}
+            print(f"\n{size} x{threads}: {clock} time of {label} / {isa} (A is {isa})")
+            print(_row("ratio", [f"{'least':>8}{'median':>8}{'quartiles':>16}"]))
+            for name in _ordered(dict.fromkeys(n for n in least["a"] if n in least["b"])):
+                rounds[name] = [
+                    _ratio(tb, ta)
+                    for ta, tb in zip(least["a"][name], least["b"][name], strict=True)
+                ]
                 low, middle, high = _quartiles(rounds[name])
-                print(_row(name, [f"{middle:>8.3f}{f'{low:.3f} … {high:.3f}':>16}"]))
+                of_least = _ratio(min(least["b"][name]), min(least["a"][name]))
+                cells = f"{of_least:>8.3f}{middle:>8.3f}{f'{low:.3f} … {high:.3f}':>16}"
+                print(_row(name, [cells]))
             results.append(
                 {"size": size, "threads": threads, "a": isa, "b": label, "ratios": rounds}
             )
@@ -267,6 +272,10 @@ def _ordered(names: dict[str, Any]) -> list[str]:
     known = [name for name in STAGES.values() if name in names]
     others = [name for name in names if name not in (*known, REST, TOTAL)]
     return [*known, *others, REST, TOTAL]
+
+
+def _ratio(b: float, a: float) -> float:
+    return b / a if a > 0 else 1.0
 
 
 def _quartiles(values: list[float]) -> tuple[float, float, float]:
