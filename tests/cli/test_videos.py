@@ -1,4 +1,4 @@
-"""`snowsplat render --path`: videos of a training and of a scene file."""
+"""`snowsplat render --path`: videos of a training run and of a scene file."""
 
 import shutil
 from pathlib import Path
@@ -78,7 +78,7 @@ def test_video_of_a_file(run, refused, trained, tmp_path):
     assert run("render", inside, "--path", "training", *SHORT, "--video", target).code == 0
     assert target.exists()
     for path in ("training", "spiral"):
-        assert "needs the cameras of a training" in refused("render", scene, "--path", path)
+        assert "needs the cameras of a training run" in refused("render", scene, "--path", path)
 
 
 def test_errors(refused, trained, tmp_path):

@@ -481,7 +481,7 @@ def train_jobs(dataset: Path) -> list[Job]:
         return ["train", dataset, "-o", output, *_PLAIN, "--overwrite"]
 
     def older(output: Path) -> None:
-        """The output of a training with other settings."""
+        """The output of a training run with other settings."""
         shutil.copytree(_older_training(output.parents[1], dataset), output)
 
     return [

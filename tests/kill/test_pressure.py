@@ -21,7 +21,7 @@ CPU = ("--device", "cpu", "--threads", 1)
 
 @pytest.fixture(scope="module")
 def trained(zygote, dataset) -> Path:
-    """A training with checkpoints of steps 20 and 30; read-only for the tests."""
+    """A training run with checkpoints of steps 20 and 30; read-only for the tests."""
     out = zygote.folder / "trained"
     ended = zygote.run(
         ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10, "--eval", *CPU]
@@ -82,7 +82,7 @@ def refused(ended: Ended, pattern: str) -> None:
 
 
 def commands(place: Path, trained: Path, dataset: Path, photos: Path) -> dict[str, list[object]]:
-    """One command per subcommand, which writes below ``place``; ``place``/trained is a training."""
+    """One command per subcommand, writing below ``place``; ``place``/trained is a training run."""
     output = place / "trained"
     return {
         "convert": ["convert", trained, place / "a.html"],

@@ -46,7 +46,7 @@ from tests.viewer.clients import (  # noqa: E402
 )
 
 BOUND = 0.5  # MiB per minute
-RATIO = 0.7  # of the steps per second that a training makes alone
+RATIO = 0.7  # of the steps per second that a training run makes alone
 LIMITS = {"threads": 320, "descriptors": 400}
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"}
 

@@ -18,7 +18,7 @@ from snowsplat.util.errors import SettingError, UserError
 
 
 class Recorder(Observer):
-    """Records the events of a training, in order."""
+    """Records the events of a training run, in order."""
 
     def __init__(self, interrupt_at: int = 0) -> None:
         self.events: list[str] = []

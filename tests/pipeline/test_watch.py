@@ -61,7 +61,7 @@ def test_a_checkpoint_of_something_else(trained, tmp_path):
     shutil.copytree(trained, out.path)
     for tensors in ({"a": torch.zeros(3)}, {"gaussians.means": torch.zeros(3)}):
         checkpoint.save(out.checkpoints, 5000, tensors, {})
-        with pytest.raises(UserError, match="not the checkpoint of a training"):
+        with pytest.raises(UserError, match="not a checkpoint of a training run"):
             NewestScene(out, None)()
 
 

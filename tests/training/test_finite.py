@@ -45,7 +45,7 @@ HUGE_GRADIENTS = replace(
 def begun(
     request: pytest.FixtureRequest, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[TrainConfig], Trainer]:
-    """A training of two steps, by the kernels of each engine."""
+    """A training run of two steps, by the kernels of each engine."""
     if request.param != "native":
         monkeypatch.setitem(LAUNCHERS, "cpu", launcher(request.param))
 

@@ -1,4 +1,4 @@
-"""The curves of a training: few points, exact sums, and continuation after resuming."""
+"""The curves of a training run: few points, exact sums, and continuation after resuming."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Estimates of the memory of a training, sizes as text, and reductions to fit a budget."""
+"""Estimates of the memory of a training run, sizes as text, and reductions to fit a budget."""
 
 from __future__ import annotations
 

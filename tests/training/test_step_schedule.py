@@ -1,4 +1,4 @@
-"""The length of a training, and the effect of stretching it on its moments."""
+"""The length of a training run, and the effect of stretching it on its moments."""
 
 import pytest
 

@@ -23,7 +23,7 @@ class Trained:
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory) -> Trained:
-    """A training of 200 steps: balls in a sphere, world z up, cameras at a distance of 3."""
+    """A training run of 200 steps: balls in a sphere, world z up, cameras at a distance of 3."""
     root = tmp_path_factory.mktemp("trained")
     dataset = write_toy_dataset(root / "capture", "colmap-bin", 12, 96, 72, n_points=2000)
     flags = ["--iterations", "200", "--quiet"]

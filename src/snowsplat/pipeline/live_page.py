@@ -97,7 +97,7 @@ class LivePage:
         return self._viewer.url
 
     def hold(self) -> None:
-        """Show the scene of the finished training until Ctrl-C."""
+        """Show the scene of the finished training run until Ctrl-C."""
         assert self._training is not None
         assert self._trainer is not None
         with suppress(KeyboardInterrupt):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """A finished training.
+    """A finished training run.
 
     Attributes:
         scene: the PLY file.

@@ -1,4 +1,4 @@
-"""Checkpoints: the complete state of a training, from which it resumes with a bit-identical result.
+"""Checkpoints: the complete state of a training run; resuming gives a bit-identical result.
 
 A checkpoint is a set of named tensors (parameters, optimiser moments, random states, statistics,
 the order of the views) and a JSON value in one safetensors file, a format that contains only
@@ -68,7 +68,7 @@ def save(
 def remove_old(folder: Path | str, step: int, *, keep: int = 2) -> None:
     """Remove all but the ``keep`` newest checkpoints up to ``step``, and files of killed saves.
 
-    Newer ones are kept: they are damaged if a training resumes from ``step``.
+    Newer ones are kept: they are damaged if a training run resumes from ``step``.
     """
     folder = Path(folder)
     for leftover in folder.glob(".*tmp*"):

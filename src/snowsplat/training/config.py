@@ -1,4 +1,4 @@
-"""`TrainConfig`: the settings of a training; changing them by name; storing them as JSON."""
+"""`TrainConfig`: the settings of a training run; changing them by name; storing them as JSON."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SEED_LIMIT = 2**61
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """All settings of a training; the defaults are the paper's.
+    """All settings of a training run; the defaults are the paper's.
 
     A moment (`When`) is an int, that step, or a float, that fraction of ``iterations``.
 

@@ -1,4 +1,4 @@
-"""`History`: the curves of a training, as a few hundred points for any number of steps."""
+"""`History`: the curves of a training run, as a few hundred points for any number of steps."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class History:
         """Read the file up to ``last_step``: training may resume from a checkpoint before its end.
 
         Returns an empty history if the file is missing or damaged: curves are no reason not to
-        resume a training.
+        resume a training run.
         """
         try:
             values = read_json(path)

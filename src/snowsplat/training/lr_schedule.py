@@ -29,7 +29,7 @@ class LearningRates:
     sh_rest: float = 2.5e-3 / 20
 
     def scaled(self, factor: float) -> LearningRates:
-        """All rates except ``means_final`` times ``factor``, for short trainings."""
+        """All rates except ``means_final`` times ``factor``, for short training runs."""
         rates = [f.name for f in fields(self) if f.name not in ("means_final", "means_steps")]
         return replace(self, **{name: factor * getattr(self, name) for name in rates})
 

@@ -1,4 +1,4 @@
-"""How much memory a training takes, estimated before it starts, and how to make it take less.
+"""How much memory a training run takes, estimated before it starts, and how to make it take less.
 
 Counted is what comes on top of a fresh import of PyTorch; on a GPU, on top of what the driver
 allocates for itself.
@@ -30,7 +30,7 @@ _EXTRA_OF_RANDOM = 2
 
 @dataclass(frozen=True)
 class Cost:
-    """Memory that a training takes on one kind of device.
+    """Memory that a training run takes on one kind of device.
 
     Attributes:
         fixed: bytes, for any training.
@@ -98,7 +98,7 @@ class MemoryPlan:
 
 @dataclass(frozen=True)
 class _SceneCost:
-    """Bytes of the Gaussians of one training.
+    """Bytes of the Gaussians of one training run.
 
     Attributes:
         each: bytes per Gaussian.
@@ -128,14 +128,14 @@ def plan_memory(
     budget: int | None = None,
     present: int = 0,
 ) -> MemoryPlan:
-    """Estimate the memory of a training on ``dataset``; with a ``budget``, make it take no more.
+    """Estimate the memory of training on ``dataset``; with a ``budget``, reduce it to this budget.
 
     First fewer photos stay decoded, then the number of Gaussians is limited.
 
     Args:
         available: bytes that the device has left, of which photos may have half.
         budget: bytes; None: no limit.
-        present: number of Gaussians of a resumed training: none of them is removed.
+        present: number of Gaussians of a resumed training run: none of them is removed.
 
     Raises:
         SettingError: ``memory`` is too little for photos of this size, or for what is present.

@@ -1,4 +1,4 @@
-"""`Schedule`: the number of steps of a training, and the step that a fraction of it means."""
+"""`Schedule`: the number of steps of a training run, and the step that a fraction of it means."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ When = int | float
 
 @dataclass
 class Schedule:
-    """The length of one training; trainer, optimiser and density control share this object.
+    """The length of one training run; trainer, optimiser and density control share this object.
 
-    `stretch` makes a training longer or shorter while it runs. It scales the remaining part of the
+    `stretch` makes a training run longer or shorter while it runs. It scales the rest of the
     schedule evenly and leaves the past unchanged: learning rates continue from their current
     values, no stage is repeated, and each still reaches its end.
 

@@ -79,7 +79,7 @@ class Trainer:
     ) -> None:
         """
         Args:
-            schedule: the schedule of a resumed training; default: ``config.iterations`` steps.
+            schedule: the schedule of a resumed training run; default: ``config.iterations`` steps.
             device: the device to train on; default: the CPU.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Settings of the process during a training: one torch thread, and deferred Ctrl-C."""
+"""Settings of the process during a training run: one torch thread, and deferred Ctrl-C."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report of a training: complete, self-contained, correct, and without private paths."""
+"""The report of a training run: complete, self-contained, correct, and without private paths."""
 
 import json
 import re

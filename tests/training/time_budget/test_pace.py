@@ -1,4 +1,4 @@
-"""Trainings within a time budget, on simulated machines."""
+"""Training runs within a time budget, on simulated machines."""
 
 from collections.abc import Callable
 
@@ -127,7 +127,7 @@ def test_one_slow_step_is_an_outlier():
 
 
 def test_a_pause_moves_the_deadline():
-    """A training that is paused for a minute ends a minute later, with the same number of steps."""
+    """Training that is paused for a minute ends a minute later, with the same number of steps."""
     now = 100.0
     config = recipe("default")
     pace, paused = (Pace(Work(config, PIXELS, VIEWS), 60.0, 1.0, lambda: now) for _ in range(2))

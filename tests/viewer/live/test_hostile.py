@@ -1,4 +1,4 @@
-"""A training with hostile clients: it continues, nearly as fast, with a bit-identical result."""
+"""Training with hostile clients: it continues, nearly as fast, with a bit-identical result."""
 
 import dataclasses
 import os
@@ -34,7 +34,7 @@ STEPS = 1_000_000
 
 
 class Watched:
-    """A training with a page; the test makes its steps."""
+    """A training run with a page; the test makes its steps."""
 
     def __init__(self, dataset: Dataset) -> None:
         self.trainer = Trainer(dataset, TrainConfig(iterations=STEPS))
@@ -119,7 +119,7 @@ def test_the_training_continues_bit_identically(watched, dataset, capfd):
 
 
 def test_viser_is_only_used_in_its_own_thread(watched, monkeypatch):
-    """Its buffers are not thread-safe: a connecting browser could end a training."""
+    """Its buffers are not thread-safe: a connecting browser could end a training run."""
     threads = set()
     push = AsyncMessageBuffer.push
 

@@ -1,4 +1,4 @@
-"""The page in real Chromium during a training: its images and its controls."""
+"""The page in real Chromium during a training run: its images and its controls."""
 
 import os
 import re
@@ -26,7 +26,7 @@ BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() 
 
 
 class Training:
-    """A training in a separate process, with a page."""
+    """A training run in a separate process, with a page."""
 
     def __init__(self, dataset: Path, out: Path) -> None:
         port = free_port("127.0.0.1", None)

@@ -170,7 +170,7 @@ def test_pause_step_and_resume(session):
     session.resume()
     assert session.may_step()
     assert not session.busy
-    session.step()  # of a running training: it pauses after the current step
+    session.step()  # of an ongoing training run: it pauses after the current step
     assert not session.may_step()
     assert session.paused
 

@@ -1,4 +1,4 @@
-"""report.html: the course and the result of a training."""
+"""report.html: the course and the result of a training run."""
 
 from snowsplat.training.report.page import Trained, write_training_report
 

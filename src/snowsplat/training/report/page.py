@@ -1,4 +1,4 @@
-"""report.html: the course and the result of a training, as one self-contained page."""
+"""report.html: the course and the result of a training run, as one self-contained page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`Pace`: makes a training end within a time budget, with its schedule complete.
+"""`Pace`: makes a training run end within a time budget, with its schedule complete.
 
 The time of a step depends on the resolution of the stage, on the growing number of Gaussians, and
 on other load of the machine. It is measured continuously, and the remaining time is estimated from
@@ -27,7 +27,7 @@ _HURRY = 10.0
 
 
 class Pace:
-    """Keeps one training within its time; call `iterations_after` after each of its steps."""
+    """Keeps one training run within its time; call `iterations_after` after each of its steps."""
 
     def __init__(
         self,

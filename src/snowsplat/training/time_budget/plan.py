@@ -1,4 +1,4 @@
-"""Plans a training for a given time on this machine: photo size, number of Gaussians, steps.
+"""Plans a training run for a given time on this machine: photo size, number of Gaussians, steps.
 
 With more time, the number of steps increases first, then the size of the photos, then the number of
 Gaussians: see "Training in a given time" in docs/performance.md.
@@ -31,14 +31,15 @@ _MAX_SIDE = 1600
 _STEPS_FOR_MORE_GAUSSIANS = 4500
 #: Maximum factor by which this limit is raised.
 _MAX_RISE = 2.0
-#: Minimum number of densifications in the first half of a short training, if the interval allows.
+#: Minimum number of densifications in the first half of a short training run. The minimum interval
+#: between densifications has priority.
 _MIN_DENSIFICATIONS = 15
 #: Minimum interval between densifications, in steps.
 _MIN_DENSIFY_INTERVAL = 25
 #: Seconds before the first step: preparation, and decoding the first photos.
 _SETUP_SECONDS = 0.5
 
-# A small training, the sample, measures the speed of the machine.
+# A small training run, the sample, measures the speed of the machine.
 #: Maximum duration of the sample, in seconds.
 _SAMPLE_SECONDS = 0.7
 #: Maximum number of steps.
@@ -101,7 +102,7 @@ def make_plan(
         slowness: the result of `measure_slowness`.
         resize: whether the photos may be reduced.
         more_gaussians: whether the limit of the number of Gaussians may be raised.
-        more_often: whether a short training may densify more often.
+        more_often: whether a short training run may densify more often.
     """
     camera = max((view.camera for view in dataset.train), key=lambda c: c.width * c.height)
     longer = max(camera.width, camera.height)

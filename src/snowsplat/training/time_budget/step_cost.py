@@ -35,7 +35,7 @@ _OUTLIER = 5.0
 
 @dataclass(frozen=True)
 class Work:
-    """What the time of a training depends on.
+    """What the time of a training run depends on.
 
     Attributes:
         config: the configuration; its coarse-to-fine stages and its densification are used.

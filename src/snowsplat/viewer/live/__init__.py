@@ -14,5 +14,5 @@ wait for are rendered from the same tensors that the next step changes. The comm
     photos.py       the cameras of the photos: frustums, and views at their positions
     key_cameras.py  camera positions stored by a browser, for a video
     viewer.py       combines all of these
-    training.py     the viewer between the steps of a training
+    training.py     the viewer between the steps of a training run
 """

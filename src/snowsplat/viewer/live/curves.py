@@ -1,4 +1,4 @@
-"""The curves of a training in the viewer: loss of all steps, PSNR of a few views."""
+"""The curves of a training run in the viewer: loss of all steps, PSNR of a few views."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ _MOVING_SECONDS = 0.05  # maximum time to render while the camera moves; the siz
 _SMALLEST = 160  # pixels: minimum of the longer side of such a reduced image
 # Images are "requested" if a user moved the camera or changed a setting, and "idle" if only the
 # scene has changed.
-IDLE_SHARE = 0.05  # maximum share of the time of a training for idle images
+IDLE_SHARE = 0.05  # maximum share of the time of a training run for idle images
 _IDLE_SECONDS = 1.0  # minimum time between two idle images
 
 
@@ -126,7 +126,7 @@ class Session:
         self._visitors: dict[int, Visitor] = {}
         self._paused = False
         self._steps = 0  # single steps that are allowed while paused
-        self.training = False  # whether a training is running or paused
+        self.training = False  # whether a training run is running or paused
         self.share = 0.5  # maximum share of the time for requested images during training
         self._free_at = {"requested": 0.0, "idle": 0.0}  # time at which the next image is allowed
         self.busy = False  # whether a browser is connected or the training is paused
@@ -222,7 +222,7 @@ class Session:
 
         Args:
             scene: a number that changes when the scene changes.
-            training: whether a training is waiting to continue.
+            training: whether a training run is waiting to continue.
         """
         now = self._clock()
         with self._changed:

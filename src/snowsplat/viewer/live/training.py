@@ -1,4 +1,4 @@
-"""`TrainingViewer`: updates the page between two steps of a training."""
+"""`TrainingViewer`: updates the page between two steps of a training run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _RATE_SECONDS = 3.0  # over which the displayed rate is averaged, approximately
 
 
 class TrainingViewer:
-    """Shows and pauses a training; call `after_step` after each step."""
+    """Shows and pauses a training run; call `after_step` after each step."""
 
     def __init__(self, viewer: NetworkViewer, sampled_psnr: SampledPsnr) -> None:
         self.viewer = viewer
@@ -97,7 +97,7 @@ class TrainingViewer:
         return self._rate
 
     def end(self, step: int, gaussians: Gaussians) -> None:
-        """Show the result of the finished training until Ctrl-C, which is raised."""
+        """Show the result of the finished training run until Ctrl-C, which is raised."""
         self._session.training = False
         self._session.resume()
         self._panel.end()
