@@ -1,12 +1,12 @@
-// The rule of Adam (Kingma & Ba 2015), on both engines:
+// The update rule of Adam (Kingma & Ba 2015), for CPU and GPU:
 //
 //   m ← β₁ m + (1 − β₁) g,   v ← β₂ v + (1 − β₂) g²,   p ← p − lr m̂ / √(v̂ + ε²)
 //
-// ε is inside the root, so that one reciprocal square root suffices; for the ε = 1e-15 used here
-// this equals √v̂ + ε in practice.
+// ε is inside the root, so that one reciprocal square root suffices. For ε = 1e-15, which is used
+// here, the result equals that of √v̂ + ε in practice.
 //
-// If a step would make a value infinite or NaN, the value and its moments stay unchanged, so no
-// non-finite gradient reaches the parameters. Rows with such values are counted.
+// If a step would make a value infinite or NaN, the value and its moments stay unchanged. So a
+// non-finite gradient does not change the parameters. Rows with such values are counted.
 #pragma once
 
 #include "params.h"
@@ -30,7 +30,8 @@ struct AdamRule {
     v = beta2 * v + gain2 * g * g;
     p -= rate * m * rsqrt(v * inv_correction2 + eps2);
   }
-  // Whether the results of a step are finite: v is finite only if the gradient and m are.
+  // Whether the results of a step are finite. m need not be tested: v is finite only if the
+  // gradient and m are.
   SNOW_INLINE static auto is_taken(Real v, Real p) { return is_finite(v + p); }
 };
 

@@ -1,5 +1,6 @@
-// The layout of a struct of parameters as one number. Python fills these structs (ops/params.py) and
-// computes the same number; when it loads a library, it compares the two numbers.
+// The layout of a struct of parameters as one number. Python fills these structs (ops/params.py)
+// and computes the number of its own definition. When it loads a library, it compares the two
+// numbers.
 //
 //   struct ExampleParams {
 //     int64_t n;
@@ -8,8 +9,8 @@
 //   };
 //
 // layout_of<ExampleParams>() is a hash of the text "n:i@0;values:p@8;#16": for each field the name,
-// the kind (p pointer, i int64_t, d double, or {…} for a nested struct) and the offset in bytes,
-// then the size of the struct. The text begins with the constants that Python and C++ share.
+// the kind (p: pointer, i: int64_t, d: double, {…}: nested struct) and the offset in bytes, and at
+// the end the size of the struct. The text begins with the constants that Python and C++ share.
 #pragma once
 
 #include "portable.h"
@@ -17,8 +18,8 @@
 namespace snow {
 
 constexpr int kTile = 16;           // edge of a tile in pixels
-constexpr int kGroupChannels = 4;   // most channels of one rasterization pass
-constexpr int kSlotWidth = 16;      // scalars of a (tile, splat) gradient: ≤ 4 colours, 6 moments
+constexpr int kGroupChannels = 4;   // maximum number of channels of one rasterization pass
+constexpr int kSlotWidth = 16;      // numbers of an instance's gradient: ≤ 4 colours, 6 moments
 constexpr int kPackedHeader = 8;    // columns of Splats2D before the colours
 constexpr int kPackedStride = 16;   // columns of Splats2D with three colours
 constexpr int kPoseSums = 15;       // 9 of the rotation, 3 of the translation, 3 of the position
@@ -40,7 +41,7 @@ class LayoutHash {
   uint64_t value = 14695981039346656037ull;
 };
 
-// A nested struct; the specialisations are the kinds of single fields.
+// The kind of a nested struct; the specialisations are for single fields.
 template <class Field>
 struct FieldKind {
   static constexpr void describe(LayoutHash& hash) {
@@ -76,13 +77,13 @@ constexpr uint64_t layout_of() {
 
 }  // namespace snow
 
-#if defined(__CUDACC_RTC__)  // has neither <cstddef> nor the builtin
+#if defined(__CUDACC_RTC__)  // NVRTC has neither <cstddef> nor the builtin
 #define SNOW_OFFSET_OF(STRUCT, NAME) __INTADDR__(&(static_cast<STRUCT*>(0)->NAME))
 #else
 #define SNOW_OFFSET_OF(STRUCT, NAME) __builtin_offsetof(STRUCT, NAME)
 #endif
 
-// Within a struct: its members, in order.
+// Used within a struct: lists its members, in order.
 #define SNOW_FIELDS(...)                                   \
   template <class Self>                                    \
   static constexpr void describe(snow::LayoutHash& hash) { \

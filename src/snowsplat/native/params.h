@@ -1,9 +1,9 @@
-// The parameters of every operation: one struct each, passed across the boundary between Python and
-// the kernels. A CPU entry takes a pointer to the struct, a CUDA kernel takes it by value. The
-// Python side fills them by name (ops/params.py); layout.h describes how the two are compared.
+// The parameters of every operation: one struct for each. Python fills the structs by name
+// (ops/params.py) and passes them to the kernels: to a CPU entry by pointer, to a CUDA kernel by
+// value. layout.h describes how the definitions in Python and C++ are compared.
 //
-// Every field has 8 bytes. `n` comes first: how many items the operation processes. T is float or
-// double. Pointers marked "or null" are optional. Shapes are row-major.
+// Every field has 8 bytes. The first field is `n`, the number of items that the operation
+// processes. T is float or double. Pointers marked "or null" are optional. Shapes are row-major.
 #pragma once
 
 #include "layout.h"
@@ -43,16 +43,16 @@ template <class T>
 struct GaussianTensors {
   const T* means;           // (N, 3) world units
   const T* log_scales;      // (N, 3)
-  const T* quats;           // (N, 4) wxyz, of any length
+  const T* quats;           // (N, 4) wxyz, not necessarily normalised
   const T* opacity_logits;  // (N,)
   const T* sh_dc;           // (N, 1, 3)
   const T* sh_rest;         // (N, sh_rest_rows, 3)
   int64_t sh_rest_rows;     // rows of sh_rest as stored
-  int64_t sh_degree;        // 0 to 3: uses the first (sh_degree + 1)² − 1 of them
+  int64_t sh_degree;        // 0 to 3: the first (sh_degree + 1)² − 1 rows are used
   SNOW_FIELDS(means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_rest_rows, sh_degree)
 };
 
-// Their gradients, of the same shapes.
+// The gradients of these parameters, of the same shapes.
 template <class T>
 struct GaussianGradients {
   T *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;
@@ -67,7 +67,8 @@ struct ProjectCullParams {
   int64_t n;  // Gaussians
   GaussianTensors<T> gaussians;
   CameraParams<T> camera;
-  int32_t* ids;  // out, (n,). CPU: the visible ones, compacted; returns their number. CUDA: i or −1
+  // out, (n,). CPU: the visible Gaussians, compacted; returns their number. CUDA: i or −1.
+  int32_t* ids;
   SNOW_FIELDS(n, gaussians, camera, ids)
 };
 
@@ -91,7 +92,7 @@ struct ProjectBackwardParams {
   CameraParams<T> camera;
   const T* grad_packed;        // (n, 16)
   GaussianGradients<T> grads;  // out; rows without a splat are not written
-  double* pose;                // out, or null: (project_pose_blocks, 15) sums, to be added up
+  double* pose;  // out, (project_pose_blocks, 15) sums, which the caller adds; or null
   SNOW_FIELDS(n, ids, gaussians, camera, grad_packed, grads, pose)
 };
 
@@ -110,7 +111,7 @@ template <class T>
 struct AdamStepParams {
   int64_t n;             // Gaussians
   int64_t splats;        // rows of grad_packed
-  const int32_t* ids;    // CPU: (splats,) ascending rows of Gaussians. CUDA: (n,) the splat or −1
+  const int32_t* ids;    // CPU: (splats,) the Gaussians, ascending. CUDA: (n,) the splats or −1
   const T* grad_packed;  // (splats, 16)
   CameraParams<T> camera;
   int64_t sh_rest_rows, sh_degree;  // as in GaussianTensors
@@ -118,8 +119,8 @@ struct AdamStepParams {
   double beta1, beta2;
   double inv_correction2;   // 1 / (1 − β₂ᵗ)
   double eps2;              // ε²
-  int64_t visible_only;     // 1: Gaussians without a splat keep their values and moments
-  const bool* valid;        // (1,), or null; false: changes nothing
+  int64_t visible_only;     // 1: the values and moments of Gaussians without a splat stay unchanged
+  const bool* valid;        // (1,), or null; false: nothing is changed
   int32_t* nonfinite_rows;  // (6,), or null: increased by the number of skipped rows
   SNOW_FIELDS(n, splats, ids, grad_packed, camera, sh_rest_rows, sh_degree, means, log_scales,
               quats, opacity_logits, sh_dc, sh_rest, beta1, beta2, inv_correction2, eps2,
@@ -136,23 +137,23 @@ struct ScreenStatisticsParams {
   const T* grad_packed;  // (n, stride)
   int64_t stride;        // columns
   double width, height;  // pixels
-  T* norm_sum;           // (N,) the norm of the gradient of the mean is added
+  T* norm_sum;           // (N,) the norm of the gradient of the 2D mean is added
   T* views;              // (N,) 1 is added
-  T* max_radii;          // (N,), or null: becomes the maximum with the radius
-  const bool* valid;     // (1,), or null; false: changes nothing
+  T* max_radii;          // (N,), or null: replaced by the radius if that is larger
+  const bool* valid;     // (1,), or null; false: nothing is changed
   SNOW_FIELDS(n, ids, packed, grad_packed, stride, width, height, norm_sum, views, max_radii, valid)
 };
 
 // ---- rasterize: splats → tiles ------------------------------------------------------------------
 
-// splats_prepare: depth keys, and on the CPU the records that the later stages read.
+// splats_prepare: the depth keys; on the CPU also the records, which the later stages read.
 template <class T>
 struct SplatsPrepareParams {
   int64_t n;                // splats
   const T* packed;          // (n, stride)
   int64_t stride;           // columns
   int64_t width, height;    // pixels
-  const int64_t* columns;   // (4,) the columns that become channels; −1: zero
+  const int64_t* columns;   // (4,) the column of each channel; −1: the channel is zero
   SplatRecord<T>* records;  // out, (n,); CPU only
   DepthKey<T>* keys;        // out, (n,)
   SNOW_FIELDS(n, packed, stride, width, height, columns, records, keys)
@@ -194,12 +195,12 @@ struct TileBinning {
   SNOW_FIELDS(order, packed, stride, records, tiles_x, tiles_y, parts, workspace, tile_start)
 };
 
-// tiles_count: the number of instances (pairs of a splat and a tile that it touches).
+// tiles_count: counts the instances (pairs of a splat and a tile that it touches).
 template <class T>
 struct TilesCountParams {
   int64_t n;  // splats
   TileBinning<T> binning;
-  int64_t capacity;   // CUDA: instances that memory is allocated for, or −1 to wait for the count
+  int64_t capacity;   // CUDA: instances for which memory is allocated, or −1 to wait for the count
   int64_t* required;  // out, (1,) instances
   SNOW_FIELDS(n, binning, capacity, required)
 };
@@ -212,7 +213,7 @@ struct TilesFillParams {
   int64_t capacity;          // size of the instance arrays
   uint32_t* instance_splat;  // out, (capacity,) sorted by tile
   uint32_t* instance_slot;   // out, (capacity,) index in the list ordered by splat; CUDA: or null
-  uint32_t* slot_range;  // out, (n, 2) first slot of a splat and the one after its last; or null
+  uint32_t* slot_range;      // out, (n, 2) first slot of a splat, and its last slot + 1; or null
   SNOW_FIELDS(n, binning, capacity, instance_splat, instance_slot, slot_range)
 };
 
@@ -224,10 +225,10 @@ struct FrameParams {
   int64_t width, height;           // pixels
   const T* packed;                 // (splats, stride)
   int64_t stride;                  // columns
-  const int64_t* columns;          // (4,) the columns that are the channels; −1: zero
+  const int64_t* columns;          // (4,) the column of each channel; −1: the channel is zero
   const SplatRecord<T>* records;   // (splats,); CPU only
   const uint32_t* tile_start;      // (tiles + 1,)
-  uint32_t* tile_end;              // (tiles,) where the forward pass stopped: all pixels finished
+  uint32_t* tile_end;              // (tiles,) end of the instances that the forward pass visited
   const uint32_t* instance_splat;  // (instances,)
   void* instance_blocks;           // (instances,) bits of the pixel blocks that a splat touches
   SNOW_FIELDS(width, height, packed, stride, columns, records, tile_start, tile_end, instance_splat,
@@ -245,7 +246,7 @@ struct RasterizeForwardParams {
   SNOW_FIELDS(n, frame, channels, background, image, alpha)
 };
 
-// rasterize_count: how many splats each pixel blends.
+// rasterize_count: the number of splats that are blended in each pixel.
 template <class T>
 struct RasterizeCountParams {
   int64_t n;  // tiles
@@ -264,7 +265,7 @@ struct RasterizeBackwardParams {
   const T* grad_image;            // the same shape
   const T* alpha;                 // (height, width)
   const T* grad_alpha;            // (height, width), or null
-  T* slots;                       // out, (instances, 16) gradients, to be added by splats_reduce;
+  T* slots;                       // out, (instances, 16) gradients, which splats_reduce adds;
                                   // null: they are added to grad_packed atomically (CUDA)
   T* grad_packed;                 // (splats, stride)
   SNOW_FIELDS(n, frame, channels, instance_slot, image, grad_image, alpha, grad_alpha, slots,
@@ -307,8 +308,8 @@ struct PhotometricParams {
   int64_t width, height;          // pixels
   const T* image;                 // (n, height, width)
   const Target* target;           // (n, height, width)
-  double l1_weight, ssim_weight;  // weights of the two in the gradient
-  T* grad;                        // out, of the weighted sum, or null
+  double l1_weight, ssim_weight;  // weights of L1 and SSIM in the gradient
+  T* grad;                        // out, the gradient of the weighted sum, or null
   double* means;                  // out, (2,) mean |a − b| and mean SSIM
   SNOW_FIELDS(n, width, height, image, target, l1_weight, ssim_weight, grad, means)
 };
@@ -320,13 +321,13 @@ struct NeighboursParams {
   int64_t n;        // points
   const T* points;  // (n, 3)
   int64_t k;        // 1 to 64
-  T* distances;     // out, (n, k) ascending; infinity if there are fewer others
+  T* distances;     // out, (n, k) ascending; infinity if there are fewer than k other points
   SNOW_FIELDS(n, points, k, distances)
 };
 
 // ---- sizes --------------------------------------------------------------------------------------
 
-// Queries the size of a scratch tensor; the entry returns it.
+// Parameters of the entries that return a size, such as that of a scratch tensor.
 struct SizeQueryParams {
   int64_t n;      // items
   int64_t tiles;  // tiles_workspace_bytes only

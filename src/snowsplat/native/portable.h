@@ -1,6 +1,6 @@
-// Functions used by the maths headers, so that the same code works for every `Real`: float and double
-// (CUDA), Simd<float, W> (CPU) and Simd<double, W> (gradient checks). Branches that depend on data
-// are written as select(), because SIMD lanes may take different branches.
+// Functions that make the mathematics headers work for every type `Real`: float and double (CUDA),
+// Simd<float, W> (CPU) and Simd<double, W> (CPU, for gradient checks). A choice that depends on
+// data is written as select() instead of a branch, because it may differ between SIMD lanes.
 #pragma once
 
 #if defined(__CUDACC_RTC__)  // NVRTC has no headers of the C library
@@ -44,7 +44,7 @@ SNOW_INLINE double log2(double a) { return ::log2(a); }
 SNOW_INLINE double exp2_blend(double a) { return ::exp2(a); }
 SNOW_INLINE double fma(double a, double b, double c) { return ::fma(a, b, c); }
 
-// 1/a and 1/√a. GPUs have instructions for these in float.
+// 1/a and 1/√a. In float, GPUs have instructions for them.
 SNOW_INLINE double reciprocal(double a) { return 1.0 / a; }
 SNOW_INLINE double rsqrt(double a) { return 1.0 / ::sqrt(a); }
 SNOW_INLINE double reciprocal_estimate(double a) { return 1.0 / a; }
@@ -58,7 +58,8 @@ SNOW_INLINE float rsqrt(float a) { return 1.f / ::sqrtf(a); }
 SNOW_INLINE float reciprocal_estimate(float a) { return 1.f / a; }
 #endif
 
-// Neither infinite nor NaN: infinity minus itself is NaN, and comparisons with NaN are false.
+// Whether a is neither infinite nor NaN. Infinity minus itself is NaN, and comparisons with NaN are
+// false.
 template <class Real>
 SNOW_INLINE auto is_finite(Real a) {
   return a - a >= Real(0.f);
@@ -86,10 +87,10 @@ constexpr double kLn2 = 0.6931471805599453;
 constexpr double kLn255 = 5.541263545158426;
 
 // Constants of Kerbl et al. 2023, section 6 and appendix C.
-constexpr double kMinAlpha = 1.0 / 255.0;             // fainter contributions are skipped
-constexpr double kMaxAlpha = 0.99;                    // keeps 1 - alpha away from 0
-constexpr double kMinTransmittance = 1e-4;            // a pixel this opaque is finished
+constexpr double kMinAlpha = 1.0 / 255.0;   // contributions with a smaller alpha are skipped
+constexpr double kMaxAlpha = 0.99;          // keeps 1 - alpha away from 0
+constexpr double kMinTransmittance = 1e-4;  // a pixel is finished before T falls below
 constexpr double kLog2MinAlpha = -7.994353436858858;  // log2(1/255)
-constexpr double kDilation = 0.3;  // low-pass added to the 2D covariance, pixels^2
+constexpr double kDilation = 0.3;  // added to the diagonal of the 2D covariance, pixels^2
 
 }  // namespace snow

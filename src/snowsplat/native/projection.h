@@ -1,12 +1,12 @@
 // The geometry of one Gaussian: world → camera → 2D splat (EWA splatting, Zwicker et al. 2002;
-// Kerbl et al. 2023, eq. 5 and 6), and its vector-Jacobian product below.
+// Kerbl et al. 2023, eq. 5 and 6), and the vector-Jacobian product of this map.
 //
 //   Σ  = R S Sᵀ Rᵀ            3D covariance, R from the quaternion, S = diag(exp(log_scales))
 //   Σ' = J W Σ Wᵀ Jᵀ + 0.3 I  2D covariance, W the rotation of cam_from_world, J the Jacobian of
 //                             the pinhole projection at the mean
 //
-// Written as Σ' = U Uᵀ + 0.3 I with U = T M, T = J W (2×3), M = R S (3×3), without computing the 3D
-// covariance.
+// Σ' is computed as U Uᵀ + 0.3 I, with U = T M, T = J W (2×3) and M = R S (3×3), without the 3D
+// covariance Σ.
 #pragma once
 
 #include "params.h"
@@ -20,12 +20,12 @@ struct PinholeCamera {
   T rotation[9], translation[3];  // cam_from_world
   T position[3];                  // camera centre in the world, -Rᵀ t
   T fx, fy, cx, cy, width, height, near;
-  // J is evaluated with x/z and y/z clamped to 15% beyond the image, because farther out the
-  // linearisation of the projection is unbounded.
+  // Limits of x/z and y/z, 15% outside of the image. J is evaluated with the clamped values,
+  // because the linear approximation of the projection is unbounded farther outside.
   T min_tx, max_tx, min_ty, max_ty;
 
-  // Real: the type in which the limits are computed. double on the CPU; T on a GPU, where every
-  // thread computes them.
+  // Real is the type in which the limits are computed: double on the CPU, T on a GPU, because there
+  // every thread computes them.
   template <class Real>
   SNOW_INLINE PinholeCamera(const CameraParams<T>& c, Real)
       : fx(T(c.fx)), fy(T(c.fy)), cx(T(c.cx)), cy(T(c.cy)), width(T(c.width)), height(T(c.height)),
@@ -58,7 +58,7 @@ struct ProjectedGaussian {
   Real scale[3], quat[4];  // activated: exp, normalised
   Real inv_quat_norm;
   Real R[9], M[9], T[6], U[6];
-  Real normal[3];  // U₀ × U₁, of the rows of U
+  Real normal[3];  // U₀ × U₁, the cross product of the rows of U
   Real cov_xx, cov_xy, cov_yy, inv_det;
   Real mean2d[2], conic[3], opacity;
 };
@@ -96,7 +96,7 @@ SNOW_INLINE void project_gaussian(const GaussianShape<Real>& g, const PinholeCam
   p.z = Real(W[6]) * mx + Real(W[7]) * my + Real(W[8]) * mz + Real(cam.translation[2]);
   p.inv_z = Real(1.f) / p.z;
 
-  // A zero quaternion stays zero, which quat_to_rotation turns into the identity.
+  // A zero quaternion stays zero. quat_to_rotation returns the identity for it.
   Real norm2 = g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] +
                g.quat[3] * g.quat[3] + Real(1e-24f);
   p.inv_quat_norm = Real(1.f) / sqrt(norm2);
@@ -123,9 +123,9 @@ SNOW_INLINE void project_gaussian(const GaussianShape<Real>& g, const PinholeCam
   p.cov_xx = U[0] * U[0] + U[1] * U[1] + U[2] * U[2] + Real(kDilation);
   p.cov_xy = U[0] * U[3] + U[1] * U[4] + U[2] * U[5];
   p.cov_yy = U[3] * U[3] + U[4] * U[4] + U[5] * U[5] + Real(kDilation);
-  // det Σ' = |U₀ × U₁|² + d (U₀·U₀ + U₁·U₁) + d², with d the dilation. The formula
-  // xx·yy − xy² loses precision for long thin splats: in float, the error is 19% at σ = 1000
-  // pixels, and larger splats give NaN.
+  // det Σ' = |U₀ × U₁|² + d (U₀·U₀ + U₁·U₁) + d², where d = 0.3 is the dilation. The formula
+  // xx·yy − xy² is inaccurate for long thin splats: in float, its error is 19% at σ = 1000 pixels,
+  // and it gives NaN for larger splats.
   Real* n = p.normal;
   n[0] = U[1] * U[5] - U[2] * U[4];
   n[1] = U[2] * U[3] - U[0] * U[5];
@@ -147,11 +147,11 @@ struct SplatGradient {  // with respect to the geometric columns of Splats2D
 };
 
 template <class Real>
-struct PoseGradient {  // of one Gaussian, with respect to cam_from_world
+struct PoseGradient {  // with respect to cam_from_world, from one Gaussian
   Real rotation[9], translation[3];
 };
 
-// `grad` receives mean, log_scale, quat and opacity_logit gradients; `pose` may be null.
+// `grad` receives the gradients of mean, log_scale, quat and opacity_logit. `pose` may be null.
 template <class Real, class T>
 SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const PinholeCamera<T>& cam,
                                       const ProjectedGaussian<Real>& p,
@@ -161,8 +161,9 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
   const Real two(2.f), half(0.5f);
   grad.opacity_logit = d.opacity * p.opacity * (Real(1.f) - p.opacity);
 
-  // V = K U with the conic K = Σ'⁻¹, by (v·v) u − (u·v) v = v × (u × v). Computing K U
-  // directly loses precision for long thin splats, as the determinant does.
+  // V = K U, where K = Σ'⁻¹ is the conic. It is computed from the identity
+  // (v·v) u − (u·v) v = v × (u × v). The direct product K U is inaccurate for long thin splats, for
+  // the same reason as the determinant above.
   const Real dilation(kDilation);
   const Real *U = p.U, *n = p.normal;
   Real V[6];
@@ -172,8 +173,10 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
     V[3 + k] = (dilation * U[3 + k] + n[k1] * U[k2] - n[k2] * U[k1]) * p.inv_det;
   }
 
-  // Σ' = U Uᵀ + d I and dΣ' = −K G K, with G symmetric, half of d.conic[1] off its diagonal. So
-  // dU = −2 K G V;  U = T M. As M = R S, ∂/∂ log s of column k is U_k·dU_k = −2 V_k·(G V_k).
+  // G is the symmetric matrix of the gradient of the conic; its off-diagonal element is half of
+  // d.conic[1]. From Σ' = U Uᵀ + d I follow dΣ' = −K G K and dU = −2 K G V. Because U = T M and
+  // M = R S, the gradient of log s_k is the dot product of the columns k of U and dU:
+  // U_k·dU_k = −2 V_k·(G V_k).
   const Real a = p.conic[0], b = p.conic[1], c = p.conic[2];
   const Real ga = d.conic[0], gb = half * d.conic[1], gc = d.conic[2];
   Real dU[6], dM[9], dT[6];
@@ -200,8 +203,8 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
   const Real u = p.x * iz, v = p.y * iz;
   const auto free_x = (u >= Real(cam.min_tx)) & (Real(cam.max_tx) >= u);
   const auto free_y = (v >= Real(cam.min_ty)) & (Real(cam.max_ty) >= v);
-  // The derivatives with respect to u = x/z and v = y/z: through the mean, and through J where u
-  // and v are not clamped.
+  // The derivatives with respect to u = x/z and v = y/z: through the 2D mean, and, if u and v are
+  // not clamped, through J.
   const Real zero(0.f);
   const Real du = fx * d.mean2d[0] - select(free_x, dj02 * fx * iz, zero);
   const Real dv = fy * d.mean2d[1] - select(free_y, dj12 * fy * iz, zero);
@@ -235,8 +238,9 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
   for (int k = 0; k < 4; k++) grad.quat[k] = (dq[k] - radial * p.quat[k]) * p.inv_quat_norm;
 }
 
-// In front of the near plane, at least 1/255 opaque, and the box of the ellipse {α ≥ 1/255} reaches
-// the range of the pixel centres. Non-finite values fail one of these comparisons.
+// Whether the Gaussian is beyond the near plane, its opacity is at least 1/255, and the bounding
+// box of the ellipse {α ≥ 1/255} overlaps the rectangle of the pixel centres. With non-finite
+// values, one of these comparisons is false.
 template <class Real, class T>
 SNOW_INLINE auto is_visible(const ProjectedGaussian<Real>& p, const PinholeCamera<T>& c) {
   Real k2 = squared_cutoff(p.opacity);
@@ -253,9 +257,9 @@ SNOW_INLINE void splat_header(const ProjectedGaussian<Real>& p, Real* column) {
   column[0] = p.mean2d[0], column[1] = p.mean2d[1];
   for (int k = 0; k < 3; k++) column[2 + k] = p.conic[k];
   column[5] = p.opacity, column[6] = p.z;
-  // Larger eigenvalue of Σ': mean of the diagonal + sqrt(half difference² + off-diagonal²).
+  // The larger eigenvalue of Σ' is mid + sqrt(dif² + cov_xy²).
   Real mid = Real(0.5f) * (p.cov_xx + p.cov_yy), dif = Real(0.5f) * (p.cov_xx - p.cov_yy);
-  dif = dif / mid;  // relative to the mean, since the squares would overflow
+  dif = dif / mid;  // relative to mid, because the squares could overflow
   Real off = p.cov_xy / mid;
   column[7] = Real(3.f) * sqrt(mid + mid * sqrt(dif * dif + off * off));
 }

@@ -1,15 +1,15 @@
 // The opacity of one splat at one pixel, the pixels where it is visible, and how splats are
 // composited.
 //
-// With d = pixel − mean, α(d) = o exp(−½ dᵀ K d) (Kerbl et al. 2023, eq. 3 and appendix). Kernels
-// use the base-2 logarithm: the opacity becomes a summand, and the test α ≥ 1/255 a single
-// comparison:
+// α(d) = o exp(−½ dᵀ K d), where d = pixel − mean, o is the opacity and K the conic (Kerbl et al.
+// 2023, eq. 3 and appendix). The kernels use the base-2 logarithm. Then the opacity is a summand,
+// and the test α ≥ 1/255 is a single comparison:
 //
 //   log₂ α = A dx² + B dx dy + C dy² + log₂ o,
 //   A = −½ log₂e · a,  B = −log₂e · b,  C = −½ log₂e · c
 //
-// Along a row of pixels x = X + x₀ this is a quadratic in X whose coefficients depend only on the
-// row.
+// Along a row of pixels, x = X + x₀, this is a quadratic function of X. Its coefficients depend
+// only on the row.
 #pragma once
 
 #include "layout.h"
@@ -18,15 +18,15 @@ namespace snow {
 
 // ---- Where a splat is visible -------------------------------------------------------------------
 
-// Squared Mahalanobis radius at which the splat fades to α = 1/255: α = o exp(−k²/2).
+// The squared Mahalanobis distance k² at which α = o exp(−k²/2) is 1/255.
 template <class Real>
 SNOW_INLINE Real squared_cutoff(Real opacity) {
   return Real(2 * kLn2) * (log2(opacity) - Real(kLog2MinAlpha));
 }
 
-// The pixels that the box of a splat's ellipse {α ≥ 1/255} covers, clamped to an image whose last
-// pixel is (right, bottom). `visible` is false if the box does not overlap the image or the conic is
-// not an ellipse.
+// The rectangle of pixels that the bounding box of a splat's ellipse {α ≥ 1/255} covers, clamped to
+// an image whose last pixel is (right, bottom). `visible` is false if the box does not overlap the
+// image or the conic is not positive definite.
 template <class Real>
 struct PixelExtent {
   Real x0, y0, x1, y1;
@@ -45,7 +45,7 @@ struct PixelExtent {
   }
 };
 
-// Unsigned integers with the same order as the floats: the keys for sorting splats by depth.
+// An unsigned integer for each float, in the same order: the keys for sorting splats by depth.
 SNOW_INLINE uint32_t ordered_bits(float x) {
   const uint32_t b = bits_of(x);
   return b >> 31 ? ~b : b | 0x80000000u;
@@ -58,7 +58,8 @@ SNOW_INLINE uint64_t ordered_bits(double x) {
 template <class Real>
 struct SplatTerms {
   Real mean_x, mean_y, A, B, C, log2_opacity;
-  // −B/2A, −B/2C: log₂α peaks along a row at x = slope_x · dy, along a column at y = slope_y · dx.
+  // −B/2A and −B/2C: along a row, log₂α is largest at dx = slope_x · dy; along a column, it is
+  // largest at dy = slope_y · dx.
   Real slope_x, slope_y;
 };
 
@@ -76,9 +77,10 @@ SNOW_INLINE SplatTerms<Real> splat_terms(Real mean_x, Real mean_y, const Real* c
   return s;
 }
 
-// The largest log₂(α / o) over the pixel centres' rectangle [x0, x1] × [y0, y1], relative to the
-// mean. The quadratic is concave with its maximum at the origin, so its maximum over a rectangle
-// lies on an edge facing the origin.
+// The maximum of log₂(α / o) over the rectangle [x0, x1] × [y0, y1] of pixel centres, whose
+// coordinates are relative to the mean. The quadratic is concave, with its maximum at the origin.
+// So its maximum over a rectangle that does not contain the origin is on an edge that faces the
+// origin.
 template <class Real>
 SNOW_INLINE Real peak_over_rectangle(const SplatTerms<Real>& s, Real x0, Real y0, Real x1,
                                      Real y1) {
@@ -90,20 +92,21 @@ SNOW_INLINE Real peak_over_rectangle(const SplatTerms<Real>& s, Real x0, Real y0
   return max(on_row, on_column);
 }
 
-// Culling lowers the threshold of log₂α by this margin, because of rounding.
+// Because of rounding, culling lowers the threshold of log₂α by this margin.
 constexpr double kCullSlack = 1e-3;
 
 // ---- Compositing --------------------------------------------------------------------------------
 //
-// Front to back, with the transmittance T = Π (1 − α) of the splats in front. A splat has the weight
-// α T and is skipped if α < 1/255. A pixel is finished when the next splat would make T < 1e-4.
+// Splats are composited front to back. T = Π (1 − α) is the transmittance of the splats in front.
+// The weight of a splat is α T; a splat with α < 1/255 is skipped. A pixel is finished when the
+// next splat would make T < 1e-4.
 
 template <class Real>
 SNOW_INLINE auto is_blended(Real log2_alpha) {
   return log2_alpha >= Real(kLog2MinAlpha);
 }
 
-// Keeps 1 − α away from 0.
+// α, limited so that 1 − α is not near 0.
 template <class Real>
 SNOW_INLINE Real capped_alpha(Real alpha) {
   return min(alpha, Real(kMaxAlpha));
@@ -114,14 +117,16 @@ SNOW_INLINE auto is_open(Real transmittance) {
   return transmittance >= Real(kMinTransmittance);
 }
 
-// ∂L/∂(log α) of a splat at a pixel: `ahead` is its weight times ∂L/∂C · c, `behind` the sum of that
-// over the splats behind it. No division by T is needed.
+// ∂L/∂(log α) of a splat at a pixel. `weighted_dot` is the weight of the splat times the dot
+// product of ∂L/∂C and its colour; `behind` is the sum of this product over the splats behind it.
+// No division by T is needed.
 template <class Real>
-SNOW_INLINE Real log_alpha_gradient(Real ahead, Real alpha, Real behind) {
-  return ahead - alpha * behind * reciprocal_estimate(Real(1.f) - alpha);
+SNOW_INLINE Real log_alpha_gradient(Real weighted_dot, Real alpha, Real behind) {
+  return weighted_dot - alpha * behind * reciprocal_estimate(Real(1.f) - alpha);
 }
 
-// The geometric gradients follow from sums of q = ∂L/∂(log α) over pixels, weighted by powers of d:
+// The geometric gradients are computed from sums of q = ∂L/∂(log α) over pixels, weighted by powers
+// of d:
 //   ∂ log α/∂mean = K d,  ∂/∂a = −½ dx²,  ∂/∂b = −dx dy,  ∂/∂c = −½ dy²,  ∂/∂o = 1/o
 template <class Real>
 struct BlendMoments {

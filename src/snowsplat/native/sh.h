@@ -1,5 +1,5 @@
-// Real spherical harmonics to degree 3 and the view-dependent colour max(0, ½ + Σ c_k Y_k(dir)).
-// Coefficients are stored k-major, channel-last: c[3 k + channel].
+// Real spherical harmonics up to degree 3, and the view-dependent colour max(0, ½ + Σ c_k
+// Y_k(dir)). The coefficients of the three channels are adjacent: c[3 k + channel].
 #pragma once
 
 #include "portable.h"
@@ -39,7 +39,7 @@ SNOW_INLINE void sh_basis(int degree, Real x, Real y, Real z, Real* Y) {
   Y[15] = c(kSH3[6]) * x * (xx - three * yy);
 }
 
-// d[k] = ∂L/∂Y_k → gradient with respect to (x, y, z), each treated as free.
+// The gradient with respect to x, y and z (as independent variables) from d[k] = ∂L/∂Y_k.
 template <class Real>
 SNOW_INLINE void sh_basis_vjp(int degree, Real x, Real y, Real z, const Real* d, Real* g) {
   auto c = [](double value) { return Real(value); };
@@ -80,7 +80,7 @@ SNOW_INLINE ViewDirection<Real> view_direction(const Real* mean, const T* positi
   return {x * inv, y * inv, z * inv, inv};
 }
 
-// Colour before the clamp at 0. dc: 3 values; rest: 3 ((degree+1)² − 1) values.
+// The colour before it is clamped at 0. dc: 3 values; rest: 3 ((degree+1)² − 1) values.
 template <class Real>
 SNOW_INLINE void sh_color(int degree, const ViewDirection<Real>& dir, const Real* dc,
                           const Real* rest, Real* color) {
@@ -91,8 +91,7 @@ SNOW_INLINE void sh_color(int degree, const ViewDirection<Real>& dir, const Real
     for (int ch = 0; ch < 3; ch++) color[ch] += Y[k] * rest[3 * (k - 1) + ch];
 }
 
-// d_color → d_dc, d_rest (both written) and d_mean (written; −d_mean is the gradient of the
-// camera's position).
+// Computes d_dc, d_rest and d_mean from d_color. −d_mean is the gradient of the camera's position.
 template <class Real>
 SNOW_INLINE void sh_color_vjp(int degree, const ViewDirection<Real>& dir, const Real* dc,
                               const Real* rest, const Real* d_color, Real* d_dc, Real* d_rest,

@@ -1,9 +1,9 @@
 // Simd<T, W>: W lanes of T with the operations that the kernels need.
 //
-// The primary template uses compiler vectors and works on every target (SSE2 and NEON at W = 4,
-// and double); simd_avx2.h and simd_avx512.h have specialisations with the same members, written in
-// intrinsics only where the compiler generates slow code. Arithmetic uses operators, so that the
-// compiler contracts multiply-adds.
+// The primary template uses the vector extensions of the compiler and works on every target: SSE2
+// and NEON with W = 4, and double. simd_avx2.h and simd_avx512.h contain specialisations with the
+// same members. They use intrinsics only where the compiler generates slow code. Arithmetic is
+// written with operators, so that the compiler can fuse multiplications and additions.
 #pragma once
 
 #include <cstdint>
@@ -19,7 +19,8 @@
 namespace snow {
 
 namespace detail {
-// The compiler's vector types, spelled out: GCC drops the attribute from a dependent typedef.
+// The vector types of the compiler. Each is written out, because GCC ignores the attribute in a
+// typedef that depends on a template parameter.
 template <class T, int W>
 struct VectorTypes;
 template <>
@@ -124,7 +125,7 @@ struct Simd {
   SNOW_INLINE friend Simd reciprocal_estimate(Simd a) { return Simd(T(1)) / a; }
   SNOW_INLINE friend Simd rsqrt(Simd a) { return Simd(T(1)) / sqrt(a); }
 
-  // Splits x = floor(x) + f; exp2 = 2^floor(x) · poly(f) is assembled by the callers below.
+  // Splits x into floor(x) and f, for exp2(x) = 2^floor(x) · poly(f) (simd_math.h).
   SNOW_INLINE static void split(Simd x, Simd& f, IVec& whole) {
     IVec i = __builtin_convertvector(x.v, IVec);
     i += (__builtin_convertvector(i, Vec) > x.v);  // truncation towards 0 → floor (true is -1)
@@ -146,8 +147,9 @@ struct Simd {
 };
 
 // ---- rows ⇄ lanes -------------------------------------------------------------------------------
-// Parameters are stored with one Gaussian per row, (N, K); kernels need one Gaussian per lane. These
-// functions convert W rows of K columns, four columns at a time, by 4×4 transposes in 128-bit lanes.
+// Parameters are stored with one Gaussian per row, (N, K); the kernels need one Gaussian per SIMD
+// lane. These functions convert W rows of K columns, four columns at a time, by 4×4 transpositions
+// in 128-bit parts of the vectors.
 
 #if defined(__SSE2__)
 SNOW_INLINE __m128 load_quad(const float* p, int n) {
@@ -174,7 +176,7 @@ SNOW_INLINE void store_quad(float* p, __m128 q, int n) {
 template <class V>
 struct RowMover {
   using T = typename V::Scalar;
-  // rows[l] + column: four (n) columns of row l → out[0..n) in lane l.
+  // Loads n ≤ 4 columns of each row l, from rows[l] + column on, into lane l of out[0..n).
   SNOW_INLINE static void gather4(const T* const* rows, int column, int n, V* out) {
     for (int k = 0; k < n; k++)
       for (int l = 0; l < V::width; l++) out[k].v[l] = rows[l][column + k];
@@ -207,7 +209,7 @@ SNOW_INLINE void sum_lanes(const V* in, typename V::Scalar* out) {
 
 namespace snow {
 
-// The native vector of this build, and the one in which the double-precision checks run.
+// The native vector of this build, and the vector of the checks in double precision.
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 using VecF = Simd<float, 16>;
 #elif defined(__AVX2__) && defined(__FMA__)
@@ -217,8 +219,8 @@ using VecF = Simd<float, 4>;
 #endif
 using VecD = Simd<double, 4>;
 
-// W rows of `columns` columns ⇄ `columns` vectors. Not inlined: a kernel converts a dozen tensors, and
-// the unrolled code would not fit into the instruction cache.
+// W rows of `columns` columns ⇄ `columns` vectors. The functions are not inlined: a kernel converts
+// about twelve tensors, and the unrolled code would not fit into the instruction cache.
 template <class V>
 __attribute__((noinline)) void gather_rows(const typename V::Scalar* base, int64_t stride,
                                            const int64_t* row, int columns, V* out) {
@@ -245,8 +247,8 @@ __attribute__((noinline)) void scatter_rows(typename V::Scalar* base, int64_t st
 
 SNOW_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
 
-// Denormals make blending 1.7× slower. Every kernel flushes them to zero on each of its threads, and
-// restores the caller's mode.
+// Denormal numbers make blending 1.7× slower. Every kernel sets the mode that flushes them to zero
+// in each of its threads, and restores the caller's mode at its end.
 struct FlushDenormals {
 #if defined(__x86_64__)
   unsigned saved = _mm_getcsr();

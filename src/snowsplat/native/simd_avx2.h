@@ -1,4 +1,4 @@
-// Simd<float, 8> in AVX2 and FMA: see simd.h, which includes this if the compiler supports them.
+// Simd<float, 8> with AVX2 and FMA. simd.h includes this file if the compiler supports them.
 #pragma once
 
 #include "simd.h"

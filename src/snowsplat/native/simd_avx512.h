@@ -1,4 +1,4 @@
-// Simd<float, 16> in AVX-512 (F and DQ): see simd.h, which includes this if the compiler supports them.
+// Simd<float, 16> with AVX-512 (F and DQ). simd.h includes this file if the compiler supports them.
 #pragma once
 
 #include "simd.h"
@@ -11,7 +11,7 @@ struct Simd<float, 16> {
   using Int = int32_t;
   static constexpr int width = 16;
   typedef __m512 Vec;
-  typedef __m512 IVec;  // split() keeps x itself: vscalefps does floor and scale in one
+  typedef __m512 IVec;  // split() returns x itself: vscalefps computes floor and scale
 
   struct Mask {
     __mmask16 m;

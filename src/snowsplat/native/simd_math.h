@@ -1,4 +1,4 @@
-// exp, exp2 and log2 of Simd lanes: polynomials in float, the C library in double.
+// exp, exp2 and log2 of SIMD lanes: polynomials in float, functions of the C library in double.
 #pragma once
 
 #include "simd.h"
@@ -11,8 +11,9 @@ SNOW_INLINE V map_lanes(V x, double (*f)(double)) {
   return x;
 }
 
-// 2^x for blending, x in about [-30, 1]: minimax quartic on [0, 1), relative error 2.6e-6.
-// Lanes far outside of this range are undefined; the caller masks them.
+// 2^x for blending, for x between about -30 and 1: a minimax polynomial of degree 4 on [0, 1) with
+// a relative error of 2.6e-6. The result is undefined for x far outside of this range; the caller
+// masks such lanes.
 template <int W>
 SNOW_INLINE Simd<float, W> exp2_blend(Simd<float, W> x) {
   using V = Simd<float, W>;
@@ -27,7 +28,7 @@ SNOW_INLINE Simd<float, W> exp2_blend(Simd<float, W> x) {
 }
 SNOW_INLINE VecD exp2_blend(VecD x) { return map_lanes(x, std::exp2); }
 
-// e^x, clamped to e^±80: degree 6 on [0, 1), relative error 2e-7.
+// e^x, clamped to e^±80: a polynomial of degree 6 on [0, 1) with a relative error of 2e-7.
 template <int W>
 SNOW_INLINE Simd<float, W> exp(Simd<float, W> x) {
   using V = Simd<float, W>;

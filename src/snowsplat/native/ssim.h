@@ -1,5 +1,5 @@
-// Structural similarity of two images at one pixel (Wang et al. 2004), from the windowed means of
-// a, b, a² + b² and ab, and its derivatives with respect to those that depend on a.
+// Structural similarity of two images a and b at one pixel (Wang et al. 2004), from the windowed
+// means of a, b, a² + b² and ab, and its derivatives with respect to the means that depend on a.
 #pragma once
 
 #include "portable.h"

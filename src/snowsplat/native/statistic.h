@@ -1,11 +1,11 @@
-// accumulate_screen_statistics for one splat, on both engines.
+// accumulate_screen_statistics for one splat, for CPU and GPU.
 #pragma once
 
 #include "params.h"
 
 namespace snow {
 
-// Rows are distinct Gaussians, so no two threads share a sum. A splat with a non-finite
+// The ids are distinct, so two threads never add to the same sum. A splat with a non-finite
 // gradient is skipped. Columns of Splats2D: 0 and 1 are the mean, 7 the radius.
 template <class T>
 SNOW_INLINE void accumulate_splat(const ScreenStatisticsParams<T>& p, int64_t i, T half_width,

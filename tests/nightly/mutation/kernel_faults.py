@@ -226,8 +226,8 @@ FAULTS = (
     ),
     Fault(
         "rasterize.h",
-        "return ahead - alpha * behind *",
-        "return ahead + alpha * behind *",
+        "return weighted_dot - alpha * behind *",
+        "return weighted_dot + alpha * behind *",
         "gradient of α from what is behind",
         "rasterize",
     ),
@@ -501,7 +501,7 @@ FAULTS = (
     ),
     Fault(
         "cuda/rasterize.cu",
-        "if (visible && !open) rest = negative(rest);",
+        "if (visible && !open) signed_transmittance = negative(signed_transmittance);",
         "",
         "a finished pixel stays open",
         "rasterize",

@@ -1,5 +1,5 @@
-// adam_step: carries the gradient of the splats through the projection and applies Adam (adam.h)
-// immediately: the gradients of the parameters are never written to memory.
+// adam_step: computes the gradients of the parameters from those of the splats, and applies Adam
+// (adam.h) immediately. The gradients of the parameters are never written to memory.
 #include "adam.h"
 
 #include <algorithm>
@@ -36,8 +36,8 @@ SNOW_INLINE bool all_finite(V a) {
   return __builtin_expect(V::bits(is_finite(a)) == V::bits(V::first(V::width)), 1);
 }
 
-// Takes the step in lanes where its results are finite; returns the other lanes. Rarely called, so
-// it is not inlined.
+// Applies the step in the lanes in which its results are finite, and returns the bits of the other
+// lanes. It is rarely called, so it is not inlined.
 template <class V>
 __attribute__((noinline, cold)) uint32_t step_where_finite(const AdamRule<V>& rule, const V& g,
                                                            V& m, V& v, V& p, const V& rate) {
@@ -67,7 +67,7 @@ __attribute__((noinline, cold)) void update_finite_lanes(const AdamRule<V>& rule
   scatter_rows(t.v, t.stride, rows.row, rows.count, columns, v);
 }
 
-// At most four columns of W rows, one row per lane.
+// Updates at most four columns of W rows, with one row per lane.
 template <class V, class T = typename V::Scalar>
 __attribute__((noinline)) void update_lanes(const AdamRule<V>& rule, const AdamRows<T>& t,
                                             const RowIndex<V::width>& rows, V* g) {
@@ -91,7 +91,7 @@ __attribute__((noinline)) void update_lanes(const AdamRule<V>& rule, const AdamR
   scatter_rows(t.v, t.stride, rows.row, rows.count, columns, v);
 }
 
-// Up to a vector of columns, from m, v and value on; returns the lanes that were skipped.
+// Updates n ≤ W adjacent columns; returns the bits of the lanes that were skipped.
 template <class V, class T = typename V::Scalar>
 __attribute__((noinline, cold)) uint32_t update_finite(const AdamRule<V>& rule, int n, T* value,
                                                        T* m, T* v, const T* g, const T* extra,
@@ -104,7 +104,7 @@ __attribute__((noinline, cold)) uint32_t update_finite(const AdamRule<V>& rule, 
   return nonfinite & V::bits(V::first(n));
 }
 
-// `columns` (many) of one row, contiguous; g may be null (zero gradient).
+// Updates `columns` contiguous columns of one row. g may be null: a gradient of zero.
 template <class V, class T = typename V::Scalar>
 __attribute__((noinline)) void update_row(const AdamRule<V>& rule, const AdamRows<T>& t,
                                           int64_t row, int columns, const T* g) {
@@ -137,7 +137,8 @@ __attribute__((noinline)) void update_row(const AdamRule<V>& rule, const AdamRow
   if (nonfinite) t.count_nonfinite(1);
 }
 
-// Visible rows have gaps between them that the hardware prefetcher does not predict.
+// The hardware prefetcher does not predict the next visible row, because the gaps between them
+// vary.
 template <class T>
 SNOW_INLINE void prefetch_row(int64_t row, const AdamRows<T>* t, int rest_columns) {
   for (int k = 0; k < kAdamParameters; k++) {
@@ -147,7 +148,7 @@ SNOW_INLINE void prefetch_row(int64_t row, const AdamRows<T>* t, int rest_column
   }
 }
 
-// Returns −1 and changes nothing if an id is negative: such rows only come from a GPU.
+// If an id is negative, returns −1 and changes nothing: only a GPU creates such rows.
 template <class V, class T = typename V::Scalar>
 int64_t step(const AdamStepParams<T>& p) {
   constexpr int W = V::width;
@@ -168,7 +169,8 @@ int64_t step(const AdamStepParams<T>& p) {
   const AdamRule<V> rule(p);
   const bool visible_only = p.visible_only != 0;
   const int degree = int(p.sh_degree), rest_columns = sh_columns(degree);
-  // A task is a range of Gaussians and their splats, which are contiguous because ids ascend.
+  // A task is a range of Gaussians and their splats, which are contiguous because ids are
+  // ascending.
   const int64_t units = visible_only ? m : n;
   parallel_for((units + kBlock - 1) / kBlock, [&](int64_t block) {
     const int64_t begin = block * kBlock, end = std::min(begin + kBlock, units);

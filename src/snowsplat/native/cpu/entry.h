@@ -2,8 +2,8 @@
 //
 //   SNOW_ENTRY(name, Params) { … }
 //
-// defines int64_t name(const Params& p), and name_layout(), by which Python checks that its struct
-// has the layout of `Params` (see layout.h).
+// defines int64_t name(const Params& p), and name_layout(). With the latter, Python checks that its
+// struct has the layout of `Params` (see layout.h).
 #pragma once
 
 #include "params.h"

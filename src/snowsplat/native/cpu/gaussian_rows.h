@@ -1,6 +1,6 @@
-// W Gaussians at a time, one per SIMD lane: loads their parameters from row-major tensors, and
-// computes the gradients of these parameters from the gradient of their splats. Shared by project_bwd, which
-// writes the gradients, and adam_step, which applies them immediately.
+// Groups of W Gaussians, one per SIMD lane. Loads their parameters from row-major tensors, and
+// computes the gradients of the parameters from the gradients of the splats. project_bwd writes the
+// gradients of the parameters; adam_step applies them immediately.
 #pragma once
 
 #include "projection.h"
@@ -9,7 +9,8 @@
 
 namespace snow {
 
-// Rows of the W Gaussians of a group. A last, shorter group repeats its final row in the idle lanes.
+// The rows of the W Gaussians of a group. If the last group is shorter, the remaining lanes repeat
+// its last row.
 template <int W>
 struct RowIndex {
   int64_t row[W];
@@ -56,8 +57,9 @@ struct GaussianGroupGradient {
   V dc[3], rest[3 * (kMaxShCoefficients - 1) + 1];
 };
 
-// grad_packed rows [first, first + W) of the splats → gradients of the group's parameters.
-// `pose` and `position` (gradient of the camera's centre, through the view directions) may be null.
+// Computes the gradients of a group's parameters from the rows [first, first + W) of grad_packed.
+// `position` receives the gradient of the camera's centre through the view directions. `pose` and
+// `position` may be null.
 template <class V, class T = typename V::Scalar>
 SNOW_INLINE void group_vjp(const GaussianGroup<V>& g, const PinholeCamera<T>& cam, int degree,
                            const T* grad_packed, int64_t first, int64_t end,

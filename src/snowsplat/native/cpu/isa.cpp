@@ -1,7 +1,9 @@
-// The instruction set that this library was built for, and the best one that this machine supports.
+// The instruction set for which this library was built, and the best one that this machine
+// supports.
 //
-// The loader (ops/native.py) calls the baseline library, which runs everywhere, before it loads
-// another one, because loading a library already runs its static constructors.
+// The loader (ops/native.py) calls best_isa() of the baseline library, which runs on every machine.
+// It must do so before it loads another library, because loading a library runs its static
+// constructors.
 #include <cstdint>
 
 #if defined(__x86_64__)
@@ -12,12 +14,12 @@
 
 namespace {
 
-// The order is that of ISAS in ops/native.py.
+// In the order of ISAS in ops/native.py.
 enum Isa : int64_t { kBaseline = 0, kAvx2 = 1, kAvx512 = 2 };
 
 #if defined(__x86_64__)
-// On processors without lzcnt, the instruction is executed as bsr: wrong results instead of a fault.
-// __builtin_cpu_supports of older compilers does not support its name.
+// A processor without lzcnt executes this instruction as bsr: the results are wrong, and there is
+// no fault. __builtin_cpu_supports of older compilers does not accept the name "lzcnt".
 bool has_lzcnt() {
   unsigned a = 0, b = 0, c = 0, d = 0;
   return __get_cpuid(0x80000001u, &a, &b, &c, &d) && (c & (1u << 5));
@@ -26,7 +28,7 @@ bool has_lzcnt() {
 
 }  // namespace
 
-// The instruction set that this library was built for.
+// The instruction set for which this library was built.
 SNOW_EXPORT int64_t built_isa() {
 #if defined(SNOWSPLAT_ISA_AVX512)
   return kAvx512;
@@ -37,8 +39,8 @@ SNOW_EXPORT int64_t built_isa() {
 #endif
 }
 
-// The best instruction set of the processor whose registers the operating system saves on a task
-// switch (__builtin_cpu_supports checks XCR0 for the wide registers).
+// The best instruction set that the processor and the operating system support. The system must
+// save the wide registers at a context switch; __builtin_cpu_supports checks this in XCR0.
 SNOW_EXPORT int64_t best_isa() {
 #if defined(__x86_64__)
   __builtin_cpu_init();

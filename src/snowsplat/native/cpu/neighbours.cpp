@@ -1,8 +1,8 @@
-// neighbours: the exact distances from each point to its k nearest others, by a k-d tree.
+// neighbours: the exact distances from each point to its k nearest other points, by a k-d tree.
 //
-// The tree is implicit: the points are reordered so that each node is a range, cut at its middle
-// along its widest axis, down to leaves of at most 16 points. Every query starts at the root and
-// prunes by the distance to the splitting planes.
+// The tree is implicit: the points are reordered so that each node is a range of points. A range is
+// split at its median along the widest axis, until it has at most 16 points. Every query starts at
+// the root and skips nodes that are too far away, by the distance to the splitting planes.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -22,8 +22,8 @@ class Tree {
  public:
   Tree(const T* points, int64_t n) : order_(size_t(n)), nodes_(size_t(node_count(n))) {
     for (int64_t i = 0; i < n; i++) order_[size_t(i)] = int32_t(i);
-    // The top of the tree is built serially until there is work for every thread, then the subtrees
-    // in parallel.
+    // The top of the tree is built serially, until there are enough subtrees for all threads. The
+    // subtrees are built in parallel.
     std::vector<Job> jobs = {{0, 0, n}};
     while (!jobs.empty() && int64_t(jobs.size()) < 4 * pool_size()) {
       std::vector<Job> next;

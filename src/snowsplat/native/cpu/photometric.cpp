@@ -1,10 +1,10 @@
 // photometric: L1 and SSIM between two images and the gradient of their weighted sum, in one pass.
 //
-// Images are planar, (3, H, W). A task is one channel of a strip of columns over a segment of rows.
-// It moves down the rows and keeps the last 11 horizontally filtered rows in ring buffers: first of
-// the window means, then of the derivatives. Only the images themselves are read from and written to
-// memory. The division into tasks depends only on the image size, and partial sums are added in
-// order.
+// Images are planar, (channels, H, W). A task is one channel of a strip of columns and a segment of
+// rows. It processes the rows from top to bottom. Ring buffers contain the last 11 horizontally
+// filtered rows of the window means, and those of the derivatives. Only the images and the gradient
+// are read from or written to main memory. The division into tasks depends only on the image size,
+// and partial sums are added in order, so the result does not depend on the number of threads.
 #include <cstring>
 #include <utility>
 #include <vector>
@@ -17,7 +17,7 @@
 namespace snow {
 namespace {
 
-constexpr int kStrip = 256;  // most columns of a task
+constexpr int kStrip = 256;  // maximum number of columns of a task
 constexpr int kMargin = 16;  // columns computed on each side for the second filter
 constexpr int kPad = 32;     // columns of buffer on each side
 constexpr int kRow = kStrip + 2 * kPad;
@@ -25,7 +25,7 @@ constexpr int kSegment = 540;  // rows of a task, approximately
 
 int64_t strip_count(int64_t width) { return (width + kStrip - 1) / kStrip; }
 
-// n pixels (n ≤ W) of either kind of image.
+// Loads n ≤ W pixels of an image of either type.
 template <class V>
 SNOW_INLINE V load_pixels(const typename V::Scalar* p, int64_t n) {
   return n >= V::width ? V::load(p) : V::load_first(p, int(n));
@@ -37,8 +37,9 @@ SNOW_INLINE V load_pixels(const uint8_t* p, int64_t n) {
   return V::load_bytes(n >= V::width ? p : bytes) * V(1.0 / 255.0);
 }
 
-// row[x + k − 5 …], k = 0 … 10, for x a multiple of W: eleven loads, most of them across two cache
-// lines; with 16 lanes, three aligned loads and shifts between registers are used instead.
+// shifted<k>() is the vector at row[x + k − 5], for k = 0 … 10 and x a multiple of W. This takes
+// eleven loads, most of which cross a cache line. With 16 lanes, three aligned loads and shifts
+// between registers are used instead.
 template <class V>
 struct Neighbourhood {
   const typename V::Scalar* at;

@@ -105,7 +105,8 @@ std::mutex pool_mutex;
 Pool* pool = nullptr;
 int wanted = 1;
 
-// A forked child has none of its parent's threads: discard the pool; a new one is created when needed.
+// A forked process does not have the threads of its parent. So the pool is discarded, and a new one
+// is created when it is needed.
 void after_fork_in_child() {
   new (&pool_mutex) std::mutex;
   pool = nullptr;

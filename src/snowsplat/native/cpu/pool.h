@@ -1,8 +1,9 @@
 // A small pool of threads shared by all kernels of this library.
 //
-// parallel_for(tasks, body) calls body(task) once for each task in [0, tasks), on any thread in any
-// order; the result of a kernel must not depend on either. Idle workers sleep after a short spin, so
-// that waiting does not slow down other processes. Denormals are flushed inside and the mode is restored.
+// parallel_for(tasks, body) calls body(task) once for each task in [0, tasks), on any thread and in
+// any order. The result of a kernel must not depend on the thread or the order. Idle workers sleep
+// after a short spin, so that waiting does not slow down other processes. Within `body`, denormal
+// numbers are flushed to zero; the caller's mode is restored afterwards.
 #pragma once
 
 #include <cstdint>
@@ -17,7 +18,7 @@ inline void parallel_for(int64_t tasks, F&& body) {
   pool_run(tasks, [](void* context, int64_t task) { (*static_cast<F*>(context))(task); }, &body);
 }
 
-// Cuts [0, n) into `parts` contiguous ranges of multiples of `unit`; range `part` is [begin, end).
+// Splits [0, n) into `parts` contiguous ranges, at multiples of `unit`, and returns number `part`.
 struct Range {
   int64_t begin, end;
 };

@@ -1,5 +1,5 @@
 // project: the Gaussians that a camera sees (project_cull), their 2D splats (project_fwd), and the
-// gradients of the parameters and the pose from those of the splats (project_bwd).
+// gradients of the parameters and the pose from the gradients of the splats (project_bwd).
 #include <cstring>
 #include <vector>
 
@@ -12,8 +12,9 @@ namespace {
 
 constexpr int64_t kBlock = 2048;  // Gaussians per task: independent of the number of threads
 
-// Bound on the half extents of the splat from its largest scale alone: λmax(Σ) = s², so
-// Σ'xx ≤ |J_x|² s² + 0.3 with |J_x|² = (fx/z)² (1 + tx²). It is cheap, and never too small.
+// Whether a Gaussian may be visible, by an upper bound on the half extents of its splat. The bound
+// needs only the largest scale s: λmax(Σ) = s², so Σ'xx ≤ |J_x|² s² + 0.3 with
+// |J_x|² = (fx/z)² (1 + tx²). It is fast to compute.
 template <class V, class T>
 SNOW_INLINE typename V::Mask may_touch_image(const GaussianShape<V>& g, const PinholeCamera<T>& c) {
   const T* W = c.rotation;

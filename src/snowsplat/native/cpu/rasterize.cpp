@@ -1,17 +1,19 @@
-// Rasterization: composites the splats of each 16×16 tile front to back; and its gradient.
+// Rasterization: composites the splats of each 16×16 tile front to back, and computes the gradient.
 //
-// Pixels are in SIMD lanes: a block is W neighbouring pixels of one row (a whole row at W = 16), a
-// tile has 256/W blocks, numbered column-major: block = (x / W) · 16 + y. One vector test per
-// (tile, splat) finds the blocks its ellipse touches; the forward pass stores these bits for the
-// backward pass.
+// Pixels are in SIMD lanes. A block is W adjacent pixels of one row (a whole row of the tile if
+// W = 16). A tile has 256/W blocks, numbered by columns: block = (x / W) · 16 + y. For each pair of
+// a tile and a splat, one vectorised test finds the blocks that the ellipse of the splat touches.
+// The forward pass stores these bits for the backward pass.
 //
-// Forward   processes chunks of 64 splats block by block, so that a block's transmittance and
-//           colour stay in registers over the chunk.
-// Backward  processes splat by splat, front to back again. With S, the sum over the splats behind
-//           (known at the start: S₀ = ∂L/∂C · C, since all splats are behind), the derivative with respect
-//           to log α is w·(g·c) − α S/(1 − α): no division by T, no last index per pixel. A splat's
-//           sums stay in lanes over its blocks and are added once, into a separate slot: no
-//           atomics, so the result is the same for any number of threads.
+// Forward   Chunks of 64 splats are processed block by block, so that the transmittance and the
+//           colour of a block stay in registers during a chunk.
+// Backward  The splats are processed one by one, front to back again. S is the dot product of
+//           g = ∂L/∂C and the contribution of the splats behind the current one. At the start all
+//           splats are behind, so S₀ = g·C is known. The derivative with respect to log α is
+//           w·(g·c) − α S/(1 − α). It needs no division by T and no last index per pixel. The sums
+//           of a splat over its blocks stay in SIMD lanes. At the end, the lanes are added and
+//           written to the slot of the instance. No atomic operations are used, so the result does
+//           not depend on the number of threads.
 #include "cpu/entry.h"
 #include "cpu/pool.h"
 #include "cpu/splat_record.h"
@@ -55,7 +57,7 @@ struct Tile {
     columns = width - x < kTile ? int(width - x) : kTile;
     rows = height - y < kTile ? int(height - y) : kTile;
   }
-  // The number of lanes of a block that are pixels of the image.
+  // The number of lanes of a block that are inside the image.
   SNOW_INLINE int lanes(int block) const {
     const int n = columns - block / kTile * W;
     return block % kTile < rows ? (n < 0 ? 0 : n < W ? n : W) : 0;
@@ -65,8 +67,8 @@ struct Tile {
   }
 };
 
-// The quadratic of a splat along each row of a tile: log₂α = (A X + p1[row]) X + p0[row] for the
-// pixel X columns into the tile. `reach` returns the bits of the blocks that can hold α ≥ 1/255.
+// The quadratic of a splat along each row of a tile: log₂α = (A X + p1[row]) X + p0[row] in column
+// X of the tile. `touched_blocks` returns the bits of the blocks in which α may reach 1/255.
 template <class V>
 struct RowTerms {
   using T = typename V::Scalar;
@@ -83,7 +85,8 @@ struct RowTerms {
       d.store(dy + k * V::width);
     }
   }
-  SNOW_INLINE typename Tile<V>::Bits reach(const SplatTerms<T>& s, const Tile<V>& tile) const {
+  SNOW_INLINE typename Tile<V>::Bits touched_blocks(const SplatTerms<T>& s,
+                                                    const Tile<V>& tile) const {
     const T x0 = s.mean_x - (T(tile.x) + T(0.5));
     const V threshold(kLog2MinAlpha - kCullSlack);
     typename Tile<V>::Bits bits = 0;
@@ -101,7 +104,8 @@ struct RowTerms {
   }
 };
 
-// For each block, the splats of the chunk that touch it: the transpose of the splats' block bits.
+// For each block, the bits of the splats of the chunk that touch it: the transpose of the block
+// bits of the splats.
 template <class V>
 struct BlockLists {
   uint64_t list[Tile<V>::kBlocks] = {};
@@ -168,7 +172,7 @@ struct Frame {
         instance_blocks(static_cast<typename Tile<V>::Bits*>(p.instance_blocks)) {}
 };
 
-// With `Count`, the image is the number of splats that were blended.
+// With `Count`, the value of a pixel is the number of blended splats.
 template <class V, int C, bool Count = false, class T = typename V::Scalar>
 void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* background, T* image,
                   T* alpha) {
@@ -203,7 +207,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
       const SplatRecord<T>& r = f.records[f.instance_splat[i + j]];
       splat[j] = &r;
       rows[j].set(r.terms, tile);
-      const Bits touched = rows[j].reach(r.terms, tile) & live;
+      const Bits touched = rows[j].touched_blocks(r.terms, tile) & live;
       blocks_of[j] = touched;
       lists.add(j, touched);
     }
@@ -225,7 +229,8 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
         V weight = a * transmittance, next = transmittance - weight;
         const auto open = is_open(next);
         if (__builtin_expect(V::bits(open) != still, 0)) {
-          // Lanes whose transmittance would fall below the minimum stop here, before this splat.
+          // Lanes in which this splat would reduce the transmittance below the minimum are
+          // finished.
           const auto stops = V::from_bits(still & ~V::bits(open));
           block[b].stopped = select(stops, transmittance, block[b].stopped);
           still = V::bits(open);
@@ -261,7 +266,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
   }
 }
 
-// grad_alpha may be null. image and grad_image are the planes of the group of channels.
+// grad_alpha may be null. image and grad_image contain the channels of the current group.
 template <class V, int C, class T = typename V::Scalar>
 void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_t* instance_slot,
                    const T* image, const T* grad_image, const T* alpha, const T* grad_alpha,
@@ -335,14 +340,15 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
           weight = zero_unless(open, weight), next = zero_unless(open, next);
         }
         s.transmittance = next;
-        V seen = s.grad_alpha;
+        V grad_dot_color = s.grad_alpha;
         for (int k = 0; k < C; k++) {
-          seen += color[k] * s.grad[k];
+          grad_dot_color += color[k] * s.grad[k];
           sums[k] += weight * s.grad[k];
         }
-        const V ahead = weight * seen, behind = s.behind - ahead;
+        const V weighted_dot = weight * grad_dot_color, behind = s.behind - weighted_dot;
         s.behind = behind;
-        const V q = zero_unless(open & (e < max_alpha), log_alpha_gradient(ahead, a, behind));
+        const V q =
+            zero_unless(open & (e < max_alpha), log_alpha_gradient(weighted_dot, a, behind));
         const V dy(rows.dy[row]);
         q0 += q;
         qy += q * dy;
@@ -360,7 +366,7 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
   }
 }
 
-// Sum over pixels of grad_image · (1 − alpha), per row: the gradient of the background.
+// The gradient of the background, per row: the sum over pixels of grad_image · (1 − alpha).
 template <class T>
 int64_t background_rows(const BackgroundBackwardParams<T>& p) {
   parallel_for(p.n, [&](int64_t y) {
@@ -377,9 +383,10 @@ int64_t background_rows(const BackgroundBackwardParams<T>& p) {
 
 template <class F>
 void for_tiles(int64_t tiles, F&& body) {
-  constexpr int64_t kTogether = 4;  // tiles per task: neighbours share splats in the cache
-  parallel_for((tiles + kTogether - 1) / kTogether, [&](int64_t task) {
-    for (int64_t t = task * kTogether; t < tiles && t < (task + 1) * kTogether; t++) body(t);
+  constexpr int64_t kTilesPerTask = 4;  // adjacent tiles share splats in the cache
+  parallel_for((tiles + kTilesPerTask - 1) / kTilesPerTask, [&](int64_t task) {
+    for (int64_t t = task * kTilesPerTask; t < tiles && t < (task + 1) * kTilesPerTask; t++)
+      body(t);
   });
 }
 

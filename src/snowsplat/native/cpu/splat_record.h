@@ -1,4 +1,5 @@
-// The data of a splat that the rasterizer reads: one cache line (in float), prepared once per frame.
+// The data of a splat for the rasterizer. It is prepared once per frame, and has the size of one
+// cache line in float.
 #pragma once
 
 #include "rasterize.h"

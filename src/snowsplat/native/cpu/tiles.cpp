@@ -1,10 +1,10 @@
 // From splats to a depth-sorted list of splats for each 16×16 tile:
 //   splats_prepare   records, tile rectangles and depth keys
-//   splats_sort      radix sort of the depth keys (stable, so equal depths keep row order)
-//   tiles_count      the exact set of tiles that each splat touches; counts per tile
-//   tiles_fill       a stable counting scatter by tile, in depth order
-// and back: splats_reduce sums the gradients of a splat's tiles. No result depends on the number of
-// threads.
+//   splats_sort      a stable radix sort by depth key: splats of equal depth stay in row order
+//   tiles_count      the exact set of tiles that each splat touches; the number of splats per tile
+//   tiles_fill       the instances, sorted by tile; within a tile, they stay in depth order
+// In the backward pass, splats_reduce sums the gradients of a splat over its tiles. No result
+// depends on the number of threads.
 #include <cstring>
 #include <vector>
 
@@ -66,8 +66,8 @@ int64_t prepare(const SplatsPrepareParams<T>& p) {
   return 0;
 }
 
-// Least significant digit first, 11 bits per pass, over the bits of
-// (largest key − smallest key).
+// Sorts by digits of 11 bits, the least significant first. The number of passes depends on the
+// number of bits of (largest key − smallest key).
 template <class T>
 int64_t radix_sort(const SplatsSortParams<T>& p) {
   using Key = DepthKey<T>;
@@ -134,15 +134,17 @@ int64_t radix_sort(const SplatsSortParams<T>& p) {
   return 0;
 }
 
-// The tiles of one splat: a rectangle, and for small ones (≤ 16 tiles) the exact subset as bits,
-// row-major in a rectangle `width` tiles wide. For larger splats, `fill_tiles` repeats the tests.
+// The tiles of one splat. (x0, y0) is the first tile of its rectangle. For a rectangle of at most
+// 16 tiles, `bits` marks the tiles that the splat touches, row by row, `width` tiles per row. A
+// larger rectangle has the flag `large`; `fill_tiles` repeats the tests for it.
 struct TileSpan {
   uint16_t x0, y0, bits;
   uint8_t width, large;
 };
 static_assert(sizeof(TileSpan) == 8, "layout of the scratch tensor");
 
-// The tiles among 16 that the splat touches: tile k of the 16 is at (k % width, k / width) from (x, y).
+// Tests 16 tiles at once: returns the bits of those that the splat touches. Tile k is
+// (x + k % width, y + k / width).
 template <class V, class T = typename V::Scalar>
 struct TileTest {
   alignas(64) T column[kTile + 1][16], row[kTile + 1][16];
@@ -184,7 +186,7 @@ SNOW_INLINE void for_each_tile_of_large(const SplatRecord<T>& r, int64_t tiles_x
 }
 
 // The data that tiles_count passes to tiles_fill, in one block of memory: the tiles of every splat,
-// the first slot of every part, and for each part a count per tile.
+// the first slot of every part, and for each part and tile a count.
 struct TileWork {
   TileSpan* spans;
   uint32_t* part_slots;
@@ -198,7 +200,7 @@ struct TileWork {
   }
 };
 
-struct SmallOffsets {  // tile offset of bit k in a span `width` wide
+struct SmallOffsets {  // at[width][k]: offset of the tile of bit k in a TileSpan of this width
   uint32_t at[17][16];
   explicit SmallOffsets(int64_t tiles_x) {
     for (int w = 1; w <= 16; w++)
@@ -206,8 +208,8 @@ struct SmallOffsets {  // tile offset of bit k in a span `width` wide
   }
 };
 
-// Returns the number of instances, also in *required. On the CPU, the caller allocates the memory
-// of the instances after this call.
+// Returns the number of instances and stores it in *required. On the CPU, the caller allocates the
+// memory for the instances after this call.
 template <class V, class T = typename V::Scalar>
 int64_t count_tiles(const TilesCountParams<T>& p) {
   const int64_t m = p.n, tiles_x = p.binning.tiles_x, parts = p.binning.parts;
@@ -299,8 +301,8 @@ int64_t fill_tiles(const TilesFillParams<T>& p) {
   return 0;
 }
 
-// Sums each splat's slots in slot order and writes (or, for further groups of channels, adds) its
-// row of the packed gradient.
+// Sums the slots of each splat in slot order. Writes the sum to the splat's row of the packed
+// gradient; for further groups of channels, adds it to this row.
 template <class V, class T = typename V::Scalar>
 int64_t reduce(const SplatsReduceParams<T>& p) {
   const int64_t m = p.n, stride = p.stride, channels = p.channels;
@@ -368,7 +370,7 @@ SNOW_ENTRY(splat_record_bytes, SizeQueryParams) { return (void)p, sizeof(SplatRe
 SNOW_ENTRY(splat_record_bytes_f64, SizeQueryParams) { return (void)p, sizeof(SplatRecord<double>); }
 // The number of parts into which tiles_count and tiles_fill divide n splats.
 SNOW_ENTRY(tiles_parts, SizeQueryParams) { return part_count(p.n); }
-// Bytes of their workspace.
+// Bytes of the workspace of tiles_count and tiles_fill.
 SNOW_ENTRY(tiles_workspace_bytes, SizeQueryParams) {
   return TileWork::bytes(p.n, p.tiles, p.parts);
 }

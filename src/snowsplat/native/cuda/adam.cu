@@ -1,17 +1,19 @@
-// adam_step: carries the gradient of the splats through the projection and applies Adam (adam.h)
-// immediately: the gradients of the parameters are never written to global memory. The time is that
-// of the memory traffic. The gradients of a block's Gaussians are computed into shared memory; then all
-// threads process each tensor and its moments cooperatively.
+// adam_step: computes the gradients of the parameters from those of the splats, and applies Adam
+// (adam.h) immediately. The gradients of the parameters are never written to global memory. The
+// time is limited by the memory traffic. A block writes the gradients of its Gaussians to shared
+// memory; then all its threads together update each tensor and its moments.
 #include "adam.h"
 #include "cuda/gaussian_row.h"
 
 namespace snow {
 namespace {
 
-// Values in `splats` for rows without a splat: the gradient is 0, or the row is not updated.
-constexpr int32_t kUnseen = -1, kLeaveAlone = -2;
+// Values in `splats` for rows without a splat. kUnseen: the row is updated with a gradient of 0.
+// kNotUpdated: the row is not updated.
+constexpr int32_t kUnseen = -1, kNotUpdated = -2;
 
-// The splat of each Gaussian, from the ids of splats without empty rows. splat_of holds −1 before.
+// adam_splat_of: finds the splat of each Gaussian, if the rows of the splats are compacted. The
+// caller fills splat_of with −1 before.
 struct AdamSplatOfParams {
   int64_t n;           // splats
   const int32_t* ids;  // (n,) rows of Gaussians
@@ -20,8 +22,9 @@ struct AdamSplatOfParams {
   SNOW_FIELDS(n, ids, gaussians, splat_of)
 };
 
-// Updates the columns of the rows from `first` on. `gradient` is their first column of the tile. Rows
-// with values that were skipped get `bit` in `nonfinite`.
+// Updates the columns of the block's rows; row 0 is Gaussian `first`. `gradient` points to the
+// first of these columns in the tile of gradients. `bit` is set in `nonfinite` for each row in
+// which a value was skipped.
 template <int kBatch, class T>
 SNOW_INLINE void update(const AdamRule<T>& rule, const AdamTensor<T>& tensor, int64_t first,
                         int stride, int columns, const int32_t* splats, const T* gradient,
@@ -34,14 +37,14 @@ SNOW_INLINE void update(const AdamRule<T>& rule, const AdamTensor<T>& tensor, in
     T g[kBatch] = {}, m[kBatch] = {}, v[kBatch] = {}, p[kBatch] = {};
     for (int j = 0; j < kBatch; j++) {
       const int32_t splat = splats[row[j]];
-      if (splat == kLeaveAlone) continue;
+      if (splat == kNotUpdated) continue;
       const int at = row[j] * stride + column[j];
       m[j] = ms[at], v[j] = vs[at], p[j] = value[at];
       if (extra) g[j] = extra[at];
     }
     for (int j = 0; j < kBatch; j++) {
       const int32_t splat = splats[row[j]];
-      if (splat == kLeaveAlone) continue;
+      if (splat == kNotUpdated) continue;
       if (splat >= 0) g[j] += gradient[row[j] * kRowColumns + column[j]];
       rule.step(g[j], m[j], v[j], p[j], rate);
       const int at = row[j] * stride + column[j];
@@ -65,8 +68,8 @@ SNOW_INLINE void step(const AdamStepParams<T>& p) {
   const int32_t splat = i < p.n ? p.ids[i] : kUnseen;
   nonfinite[threadIdx.x] = 0;
   ids[threadIdx.x] = splat >= 0 ? int32_t(i) : -1;
-  splats[threadIdx.x] = i >= p.n || (p.visible_only && splat < 0) ? kLeaveAlone : splat;
-  if (threadIdx.x == 0) ids[kRowThreads] = -1, splats[kRowThreads] = kLeaveAlone;
+  splats[threadIdx.x] = i >= p.n || (p.visible_only && splat < 0) ? kNotUpdated : splat;
+  if (threadIdx.x == 0) ids[kRowThreads] = -1, splats[kRowThreads] = kNotUpdated;
   __syncthreads();
 
   const GaussianTensors<T> gaussians = {p.means.value,          p.log_scales.value, p.quats.value,

@@ -1,17 +1,17 @@
-// The first header of every .cu file. Two compilers read these files: NVRTC, which has no headers of
-// the C library, and, for tests, the C++ compiler, which runs the kernels on a CPU
-// (tests/ops/emulation).
+// The first header of every .cu file. Two compilers read these files. NVRTC compiles them for GPUs;
+// it has no headers of the C library. In tests, the C++ compiler compiles them for an emulation on
+// the CPU (tests/ops/emulation).
 //
-//   SNOW_KERNEL(name, threads, Params) { … }             a kernel, and the threads of its blocks
-//   SNOW_KERNEL_OF(name, threads, blocks, Params) { … }  the same, with registers limited so that at
-//                                                        least `blocks` fit on a multiprocessor
+//   SNOW_KERNEL(name, threads, Params) { … }             a kernel with `threads` per block
+//   SNOW_KERNEL_OF(name, threads, blocks, Params) { … }  the same; the registers are limited, so
+//                                                        that `blocks` fit on a multiprocessor
 //   SNOW_SHARED(type, name, count);                      an array in shared memory
 //
-// A kernel has one parameter, `p`: a struct (params.h, or in the same file where only the GPU has it).
-// Beside the kernel `name` there is a variable `name_layout`, the layout of its struct (layout.h),
-// which the loader compares with that of Python. Blocks and threads are one-dimensional; ops/cuda
-// determines the number of blocks. Kernels use raw intrinsics and these headers only: NVRTC
-// then compiles them quickly, and the emulation implements every intrinsic that they use.
+// A kernel has one parameter, `p`: a struct from params.h, or from the same file if only the GPU
+// needs it. For each kernel `name` there is a variable `name_layout`: the layout of its struct
+// (layout.h). The loader compares it with the layout in Python. Blocks and threads are
+// one-dimensional; ops/cuda determines the number of blocks. Kernels use only intrinsics and these
+// headers, so that NVRTC compiles them quickly and the emulation can implement all intrinsics.
 #pragma once
 
 #if defined(SNOWSPLAT_EMULATION)
@@ -40,7 +40,7 @@ constexpr unsigned kAllLanes = 0xffffffffu;
 SNOW_INLINE int lane_id() { return int(threadIdx.x % kWarp); }
 SNOW_INLINE int warp_id() { return int(threadIdx.x / kWarp); }
 SNOW_INLINE uint32_t lanes_below() { return (1u << lane_id()) - 1; }
-// The index of this thread among those of all blocks.
+// The index of this thread among the threads of all blocks.
 SNOW_INLINE int64_t thread_index() { return int64_t(blockIdx.x) * blockDim.x + threadIdx.x; }
 
 }  // namespace snow

@@ -1,8 +1,8 @@
-// Rows of parameters in a block of threads, which processes as many Gaussians as it has threads. One
-// thread computes one Gaussian; loads and stores are cooperative: all threads copy the rows,
-// which are contiguous in a tensor, so that neighbouring threads access neighbouring addresses. In
-// between, the rows are in a tile in shared memory with an odd stride, so that threads that access
-// the same column use different banks.
+// Rows of parameters in a block of threads. A block processes as many Gaussians as it has threads;
+// each thread computes one Gaussian. Loads and stores are cooperative. The rows of a block are
+// contiguous in a tensor, and all threads copy them together, so that neighbouring threads access
+// neighbouring addresses. The copy in shared memory is called a tile. Its stride is odd, so that
+// threads that access the same column use different banks.
 #pragma once
 
 #include "cuda/device.h"
@@ -14,7 +14,7 @@ namespace snow {
 constexpr int kRowThreads = 64;
 constexpr int kRestColumns = 3 * (kMaxShCoefficients - 1);
 
-// A row of parameters or their gradients in a tile: sh_rest, then the others.
+// The columns of a tile, for parameters or their gradients: sh_rest, then the others.
 constexpr int kMeanColumn = kRestColumns;
 constexpr int kLogScaleColumn = kMeanColumn + 3;
 constexpr int kQuatColumn = kLogScaleColumn + 3;
@@ -23,7 +23,7 @@ constexpr int kDcColumn = kLogitColumn + 1;
 constexpr int kRowColumns = kDcColumn + 3;
 
 // Calls f(row, column) for `columns` (> 0) columns of the block's rows, in batches of kBatch, so
-// that loads do not wait for each other. Row kRowThreads means none.
+// that loads do not wait for each other. Row kRowThreads stands for no row.
 template <int kBatch, class F>
 SNOW_INLINE void for_each_number(int columns, const F& f) {
   const int rows_a_step = kRowThreads / columns, columns_a_step = kRowThreads % columns;
@@ -39,10 +39,10 @@ SNOW_INLINE void for_each_number(int columns, const F& f) {
   }
 }
 
-constexpr int kRestBatch = 8;  // of sh_rest
+constexpr int kRestBatch = 8;  // kBatch for sh_rest
 
-// Calls f with the degree as a constant: arrays that are indexed by unrolled loops then stay in
-// registers.
+// Calls f with the degree as a compile-time constant. The loops over coefficients are then
+// unrolled, and the arrays that they index stay in registers.
 template <int kValue>
 struct Constant {
   static constexpr int value = kValue;
@@ -57,7 +57,8 @@ SNOW_INLINE void with_degree(int degree, const F& f) {
   }
 }
 
-// The active columns of sh_rest of the Gaussians `ids` (kRowThreads + 1 of them, −1: none).
+// Loads the active columns of sh_rest into the tile. ids: the Gaussian of each of the kRowThreads +
+// 1 rows, or −1 for none.
 template <int kStride, class T>
 SNOW_INLINE void load_rest(const GaussianTensors<T>& tensors, const int32_t* ids, T* tile) {
   const int degree = int(tensors.sh_degree);
@@ -82,8 +83,9 @@ SNOW_INLINE void load_shape(const GaussianTensors<T>& tensors, int64_t id, Gauss
   g.opacity_logit = tensors.opacity_logits[id];
 }
 
-// The gradient of a splat, a row of 16, → the gradients of the parameters of its Gaussian, in its row
-// of a tile, which holds sh_rest before. `position` is the gradient of the camera's position.
+// Computes the gradients of the parameters of a Gaussian from the gradient of its splat, a row of
+// 16 numbers. `row` is the row of the tile: it contains sh_rest before the call, and the gradients
+// after it. `position` receives the gradient of the camera's position.
 template <class T>
 SNOW_INLINE void row_vjp(const GaussianTensors<T>& tensors, int64_t id, const PinholeCamera<T>& cam,
                          const T* grad_splat, T* row, PoseGradient<T>& pose, T* position) {

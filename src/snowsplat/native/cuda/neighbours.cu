@@ -1,15 +1,16 @@
 // neighbours: the exact distances from each point to its k nearest others.
 //
-//   neighbours_codes    the position of each point on a Morton curve (Morton 1966), 21 bits per axis
-//   (a sort)            so that consecutive points are near each other
-//   neighbours_chunks   the points in that order; the box of each chunk of 32
-//   neighbours_groups   the box of each group of 32 chunks
+//   neighbours_codes    the index of each point on a Morton curve (Morton 1966), 21 bits per axis
+//   (a sort by code)    consecutive points are then near each other
+//   neighbours_chunks   the points in that order; the bounding box of each chunk of 32 points
+//   neighbours_groups   the bounding box of each group of 32 chunks
 //   neighbours_of_*     the search: one warp per chunk of queries, one lane per query
 //
-// A warp begins with its own chunk and the adjacent ones on the curve, which bounds the distances of
-// its lanes. It then goes through all groups and visits each chunk whose box is nearer to
-// one of its queries than the k-th best distance so far. The order only affects the time: the
-// result is exact, even where all points fall into one cell of the curve.
+// A warp begins with its own chunk and the two adjacent chunks on the curve. This gives each of its
+// queries an upper bound on the k-th distance. The warp then goes through all groups, and visits
+// each chunk whose box is nearer to one of its queries than the k-th best distance so far. The
+// order only affects the time. The result is exact, even if all points are in one cell of the
+// curve.
 #include "cuda/device.h"
 
 namespace snow {
@@ -28,7 +29,7 @@ struct alignas(16) Point {
   T x, y, z, unused;
 };
 
-// Empty where low > high.
+// An axis-aligned box; it is empty if low > high.
 template <class T>
 struct alignas(16) Box {
   Point<T> low, high;
@@ -48,7 +49,7 @@ template <class T>
 struct NeighboursChunksParams {
   int64_t n;             // points
   const T* points;       // (n, 3)
-  const int32_t* order;  // (n,) by their codes
+  const int32_t* order;  // (n,) indices of the points, sorted by code
   T* ordered;            // out, (n, 3) points in that order
   Box<T>* boxes;         // out, one per chunk of 32
   SNOW_FIELDS(n, points, order, ordered, boxes)
@@ -82,8 +83,8 @@ template <class T>
 SNOW_INLINE T squared(T x, T y, T z) {
   return x * x + y * y + z * z;
 }
-// Squared distances, all by the same operations, so that rounding never makes a point nearer than its
-// box.
+// Squared distances. All use the same operations, so that after rounding no point is nearer than
+// its bounding box.
 template <class T>
 SNOW_INLINE T away(const Point<T>& a, const Point<T>& b) {
   return squared(a.x - b.x, a.y - b.y, a.z - b.z);
@@ -111,14 +112,14 @@ template <class T>
 SNOW_INLINE T warp_max(T value) {
   return -warp_min(-value);
 }
-// The box around the boxes of all lanes.
+// The bounding box of the boxes of all lanes.
 template <class T>
 SNOW_INLINE Box<T> warp_box(const Box<T>& b) {
   return {{warp_min(b.low.x), warp_min(b.low.y), warp_min(b.low.z), T(0)},
           {warp_max(b.high.x), warp_max(b.high.y), warp_max(b.high.z), T(0)}};
 }
 
-// Spreads bits by three: bit i of the lower 21 moves to bit 3i.
+// Moves bit i of the lower 21 bits to bit 3i.
 SNOW_INLINE uint64_t spread(uint64_t x) {
   x = (x | x << 32) & 0x001f00000000ffffull;
   x = (x | x << 16) & 0x001f0000ff0000ffull;
@@ -128,8 +129,8 @@ SNOW_INLINE uint64_t spread(uint64_t x) {
   return x;
 }
 
-// Cells are cubes; low and high are the corners of the box of all points. Coordinates are halved, so
-// that differences do not overflow.
+// Cells are cubes. low and high are the corners of the bounding box of all points. Coordinates are
+// halved, so that differences do not overflow.
 template <class T>
 SNOW_INLINE void codes(int n, const T* points, const T* low, const T* high, uint64_t* out) {
   const int64_t i = thread_index();
@@ -148,7 +149,7 @@ SNOW_INLINE void codes(int n, const T* points, const T* low, const T* high, uint
   out[i] = code;
 }
 
-// One warp per chunk. order: the points by their codes.
+// One warp per chunk. order: the indices of the points, sorted by code.
 template <class T>
 SNOW_INLINE void chunks(int n, const T* points, const int32_t* order, T* ordered, Box<T>* boxes) {
   const int64_t i = thread_index();
@@ -174,8 +175,9 @@ SNOW_INLINE void groups(int chunk_count, const Box<T>* chunk_boxes, Box<T>* boxe
   if (lane_id() == 0 && i < chunk_count) boxes[i / kWarp] = box;
 }
 
-// The kBest smallest squared distances so far, ascending. For k < kBest, the first entries are
-// filled initially with a distance below all others; in a lane without a query, all entries are.
+// The kBest smallest squared distances so far, ascending. For k < kBest, the first kBest − k
+// entries are initialised with −1, which is below all distances. In a lane without a query, all
+// entries are.
 template <class T, int kBest>
 struct Best {
   T distances[kBest];
@@ -205,7 +207,7 @@ SNOW_INLINE void search(int n, const T* __restrict__ points, const int32_t* __re
   if (own >= chunk_count) return;  // the complete warp; no barrier of the block follows
   const T inf = infinity<T>();
 
-  // Beyond the last point: infinitely far from every query.
+  // Indices after the last point: a point that is infinitely far from every query.
   const auto load = [&](int i) -> Point<T> {
     if (i >= n) return {inf, inf, inf, T(0)};
     const T* const p = points + 3 * int64_t(i);

@@ -1,18 +1,20 @@
 // photometric: L1 and SSIM between two images, and the gradient of their weighted sum.
 //
-// Images are planar, (channels, H, W), each plane of fewer than 2³¹ pixels. A block processes a tile of
-// one channel, 32 columns wide: it loads the tile with a margin of 5, filters the rows into shared
-// memory, then the columns from there. The Gaussian window is separable and symmetric, and the image
-// is padded with zeros, so the same two passes over the maps of derivatives are its adjoint.
+// Images are planar, (channels, H, W). Each plane has fewer than 2³¹ pixels. A block processes a
+// tile of one channel, 32 columns wide. It loads the tile with a margin of 5 pixels, filters the
+// rows, and writes the result to shared memory. From there it filters the columns. The Gaussian
+// window is separable and symmetric, and the image is padded with zeros. So the adjoint of the
+// filter is the same filter, applied to the maps of derivatives.
 //
 //   photometric_similarity   SSIM per pixel, sums per block, the three derivatives of SSIM as maps
 //   photometric_gradient     the gradient from the filtered maps, plus that of L1
 //   photometric_means        adds the sums of the blocks in order: bit-identical in every run
 //
-// The maps go through global memory. Without them, a block would have to load its tile with a margin
-// of 10 and filter all of it: about 50% more arithmetic, and more than the 48 kB of shared memory that a block has by default. Instead photometric.py limits the number of channels processed
-// at a time for large images (the maps of one channel of 1920×1080 have 25 MB, which mostly fit into the
-// caches of larger GPUs).
+// The maps are written to global memory and read back. Without them, a block would have to load its
+// tile with a margin of 10 pixels and filter all of it. This takes about 50% more arithmetic, and
+// more than the 48 kB of shared memory that a block has by default. For large images,
+// photometric.py limits the number of channels that are processed at a time: the maps of one
+// channel of 1920×1080 pixels have 25 MB, which mostly fit into the caches of larger GPUs.
 #include "cuda/device.h"
 #include "ssim.h"
 
@@ -23,13 +25,14 @@ constexpr int kThreads = 192, kWarps = kThreads / kWarp;
 
 constexpr int kColumns = kWarp;                           // of a tile: one lane per column
 constexpr int kWideColumns = kColumns + 2 * kSsimRadius;  // with its margins
-// Odd, so that the lanes of a warp, in 8 rows × every 8th column, use different banks.
+// The pitches are odd: the lanes of a warp, in 8 rows × every 8th column, use different banks.
 constexpr int kWidePitch = kWideColumns + 1, kPitch = kColumns + 1;
 constexpr int kRun = 8;  // neighbouring pixels of a row that a thread filters together
 constexpr int kRuns = kColumns / kRun;
 
-// Rows of a tile: in float as many as allow two blocks per multiprocessor on the smallest GPUs, in
-// double as many as fit. photometric.py computes the number of blocks from the same size.
+// A tile. The number of its rows is limited by shared memory: in float, two blocks per
+// multiprocessor fit on the smallest GPUs; in double, the tile has as many rows as fit.
+// photometric.py computes the number of blocks from the same tile size.
 template <class T>
 struct Tile {
   static constexpr int kOwnRows = sizeof(T) == 4 ? 4 : 2;  // of a thread, in the second pass
@@ -37,7 +40,7 @@ struct Tile {
   static constexpr int kWideRows = kRows + 2 * kSsimRadius;
   static constexpr int kWideCount = kWideRows * kWidePitch, kCount = kWideRows * kPitch;
 
-  int channel, x, y;  // of its first pixel
+  int channel, x, y;  // of the first pixel
   SNOW_INLINE Tile(int width, int height) {
     const int across = (width + kColumns - 1) / kColumns, down = (height + kRows - 1) / kRows;
     const int row = int(blockIdx.x) / across;
@@ -87,7 +90,7 @@ SNOW_INLINE T pixel(const uint8_t* p, int at) {
   return T(p[at]) * T(1.0 / 255.0);
 }
 
-// Calls load(place in a wide tile, pixel in the plane or −1) for every pixel of the wide tile.
+// Calls load(index in a wide tile, index in the plane or −1) for every pixel of the wide tile.
 template <class T, class Load>
 SNOW_INLINE void load_tile(const Tile<T>& tile, int width, int height, Load load) {
   constexpr int kPixels = Tile<T>::kWideRows * kWideColumns;
@@ -102,7 +105,8 @@ SNOW_INLINE void load_tile(const Tile<T>& tile, int width, int height, Load load
   }
 }
 
-// Filters the rows of a wide tile: from what values(place in it, kMaps values) returns into `rows`.
+// Filters the rows of kMaps wide tiles and writes the result to `rows`. values(index, value) reads
+// the values of all maps at an index in the wide tile.
 template <int kMaps, class T, class Values>
 SNOW_INLINE void filter_rows(T* rows, Values values) {
   static_assert(Tile<T>::kWideRows * kRuns <= kThreads, "at most one run per thread");
@@ -129,7 +133,7 @@ SNOW_INLINE void filter_rows(T* rows, Values values) {
   }
 }
 
-// Filters a column of those: the pixels of this thread, from row `first` of the tile on.
+// Filters a column of `rows`, for the pixels of this thread: from row `first` of the tile on.
 template <int kMaps, class T>
 SNOW_INLINE void filter_column(const T* rows, int first, T (&sums)[kMaps][Tile<T>::kOwnRows]) {
 #pragma unroll
@@ -146,7 +150,7 @@ SNOW_INLINE void filter_column(const T* rows, int first, T (&sums)[kMaps][Tile<T
   }
 }
 
-// The sum over the lanes of a warp, in all of them.
+// The sum over the lanes of a warp; all lanes receive it.
 template <class T>
 SNOW_INLINE T warp_sum(T value) {
 #pragma unroll
@@ -166,13 +170,13 @@ SNOW_INLINE void similarity(int width, int height, const T* __restrict__ image,
   const int64_t plane = int64_t(width) * height;
   image += tile.channel * plane, target += tile.channel * plane;
 
-  load_tile(tile, width, height, [&](int place, int at) {
-    a[place] = at >= 0 ? pixel<T>(image, at) : T(0);
-    b[place] = at >= 0 ? pixel<T>(target, at) : T(0);
+  load_tile(tile, width, height, [&](int index, int at) {
+    a[index] = at >= 0 ? pixel<T>(image, at) : T(0);
+    b[index] = at >= 0 ? pixel<T>(target, at) : T(0);
   });
   __syncthreads();
-  filter_rows<4>(rows, [&](int place, T(&value)[4]) {
-    const T p = a[place], q = b[place];
+  filter_rows<4>(rows, [&](int index, T(&value)[4]) {
+    const T p = a[index], q = b[index];
     value[0] = p, value[1] = q, value[2] = p * p + q * q, value[3] = p * q;
   });
   __syncthreads();
@@ -186,8 +190,8 @@ SNOW_INLINE void similarity(int width, int height, const T* __restrict__ image,
   for (int i = 0; i < Tile<T>::kOwnRows; i++) {
     const int y = tile.y + first + i;
     if (x >= width || y >= height) continue;
-    const int place = (first + i + kSsimRadius) * kWidePitch + lane_id() + kSsimRadius;
-    const T difference = a[place] - b[place];
+    const int index = (first + i + kSsimRadius) * kWidePitch + lane_id() + kSsimRadius;
+    const T difference = a[index] - b[index];
     SsimDerivatives<T> d;
     similarities += ssim_pixel(means[0][i], means[1][i], means[2][i], means[3][i], d);
     differences += max(difference, -difference);
@@ -223,15 +227,15 @@ SNOW_INLINE void gradient(int width, int height, const T* __restrict__ image,
   const T* const map[3] = {maps, maps + plane, maps + 2 * plane};
 
   // Windows are centred only on pixels of the image: outside of it the derivatives are 0.
-  load_tile(tile, width, height, [&](int place, int at) {
+  load_tile(tile, width, height, [&](int index, int at) {
 #pragma unroll
     for (int m = 0; m < 3; m++)
-      derivatives[m * Tile<T>::kWideCount + place] = at >= 0 ? map[m][at] : T(0);
+      derivatives[m * Tile<T>::kWideCount + index] = at >= 0 ? map[m][at] : T(0);
   });
   __syncthreads();
-  filter_rows<3>(rows, [&](int place, T(&value)[3]) {
+  filter_rows<3>(rows, [&](int index, T(&value)[3]) {
 #pragma unroll
-    for (int m = 0; m < 3; m++) value[m] = derivatives[m * Tile<T>::kWideCount + place];
+    for (int m = 0; m < 3; m++) value[m] = derivatives[m * Tile<T>::kWideCount + index];
   });
   __syncthreads();
 

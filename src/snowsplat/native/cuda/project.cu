@@ -1,6 +1,7 @@
 // project: the Gaussians that a camera sees (project_cull), their 2D splats (project_fwd), and the
-// gradients of the parameters and the pose from those of the splats (project_bwd). Unlike on the CPU,
-// rows are not compacted: ids[i] is i, or −1 if a Gaussian is not visible, and its row is empty.
+// gradients of the parameters and the pose from the gradients of the splats (project_bwd). Unlike
+// on the CPU, rows are not compacted: ids[i] is i, or −1 if Gaussian i is not visible. The row of a
+// Gaussian that is not visible is empty.
 #include "cuda/gaussian_row.h"
 
 namespace snow {
@@ -26,7 +27,7 @@ SNOW_INLINE void cull(const ProjectCullParams<T>& p) {
   p.ids[i] = is_visible(projected, cam) ? int32_t(i) : -1;
 }
 
-// The ids of the block's splats, followed by −1; returns that of this thread.
+// Loads the ids of the block's splats, followed by −1, and returns the id of this thread's splat.
 SNOW_INLINE int32_t load_ids(int64_t m, const int32_t* ids, int32_t* of_block) {
   const int64_t i = thread_index();
   const int32_t own = i < m ? ids[i] : -1;
@@ -73,7 +74,7 @@ SNOW_INLINE void forward(const ProjectForwardParams<T>& p) {
   });
 }
 
-// Columns of a tile → rows `ids` of a tensor.
+// Copies columns of a tile to the rows `ids` of a tensor.
 template <int kBatch, class T>
 SNOW_INLINE void store_columns(const T* tile, int columns, const int32_t* ids, int64_t stride,
                                T* tensor) {
@@ -116,8 +117,8 @@ SNOW_INLINE void backward(const ProjectBackwardParams<T>& p) {
                               grads.sh_rest);
   if (!p.pose) return;
 
-  // In double and in a fixed order: each thread sums a quarter of the rows, then the quarters are
-  // added.
+  // The sums are computed in double and in a fixed order: each thread sums a quarter of the rows,
+  // then the quarters are added.
   __syncthreads();
   for (int k = 0; k < 9; k++) row[k] = d_pose.rotation[k];
   for (int k = 0; k < 3; k++) row[9 + k] = d_pose.translation[k];

@@ -18,7 +18,7 @@ SNOW_INLINE T warp_inclusive_scan(T value) {
 
 template <class T>
 struct BlockScan {
-  T before, total;  // the sum over the threads before this one, and over all
+  T before, total;  // the sum over the threads before this one; the sum over all threads
 };
 
 // All threads of the block must take part.

@@ -1,10 +1,11 @@
-// Prefix sums and a radix sort of any length, for the other kernels. No block waits for another: each
-// step that needs the results of all blocks is a separate kernel (see ops/cuda/sorting.py).
+// Prefix sums and a radix sort of any length, used by the other operations. No block waits for
+// another block: each step that needs the results of all blocks is a separate kernel (see
+// ops/cuda/sorting.py).
 //
 //   scan_sums, scan_of_sums, scan_apply   an exclusive prefix sum
 //   sort_count, sort_offsets, sort_scatter   one pass of the sort, by one digit of at most 8 bits
 //
-// Keys are unsigned, of 16, 32 or 64 bits; values have 32. The sort is stable.
+// Keys are unsigned integers of 16, 32 or 64 bits; values have 32 bits. The sort is stable.
 #include "cuda/scan.h"
 
 namespace snow {
@@ -16,13 +17,13 @@ constexpr int kThreads = 256;
 struct ScanParams {
   int64_t n;               // items
   const uint32_t* values;  // (n,)
-  uint64_t* sums;          // one per block of 1024 values; then the sum of the blocks before
-  uint32_t* out;           // (n,) may be `values`
-  int64_t* total;          // out, (1,)
+  uint64_t* sums;  // one per block of 1024 values; after the scan, that of the blocks before
+  uint32_t* out;   // (n,) may be `values`
+  int64_t* total;  // out, (1,)
   SNOW_FIELDS(n, values, sums, out, total)
 };
 
-// One pass of the sort, by `bits` bits (at most 8) from bit `shift` on.
+// One pass of the sort. The digit has `bits` bits (at most 8), from bit `shift` on.
 template <class Key>
 struct SortPassParams {
   int64_t n;               // pairs that memory is allocated for
@@ -38,7 +39,7 @@ struct SortPassParams {
   SNOW_FIELDS(n, keys, values, keys_out, values_out, shift, bits, blocks, counts, totals, count)
 };
 
-// Between sort_count and sort_scatter: the sums of the counts of the preceding blocks.
+// sort_offsets, between sort_count and sort_scatter: sums of the counts of the preceding blocks.
 struct SortOffsetsParams {
   int64_t n;         // blocks
   uint32_t* counts;  // (digits, n)
@@ -72,7 +73,7 @@ SNOW_INLINE void sum_blocks(int64_t n, const uint32_t* values, uint64_t* sums) {
   if (threadIdx.x == 0) sums[blockIdx.x] = scan.total;
 }
 
-// One block. Replaces each sum by the sum of those before it.
+// One block. Replaces each sum with the sum of the preceding ones.
 SNOW_INLINE void scan_blocks(int64_t n, uint64_t* sums, int64_t* total) {
   uint64_t carry = 0;
   for (int64_t first = 0; first < n; first += kThreads) {
@@ -84,7 +85,7 @@ SNOW_INLINE void scan_blocks(int64_t n, uint64_t* sums, int64_t* total) {
   if (threadIdx.x == 0) *total = int64_t(carry);
 }
 
-// Sums that do not fit into 32 bits become 2³² − 1, which is larger than any allocated memory.
+// A sum that does not fit into 32 bits becomes 2³² − 1, which is larger than any capacity.
 SNOW_INLINE void apply_scan(int64_t n, const uint32_t* values, const uint64_t* sums,
                             uint32_t* out) {
   const ScanItems items = load_scan_items(n, values);
@@ -125,8 +126,8 @@ SNOW_INLINE int64_t valid_items(int64_t n, const int64_t* count) {
   return count && *count < n ? *count : n;
 }
 
-// The lanes that have the same digit. One vote per bit: unlike the instruction that compares complete
-// values, the time does not depend on the number of different digits.
+// The lanes that have the same digit, by one vote per bit. The time does not depend on the number
+// of different digits; that of the instruction for complete values (match) does.
 SNOW_INLINE uint32_t lanes_with(int digit) {
   uint32_t same = kAllLanes;
 #pragma unroll
@@ -155,7 +156,8 @@ SNOW_INLINE void count_digits(const SortPassParams<Key>& p) {
       const int at = k * kThreads + int(threadIdx.x);
       const bool is_valid = at < left;
       const int digit = is_valid ? digit_of(p.keys[first + at]) : 0;
-      // One lane adds for all lanes with the same digit: often most lanes have the same one.
+      // One lane adds the count for all lanes with the same digit, because often most lanes have
+      // the same digit.
       const uint32_t same = lanes_with(digit) & __ballot_sync(kAllLanes, is_valid);
       if (is_valid && (same & lanes_below()) == 0) atomicAdd(&histogram[digit], __popc(same));
     }
@@ -165,8 +167,8 @@ SNOW_INLINE void count_digits(const SortPassParams<Key>& p) {
     p.counts[int64_t(threadIdx.x) * p.blocks + blockIdx.x] = histogram[threadIdx.x];
 }
 
-// One block per digit: its counts become the sums of the counts of the blocks before, and
-// totals[digit] the sum of all.
+// One block per digit. Replaces each count of the digit with the sum of the counts of the preceding
+// blocks, and writes the sum of all counts to totals[digit].
 SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals) {
   uint32_t* row = counts + int64_t(blockIdx.x) * blocks;
   uint32_t carry = 0;
@@ -190,27 +192,29 @@ SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals)
   if (threadIdx.x == 0) totals[blockIdx.x] = carry;
 }
 
-// Each warp has kItems × 32 consecutive keys. It ranks them, 32 at a time, among its own keys with the
-// same digit; the tallies of all warps then give the place of a key in the block's keys sorted by
-// digit. In this order the keys go to shared memory and from there out, so that neighbouring threads
-// write to neighbouring addresses; the values follow. Invalid items are at the end and have the last
-// digit, so they stay at the end.
-// With a single block, sort_offsets may be skipped: its counts are the totals.
+// Each warp has kItems × 32 consecutive keys. It computes the rank of each key among its keys with
+// the same digit, 32 keys at a time. The histograms of all warps then give the position of each key
+// in the keys of the block, sorted by digit. The keys are written to shared memory in this order,
+// and from there to global memory, so that neighbouring threads write to neighbouring addresses.
+// Then the values are written in the same way. Invalid items are at the end and have the last
+// digit, so they stay at the end. With a single block, sort_offsets may be skipped: the counts of
+// the block are the totals.
 template <class Key>
 SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const uint32_t* values,
                                Key* keys_out, uint32_t* values_out, Digit digit_of, int64_t blocks,
                                const uint32_t* counts, const uint32_t* totals) {
   constexpr int kItems = kSortItems<Key>, kWarps = kThreads / kWarp, kAll = kThreads * kItems;
   constexpr int kWords = kAll * int(sizeof(Key) == 8 ? 2 : 1) / 2;
-  SNOW_SHARED(uint16_t, tally, kWarps* kDigits);
-  SNOW_SHARED(uint32_t, run_start, kDigits);  // where a digit's keys go, minus their place here
+  SNOW_SHARED(uint16_t, histograms, kWarps* kDigits);
+  // For each digit, the position of its first key in the output, minus that in the block:
+  SNOW_SHARED(uint32_t, run_start, kDigits);
   SNOW_SHARED(uint64_t, staged, kWords);
   Key* const staged_keys = reinterpret_cast<Key*>(staged);
   uint32_t* const staged_values = reinterpret_cast<uint32_t*>(staged);
 
   const int thread = int(threadIdx.x), lane = lane_id();
   const int mine = warp_id() * (kItems * kWarp) + lane;
-  uint16_t* const own = tally + warp_id() * kDigits;
+  uint16_t* const histogram = histograms + warp_id() * kDigits;
 
   Key key[kItems];
 #pragma unroll
@@ -219,19 +223,19 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
     key[k] = at < valid ? keys[first + at] : Key(~Key(0));
   }
 #pragma unroll
-  for (int w = 0; w < kWarps; w++) tally[w * kDigits + thread] = 0;
+  for (int w = 0; w < kWarps; w++) histograms[w * kDigits + thread] = 0;
   __syncthreads();
 
-  int place[kItems];
+  int position[kItems];
 #pragma unroll
   for (int k = 0; k < kItems; k++) {
     const int digit = digit_of(key[k]);
     const uint32_t same = lanes_with(digit), below = same & lanes_below();
-    const int before = own[digit];
+    const int before = histogram[digit];
     __syncwarp();
-    if (below == 0) own[digit] = uint16_t(before + __popc(same));
+    if (below == 0) histogram[digit] = uint16_t(before + __popc(same));
     __syncwarp();
-    place[k] = before + __popc(below);
+    position[k] = before + __popc(below);
   }
   __syncthreads();
 
@@ -240,18 +244,18 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
     uint32_t sum = 0;
 #pragma unroll
     for (int w = 0; w < kWarps; w++) {
-      const uint32_t c = tally[w * kDigits + thread];
-      tally[w * kDigits + thread] = uint16_t(sum);
+      const uint32_t c = histograms[w * kDigits + thread];
+      histograms[w * kDigits + thread] = uint16_t(sum);
       sum += c;
     }
-    // Two scans in one: the digits of this block in the low half, those of all blocks in the high
-    // half.
+    // Two scans in one: of the counts of this block in the low half, and of the counts of all
+    // blocks in the high half.
     const uint64_t both = uint64_t(is_digit ? totals[thread] : 0) << 32 | sum;
     const uint64_t before = block_scan<kThreads>(both).before;
     const uint32_t here = uint32_t(before);
 #pragma unroll
     for (int w = 0; w < kWarps; w++)
-      tally[w * kDigits + thread] = uint16_t(tally[w * kDigits + thread] + here);
+      histograms[w * kDigits + thread] = uint16_t(histograms[w * kDigits + thread] + here);
     uint32_t other_blocks = 0;
     if (is_digit && blocks > 1) other_blocks = counts[int64_t(thread) * blocks + blockIdx.x];
     run_start[thread] = uint32_t(before >> 32) + other_blocks - here;
@@ -260,8 +264,8 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
 
 #pragma unroll
   for (int k = 0; k < kItems; k++) {
-    place[k] += own[digit_of(key[k])];
-    staged_keys[place[k]] = key[k];
+    position[k] += histogram[digit_of(key[k])];
+    staged_keys[position[k]] = key[k];
   }
   __syncthreads();
 
@@ -278,7 +282,7 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
 #pragma unroll
   for (int k = 0; k < kItems; k++) {
     const int at = mine + k * kWarp;
-    if (at < valid) staged_values[place[k]] = values ? values[first + at] : uint32_t(first + at);
+    if (at < valid) staged_values[position[k]] = values ? values[first + at] : uint32_t(first + at);
   }
   __syncthreads();
 #pragma unroll

@@ -1,11 +1,13 @@
 // From splats to a depth-sorted list of splats for each 16×16 tile, and back:
-//   splats_prepare   depth keys, which ops/cuda/tiling.py sorts
+//   splats_prepare   depth keys; ops/cuda/tiling.py then sorts the splats by them
 //   tiles_count      the tiles that each splat touches, in the order of depth
-//   tiles_fill       the instances, pairs of a tile and a splat, in that order; then sorted by tile
+//   tiles_fill       the instances (pairs of a splat and a tile) in this order; ops/cuda/tiling.py
+//                    then sorts them by tile
 //   tiles_start      the first instance of each tile
 //   splats_reduce    sums the gradients of a splat's tiles in a fixed order
-// A splat touches the same tiles as on the CPU (native/cpu/tiles.cpp), except that the image is
-// extended to a multiple of the tile size. A splat that may touch many tiles is tested by a warp.
+// The tiles that a splat touches are the same as on the CPU (native/cpu/tiles.cpp), except that the
+// image is extended to a multiple of the tile size. If a splat may touch many tiles, a whole warp
+// tests them.
 #include "cuda/device.h"
 #include "cuda/scan.h"
 #include "rasterize.h"
@@ -18,8 +20,10 @@ constexpr int kSmall = 32;               // tiles of a rectangle that one thread
 constexpr int kColumns = kPackedHeader;  // of a packed row: mean, conic, opacity, depth, radius
 constexpr int kRow = kColumns + 1;       // stride of the rows in shared memory: odd
 
-// tiles_count: for each splat, in the order of depth, its rectangle of tiles as pairs of 16 bits, the
-// number of tiles that it touches, and these tiles (as bits; above 32 tiles, the number again).
+// tiles_count: for each splat, in the order of depth:
+//   corners, sizes   its rectangle of tiles, as pairs of 16 bits
+//   counts           the number of tiles that it touches
+//   tiles            these tiles, as bits; for a rectangle of more than 32 tiles, the number again
 template <class T>
 struct TilesCountKernelParams {
   int64_t n;                                   // splats
@@ -31,7 +35,7 @@ struct TilesCountKernelParams {
   SNOW_FIELDS(n, order, packed, stride, tiles_x, tiles_y, corners, sizes, tiles, counts)
 };
 
-// tiles_fill: the instances, as a tile and a splat each. One of tiles_16 and tiles_32 is null.
+// tiles_fill: the tile and the splat of each instance. One of tiles_16 and tiles_32 is null.
 template <class T>
 struct TilesFillKernelParams {
   int64_t n;                                // splats
@@ -50,7 +54,7 @@ struct TilesFillKernelParams {
               tiles_16, tiles_32, splats, capacity, slot_range)
 };
 
-// tiles_start: the first instance of each tile, in the sorted list of their tiles.
+// tiles_start: the first instance of each tile. keys: the sorted tiles of the instances.
 template <class Key>
 struct TilesStartParams {
   int64_t n;                // tiles + 1
@@ -71,8 +75,8 @@ struct TilesGatherParams {
   SNOW_FIELDS(n, slot_splat, instance_slot, required, instance_splat)
 };
 
-// Copies the first columns of the rows of a warp's lanes (< 0: none) to shared memory, 8 lanes per
-// row, and returns that of this lane.
+// Copies the first kColumns columns of a row for each lane of the warp to shared memory, by 8 lanes
+// per row. Returns the row of this lane. row < 0: no row for this lane.
 template <class T>
 SNOW_INLINE const T* stage_rows(const T* packed, int64_t stride, int row, T* stage) {
   const int column = lane_id() % kColumns;
@@ -86,7 +90,7 @@ SNOW_INLINE const T* stage_rows(const T* packed, int64_t stride, int row, T* sta
   return stage + lane_id() * kRow;
 }
 
-// Tiles x0 … x0 + width − 1, likewise y; empty: both sizes are 0.
+// Columns x0 … x0 + width − 1 and rows y0 … y0 + height − 1 of tiles; empty: both sizes are 0.
 struct TileRectangle {
   int x0, y0, width, height;
 };
@@ -102,7 +106,7 @@ SNOW_INLINE TileRectangle tile_rectangle(const T* row, int tiles_x, int tiles_y)
           int(extent.y1) / kTile - first_y + 1};
 }
 
-// Whether a splat reaches α = 1/255 somewhere between the pixel centres at the corners of a tile.
+// Whether α of a splat reaches 1/255 somewhere in the rectangle of the pixel centres of a tile.
 template <class T>
 struct TileTest {
   SplatTerms<T> terms;
@@ -119,8 +123,9 @@ struct TileTest {
   }
 };
 
-// A warp goes row by row through the tiles of a rectangle, 32 at a time, and calls f(whether this
-// lane's tile is touched, x, y). All lanes take part in each call.
+// A warp visits the tiles of a rectangle row by row, 32 at a time. Each lane calls f(touched, x,
+// y):
+// whether the splat touches its tile, and the position of the tile. All lanes call f equally often.
 template <class T, class F>
 SNOW_INLINE void for_each_32_tiles(const TileRectangle& r, const TileTest<T>& touches, F&& f) {
   const int area = r.width * r.height;
@@ -156,7 +161,7 @@ SNOW_INLINE void count_tiles(const TilesCountKernelParams<T>& out) {
   const int64_t m = out.n;
   const int tiles_x = int(out.tiles_x), tiles_y = int(out.tiles_y);
   SNOW_SHARED(T, stage, kThreads * kRow);
-  SNOW_SHARED(int, large, kThreads);  // the threads whose splats a warp has to process
+  SNOW_SHARED(int, large, kThreads);  // the threads whose splats have to be tested by a warp
   SNOW_SHARED(int, large_count, 1);
   if (threadIdx.x == 0) *large_count = 0;
   __syncthreads();
@@ -226,8 +231,8 @@ SNOW_INLINE void fill_tiles(const TilesFillKernelParams<T>& p) {
   if (threadIdx.x == 0) *large_count = 0;
   __syncthreads();
 
-  // First one thread per splat, then one lane per tile of the warp's small splats, so that
-  // neighbouring lanes write to neighbouring addresses.
+  // First, each thread reads one splat. Then each lane writes one tile of the small splats of its
+  // warp, so that neighbouring lanes write to neighbouring addresses.
   const int64_t i = thread_index();
   uint32_t splat = 0, corner = 0, tiles = 0, first_slot = 0;
   int width = 1, area = 0;
@@ -250,7 +255,7 @@ SNOW_INLINE void fill_tiles(const TilesFillKernelParams<T>& p) {
   const int end = warp_inclusive_scan(area), all = __shfl_sync(kAllLanes, end, kWarp - 1);
   for (int first = 0; first < all; first += kWarp) {
     const int item = first + lane_id();
-    int owner = 0;  // the first lane whose end is beyond the item
+    int owner = 0;  // the lane whose splat the item belongs to: the first with item < end
 #pragma unroll
     for (int step = kWarp / 2; step > 0; step /= 2)
       if (__shfl_sync(kAllLanes, end, owner + step - 1) <= item) owner += step;
@@ -285,8 +290,8 @@ SNOW_INLINE void fill_tiles(const TilesFillKernelParams<T>& p) {
                           set_instance(p, its_slot + k, y * tiles_x + x, its_splat);
                         done += uint32_t(__popc(votes));
                       });
-    // If rounding makes the test differ from that of tiles_count, at tiles where the splat is not
-    // visible, the remaining instances are assigned to no tile.
+    // Because of rounding, the test may find fewer tiles than in tiles_count; the splat is not
+    // visible in the missing ones. The remaining instances get a tile index after the last tile.
     for (uint32_t k = done + uint32_t(lane_id()); k < count; k += kWarp)
       set_instance(p, its_slot + k, tiles_x * tiles_y, its_splat);
   }
@@ -307,8 +312,8 @@ SNOW_INLINE void start_tiles(const TilesStartParams<Key>& p) {
   p.tile_start[tile] = uint32_t(low);
 }
 
-// Sums each splat's slots in slot order, 16 lanes per splat, and writes (or, for further groups of
-// channels, adds) its row of the packed gradient.
+// Sums the slots of each splat in slot order, with 16 lanes per splat. Writes the sum to the
+// splat's row of the packed gradient; for further groups of channels, adds it to this row.
 template <class T>
 SNOW_INLINE void reduce(const SplatsReduceParams<T>& p) {
   const int channels = int(p.channels);
