@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from snowsplat.util.process import interrupts_between_steps, let_interrupt
+from snowsplat.util.process import interrupts_between_steps, raise_deferred_interrupt
 
 
 def press() -> None:
@@ -28,9 +28,14 @@ def done_before_interrupt(*actions: Callable[[], None]) -> int:
 
 
 def test_it_is_deferred_until_let_interrupt():
-    let_interrupt()
-    assert done_before_interrupt(let_interrupt, press, lambda: None, let_interrupt, press) == 3
-    let_interrupt()  # nothing is pending any more
+    raise_deferred_interrupt()
+    assert (
+        done_before_interrupt(
+            raise_deferred_interrupt, press, lambda: None, raise_deferred_interrupt, press
+        )
+        == 3
+    )
+    raise_deferred_interrupt()  # nothing is pending any more
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -49,7 +54,7 @@ def test_the_function_of_the_context_raises_it():
 def test_a_pending_one_is_dropped_at_the_end_of_the_context():
     with interrupts_between_steps():
         press()
-    let_interrupt()
+    raise_deferred_interrupt()
 
 
 def test_nothing_is_deferred_in_other_threads():

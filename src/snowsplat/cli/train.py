@@ -65,5 +65,5 @@ class Train(TrainFlags):
                 return 130
             if page is not None:
                 print(f"the scene stays at {page.url} until Ctrl-C", flush=True)
-                page.hold()
+                page.show_result()
         return 0

@@ -20,21 +20,21 @@ LOCAL_HOST = "127.0.0.1"
 
 
 class LivePage:
-    """A page at http://localhost:``port``. It is a context manager: its end closes the page.
+    """A page at http://localhost:``port``; as a context manager, it closes the page at the end.
 
     with LivePage() as page:
         train("garden", "out/garden", page=page)
-        page.hold()
+        page.show_result()
     """
 
     def __init__(self, port: int | None = None, host: str | None = None) -> None:
         """
         Args:
             port: None: 8080, or the next free one.
-            host: address to listen on; None: accept connections from this computer only.
+            host: address at which to listen; None: accept connections from this machine only.
 
         Raises:
-            UserError: the port is taken, or this machine cannot listen at ``host``.
+            UserError: the port is in use, or this machine cannot listen at ``host``.
         """
         from snowsplat.viewer.live.server import free_port
 
@@ -65,7 +65,7 @@ class LivePage:
             label: the title of the page.
 
         Raises:
-            UserError: the port was taken after the constructor had checked it.
+            UserError: another process has opened the port since the constructor checked it.
         """
         from snowsplat.viewer.live.viewer import NetworkViewer
 
@@ -75,7 +75,7 @@ class LivePage:
         return viewer
 
     def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
-        """As `open`, for a training run. The training then calls `after_step` after each step."""
+        """As `open`, for a training run, which then calls `after_step` after each step."""
         from snowsplat.viewer.live.curves import SampledPsnr
         from snowsplat.viewer.live.training import TrainingViewer
 
@@ -87,7 +87,7 @@ class LivePage:
         self._trainer = trainer
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
-        """Returns the seconds that the training was paused; see `TrainingViewer.after_step`."""
+        """Returns the seconds for which training was paused; see `TrainingViewer.after_step`."""
         assert self._training is not None
         return self._training.after_step(step, steps, loss, gaussians)
 
@@ -96,7 +96,7 @@ class LivePage:
         assert self._viewer is not None
         return self._viewer.url
 
-    def hold(self) -> None:
+    def show_result(self) -> None:
         """Show the scene of the finished training run until Ctrl-C."""
         assert self._training is not None
         assert self._trainer is not None
@@ -104,13 +104,13 @@ class LivePage:
             self._training.end(self._trainer.step, self._trainer.gaussians)
 
     def show(self, scene: Callable[[], Scene]) -> None:
-        """Show the newest scene, read repeatedly, until Ctrl-C."""
+        """Show the newest scene until Ctrl-C. ``scene`` is called repeatedly."""
         assert self._viewer is not None
         with suppress(KeyboardInterrupt):
-            self._viewer.hold(scene)
+            self._viewer.show_newest(scene)
 
     def close(self) -> None:
-        """Close the page if it is open, and release the trainer that it has shown."""
+        """Close the page if it is open, and release the trainer."""
         viewer, self._viewer = self._viewer, None
         self._training = self._trainer = None
         if viewer is not None:

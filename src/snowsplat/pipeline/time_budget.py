@@ -79,20 +79,20 @@ class TimeBudget:
         The speed is measured by a small sample training, since the plan decides the resolution,
         the cap and the schedule that a trainer is built with.
         """
-        from snowsplat.training.time_budget.plan import make_plan, measure_slowness
+        from snowsplat.training.time_budget.plan import make_plan, measure_time_ratio
 
-        slowness = measure_slowness(dataset, config, device, resize=may.get("resize", True))
-        return make_plan(dataset, config, self.left, slowness, **may)
+        time_ratio = measure_time_ratio(dataset, config, device, resize=may.get("resize", True))
+        return make_plan(dataset, config, self.left, time_ratio, **may)
 
     def described(self, plan: Plan) -> str:
         """The plan in one line."""
         return f"{duration(self.seconds)} on this machine: {plan}"
 
-    def pace(self, trainer: Trainer, slowness: float) -> Pace:
+    def pace(self, trainer: Trainer, time_ratio: float) -> Pace:
         """The pace that keeps the training within the time that is left."""
         from snowsplat.training.time_budget.pace import Pace
         from snowsplat.training.time_budget.step_cost import Work
 
         sizes = [view.camera.width * view.camera.height for view in trainer.dataset.train]
         work = Work(trainer.config, sum(sizes) / len(sizes), len(trainer.dataset.test))
-        return Pace(work, self.left, slowness)
+        return Pace(work, self.left, time_ratio)

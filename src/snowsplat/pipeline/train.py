@@ -219,8 +219,8 @@ class _Job:
         self.observer.note(_described(dataset))
         if budget is not None and plan is not None:
             self.observer.note(budget.described(plan))
-        slowness = 1.0 if plan is None else plan.slowness
-        return self._run(settings, name, trainer, budget, slowness, memory)
+        time_ratio = 1.0 if plan is None else plan.time_ratio
+        return self._run(settings, name, trainer, budget, time_ratio, memory)
 
     def resume(self, path: Path | str | None) -> TrainResult:
         from snowsplat.training.trainer import Trainer
@@ -258,13 +258,13 @@ class _Job:
         recipe: Recipe,
         trainer: Trainer,
         budget: TimeBudget | None,
-        slowness: float,
+        time_ratio: float,
         memory: MemoryUse,
     ) -> TrainResult:
         from snowsplat.pipeline.training_run import TrainingRun
 
         self.observer.note(str(memory))
-        pace = None if budget is None else budget.pace(trainer, slowness)
+        pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(
             *(self.out, settings, recipe, trainer, budget, pace, memory, self.observer),
             save_iterations=self.options.save_iterations,

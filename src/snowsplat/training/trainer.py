@@ -140,7 +140,7 @@ class Trainer:
             Diverged: the loss, gradients or parameters are no longer finite; names the step.
         """
         last = math.inf if until is None else until
-        with interrupts_between_steps() as let_interrupt:
+        with interrupts_between_steps() as raise_deferred_interrupt:
             while self.step < min(last, self.schedule.iterations):
                 loss = self.step_once()
                 metrics = self.evaluate() if self.step in self.config.test_iterations else None
@@ -148,7 +148,7 @@ class Trainer:
                     iterations, downscale = self.schedule.iterations, self._downscale(self.step)
                     count = len(self.gaussians)
                     on_progress(Progress(self.step, loss, count, iterations, downscale, metrics))
-                let_interrupt()
+                raise_deferred_interrupt()
         self._runner.finish(self.step, self.gaussians)
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Settings of the process during a training run: one torch thread, and deferred Ctrl-C."""
+"""Settings of the process during training: one torch thread, and deferred Ctrl-C."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def single_threaded() -> Iterator[None]:
 _pending = threading.Event()
 
 
-def let_interrupt() -> None:
-    """Raise KeyboardInterrupt if a Ctrl-C is deferred. Called by code that waits between steps."""
+def raise_deferred_interrupt() -> None:
+    """Raise KeyboardInterrupt if a Ctrl-C is deferred; for code that waits between steps."""
     if _pending.is_set():
         raise KeyboardInterrupt
 
@@ -38,8 +38,8 @@ def let_interrupt() -> None:
 def interrupts_between_steps() -> Iterator[Callable[[], None]]:
     """Defer Ctrl-C until the function that the context provides is called.
 
-    A second Ctrl-C is not deferred. If Python's own handler of SIGINT has been replaced, or outside
-    the main thread, nothing is changed.
+    A second Ctrl-C is not deferred. Nothing is changed if Python's own handler of SIGINT has been
+    replaced, or outside of the main thread.
     """
 
     def defer(*_: object) -> None:
@@ -52,7 +52,7 @@ def interrupts_between_steps() -> Iterator[Callable[[], None]]:
         return
     signal.signal(signal.SIGINT, defer)
     try:
-        yield let_interrupt
+        yield raise_deferred_interrupt
     finally:
         _pending.clear()
         signal.signal(signal.SIGINT, signal.default_int_handler)

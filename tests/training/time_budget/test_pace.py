@@ -22,11 +22,11 @@ class Machine:
         self.shares: list[float] = []
         self.lengths: list[int] = []
 
-    def train(self, seconds: float, iterations: int, slowness: float = 1.0) -> float:
+    def train(self, seconds: float, iterations: int, time_ratio: float = 1.0) -> float:
         """Returns the time of the last step, as a fraction of the budget."""
         start = self.now
         schedule = Schedule(iterations)
-        pace = Pace(Work(self.config, PIXELS, VIEWS), seconds, slowness, lambda: self.now)
+        pace = Pace(Work(self.config, PIXELS, VIEWS), seconds, time_ratio, lambda: self.now)
         step, gaussians = 0, 10_000
         while step < schedule.iterations:
             step += 1
@@ -104,7 +104,7 @@ def test_other_recipes(name):
 
 def test_the_number_of_steps_converges():
     machine = Machine(recipe("default"), usual)
-    machine.train(120.0, 10_000, slowness=1.5)
+    machine.train(120.0, 10_000, time_ratio=1.5)
     later = machine.lengths[len(machine.lengths) // 2 :]
     assert max(later) < 1.1 * min(later)
     assert machine.downscales.count(4) / machine.iterations == pytest.approx(0.15, abs=0.03)

@@ -16,7 +16,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.config import changed
 from snowsplat.training.recipes import recipe
 from snowsplat.training.time_budget import plan as planning
-from snowsplat.training.time_budget.plan import Plan, make_plan, measure_slowness
+from snowsplat.training.time_budget.plan import Plan, make_plan, measure_time_ratio
 from snowsplat.training.trainer import Trainer
 
 POSE = torch.eye(4, dtype=torch.float64)[:3]
@@ -33,8 +33,8 @@ def dataset(width: int, height: int, photos: int = 50) -> Dataset:
     return Dataset(views[1:], views[:1], points, extent=1.0)
 
 
-def planned(seconds: float, width: int, height: int, slowness: float = 1.0, **how: bool) -> Plan:
-    return make_plan(dataset(width, height), recipe("default"), seconds, slowness, **how)
+def planned(seconds: float, width: int, height: int, time_ratio: float = 1.0, **how: bool) -> Plan:
+    return make_plan(dataset(width, height), recipe("default"), seconds, time_ratio, **how)
 
 
 @pytest.mark.parametrize(("width", "height"), [(552, 986), (4032, 3024), (3024, 4032)])
@@ -57,15 +57,15 @@ def test_the_size_of_photos():
     assert planned(1, 200, 150).resolution is None
     fixed = planned(1, 4032, 3024, resize=False)
     assert (fixed.resolution, fixed.width, fixed.height) == (None, 4032, 3024)
-    slow = planned(60, 552, 986, slowness=4.0)
+    slow = planned(60, 552, 986, time_ratio=4.0)
     assert slow.width < 552
-    assert planned(240, 552, 986, slowness=4.0).width > slow.width
+    assert planned(240, 552, 986, time_ratio=4.0).width > slow.width
 
 
 def test_the_time_is_used():
     """Steps times seconds per step is the budget, except for the time before and after them."""
     for seconds in (20.0, 300.0):
-        plan = planned(seconds, 552, 986, slowness=2.0)
+        plan = planned(seconds, 552, 986, time_ratio=2.0)
         assert 0.85 * seconds < plan.config.iterations * plan.seconds < seconds
 
 
@@ -111,7 +111,7 @@ def test_the_speed_of_this_machine(tmp_path):
         folder = tmp_path / format
         write_toy_dataset(folder, format, 9, 48, 36, n_points=300)
         small = load_dataset(folder)
-        assert 0.0 < measure_slowness(small, recipe("default")) < float("inf")
+        assert 0.0 < measure_time_ratio(small, recipe("default")) < float("inf")
         assert len(small.train) == 7
         assert (small.points is None) if points is None else (len(small.points) == points)
 
@@ -137,6 +137,6 @@ def test_the_speed_is_measured_on_photos_of_at_most_the_largest_size(tmp_path, m
     monkeypatch.setattr(planning, "Trainer", Watched)
     for resize, size in ((True, (1600, 26)), (False, (4000, 64))):
         measured.clear()
-        assert measure_slowness(wide, recipe("default"), resize=resize) > 0.0
+        assert measure_time_ratio(wide, recipe("default"), resize=resize) > 0.0
         assert measured == [size] * 2
     assert views[0].camera.width == views[0].image.width == 4000

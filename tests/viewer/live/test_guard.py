@@ -22,8 +22,8 @@ from snowsplat.viewer.live.guard import (
     _BROWSERS,
     _PAGES,
     _WAITING,
-    Governor,
     Guard,
+    ServerTimeLimit,
     is_valid_message,
 )
 from snowsplat.viewer.live.server import RunningServer, start_server, stop_server
@@ -49,7 +49,7 @@ from ..clients import (
 @pytest.fixture
 def local() -> Iterator[RunningServer]:
     running = start_server("127.0.0.1", None, "a scene")
-    Governor(running.server, lambda: True)
+    ServerTimeLimit(running.server, lambda: True)
     running.open()
     yield running
     stop_server(running.server)

@@ -35,43 +35,45 @@ def pose(x: float = 0.0) -> Pose:
 
 def serve(session: Session, clock: Clock, scene: int, seconds: float, training=True) -> str | None:
     """Render the due image in ``seconds``; returns its kind."""
-    due = session.next_due(scene, training)
-    if due is None:
+    request = session.next_request(scene, training)
+    if request is None:
         return None
     clock.now += seconds
-    session.spent(due, scene, seconds)
-    return due.kind
+    session.record_rendering(request, scene, seconds)
+    return request.kind
 
 
 def test_small_while_moving_then_full_size_then_when_the_scene_changes(session, clock):
     visitor = session.enter(1)
-    assert session.next_due(0, training=False) is None  # its pose is unknown
+    assert session.next_request(0, training=False) is None  # its pose is unknown
     session.move(visitor, pose())
-    due = session.next_due(0, training=False)
-    assert (due.kind, due.width, due.height) == ("moving", 640, 360)
-    session.spent(due, 0, 0.01)
-    assert session.next_due(0, training=False) is None
+    request = session.next_request(0, training=False)
+    assert (request.kind, request.width, request.height) == ("moving", 640, 360)
+    session.record_rendering(request, 0, 0.01)
+    assert session.next_request(0, training=False) is None
     clock.now += STILL + 0.01
-    due = session.next_due(0, training=False)
-    assert (due.kind, due.width, due.height) == ("still", 1280, 720)
-    session.spent(due, 0, 0.04)
+    request = session.next_request(0, training=False)
+    assert (request.kind, request.width, request.height) == ("still", 1280, 720)
+    session.record_rendering(request, 0, 0.04)
     clock.now += 10
-    assert session.next_due(0, training=False) is None
-    assert session.next_due(1, training=False).kind == "idle"
+    assert session.next_request(0, training=False) is None
+    assert session.next_request(1, training=False).kind == "idle"
 
 
 def test_images_of_a_moving_camera_have_a_size_that_is_fast(session, clock):
     visitor = session.enter(1)
     for i in range(30):
         session.move(visitor, pose(i))
-        due = session.next_due(0, training=False)
-        session.spent(due, 0, 1e-6 * due.width * due.height)  # a microsecond per pixel
-    assert due.width * due.height == pytest.approx(50_000, rel=0.1)
+        request = session.next_request(0, training=False)
+        session.record_rendering(
+            request, 0, 1e-6 * request.width * request.height
+        )  # a microsecond per pixel
+    assert request.width * request.height == pytest.approx(50_000, rel=0.1)
     for i in range(30):
         session.move(visitor, pose(i))
-        due = session.next_due(0, training=False)
-        session.spent(due, 0, 1e-8 * due.width * due.height)
-    assert (due.width, due.height) == (1280, 720)
+        request = session.next_request(0, training=False)
+        session.record_rendering(request, 0, 1e-8 * request.width * request.height)
+    assert (request.width, request.height) == (1280, 720)
 
 
 def test_every_change_needs_a_new_image(session, clock):
@@ -83,7 +85,7 @@ def test_every_change_needs_a_new_image(session, clock):
         session.change(visitor, **change)
         clock.now += 1
         assert serve(session, clock, 0, 0.01, training=False) == "still", change
-    assert session.next_due(0, training=False) is None
+    assert session.next_request(0, training=False) is None
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
@@ -104,17 +106,17 @@ def test_one_image_at_a_time_is_being_sent(session, clock):
     """Images do not accumulate if sending is slower than rendering."""
     visitor, other = session.enter(1), session.enter(2)
     session.move(visitor, pose())
-    due = session.next_due(0, training=False)
-    session.send_to(visitor)
-    assert session.next_due(0, training=False) is None
+    request = session.next_request(0, training=False)
+    session.begin_sending(visitor)
+    assert session.next_request(0, training=False) is None
     session.move(other, pose())
-    assert session.next_due(0, training=False).visitor is other
+    assert session.next_request(0, training=False).visitor is other
     session.leave(2)
-    session.sent(due, 0.1)
-    assert session.next_due(0, training=True) is None  # sending counts as viewing time, too
-    assert session.next_due(0, training=False).visitor is visitor
+    session.end_sending(request, 0.1)
+    assert session.next_request(0, training=True) is None  # sending counts as viewing time, too
+    assert session.next_request(0, training=False).visitor is visitor
     clock.now += 0.11
-    assert session.next_due(0, training=True).visitor is visitor
+    assert session.next_request(0, training=True).visitor is visitor
 
 
 def test_the_share_while_no_camera_moves(session, clock):
@@ -135,11 +137,11 @@ def test_a_moving_camera_is_served_first(session, clock):
     session.move(still, pose())
     clock.now += 1
     session.move(moving, pose())
-    assert session.next_due(0, training=True).visitor is moving
+    assert session.next_request(0, training=True).visitor is moving
     assert serve(session, clock, 0, 0.01, training=False) == "moving"
-    assert session.next_due(0, training=False).visitor is still
+    assert session.next_request(0, training=False).visitor is still
     session.leave(1)
-    assert session.next_due(0, training=False) is None
+    assert session.next_request(0, training=False) is None
     assert not session.is_here(still)
     assert session.is_here(moving)
 
@@ -148,10 +150,10 @@ def test_a_change_during_rendering_needs_a_new_image(session, clock):
     visitor = session.enter(1)
     session.move(visitor, pose())
     clock.now += 1
-    due = session.next_due(0, training=False)
+    request = session.next_request(0, training=False)
     session.move(visitor, pose(1))
-    session.spent(due, 0, 0.01)
-    assert session.next_due(0, training=False).pose.position[0] == 1
+    session.record_rendering(request, 0, 0.01)
+    assert session.next_request(0, training=False).pose.position[0] == 1
 
 
 # Pause
@@ -205,7 +207,7 @@ def test_moving_away_leaves_the_photo(session, clock):
     session.move(visitor, pose())
     camera = Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(3, 4).double())
     photo_view = PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5))
-    session.send(visitor, photo_view)
+    session.set_photo_view(visitor, photo_view)
     clock.now += 0.1
     session.move(visitor, pose(1))  # sent before the browser was moved
     assert visitor.photo_view is photo_view
@@ -218,7 +220,9 @@ def test_moving_away_leaves_the_photo(session, clock):
 def test_a_browser_that_never_arrives_leaves_the_photo(session, clock):
     visitor = session.enter(1)
     camera = Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(3, 4).double())
-    session.send(visitor, PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5)))
+    session.set_photo_view(
+        visitor, PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5))
+    )
     clock.now += 10
     session.move(visitor, pose(1))
     assert visitor.photo_view is None

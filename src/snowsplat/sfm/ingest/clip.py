@@ -1,4 +1,4 @@
-"""A video file: its properties, read from its packets, and its decoded frames in order."""
+"""A video file: its properties, read from its packets, and its decoded frames, in order."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from typing import TYPE_CHECKING
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
-# Containers that cameras, phones and programs write, by FFmpeg's names.
+# Container formats that cameras, phones and programs write, by the names of FFmpeg.
 _FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,flv,asf,gif,mpeg,mpegts,mpegvideo,m4v,h264,hevc,"
     "vc1,av1,obu,ivf,ogg,mjpeg,dv,mxf"
 )
-_MOST_PIXELS = 1 << 26  # of a frame: 8192×8192
+_MOST_PIXELS = 1 << 26  # maximum number of pixels of a frame: 8192×8192
 
-# An mp4 file consists of nested boxes: a header of a length and a kind, then the content.
+# An mp4 file consists of nested boxes. A box is a header (its length and its kind) and content.
 _BOX_HEADER = 8  # bytes
 _KIND = re.compile(rb"[ -~\xa9]{4}")
 _NO_COUNTS = (b"mdat", b"free", b"skip", b"wide")  # boxes of frame data and padding
-# Boxes that begin with a count: of frames, also of fragments, and of edits (elst), each of which
-# may repeat all frames. A compressed header (cmov) could hide such counts.
+# Boxes that begin with a count: of frames, of frames in a fragment (trun), or of edits (elst). Each
+# edit may repeat all frames. A compressed header (cmov) could contain such counts.
 _COUNTS = re.compile(rb"stsz|stz2|trun|elst|cmov")
-_FEW_EDITS = 16  # up to this number, edits are not regarded as repetitions
+_FEW_EDITS = 16  # up to this number of edits, they are not counted as repetitions
 _ALWAYS_ALLOWED = 1 << 16  # frames that a file of any size may declare
 
 if TYPE_CHECKING:
@@ -38,23 +38,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Clip:
-    """Properties of a video, from its packets; no frame but the first is decoded."""
+    """Properties of a video, from its packets. Only the first frame is decoded."""
 
     path: Path
     packets: int  # number of frames that the file contains
-    promised: int  # number of frames that its header declares, at least `packets`
+    declared_frames: int  # number of frames that the header declares, at least `packets`
     start: float  # time of the first frame, seconds
     seconds: float  # from the first frame to the end of the last
-    width: int  # pixels, upright
+    width: int  # pixels, in the upright orientation
     height: int
-    aspect: float = 1.0  # width over height of a stored pixel; 1 except for some camcorders
+    aspect: float = 1.0  # width divided by height of a stored pixel; not 1 for some camcorders
 
 
 def _check_boxes(path: Path) -> None:
     """Check that an mp4 file does not declare more frames than it can contain.
 
-    FFmpeg allocates an entry for each declared frame, so a few bytes could request millions. The
-    counts are in boxes nested at any depth. Boxes of frame data are skipped.
+    FFmpeg allocates an entry for each declared frame, so a file of a few bytes could make it
+    allocate millions. The counts are in boxes at any depth. Boxes of frame data are skipped.
 
     Raises:
         ValueError: the file declares more frames than it has bytes.
@@ -105,13 +105,13 @@ def read_clip(path: Path) -> Clip:
     import av
 
     times: list[float] = []
-    promised = 0
+    declared_frames = 0
     try:
         with open_video(path) as container:
             stream = container.streams.video[0]
             rate = float(stream.average_rate or 30)
-            # The header is trusted only for this: to report how much of a damaged file is missing.
-            promised = stream.frames
+            # This number is used only to report how much of a damaged file is missing.
+            declared_frames = stream.frames
             aspect = float(stream.sample_aspect_ratio or 1)
             with suppress(av.FFmpegError):
                 for packet in container.demux(stream):
@@ -132,7 +132,7 @@ def read_clip(path: Path) -> Clip:
     return Clip(
         path=path,
         packets=len(times),
-        promised=max(promised, len(times)),
+        declared_frames=max(declared_frames, len(times)),
         start=min(times),
         seconds=length + length / max(1, len(times) - 1) if length > 0 else len(times) / rate,
         width=width,
@@ -144,10 +144,10 @@ def read_clip(path: Path) -> Clip:
 def frames_wanted(clip: Clip, fps: float | None, frames: int | None) -> int:
     """Number of time windows into which a video is divided; each yields at most one frame.
 
-    The default is 2.5 per second: walking around an object takes 20 to 40 s, so neighbouring frames
-    are a few degrees apart, which SIFT matches reliably. A short video has at least 60 windows,
-    since it may show as much. A long one has at most 150, or one per second up to 300 if that is
-    more: each frame costs about 2 s later, on two cores.
+    The default is 2.5 per second. Walking around an object takes 20 to 40 s, so adjacent frames are
+    a few degrees apart; SIFT matches such frames reliably. A short video has at least 60 windows,
+    because it may show as much as a long one. A long video has at most 150 windows, or one per
+    second (up to 300) if that is more, because each frame takes about 2 s later, on two cores.
     """
     if frames is not None:
         wanted = float(frames)
@@ -168,8 +168,8 @@ def upright_size(frame: VideoFrame, aspect: float) -> tuple[int, int]:
 def open_video(path: Path) -> InputContainer:
     """Open a video file of a format that cameras write; raises as `av.open` does.
 
-    FFmpeg reads many more formats, among them playlists of other files and URLs; these are
-    disabled. Frames larger than any camera's are rejected before memory is allocated for them.
+    FFmpeg also reads other formats, for example playlists of other files and URLs; they are
+    disabled. Frames larger than those of any camera are rejected before memory is allocated.
     """
     import av
 
@@ -179,7 +179,8 @@ def open_video(path: Path) -> InputContainer:
         "max_pixels": str(_MOST_PIXELS),
     }
     _check_boxes(path)
-    # "file:", as a name may look like a URL. Some metadata of cameras is not UTF-8; it is not used.
+    # The prefix "file:" is needed because a name may look like a URL. Some cameras write metadata
+    # that is not UTF-8; it is not used.
     container = av.open(f"file:{path.absolute()}", options=options, metadata_errors="replace")
     for stream in container.streams.video:
         if stream.codec_context is None:  # PyAV has no decoder
@@ -189,7 +190,7 @@ def open_video(path: Path) -> InputContainer:
 
 
 def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
-    """All frames that can be decoded; damaged ones are skipped, and the file may be truncated."""
+    """All frames that can be decoded. Damaged frames are skipped; the file may be truncated."""
     import av
 
     stream = container.streams.video[0]

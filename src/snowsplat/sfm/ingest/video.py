@@ -165,12 +165,12 @@ def _write(best: _SharpestFrame, clip: Clip, folder: Path, number: int, size: in
 
 
 def _log_summary(clip: Clip, frames: Frames) -> None:
-    if frames.read < 0.97 * clip.promised:
+    if frames.read < 0.97 * clip.declared_frames:
         logger.warning(
             "%s: the video is damaged or truncated; %d of its %d frames could be decoded",
             shown(clip.path),
             frames.read,
-            clip.promised,
+            clip.declared_frames,
         )
     same = sum(reason == SAME_VIEW for _, reason in frames.skipped)
     useless = len(frames.skipped) - same

@@ -1,9 +1,9 @@
-"""`Pace`: makes a training run end within a time budget, with its schedule complete.
+"""`Pace`: makes a training run complete its schedule within a time budget.
 
-The time of a step depends on the resolution of the stage, on the growing number of Gaussians, and
-on other load of the machine. It is measured continuously, and the remaining time is estimated from
-recent steps. `Schedule.stretch` then distributes the rest of the schedule over as many steps as
-there is time for. No stage is skipped.
+The time of a step depends on the resolution of the stage, on the number of Gaussians, and on the
+load of the machine by other processes. It is measured continuously, and the remaining time is
+estimated from recent steps. `Schedule.stretch` then distributes the rest of the schedule over as
+many steps as there is time for. No stage is skipped.
 """
 
 from __future__ import annotations
@@ -15,46 +15,47 @@ from collections.abc import Callable
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.time_budget.step_cost import StepCost, Work
 
-#: Measurements are remembered for this fraction of the time budget: long enough to average over
-#: views, short enough to follow a change of load.
+#: Measurements are averaged over this fraction of the time budget. It is long enough to average
+#: over views, and short enough to follow a change of the load.
 _MEMORY = 0.2
-#: But at least for this many seconds.
+#: Minimum number of seconds over which measurements are averaged.
 _SHORTEST_MEMORY = 3.0
-#: Seconds between two estimates, which take some time themselves.
+#: Minimum number of seconds between two estimates, because an estimate takes some time.
 _BETWEEN = 0.1
-#: If no time is left, the rest of the schedule is run with this many times fewer steps.
+#: If no time is left, the number of steps of the rest of the schedule is divided by this.
 _HURRY = 10.0
 
 
 class Pace:
-    """Keeps one training run within its time; call `iterations_after` after each of its steps."""
+    """Keeps a training run within its time; call `iterations_after` after each of its steps."""
 
     def __init__(
         self,
         work: Work,
         seconds: float,
-        slowness: float = 1.0,
+        time_ratio: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """
         Args:
             seconds: time from now to the end, including evaluation of the test photos and saving.
-            slowness: see `StepCost`.
+            time_ratio: see `StepCost`.
             clock: returns the time in seconds.
         """
         self._work = work
         self._clock = clock
         self._last_step = self._last_estimate = clock()
         self.deadline = self._last_step + seconds
-        self._cost = StepCost(work, slowness, max(_SHORTEST_MEMORY, _MEMORY * seconds))
+        self._cost = StepCost(work, time_ratio, max(_SHORTEST_MEMORY, _MEMORY * seconds))
 
     def iterations_after(
         self, schedule: Schedule, step: int, downscale: int, gaussians: int
     ) -> int | None:
-        """The total number of steps for which there is time; None: unchanged.
+        """The total number of steps for which there is time; None: leave it unchanged.
 
         Args:
-            step, downscale, gaussians: of the step that was just completed.
+            step: number of completed steps.
+            downscale, gaussians: of the last completed step.
         """
         now = self._clock()
         self._cost.observe(now - self._last_step, downscale, gaussians)
@@ -78,6 +79,6 @@ class Pace:
         return sum(self._cost.predict(*part) for part in parts) / len(parts)
 
     def _seconds_left(self, now: float, gaussians: int) -> float:
-        """Until the last step has to be completed."""
+        """Seconds until the last step has to be completed."""
         after = self._work.seconds_after(self._cost.predict(1, gaussians), gaussians)
         return self.deadline - now - after

@@ -1,7 +1,7 @@
 """Plans a training run for a given time on this machine: photo size, number of Gaussians, steps.
 
-With more time, the number of steps increases first, then the size of the photos, then the number of
-Gaussians: see "Training in a given time" in docs/performance.md.
+If there is more time, first the number of steps is increased, then the size of the photos, then the
+number of Gaussians: see "Training in a given time" in docs/performance.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.time_budget.step_cost import Work
 from snowsplat.training.trainer import Trainer
 
-# The size of the photos is reduced until there is time for both of these:
+# The size of the photos is reduced until there is time for both of these numbers of steps:
 #: Minimum number of steps.
 _MIN_STEPS = 1000
 #: Minimum number of steps per photo.
@@ -30,42 +30,42 @@ _MAX_SIDE = 1600
 #: The limit of the number of Gaussians is raised if there is time for more steps than this.
 _STEPS_FOR_MORE_GAUSSIANS = 4500
 #: Maximum factor by which this limit is raised.
-_MAX_RISE = 2.0
+_MAX_GAUSSIAN_FACTOR = 2.0
 #: Minimum number of densifications in the first half of a short training run. The minimum interval
 #: between densifications has priority.
 _MIN_DENSIFICATIONS = 15
 #: Minimum interval between densifications, in steps.
 _MIN_DENSIFY_INTERVAL = 25
-#: Seconds before the first step: preparation, and decoding the first photos.
+#: Seconds before the first step, for preparation and for decoding the first photos.
 _SETUP_SECONDS = 0.5
 
-# A small training run, the sample, measures the speed of the machine.
+# The speed of the machine is measured by a short training run, called the sample.
 #: Maximum duration of the sample, in seconds.
 _SAMPLE_SECONDS = 0.7
 #: Maximum number of steps.
 _SAMPLE_STEPS = 100
 #: Minimum number of steps, even if they take longer than `_SAMPLE_SECONDS`.
 _MIN_SAMPLE_STEPS = 3
-#: Number of photos; few, so that decoding takes little time.
+#: Number of photos. It is small, so that decoding takes little time.
 _SAMPLE_PHOTOS = 2
-#: Maximum number of points, which limits the memory.
+#: Maximum number of points. It limits the memory.
 _SAMPLE_POINTS = 20_000
 #: Photos with more pixels than this are reduced to half the size.
 _SAMPLE_PIXELS = 500_000
-#: Time of a step of a trained scene, relative to the initial points: more splats overlap (measured
-#: with fox and fern: 1.5 to 1.9).
+#: Time of a step with a trained scene, divided by that with the initial points. In a trained scene
+#: more splats overlap. Measured with fox and fern: 1.5 to 1.9.
 _TRAINED_SLOWDOWN = 1.5
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What `make_plan` chose.
+    """The result of `make_plan`.
 
     Attributes:
         resolution: width of the photos, as for `load_dataset`; None: original size.
         width, height: of a photo at that resolution, in pixels.
-        config: the configuration with the number of steps and the limit of Gaussians.
-        slowness: ratio of the seconds of a step on this machine to `Work.seconds`.
+        config: the configuration, with the chosen number of steps and limit of Gaussians.
+        time_ratio: seconds of a step on this machine, divided by `Work.seconds`.
         seconds: mean time of a step.
     """
 
@@ -73,7 +73,7 @@ class Plan:
     width: int
     height: int
     config: TrainConfig
-    slowness: float
+    time_ratio: float
     seconds: float
 
     def __str__(self) -> str:
@@ -89,17 +89,17 @@ def make_plan(
     dataset: Dataset,
     config: TrainConfig,
     seconds: float,
-    slowness: float,
+    time_ratio: float,
     *,
     resize: bool = True,
     more_gaussians: bool = True,
     more_often: bool = True,
 ) -> Plan:
-    """The best training of ``dataset`` (at full resolution) that fits into ``seconds``.
+    """The best training run that fits into ``seconds``. ``dataset``: at full resolution.
 
     Args:
-        config: the configuration of the recipe; ``iterations`` is replaced.
-        slowness: the result of `measure_slowness`.
+        config: the configuration of the recipe; its ``iterations`` are ignored.
+        time_ratio: the result of `measure_time_ratio`.
         resize: whether the photos may be reduced.
         more_gaussians: whether the limit of the number of Gaussians may be raised.
         more_often: whether a short training run may densify more often.
@@ -108,20 +108,20 @@ def make_plan(
     longer = max(camera.width, camera.height)
     enough = max(_MIN_STEPS, _MIN_STEPS_PER_PHOTO * len(dataset.train))
 
-    def plan(side: int, rise: float = 1.0) -> Plan:
+    def plan(side: int, gaussian_factor: float = 1.0) -> Plan:
         width = camera.width if side >= longer else max(1, round(camera.width * side / longer))
         height = round(camera.height * width / camera.width)
-        sized = _capped(config, width * height, rise)
+        sized = _capped(config, width * height, gaussian_factor)
         work = Work(sized, width * height, len(dataset.test))
         initial = config.initial_points if dataset.points is None else len(dataset.points)
         initial = min(initial, sized.density.max_gaussians or initial)
-        steps, mean = _steps(work, seconds - _SETUP_SECONDS, slowness, initial)
+        steps, mean = _steps(work, seconds - _SETUP_SECONDS, time_ratio, initial)
         if more_often:
             sized = _densified_in(sized, steps)
             work = replace(work, config=sized)
-            steps, mean = _steps(work, seconds - _SETUP_SECONDS, slowness, initial)
+            steps, mean = _steps(work, seconds - _SETUP_SECONDS, time_ratio, initial)
         resolution = None if width == camera.width else width
-        return Plan(resolution, width, height, replace(sized, iterations=steps), slowness, mean)
+        return Plan(resolution, width, height, replace(sized, iterations=steps), time_ratio, mean)
 
     side = longer
     if resize:
@@ -131,24 +131,26 @@ def make_plan(
             side = max(smallest, min(side - 8, round(0.97 * side)))
     best = plan(side)
     if more_gaussians and best.config.iterations > _STEPS_FOR_MORE_GAUSSIANS:
-        rise = min(_MAX_RISE, best.config.iterations / _STEPS_FOR_MORE_GAUSSIANS)
-        best = plan(side, rise)
+        gaussian_factor = min(
+            _MAX_GAUSSIAN_FACTOR, best.config.iterations / _STEPS_FOR_MORE_GAUSSIANS
+        )
+        best = plan(side, gaussian_factor)
     return best
 
 
-def measure_slowness(
+def measure_time_ratio(
     dataset: Dataset,
     config: TrainConfig,
     device: torch.device | None = None,
     *,
     resize: bool = True,
 ) -> float:
-    """Ratio of the seconds of a training step on this machine to `Work.seconds`.
+    """Measure the seconds of a training step on this machine, divided by `Work.seconds`.
 
     Args:
         device: the device to train on; default: the CPU.
-        resize: whether `make_plan` may reduce the photos. Then larger photos than its maximum are
-            reduced here, too, because they would need more time and memory than the training.
+        resize: whether `make_plan` may reduce the photos. If so, photos above its maximum size are
+            also reduced here. Otherwise the sample could need more time and memory than training.
     """
     views = dataset.train[:_SAMPLE_PHOTOS]
     if resize:
@@ -181,7 +183,7 @@ def measure_slowness(
         trainer.step_once()
         modelled = work.seconds(downscale, len(trainer.gaussians))
         ratios.append((time.monotonic() - before) / modelled)
-    # The first step is not counted: it waits for its photo.
+    # The first step is not used, because it waits until its photo is decoded.
     return _TRAINED_SLOWDOWN * statistics.median(ratios[1:])
 
 
@@ -200,11 +202,13 @@ def _at_most_max_side(view: View) -> View:
     )
 
 
-def _capped(config: TrainConfig, pixels: int, rise: float) -> TrainConfig:
-    """``config`` for photos of ``pixels``, with ``rise`` times the maximum number of Gaussians."""
+def _capped(config: TrainConfig, pixels: int, gaussian_factor: float) -> TrainConfig:
+    """``config`` for photos of ``pixels``, and the limit of Gaussians times ``gaussian_factor``."""
     cap = config.density.max_gaussians
-    if rise > 1.0 and cap:
-        config = replace(config, density=changed(config, max_gaussians=round(rise * cap)).density)
+    if gaussian_factor > 1.0 and cap:
+        config = replace(
+            config, density=changed(config, max_gaussians=round(gaussian_factor * cap)).density
+        )
     return config.capped(pixels)
 
 
@@ -220,14 +224,16 @@ def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:
     )
 
 
-def _steps(work: Work, seconds: float, slowness: float, gaussians: int) -> tuple[int, float]:
-    """The number of steps that fit, and the mean seconds of one."""
+def _steps(work: Work, seconds: float, time_ratio: float, gaussians: int) -> tuple[int, float]:
+    """The number of steps that fit into ``seconds``, and the mean seconds of a step."""
     steps = work.config.iterations
     mean = 0.0
-    for _ in range(5):  # a fixed point: the mean depends on the number of steps
+    for _ in range(5):  # fixed-point iteration: the mean depends on the number of steps
         parts = work.parts_ahead(Schedule(steps), 0, gaussians)
-        mean = slowness * sum(work.seconds(*part) for part in parts) / len(parts)
-        left = seconds - work.seconds_after(slowness * work.seconds(1, parts[-1][1]), parts[-1][1])
+        mean = time_ratio * sum(work.seconds(*part) for part in parts) / len(parts)
+        left = seconds - work.seconds_after(
+            time_ratio * work.seconds(1, parts[-1][1]), parts[-1][1]
+        )
         steps = max(1, round(left / mean))
     return steps, mean
 

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.step_schedule import Schedule
 
-# Seconds of a step on the machine of docs/performance.md. The ratio to this machine and this scene,
-# the "slowness", is measured, so only their proportions matter.
+# Seconds of a step on the machine of docs/performance.md. Only their proportions matter: the ratio
+# of the time on this machine with this scene to these seconds, `time_ratio`, is measured.
 _SECONDS_PER_STEP = 0.001
 _SECONDS_PER_MEGAPIXEL = 0.035
 _SECONDS_PER_MILLION_GAUSSIANS = 0.07
 
 # Seconds after the last step, on the same machine.
-#: Rendering a test view, in training steps at full resolution: a forward pass, no backward pass.
+#: Rendering a test view, as a multiple of a training step at full resolution: only a forward pass.
 _STEPS_PER_VIEW = 0.5
-#: Decoding its photo and computing the metrics.
+#: Decoding the photo of a test view and computing the metrics.
 _SECONDS_PER_VIEW_MEGAPIXEL = 0.05
 #: Writing the scene.
 _SECONDS_PER_MILLION_WRITTEN = 4.0
@@ -27,9 +27,9 @@ _GROWTH = 1.25
 #: The remaining steps are estimated in this many equal parts.
 _PARTS = 40
 
-#: Weight of the initial guess of the slowness, relative to the full weight of measurements.
+#: Weight of the initial value of `time_ratio`, relative to the full weight of measurements.
 _GUESS_WEIGHT = 0.3
-#: A step that takes this many times longer than predicted was delayed by something else.
+#: If a step takes this many times longer than predicted, it was delayed by something else.
 _OUTLIER = 5.0
 
 
@@ -88,10 +88,10 @@ class Work:
 class StepCost:
     """Predicts the seconds of a training step from those of previous steps."""
 
-    def __init__(self, work: Work, slowness: float, memory: float) -> None:
+    def __init__(self, work: Work, time_ratio: float, memory: float) -> None:
         """
         Args:
-            slowness: measured seconds per second of `Work.seconds`, as an initial guess.
+            time_ratio: initial value of the measured seconds divided by `Work.seconds`.
             memory: seconds after which the weight of a measurement has decreased to 1/e.
         """
         self._work = work
@@ -101,25 +101,25 @@ class StepCost:
         # first steps, which wait for photos to be decoded.
         self._measured: dict[int, float] = {}
         self._modelled: dict[int, float] = {}
-        self._slowness = slowness
-        self._guess = _GUESS_WEIGHT * memory / slowness
+        self._time_ratio = time_ratio
+        self._guess = _GUESS_WEIGHT * memory / time_ratio
 
     def observe(self, seconds: float, downscale: int, gaussians: int) -> None:
         """Add the measurement of a step."""
         expected = self.predict(downscale, gaussians)
         seconds = min(seconds, _OUTLIER * expected)
         if downscale not in self._measured:
-            self._measured[downscale] = self._guess * self._slowness
+            self._measured[downscale] = self._guess * self._time_ratio
             self._modelled[downscale] = self._guess
         keep = math.exp(-seconds / self._memory)
         modelled = self._work.seconds(downscale, gaussians)
         self._measured[downscale] = keep * self._measured[downscale] + seconds
         self._modelled[downscale] = keep * self._modelled[downscale] + modelled
-        self._slowness = self._measured[downscale] / self._modelled[downscale]
+        self._time_ratio = self._measured[downscale] / self._modelled[downscale]
 
     def predict(self, downscale: int, gaussians: float) -> float:
-        """Seconds of a step; a future stage is predicted with the slowness of the present one."""
-        slowness = self._slowness
+        """Seconds of a step; for a future stage, with the time ratio of the present stage."""
+        time_ratio = self._time_ratio
         if downscale in self._measured:
-            slowness = self._measured[downscale] / self._modelled[downscale]
-        return slowness * self._work.seconds(downscale, gaussians)
+            time_ratio = self._measured[downscale] / self._modelled[downscale]
+        return time_ratio * self._work.seconds(downscale, gaussians)

@@ -1,4 +1,4 @@
-"""Checks the requests and messages of browsers to the live viewer; limits their number and cost.
+"""Checks requests and messages of browsers to the live viewer, and limits their number and cost.
 
 viser accepts every connection, trusts all messages and processes any number of them, in the process
 that trains. Therefore `Guard.serve` starts its server with additional checks:
@@ -7,13 +7,13 @@ that trains. Therefore `Guard.serve` starts its server with additional checks:
   connect, the path must begin with a secret token.
 - The numbers of connections, page downloads and browsers are limited.
 - Messages must be of the three types that the page sends, with finite numbers. A connection that
-  sends more messages than a page can send is closed. If a client does not read its data, no further
-  messages of it are read.
-- While this process trains, the server may use a fifth of a core.
+  sends more messages than a page can send is closed. If a client does not read its data, the server
+  reads no further messages of this client.
+- During training, the server may use a fifth of a processor core.
 
-These checks run in the thread of viser's server. The data of the training is sent in the same
-thread (`call_in_server_thread`), because viser's buffers are not thread-safe while browsers connect
-or disconnect.
+These checks run in the thread of viser's server. Images and updates of the page are sent in the
+same thread (`call_in_server_thread`), because viser's buffers are not thread-safe while browsers
+connect or disconnect.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ _BROWSERS = 16  # connected browsers
 _REQUEST = 16 << 10  # bytes of a request
 _MESSAGE = 64 << 10  # bytes of a message
 _RATE = 100.0  # messages per second; a page sends 50 while its camera moves
-_BURST = 1000.0  # messages at once, which have waited while the training blocked the process
+_BURST = 1000.0  # messages at once: they accumulate while a training step blocks the process
 _FRAMES = 16  # WebSocket frames of a message; browsers send short messages in one frame
 _SHARE = 0.2  # share of a core that the server uses
-_LONGEST_PAUSE = 1.0  # seconds that the server is paused at once
+_LONGEST_PAUSE = 1.0  # seconds for which the server is paused at a time
 
 _PIECE = 4 << 10  # bytes that are processed before the limits are checked again
 _TICK = 0.05  # seconds between two measurements of the server's processor time
@@ -79,7 +79,7 @@ class Guard:
         """
         Args:
             host: the address at which the server listens.
-            token: the first part of all paths; None: no token.
+            token: the first component of all paths; None: no token.
         """
         if token is None and not is_loopback(host):
             raise ValueError(f"{host}: a server that other machines can reach needs a token")
@@ -109,7 +109,7 @@ class Guard:
     def _answer(
         self, answer: _Answer, connection: ServerConnection, request: Request
     ) -> Response | None:
-        """The response to a request: of viser or a rejection; None accepts a WebSocket."""
+        """The response to a request: that of viser, or a rejection; None accepts a WebSocket."""
         assert isinstance(connection, _Connection)
         response = self._refusal(connection, request) or answer(connection, request)
         if response is None:
@@ -124,7 +124,7 @@ class Guard:
         return response
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
-        """A response that rejects the request; None accepts it and removes the token."""
+        """A response that rejects the request. None: it is accepted; the token is removed."""
 
         def refuse(status: http.HTTPStatus, *more: tuple[str, str]) -> Response:
             headers = Headers([*more, ("Content-Length", "0"), ("Connection", "close")])
@@ -156,7 +156,7 @@ class Guard:
         return None
 
     def _path(self, path: str) -> str | None:
-        """The path without the token; None without the correct token. No decoding is applied."""
+        """The path without the token; None if the token is wrong. Nothing is decoded."""
         path = path.partition("?")[0]
         if self._token is None:
             return path
@@ -204,7 +204,7 @@ class _Connection(ServerConnection):
         self._guard.disconnected(self)
 
     def data_received(self, data: bytes) -> None:
-        for start in range(0, len(data), _PIECE):  # limits the work before data is rejected
+        for start in range(0, len(data), _PIECE):  # so that little is processed before a rejection
             if self._refused:
                 return
             piece = data[start : start + _PIECE]
@@ -222,7 +222,7 @@ class _Connection(ServerConnection):
             super().process_event(event)
 
     def _is_within_limits(self, frame: Frame) -> bool:
-        """Whether a page could send this frame now; counts it."""
+        """Count this frame, and return whether a page could send it at this rate."""
         now = self.loop.time()
         self._budget = min(_BURST, self._budget + _RATE * (now - self._counted)) - 1.0
         self._counted = now
@@ -309,16 +309,16 @@ def is_valid_message(data: Data) -> bool:
 # The thread of the server
 
 
-class Governor:
-    """Limits the server's thread to its share of a core while a training runs.
+class ServerTimeLimit:
+    """Limits the share of a core that the server's thread uses during training.
 
-    Errors in the thread are logged.
+    It also logs errors of this thread.
     """
 
     def __init__(self, server: viser.ViserServer, training: Callable[[], bool]) -> None:
         self._loop = server.get_event_loop()
         self._training = training
-        self._used = self._seen = 0.0  # thread time and clock at the last measurement, seconds
+        self._used = self._measured = 0.0  # thread time and clock at the last measurement, seconds
         self._uncounted = 0.0  # thread time that is not counted, seconds
         call_in_server_thread(server, self._begin)
 
@@ -328,15 +328,15 @@ class Governor:
 
     def _measure(self) -> None:
         used = time.thread_time() - self._used - self._uncounted
-        pause = used / _SHARE - (time.monotonic() - self._seen)
-        if self._seen and pause > 0.0 and self._training():
+        pause = used / _SHARE - (time.monotonic() - self._measured)
+        if self._measured and pause > 0.0 and self._training():
             time.sleep(min(pause, _LONGEST_PAUSE))
-        self._used, self._seen, self._uncounted = time.thread_time(), time.monotonic(), 0.0
+        self._used, self._measured, self._uncounted = time.thread_time(), time.monotonic(), 0.0
         self._loop.call_later(_TICK, self._measure)
 
     @contextlib.contextmanager
     def uncounted(self) -> Iterator[None]:
-        """A context for work that the training requests: its time is not counted."""
+        """A context for work on behalf of the training: its time does not count."""
         before = time.thread_time()
         try:
             yield

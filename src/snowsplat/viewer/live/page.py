@@ -311,7 +311,7 @@ class Controls:
                 continue  # another photo was requested meanwhile
             self._next = None
             if photo_view is not None:
-                self._photos.send(self._client, self._visitor, photo_view)
+                self._photos.go_to(self._client, self._visitor, photo_view)
                 self.follow()
 
     def follow(self) -> None:

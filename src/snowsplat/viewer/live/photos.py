@@ -1,4 +1,4 @@
-"""The cameras of the photos: as frustums in the scene, and as views to go to."""
+"""The cameras of the photos: frustums in the scene, and views to which a browser can go."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LENGTH = 0.6  # length of a frustum, relative to the distance of neighbouring c
 _LONGEST = 0.06  # maximum length of a frustum, relative to the extent of the scene
 _MOST = 400  # maximum number of frustums
 _SMALL = 96  # pixels: longer side of the thumbnails in frustums
-_READING = 0.2  # share of the time for reading thumbnails while a training runs
+_READING = 0.2  # share of the time for reading thumbnails during training
 
 
 class Photos:
@@ -135,9 +135,9 @@ class Photos:
         width, height = (now.width, now.height) if now else (view.camera.width, view.camera.height)
         return PhotoView(index, view.camera, photo, self._pose(view.camera, width, height))
 
-    def send(self, client: viser.ClientHandle, visitor: Visitor, photo_view: PhotoView) -> None:
+    def go_to(self, client: viser.ClientHandle, visitor: Visitor, photo_view: PhotoView) -> None:
         """Move the browser to the pose of the photo."""
-        self._session.send(visitor, photo_view)
+        self._session.set_photo_view(visitor, photo_view)
         up = -photo_view.camera.cam_from_world[1, :3].detach()
         with client.atomic():
             client.camera.fov = photo_view.pose.fov

@@ -1,7 +1,7 @@
 """The state of the browsers and of the training, and the choice of the next image to render.
 
-The server's thread changes this state when browsers send messages; the training thread reads it
-between two steps. This module does not render or send images, and does not depend on viser.
+The thread of the server changes this state when browsers send messages. The thread of the training
+reads it between two steps. This module does not render or send images and does not depend on viser.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from snowsplat.viewer.live.display import DisplaySettings, Pose, fit
 
 STILL = 0.2  # seconds without motion after which a camera counts as still
 _MOVE_SECONDS = 2.0  # maximum time until a browser is at the pose of a photo
-_MOVING_SECONDS = 0.05  # maximum time to render while the camera moves; the size is reduced to it
-_SMALLEST = 160  # pixels: minimum of the longer side of such a reduced image
-# Images are "requested" if a user moved the camera or changed a setting, and "idle" if only the
+# While the camera moves, images are made so small that rendering takes at most this many seconds.
+_MOVING_SECONDS = 0.05
+_SMALLEST = 160  # pixels: minimum of the longer side of such an image
+# An image is "requested" if a user moved the camera or changed a setting, and "idle" if only the
 # scene has changed.
-IDLE_SHARE = 0.05  # maximum share of the time of a training run for idle images
+IDLE_SHARE = 0.05  # maximum share of the training time for idle images
 _IDLE_SECONDS = 1.0  # minimum time between two idle images
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoView:
-    """The view at the position of a photo.
+    """A browser at the position of a photo, so that both can be compared.
 
     Attributes:
         index: index of the photo in the viewer's list.
@@ -45,12 +46,12 @@ class PhotoView:
 
 
 @dataclass(frozen=True)
-class Due:
+class RenderRequest:
     """An image to render for a browser.
 
     Attributes:
-        kind: "moving": small, because the camera moves; "still": full size; "idle": full size,
-            because only the scene has changed.
+        kind: "moving": a small image, because the camera moves; "still": full size; "idle": full
+            size, because only the scene has changed.
         version: `Visitor.version` when the image was requested.
     """
 
@@ -71,8 +72,8 @@ class Visitor:
     pose: Pose | None = None
     display: DisplaySettings = field(default_factory=DisplaySettings)
     photo_view: PhotoView | None = None
-    arrived: bool = False  # is at the pose of the photo; further motion ends the photo view
-    sent: float = 0.0  # time when the browser was moved to the photo
+    arrived: bool = False  # the browser is at the pose of the photo; motion ends the photo view
+    photo_view_since: float = 0.0  # time when the browser was moved to the photo
     longest: int = 1280  # pixels of the longer side of a full-size image
     sending: bool = False  # the last image is being sent
     version: int = 0  # incremented with each change of the attributes above
@@ -83,7 +84,7 @@ class Visitor:
     shown_scene: int = -1
     seconds_per_pixel: float = 0.0
 
-    def due(self, scene: int, now: float) -> Due | None:
+    def request(self, scene: int, now: float) -> RenderRequest | None:
         """The image that is needed at the time ``now``, if any."""
         if self.pose is None or self.sending:
             return None
@@ -98,7 +99,9 @@ class Visitor:
             kind, size = "idle", full
         else:
             return None
-        return Due(self, kind, *size, self.version, self.pose, self.display, self.photo_view)
+        return RenderRequest(
+            self, kind, *size, self.version, self.pose, self.display, self.photo_view
+        )
 
     def _moving_size(self, full: tuple[int, int]) -> tuple[int, int]:
         """A size that renders fast enough, from the times of previous images."""
@@ -108,11 +111,11 @@ class Visitor:
         scale = min(1.0, (pixels / (full[0] * full[1])) ** 0.5)
         return fit(*full, max(round(max(full) * scale), _SMALLEST))
 
-    def shown(self, due: Due, scene: int, seconds: float) -> None:
+    def record_rendering(self, request: RenderRequest, scene: int, seconds: float) -> None:
         """Record that the image was rendered in ``seconds``."""
-        self.shown_version, self.shown_scene = due.version, scene
-        self.shown_full = due.kind != "moving"
-        cost = seconds / (due.width * due.height)
+        self.shown_version, self.shown_scene = request.version, scene
+        self.shown_full = request.kind != "moving"
+        cost = seconds / (request.width * request.height)
         before = self.seconds_per_pixel or cost
         self.seconds_per_pixel = before + 0.3 * (cost - before)
 
@@ -126,9 +129,10 @@ class Session:
         self._visitors: dict[int, Visitor] = {}
         self._paused = False
         self._steps = 0  # single steps that are allowed while paused
-        self.training = False  # whether a training run is running or paused
+        self.training = False  # whether training is running or paused
         self.share = 0.5  # maximum share of the time for requested images during training
-        self._free_at = {"requested": 0.0, "idle": 0.0}  # time at which the next image is allowed
+        # For each budget, the time from which the next image is allowed:
+        self._next_allowed = {"requested": 0.0, "idle": 0.0}
         self.busy = False  # whether a browser is connected or the training is paused
 
     # From the browsers
@@ -156,19 +160,19 @@ class Session:
             self._notify()
 
     def move(self, visitor: Visitor, pose: Pose) -> None:
-        """Set the pose of a browser; motion away from the photo ends the photo view."""
+        """Set the pose of a browser. If it moves away from the photo, the photo view ends."""
         photo_view, arrived = visitor.photo_view, visitor.arrived
         if photo_view is not None:
             if pose.is_near(photo_view.pose):
                 arrived = True
             # Poses that the browser sent before it was moved to the photo are ignored here.
-            elif arrived or self._clock() - visitor.sent > _MOVE_SECONDS:
+            elif arrived or self._clock() - visitor.photo_view_since > _MOVE_SECONDS:
                 photo_view = None
         self.change(visitor, pose=pose, photo_view=photo_view, arrived=arrived)
 
-    def send(self, visitor: Visitor, photo_view: PhotoView) -> None:
-        """Record that the browser is being moved to a photo."""
-        self.change(visitor, photo_view=photo_view, arrived=False, sent=self._clock())
+    def set_photo_view(self, visitor: Visitor, photo_view: PhotoView) -> None:
+        """Record that a browser is moved to the pose of a photo."""
+        self.change(visitor, photo_view=photo_view, arrived=False, photo_view_since=self._clock())
 
     def pause(self) -> None:
         """Pause the training after the current step."""
@@ -217,57 +221,55 @@ class Session:
         with self._changed:
             return visitor in self._visitors.values()
 
-    def next_due(self, scene: int, training: bool) -> Due | None:
+    def next_request(self, scene: int, training: bool) -> RenderRequest | None:
         """The next image to render; None if there is none, or if the training has to run first.
 
         Args:
             scene: a number that changes when the scene changes.
-            training: whether a training run is waiting to continue.
+            training: whether the training waits to continue.
         """
         now = self._clock()
         with self._changed:
-            found = [due for v in self._visitors.values() if (due := v.due(scene, now))]
+            found = [request for v in self._visitors.values() if (request := v.request(scene, now))]
         if training:
-            found = [due for due in found if now >= self._free_at[_budget_of(due)]]
+            found = [request for request in found if now >= self._next_allowed[_budget_of(request)]]
         # Moving cameras first, then the visitor that has waited longest.
         order = ("moving", "still", "idle")
         return min(
-            found, key=lambda due: (order.index(due.kind), due.visitor.changed), default=None
+            found,
+            key=lambda request: (order.index(request.kind), request.visitor.changed),
+            default=None,
         )
 
-    def spent(self, due: Due, scene: int, seconds: float) -> None:
+    def record_rendering(self, request: RenderRequest, scene: int, seconds: float) -> None:
         """Record that an image was rendered in ``seconds``."""
         with self._changed:
-            due.visitor.shown(due, scene, seconds)
-        self.charge(_budget_of(due), seconds)
+            request.visitor.record_rendering(request, scene, seconds)
+        self.charge(_budget_of(request), seconds)
 
-    def send_to(self, visitor: Visitor) -> None:
-        """Record that an image is being sent: there is no other image for it until `sent`."""
+    def begin_sending(self, visitor: Visitor) -> None:
+        """Record that an image is being sent; the browser gets no other until `end_sending`."""
         with self._changed:
             visitor.sending = True
 
-    def sent(self, due: Due, seconds: float) -> None:
+    def end_sending(self, request: RenderRequest, seconds: float) -> None:
         """Record that an image was sent, ``seconds`` after rendering began."""
-        self.charge(_budget_of(due), seconds)
+        self.charge(_budget_of(request), seconds)
         with self._changed:
-            due.visitor.sending = False
+            request.visitor.sending = False
             self._notify()
 
-    def may_spend(self, budget: Literal["requested", "idle"]) -> bool:
-        """Whether an image may be rendered: the training has used its share since the last one."""
-        return self._clock() >= self._free_at[budget]
-
     def charge(self, budget: Literal["requested", "idle"], seconds: float) -> None:
-        """Reserve time for the training, so that images do not exceed their share of the time.
+        """Reserve time for training, so that rendering does not exceed its share of the time.
 
         Requested images also delay the next idle image.
         """
         now = self._clock()
         share = min(max(self.share, 0.01), 1.0)
         if budget == "requested":
-            self._free_at["requested"] = now + seconds * (1.0 / share - 1.0)
+            self._next_allowed["requested"] = now + seconds * (1.0 / share - 1.0)
         pause = max(_IDLE_SECONDS, seconds * (1.0 / min(share, IDLE_SHARE) - 1.0))
-        self._free_at["idle"] = max(self._free_at["idle"], now + pause)
+        self._next_allowed["idle"] = max(self._next_allowed["idle"], now + pause)
 
     def wait(self, seconds: float) -> None:
         """Wait until the state changes, at most ``seconds``."""
@@ -275,5 +277,5 @@ class Session:
             self._changed.wait(seconds)
 
 
-def _budget_of(due: Due) -> Literal["requested", "idle"]:
-    return "idle" if due.kind == "idle" else "requested"
+def _budget_of(request: RenderRequest) -> Literal["requested", "idle"]:
+    return "idle" if request.kind == "idle" else "requested"

@@ -1,4 +1,4 @@
-"""`TrainingViewer`: updates the page between two steps of a training run."""
+"""`TrainingViewer`: updates the page between two training steps."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import math
 import time
 
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.util.process import let_interrupt
+from snowsplat.util.process import raise_deferred_interrupt
 from snowsplat.viewer.live.curves import Curve, SampledPsnr
 from snowsplat.viewer.live.page import TrainingPanel
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
-_SECONDS = 1.0  # between two updates of the figures
-_PSNR_SHARE = 0.03  # of the time for measuring PSNR
-_LOSS_STEPS = 50  # over which the displayed loss is averaged, approximately
-_RATE_SECONDS = 3.0  # over which the displayed rate is averaged, approximately
+_SECONDS = 1.0  # time between two updates of the displayed numbers
+_PSNR_SHARE = 0.03  # share of the time for measuring PSNR
+_LOSS_STEPS = 50  # approximate number of steps over which the displayed loss is averaged
+_RATE_SECONDS = 3.0  # approximate time over which the displayed steps per second are averaged
 
 
 class TrainingViewer:
-    """Shows and pauses a training run; call `after_step` after each step."""
+    """Shows training on the page and can pause it; call `after_step` after each step."""
 
     def __init__(self, viewer: NetworkViewer, sampled_psnr: SampledPsnr) -> None:
         self.viewer = viewer
@@ -34,7 +34,7 @@ class TrainingViewer:
         self._measured = 0  # step of the last PSNR
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
-        """Render the images that are due, and wait while the training is paused.
+        """Render the requested images, and wait while the training is paused.
 
         Args:
             step: number of finished steps.
@@ -42,10 +42,10 @@ class TrainingViewer:
             loss: the loss of this step.
 
         Returns:
-            Seconds for which it was paused.
+            Seconds for which the training was paused.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C while it was paused.
+            KeyboardInterrupt: Ctrl-C while the training was paused.
         """
         self._losses.add(step, loss)
         before = loss if math.isnan(self._loss) else self._loss
@@ -62,12 +62,12 @@ class TrainingViewer:
             self._update_panel(step, steps, gaussians)
             if not self.viewer.serve(gaussians, step, training=False):
                 self.viewer.wait()
-            let_interrupt()
+            raise_deferred_interrupt()
             if self._session.may_step():
                 return time.monotonic() - started
 
     def _update_panel(self, step: int, steps: int, gaussians: Gaussians) -> None:
-        """Update figures and curves, at most once per `_SECONDS`."""
+        """Update the displayed numbers and curves, at most once per `_SECONDS`."""
         now = time.monotonic()
         if now < self._next:
             return
@@ -97,10 +97,10 @@ class TrainingViewer:
         return self._rate
 
     def end(self, step: int, gaussians: Gaussians) -> None:
-        """Show the result of the finished training run until Ctrl-C, which is raised."""
+        """Show the result of training until Ctrl-C; KeyboardInterrupt is raised."""
         self._session.training = False
         self._session.resume()
         self._panel.end()
         about = [f"Finished after {step:,} steps", f"{len(gaussians):,} Gaussians"]
         scene = Scene(gaussians, step, about)
-        self.viewer.hold(lambda: scene)
+        self.viewer.show_newest(lambda: scene)

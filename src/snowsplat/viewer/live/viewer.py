@@ -1,4 +1,4 @@
-"""`NetworkViewer`: a page for any number of browsers, and the images that they wait for."""
+"""`NetworkViewer`: a page for any number of browsers, and the images that they request."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ import viser
 from snowsplat.data import Dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.viewer.live.display import Pose
-from snowsplat.viewer.live.guard import Governor, call_in_server_thread
+from snowsplat.viewer.live.guard import ServerTimeLimit, call_in_server_thread
 from snowsplat.viewer.live.key_cameras import KeyCameras
 from snowsplat.viewer.live.page import Controls, ScenePanel
 from snowsplat.viewer.live.photos import Photos, placed_photo
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.server import start_server, stop_server
-from snowsplat.viewer.live.session import Due, Session, Visitor
+from snowsplat.viewer.live.session import RenderRequest, Session, Visitor
 
 _QUALITY = {"moving": 60, "still": 90, "idle": 90}  # of JPEG images
-_TICK = 0.02  # seconds between two checks for images that are due
+_TICK = 0.02  # seconds between two checks for requested images
 _LONG_TICK = 0.5  # the same without browsers
 _POLL = 2.0  # seconds between two checks for a newer scene
-_SMALL = 1e-9  # norms of quaternions must be above this; these and distances below its inverse
+# Norms of quaternions must be above this value. Norms and distances must be below its inverse.
+_SMALL = 1e-9
 
 _log = logging.getLogger(__name__)
 
@@ -50,10 +51,10 @@ class NetworkViewer:
     """A page at `url` that shows Gaussians.
 
     Attributes:
-        others: its address for other machines, if they can connect at another address.
+        others: the address of the page for other machines, if it differs from `url`.
 
-    Images are rendered by `serve` and `hold` in the calling thread only: nothing reads the
-    Gaussians while they change, and no copy is needed.
+    Images are rendered only in the thread that calls `serve` or `show_newest`. So the Gaussians do
+    not change during rendering, and no copy of them is needed.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class NetworkViewer:
         """
         Args:
             dataset: its cameras and photos are shown in the scene.
-            background: behind the Gaussians, 0..1.
+            background: the colour behind the Gaussians, 0..1.
             host: address at which to listen.
             port: None takes 8080, or the next free port.
             label: title of the page.
@@ -95,7 +96,7 @@ class NetworkViewer:
         self._photos.on_click(self._clicked)
         self.server.on_client_connect(self._entered)
         self.server.on_client_disconnect(self._left)
-        self._governor = Governor(self.server, lambda: self.session.training)
+        self._time_limit = ServerTimeLimit(self.server, lambda: self.session.training)
         running.open()
 
     def close(self) -> None:
@@ -103,7 +104,8 @@ class NetworkViewer:
         self._photos.close()
         stop_server(self.server)
 
-    # In the server's thread: events are processed in order, no faster than messages are read
+    # In the thread of the server. Events are processed in order; the next message is read when the
+    # previous one is processed.
 
     async def _entered(self, client: viser.ClientHandle) -> None:
         visitor = self.session.enter(client.client_id)
@@ -130,17 +132,17 @@ class NetworkViewer:
         if browser is not None:
             browser[2].go_to_photo(index)
 
-    def _send(self, due: Due, picture: np.ndarray, drawing: float) -> None:
+    def _send(self, request: RenderRequest, picture: np.ndarray, drawing: float) -> None:
         started = time.monotonic()
-        client = next((c for c, v, _ in self._browsers.values() if v is due.visitor), None)
+        client = next((c for c, v, _ in self._browsers.values() if v is request.visitor), None)
         try:
-            if client is not None:  # else it has disconnected meanwhile
-                quality = _QUALITY[due.kind]
-                with self._governor.uncounted():
+            if client is not None:  # None: the browser has disconnected
+                quality = _QUALITY[request.kind]
+                with self._time_limit.uncounted():
                     client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
                 client.flush()
         finally:
-            self.session.sent(due, drawing + time.monotonic() - started)
+            self.session.end_sending(request, drawing + time.monotonic() - started)
 
     # In the caller's thread
 
@@ -149,42 +151,42 @@ class NetworkViewer:
 
         Args:
             scene: a number that changes when the Gaussians do.
-            training: the training waits to continue and gets its share of the time.
+            training: whether the training waits to continue; then it gets its share of the time.
         """
-        due = self.session.next_due(scene, training)
-        if due is None:
+        request = self.session.next_request(scene, training)
+        if request is None:
             return False
         started = time.monotonic()
         try:
-            picture = self._draw(due, gaussians)
-            self.session.send_to(due.visitor)
+            picture = self._draw(request, gaussians)
+            self.session.begin_sending(request.visitor)
             seconds = time.monotonic() - started
-            call_in_server_thread(self.server, lambda: self._send(due, picture, seconds))
-        except Exception:  # an unusual request of a browser must not end the training
+            call_in_server_thread(self.server, lambda: self._send(request, picture, seconds))
+        except Exception:  # an invalid request of a browser must not end the training
             _log.debug("an image was not rendered", exc_info=True)
-        self.session.spent(due, scene, time.monotonic() - started)
+        self.session.record_rendering(request, scene, time.monotonic() - started)
         return True
 
-    def _draw(self, due: Due, gaussians: Gaussians) -> np.ndarray:
-        if due.photo_view is None:
-            camera = due.pose.camera(due.width, due.height)
-            return draw(gaussians, camera, due.display, self.background)
-        photo = placed_photo(due.photo_view, due.width, due.height)
-        camera = photo.placed.camera(due.photo_view.camera, due.width, due.height)
-        return draw(gaussians, camera, due.display, self.background, photo)
+    def _draw(self, request: RenderRequest, gaussians: Gaussians) -> np.ndarray:
+        if request.photo_view is None:
+            camera = request.pose.camera(request.width, request.height)
+            return draw(gaussians, camera, request.display, self.background)
+        photo = placed_photo(request.photo_view, request.width, request.height)
+        camera = photo.placed.camera(request.photo_view.camera, request.width, request.height)
+        return draw(gaussians, camera, request.display, self.background, photo)
 
     def wait(self) -> None:
         """Wait for a change, or a fraction of a second."""
         self.session.wait(_TICK if self.session.visitors else _LONG_TICK)
 
-    def hold(self, newest: Callable[[], Scene]) -> None:
-        """Show the newest scene until Ctrl-C, which is raised."""
+    def show_newest(self, newest: Callable[[], Scene]) -> None:
+        """Show the scene that ``newest`` returns, until Ctrl-C; KeyboardInterrupt is raised."""
         panel = ScenePanel(self.server)
-        scene, looked = None, 0.0
+        scene, checked = None, 0.0
         while True:
-            if time.monotonic() - looked > _POLL:
+            if time.monotonic() - checked > _POLL:
                 before, scene = scene, newest()
-                looked = time.monotonic()
+                checked = time.monotonic()
                 if scene != before:
                     panel.show(scene.about)
             assert scene is not None
