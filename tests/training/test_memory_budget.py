@@ -66,7 +66,7 @@ def test_sizes_are_formatted() -> None:
 def test_without_a_budget_nothing_is_reduced() -> None:
     config = recipe("default")
     plan = plan_memory(dataset_of(100, 1000, 500), config, DEVICE, available=10**10)
-    assert plan.given_up == ()
+    assert plan.reductions == ()
     assert plan.photos == 100 * 3 * 1000 * 500
     assert plan.config.image_memory == config.image_memory
     assert plan.limit is not None
@@ -122,13 +122,13 @@ def test_photos_are_reduced_before_gaussians() -> None:
     dataset = dataset_of(200, 1000, 1000)  # 600 MB of photos
     config = recipe("default", max_gaussians=200_000)
     wide = plan_memory(dataset, config, DEVICE, available=10**10, budget=2 * 10**9)
-    assert wide.given_up == ()
+    assert wide.reductions == ()
     narrow = plan_memory(dataset, config, DEVICE, available=10**10, budget=900_000_000)
-    assert len(narrow.given_up) == 1
+    assert len(narrow.reductions) == 1
     assert narrow.config.density.max_gaussians == 200_000
     assert narrow.config.image_memory == narrow.photos < 600_000_000
     least = plan_memory(dataset, config, DEVICE, available=10**10, budget=500_000_000)
-    assert len(least.given_up) == 2
+    assert len(least.reductions) == 2
     assert 1000 <= least.config.density.max_gaussians < 200_000
     for plan, budget in ((wide, 2e9), (narrow, 9e8), (least, 5e8)):
         assert plan.total <= budget
@@ -155,7 +155,7 @@ def test_gaussians_of_a_resumed_training_have_to_fit() -> None:
     dataset, config = dataset_of(9, 100, 100), recipe("default", max_gaussians=50_000)
     unlimited = plan_memory(dataset, config, DEVICE, 10**10)
     plan = plan_memory(dataset, config, DEVICE, 10**10, unlimited.total, present=50_000)
-    assert plan.given_up == ()
+    assert plan.reductions == ()
     with pytest.raises(
         SettingError, match=r"to resume with 50,000 Gaussians, which need \d+ MB; use more$"
     ):

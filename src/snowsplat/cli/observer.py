@@ -72,7 +72,7 @@ class TerminalObserver(Observer):
             f"{result.scene}: {result.gaussians:,} Gaussians, {count} in "
             f"{duration(result.seconds)}, {result.memory}"
         )
-        for line in result.given_up:
+        for line in result.reductions:
             print(f"for lack of memory: {line}")
         print(f"{result.report}: the report of the training")
         if result.evaluation is not None:

@@ -1,6 +1,7 @@
-"""The numerical operations on tensors, as native kernels, with a PyTorch reference in `reference`.
+"""The numerical operations on tensors: native kernels, and a PyTorch reference in `reference`.
 
-`project` → `Splats2D` → `rasterize` → `photometric_loss`, and `adam_step` back to the parameters.
+Forward: `project` → `Splats2D` → `rasterize` → `photometric_loss`. `adam_step` propagates the
+gradient of the splats to the parameters and updates them.
 """
 
 from snowsplat.ops.adam import adam_step

@@ -34,5 +34,5 @@ def check_size(op: str, width: int, height: int) -> None:
 
 
 def variant(name: str, tensor: Tensor) -> str:
-    """The native entry for the dtype of `tensor`."""
+    """The name of the native entry for the dtype of `tensor`."""
     return name if tensor.dtype == torch.float32 else name + "_f64"

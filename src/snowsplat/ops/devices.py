@@ -1,4 +1,4 @@
-"""Selects the device to compute on."""
+"""Selects the device for the computation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def default_device(note: Callable[[str], None] | None = None) -> torch.device:
     """The GPU, or the CPU if there is no usable GPU.
 
     Args:
-        note: called with a line of text if there is a GPU that cannot be used.
+        note: called with a line of text if there is a GPU but it cannot be used.
     """
     index = _current_index()
     why = availability.why_unusable(index)
@@ -29,7 +29,7 @@ def default_device(note: Callable[[str], None] | None = None) -> torch.device:
 def resolve_device(
     text: str | None = None, note: Callable[[str], None] | None = None
 ) -> torch.device:
-    """The device for a user's choice: "cpu", "cuda", "cuda:1"; None: the best available one.
+    """The device that a user chose: "cpu", "cuda" or "cuda:1"; None: the best available device.
 
     If `text` is None, the environment variable SNOWSPLAT_DEVICE is used.
 
@@ -61,5 +61,5 @@ def resolve_device(
 
 
 def _current_index() -> int:
-    """The index of "cuda": torch's current device, or 0 if torch has not initialised the driver."""
+    """The index of device "cuda": torch's current device, or 0 if the driver is not initialised."""
     return torch.cuda.current_device() if torch.cuda.is_initialized() else 0

@@ -1,9 +1,9 @@
-"""The layout of structs of parameters: packing for a kernel, and the check against the library.
+"""The layout of structs of parameters: packs them for a kernel, and checks that libraries match.
 
-A struct is a dataclass that inherits `Params`; `native/params.h` has the same struct in C++. Every
-field has 8 bytes: a tensor is passed as data pointer, None as null pointer, int and bool as int64,
-float as double, a nested struct as its fields. `Layout.hash` is the number that `layout_of` in
-`native/layout.h` computes from the names, kinds and offsets of the fields.
+A struct is a dataclass that inherits from `Params`; `native/params.h` has the same struct in C++.
+Every field has 8 bytes: a tensor is passed as a data pointer, None as a null pointer, int and bool
+as int64, float as double, and a nested struct as its fields. `Layout.hash` is a hash of the names,
+kinds and offsets of the fields; `layout_of` in `native/layout.h` computes the same hash.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from typing import Any, get_args, get_type_hints
 
 import torch
 
-# Constants that Python and C++ share; native/layout.h hashes them too.
+# Constants that Python and C++ share; they are part of the hash.
 TILE = 16
 """Edge of a tile in pixels."""
 GROUP_CHANNELS = 4
-"""Channels that one rasterization pass carries at most."""
+"""Maximum number of channels of one rasterization pass."""
 SLOT_WIDTH = 16
-"""Scalars of the gradient of one splat in one tile."""
+"""Numbers of the gradient of an instance."""
 PACKED_HEADER = 8
 """Columns of `Splats2D.packed` before the colours."""
 PACKED_STRIDE = 16
-"""Columns of `Splats2D.packed` come in multiples of this."""
+"""The number of columns of `Splats2D.packed` is a multiple of this."""
 POSE_SUMS = 15
-"""Numbers that make the gradient of a pose: 9 for R, 3 for t, 3 for the camera's position."""
+"""Number of sums for the gradient of a pose: 9 for R, 3 for t, 3 for the camera's position."""
 MAX_NEIGHBOURS = 64
 """Largest k of `nearest_neighbours.neighbours`."""
 
@@ -45,11 +45,11 @@ _CONSTANTS = {
 
 _WORD = 8  # bytes of a field
 LARGEST_PARAMS = 1024
-"""Bytes that every struct fits into."""
+"""Maximum size of a struct in bytes."""
 
 
 class Params:
-    """The parameters of an operation: the base of dataclasses with one field per member."""
+    """The parameters of an operation: the base class of dataclasses with one field per member."""
 
     __slots__ = ()
 
@@ -66,7 +66,7 @@ class Layout:
         self.size = _WORD * len(leaves)
         # Indices of the fields that are tensors.
         self.pointers = tuple(i for i, kind in enumerate(self.kinds) if kind == "p")
-        #: params → the values of all fields.
+        #: Returns the values of all fields of a struct.
         self.values: Callable[[Params], tuple[Any, ...]] = _getter(names)
         self._format = struct.Struct("=" + self.kinds.translate({112: "Q", 105: "q", 100: "d"}))
         text = "".join(f"{name}={value};" for name, value in _CONSTANTS.items())
@@ -143,7 +143,7 @@ def _describe(params: type[Params]) -> str:
 
 
 def _fields(params: type[Params]) -> Iterator[tuple[str, str | type[Params]]]:
-    """(name, kind) of the fields: p(ointer), i(nt64), d(ouble), or the nested struct."""
+    """(name, kind) of the fields. Kinds: "p" pointer, "i" int64, "d" double, or a nested struct."""
     hints = get_type_hints(params)
     for field in fields(params):  # type: ignore[arg-type]  # every subclass is a dataclass
         yield field.name, _kind(hints[field.name])

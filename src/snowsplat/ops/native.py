@@ -1,9 +1,10 @@
-"""Launches native functions, on the CPU or on a GPU: the only place where the device decides.
+"""Launches native functions on the CPU or on a GPU. Only this module distinguishes devices.
 
 The CPU has one shared library per instruction set in `snowsplat/_lib`. All have the same entries:
-C functions that take a pointer to a struct of parameters (`ops/params.py`) and return an int64. The
-best one that the machine runs is loaded at the first launch; the environment variable SNOWSPLAT_ISA
-(avx512, avx2 or baseline) forces one. A GPU has the same entries: see `ops/cuda`.
+C functions that take a pointer to a struct of parameters (`ops/params.py`) and return an int64. At
+the first launch, the best library that the machine supports is loaded. The environment variable
+SNOWSPLAT_ISA (avx512, avx2 or baseline) selects another one. A GPU has the same entries: see
+`ops/cuda`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ ISAS = ("baseline", "avx2", "avx512")
 
 _LIBRARIES = Path(__file__).resolve().parent.parent / "_lib"
 _lock = threading.RLock()
-# The functions launched so far, and their structs.
+# The functions that have been launched, and their structs.
 _functions: dict[str, tuple[Callable[[Any], int], type[Params]]] = {}
 _int = ctypes.c_int64
 
@@ -148,15 +149,15 @@ def _function(name: str) -> tuple[Callable[[Any], int], type[Params]]:
 
 
 def launch(name: str, params: Params, *, device: torch.device | None = None) -> int:
-    """Calls the native function `name` with a struct of parameters; returns its int64 result.
+    """Calls the native function `name` with a struct of parameters, and returns its int64 result.
 
-    The tensors of the struct must be contiguous and on one device, which decides where the function
-    runs; `device` names it if there is no tensor. Element types are not checked here: the function
-    for float64 tensors has the suffix `_f64`. On the CPU the interpreter lock is released during
-    the call; on a GPU the call is queued on torch's current stream.
+    The tensors of the struct must be contiguous and on one device; the function runs on this
+    device. `device` is needed if there is no tensor. Element types are not checked here: the
+    function for float64 tensors has the suffix `_f64`. On the CPU the interpreter lock is released
+    during the call; on a GPU the call is queued on torch's current stream.
 
-    Raises UserError for a device without kernels, ValueError for tensors that are not contiguous or
-    not on one device, TypeError for the struct of another function or a field of another type.
+    Raises UserError for a device without kernels; ValueError for tensors that are not contiguous or
+    not on one device; TypeError for the struct of another function or a field of another type.
     """
     layout = layout_of(type(params))
     values = layout.values(params)

@@ -12,10 +12,11 @@ from snowsplat.ops.params import NeighboursParams
 
 
 def neighbours(points: Tensor, k: int = 3) -> Tensor:
-    """Distances (N, k), ascending, from each of points (N, 3) to its k nearest others, exactly.
+    """Exact distances (N, k), ascending, from each of points (N, 3) to its k nearest other points.
 
-    A different point at the same place counts, with distance 0. Missing neighbours are inf.
-    Float32 or float64, in the units of the points. Not differentiable.
+    Another point with the same coordinates counts, with distance 0. If there are fewer than k other
+    points, the remaining distances are inf. Points are float32 or float64; distances have their
+    dtype and unit. Not differentiable.
 
     Raises ValueError for a wrong shape or dtype, k outside 1 … 64, or points that are not finite.
     """

@@ -1,7 +1,7 @@
-"""The parameters of every native operation: the structs of `native/params.h`, field by field.
+"""The parameters of every native operation: the same structs as in `native/params.h`.
 
 The meaning of the fields and the shapes of the tensors are documented there. `ENTRIES` has the
-struct of each operation; the layouts are compared when the library is loaded.
+struct of each operation. The layouts are compared when the library is loaded.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from snowsplat.ops.layout import Params
 
-# ------------------------------------------------------------------------- parts of the others
+# ------------------------------------------------------------------- parts of the structs below
 
 
 @dataclass(slots=True, kw_only=True)
@@ -303,7 +303,8 @@ class SizeQueryParams(Params):
     parts: int = 0
 
 
-#: The struct of every operation. With the suffix "_f64" those for float64 tensors take the same.
+#: The struct of every operation. The operations for float64 tensors, with the suffix "_f64", have
+#: the same structs.
 ENTRIES: dict[str, type[Params]] = {
     "project_cull": ProjectCullParams,
     "project_fwd": ProjectForwardParams,

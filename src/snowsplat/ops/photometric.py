@@ -17,9 +17,10 @@ from snowsplat.ops.params import PhotometricParams
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     """(1 − λ) · mean |a − b| + λ · (1 − SSIM), a scalar; λ is `ssim_weight` (the paper, eq. 7).
 
-    image (H, W, 3) float, target (H, W, 3) of the same dtype or uint8 (then divided by 255). Planar
-    storage, `planar.permute(1, 2, 0)`, avoids a copy. The gradient flows only to `image`; it is
-    computed together with the value, in one pass over the images.
+    image (H, W, 3): float32 or float64. target (H, W, 3): of the same dtype, or uint8, which is
+    divided by 255. If the storage is planar, as of `planar.permute(1, 2, 0)`, no copy is made. The
+    gradient flows only to `image`. It is computed together with the value, in one pass over the
+    images.
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """
@@ -30,8 +31,8 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity over pixels and channels (Wang et al. 2004), a scalar.
 
-    11×11 Gaussian window of σ = 1.5, zero padding, C₁ = 0.01², C₂ = 0.03². Arguments and errors as
-    for `photometric_loss`.
+    The window is Gaussian, 11×11 with σ = 1.5; the images are padded with zeros; C₁ = 0.01²,
+    C₂ = 0.03². Arguments and errors are as for `photometric_loss`.
     """
     return _Photometric.apply(image, target, 0.0, 1.0, "ssim")
 
@@ -85,7 +86,7 @@ class _Photometric(torch.autograd.Function):
             ),
         )
         ctx.grad = grad
-        l1, similarity = means  # tensors, because reading values would wait for a GPU
+        l1, similarity = means  # tensors, because reading their values would wait for a GPU
         return (l1_weight * l1 + ssim_weight * similarity).to(planes.dtype)
 
     @staticmethod

@@ -45,20 +45,26 @@ def project(
     sh_degree: int,
     near: float = 0.2,
 ) -> Splats2D:
-    """Projects N Gaussians to splats on a camera's image plane, without invisible ones.
+    """Projects N Gaussians to splats on a camera's image plane, without the invisible ones.
 
-    On a GPU all rows are returned, since removing rows would require waiting: rows of invisible
-    Gaussians are empty (zeros) and have the id -1.
+    On a GPU all rows are returned, because the CPU would have to wait in order to remove rows. The
+    rows of invisible Gaussians are empty (zeros) and have the id -1.
 
-    means (N, 3) in world units, log_scales (N, 3), quats (N, 4) wxyz of any length (zero: no
-    rotation), opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, K, 3), of which degree `sh_degree`
-    uses the first (sh_degree + 1)² − 1; cam_from_world (3, 4), OpenCV axes; fx, fy, cx, cy in
-    pixels; near > 0 in world units. All tensors float32, or all float64.
+    means: (N, 3) in world units.
+    log_scales: (N, 3).
+    quats: (N, 4) wxyz, not necessarily normalised; zero means no rotation.
+    opacity_logits: (N,).
+    sh_dc: (N, 1, 3).
+    sh_rest: (N, K, 3); the first (sh_degree + 1)² − 1 rows of each Gaussian are used.
+    cam_from_world: (3, 4), with the axes of OpenCV.
+    fx, fy, cx, cy: in pixels.
+    near: > 0, in world units.
+    All tensors are float32, or all are float64.
 
-    Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (Kerbl et al. 2023, eq. 5), the colour is max(0, ½ + Σ SH(direction)).
-    A Gaussian is visible if it lies beyond `near`, is at least 1/255 opaque, and the box of its
-    ellipse {α ≥ 1/255} reaches the pixel centres. Gradients flow to every tensor, including the
-    camera's pose.
+    The 2D covariance is Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (Kerbl et al. 2023, eq. 5); the colour is
+    max(0, ½ + Σ c_k Y_k(direction)). A Gaussian is visible if it lies beyond `near`, its opacity is
+    at least 1/255, and the bounding box of its ellipse {α ≥ 1/255} overlaps the rectangle of the
+    pixel centres. Gradients flow to every tensor, including the camera's pose.
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """
@@ -81,7 +87,7 @@ def camera_params(
     cy: float,
     near: float = 0.2,
 ) -> CameraParams:
-    """The camera as the native functions take it.
+    """The camera as a parameter of the native functions.
 
     Raises ValueError for an image without pixels, or a camera that is not finite or positive.
     """
@@ -196,7 +202,7 @@ def _gaussian_tensors(sh_degree: int, *parameters: Tensor) -> GaussianTensors:
 
 
 def _pose_grad(cam_from_world: Tensor, pose: Tensor | None) -> Tensor | None:
-    """(3, 4) from the kernel's sums: 9 for R, 3 for t, 3 for the camera's centre c = −Rᵀ t."""
+    """The gradient (3, 4) from the kernel's sums: 9 for R, 3 for t, 3 for the centre c = −Rᵀ t."""
     if pose is None:
         return None
     total = sum_of_rows(pose)

@@ -43,17 +43,19 @@ def rasterize(
     with_depth: bool = False,
     capacity: Capacity | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
+    """Composites splats over `background` (C,), which is black by default.
 
-    Returns image (H, W, C) of planar storage, alpha (H, W), and depth (H, W) or None. With T the
-    transmittance of the splats in front and α = min(0.99, o exp(−½ dᵀ conic d)):
-    image = Σ T α c + T_end · background, alpha = 1 − T_end, depth = Σ T α z (not divided by alpha).
-    Splats fainter than 1/255 are skipped; a pixel is finished when the next splat would leave
-    T < 1e-4 (Kerbl et al. 2023, section 6). Gradients flow to `background` and to every column of
+    The nearest splat is first; splats of equal depth are in the order of their rows. Returns image
+    (H, W, C) with planar storage, alpha (H, W), and depth (H, W) or None:
+    image = Σ T α c + T_end · background, alpha = 1 − T_end, depth = Σ T α z (not divided by alpha),
+    where T is the transmittance of the splats in front and α = min(0.99, o exp(−½ dᵀ conic d)).
+    Splats with α < 1/255 are skipped. A pixel is finished when the next splat would make T < 1e-4
+    (Kerbl et al. 2023, section 6). Gradients flow to `background` and to every column of
     `splats.packed` except the radii.
 
-    With `capacity` the CPU does not wait for a GPU to count instances. On a GPU gradients are
-    summed with atomics, in no fixed order, unless `torch.use_deterministic_algorithms` is set.
+    With `capacity`, the CPU does not wait until a GPU has counted the instances. On a GPU,
+    gradients are summed with atomic operations, in no fixed order, unless
+    `torch.use_deterministic_algorithms` is set.
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """
@@ -72,9 +74,9 @@ def rasterize(
 
 @torch.no_grad()
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
-    """(H, W) the number of splats that `rasterize` composites into each pixel (its cost).
+    """(H, W): the number of splats that `rasterize` composites into each pixel.
 
-    Splats fainter than 1/255 there, and splats behind the one that finished the pixel, are not
+    Splats with α < 1/255 in a pixel, and splats behind the one that finished the pixel, are not
     counted.
 
     Raises ValueError if shapes or dtypes do not match.
@@ -101,7 +103,7 @@ class _Frame:
     instances: int
     """Number of instances for which memory is allocated."""
     sums_in_order: bool
-    """Gradients are summed in slots, in a fixed order; else they are added atomically."""
+    """True: gradients are summed in slots, in a fixed order. False: they are added atomically."""
     instance_slot: Tensor | None
     slot_range: Tensor | None
 
@@ -109,7 +111,7 @@ class _Frame:
 def _bin_splats(
     packed: Tensor, width: int, height: int, columns: Tensor, capacity: Capacity | None
 ) -> _Frame:
-    """Sorts the splats by depth, counts the tiles that each touches, and lists them by tile.
+    """Sorts the splats by depth, counts the tiles that each splat touches, and lists them by tile.
 
     columns: (4,) the columns of `packed` for the first group of channels; -1: unused.
     """
@@ -182,7 +184,7 @@ def _bin_splats(
 def _sort_by_depth(
     packed: Tensor, width: int, height: int, columns: Tensor, records: Tensor
 ) -> Tensor:
-    """(M,) the rows of `packed`, nearest first; fills `records` on the CPU."""
+    """(M,): the rows of `packed`, nearest first. On the CPU, also fills `records`."""
     n, stride = packed.shape
     dtype = torch.int32 if packed.dtype == torch.float32 else torch.int64
     keys, keys2 = (scratch.empty((n,), dtype, packed.device) for _ in range(2))
@@ -227,7 +229,7 @@ def _with_channels(frame: _Frame, columns: Tensor) -> FrameParams:
 def _channel_groups(
     channels: int, with_depth: bool, device: torch.device
 ) -> list[tuple[int, Tensor]]:
-    """The packed columns that become image planes, up to four per pass, with their first plane."""
+    """For each pass: the index of its first image plane, and the packed columns (at most four)."""
     columns = [COLORS + c for c in range(channels)] + ([DEPTHS] if with_depth else [])
     groups = []
     for first in range(0, len(columns), GROUP_CHANNELS):
@@ -252,7 +254,7 @@ class _Rasterize(torch.autograd.Function):
         packed = packed.detach().contiguous()
         groups = _channel_groups(channels, with_depth, packed.device)
         count = channels + with_depth
-        # the background of the depth is 0
+        # The background of the depth is 0.
         background = torch.cat([background.detach(), packed.new_zeros(1)])
         planes = scratch.empty((count, height, width), packed.dtype, packed.device)
         alpha = scratch.empty((height, width), packed.dtype, packed.device)

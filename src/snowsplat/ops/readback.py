@@ -1,4 +1,4 @@
-"""`Readback`: copies values from a device to the CPU while the device continues to work."""
+"""`Readback`: copies values from a device to the CPU while the device continues to compute."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from torch import Tensor
 class Readback:
     """An asynchronous copy of a few numbers from a device to the CPU.
 
-    `start` queues the copy; `wait` waits until it is done, but not for work that was queued after
-    it: between the two, the rest of a step can be queued on a GPU. On the CPU both are immediate.
+    `start` queues the copy. `wait` waits until the copy is done, but not for work that was queued
+    after it. So the rest of a step can be queued on a GPU between the two calls. On the CPU, the
+    copy is made immediately.
     """
 
     def __init__(self, count: int, device: torch.device) -> None:

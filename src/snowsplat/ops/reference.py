@@ -1,12 +1,12 @@
-"""3D Gaussian Splatting in plain PyTorch: the reference implementation of every op.
+"""3D Gaussian Splatting in plain PyTorch: the reference of every operation.
 
-Names, arguments and results are those of `snowsplat.ops`. The functions work in any floating dtype,
-are differentiable by autograd, and are hundreds of times slower. The native kernels are tested
-against these functions in float64. From top to bottom, this file describes the method:
+Names, arguments and results are those of `snowsplat.ops`. The functions work in any floating dtype
+and are differentiable by autograd, but are hundreds of times slower. Tests compare the native
+kernels with these functions in float64. From top to bottom, this file describes the method:
 
     project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
     rasterize       2D splats → image            α, T, C             Kerbl et al. 2023, §6, eq. 2–3
-    count_blended   its cost per pixel
+    count_blended   the number of blended splats per pixel
     photometric_loss, ssim                       L1, D-SSIM          Kerbl et al. 2023, eq. 7;
                                                                      Wang et al. 2004
     neighbours      the initial size             Kerbl et al. 2023, §5.1
@@ -32,11 +32,11 @@ from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.layout import TILE
 from snowsplat.ops.splats import Splats2D
 
-LOW_PASS = 0.3  # pixels²: blurs every splat, so that none falls between pixel centres
+LOW_PASS = 0.3  # pixels²: blurs every splat, so that it covers at least one pixel centre
 ALPHA_MIN = 1 / 255  # smaller contributions do not change an 8-bit image and are skipped
 ALPHA_MAX = 0.99  # so that 1 − α, and with it the transmittance, is never 0
-TRANSMITTANCE_MIN = 1e-4  # a pixel is finished when its transmittance would be lower
-JACOBIAN_MARGIN = 0.15  # of the image size: J is clamped farther outside of the image
+TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance becomes lower
+JACOBIAN_MARGIN = 0.15  # fraction of the image size; J is clamped beyond this margin
 QUAT_EPS = 1e-12
 
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
@@ -75,16 +75,16 @@ def project(
     sh_degree: int,
     near: float = 0.2,
 ) -> Splats2D:
-    """Projects N Gaussians to splats on a camera's image plane, without invisible ones.
+    """Projects N Gaussians to splats on a camera's image plane, without the invisible ones.
 
-    means (N, 3) world, log_scales (N, 3), quats (N, 4) wxyz of any length (zero: no rotation),
-    opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, K, 3), of which degree `sh_degree` uses the
-    first (sh_degree + 1)² − 1; cam_from_world (3, 4); fx, fy, cx, cy in pixels; near > 0 in world
-    units.
+    means (N, 3) in world units; log_scales (N, 3); quats (N, 4) wxyz, not necessarily normalised
+    (zero: no rotation); opacity_logits (N,); sh_dc (N, 1, 3); sh_rest (N, K, 3), whose first
+    (sh_degree + 1)² − 1 rows are used; cam_from_world (3, 4); fx, fy, cx, cy in pixels; near > 0 in
+    world units.
 
-    A Gaussian is visible if it lies beyond `near`, has an opacity ≥ 1/255, and the box around its
-    ellipse {α ≥ 1/255} reaches the pixel centres. A Gaussian whose 2D covariance overflows the
-    dtype is not visible.
+    A Gaussian is visible if it lies beyond `near`, its opacity is ≥ 1/255, and the bounding box of
+    its ellipse {α ≥ 1/255} overlaps the rectangle of the pixel centres. A Gaussian whose 2D
+    covariance overflows the dtype is not visible.
     """
     if sh_rest.shape[1] < (sh_degree + 1) ** 2 - 1:
         raise ValueError(
@@ -100,8 +100,8 @@ def project(
         half_extent = _half_extents(variances, splats.opacities)
         last = torch.tensor([width - 0.5, height - 0.5]).to(means)
         touches = (splats.means2d + half_extent >= 0.5) & (splats.means2d - half_extent <= last)
-        ids = ids[touches.all(dim=1)]  # comparisons with NaN are false: invisible
-    # Recomputed for the visible rows only, so that no NaN gradient comes from behind the camera.
+        ids = ids[touches.all(dim=1)]  # comparisons with NaN are false: not visible
+    # Computed again for the visible rows only: otherwise the other rows could give NaN gradients.
     splats, _ = _project_rows([p[ids] for p in parameters], *view)
     return Splats2D(splats.packed, ids.to(torch.int32), splats.channels)
 
@@ -131,8 +131,8 @@ def _project_rows(
     # Σ = R S Sᵀ Rᵀ (eq. 6), represented by its factor R S. (M, 3, 3)
     RS = _rotation_matrices(quats) * log_scales.exp()[:, None, :]
 
-    # J, the affine approximation of the projection at the centre (Zwicker et al. 2001, eq. 29). Far
-    # outside of the image it is unbounded, so the ratios are clamped near the border. (M, 2, 3)
+    # J, the affine approximation of the projection at the centre (Zwicker et al. 2001, eq. 29). It
+    # is unbounded far outside of the image, so x/z and y/z are clamped near the border. (M, 2, 3)
     x_margin, y_margin = JACOBIAN_MARGIN * width, JACOBIAN_MARGIN * height
     tx = (x / z).clamp(-(cx + x_margin) / fx, (width - cx + x_margin) / fx)
     ty = (y / z).clamp(-(cy + y_margin) / fy, (height - cy + y_margin) / fy)
@@ -140,11 +140,11 @@ def _project_rows(
     J_rows = [fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z]
     J = torch.stack(J_rows, dim=1).reshape(-1, 2, 3)
 
-    # Σ' = J W Σ Wᵀ Jᵀ (eq. 5) plus the low-pass filter, with U = J W R S so that Σ' = U Uᵀ + 0.3 I.
+    # Σ' = J W Σ Wᵀ Jᵀ (eq. 5) plus the low-pass filter: Σ' = U Uᵀ + 0.3 I with U = J W R S.
     u0, u1 = (J @ W @ RS).unbind(dim=1)  # (M, 3) each
     xx, xy, yy = (u0 * u0).sum(dim=1), (u0 * u1).sum(dim=1), (u1 * u1).sum(dim=1)
-    # det Σ' = |u0 × u1|² + 0.3 (xx + yy) + 0.3². The expanded form xx·yy − xy² loses precision for
-    # thin splats.
+    # det Σ' = |u0 × u1|² + 0.3 (xx + yy) + 0.3². The formula xx·yy − xy² is inaccurate for thin
+    # splats.
     cross = torch.linalg.cross(u0, u1)
     det = (cross * cross).sum(dim=1) + LOW_PASS * (xx + yy) + LOW_PASS**2
     xx, yy = xx + LOW_PASS, yy + LOW_PASS
@@ -153,7 +153,7 @@ def _project_rows(
     variances = torch.stack([xx, yy], dim=1)
     variances = torch.where(det.isfinite()[:, None], variances, torch.nan)
 
-    # The view-dependent colour from the camera, whose position in the world is −Wᵀ t.
+    # The view-dependent colour. The position of the camera in the world is −Wᵀ t.
     directions = means + W.T @ t
     directions = directions / directions.norm(dim=1, keepdim=True)
     count = (sh_degree + 1) ** 2
@@ -167,7 +167,7 @@ def _project_rows(
 
 
 def _rotation_matrices(quats: Tensor) -> Tensor:
-    """Quaternions (M, 4) wxyz of any length to rotations (M, 3, 3). Zero gives the identity."""
+    """Rotations (M, 3, 3) of quaternions (M, 4) wxyz, which are normalised. Zero: the identity."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp(min=QUAT_EPS)).unbind(dim=1)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -209,10 +209,10 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def _half_extents(variances: Tensor, opacities: Tensor) -> Tensor:
-    """Half width and height, (M, 2) pixels, of the box around {α ≥ 1/255}; NaN if it is empty.
+    """Half width and height, (M, 2) pixels, of the bounding box of {α ≥ 1/255}; NaN if it is empty.
 
-    o exp(−½ dᵀ Σ'⁻¹ d) = 1/255 where dᵀ Σ'⁻¹ d = 2 ln(255 o): an ellipse, whose half width is
-    √(2 ln(255 o) Σ'xx).
+    o exp(−½ dᵀ Σ'⁻¹ d) = 1/255 is equivalent to dᵀ Σ'⁻¹ d = 2 ln(255 o). This is an ellipse; its
+    half width is √(2 ln(255 o) Σ'xx).
     """
     return (2 * torch.log(opacities / ALPHA_MIN)[:, None] * variances).sqrt()
 
@@ -229,12 +229,13 @@ def rasterize(
     with_depth: bool = False,
     capacity: Capacity | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Blends splats, nearest first (equal depths by row), over `background` (C,), default black.
+    """Composites splats over `background` (C,), which is black by default.
 
-    Returns image (H, W, C) of planar storage, alpha (H, W) and depth (H, W) or None. With T the
-    transmittance of the splats in front, image = Σ T α c + T_end · background,
-    alpha = 1 − T_end, depth = Σ T α z (not divided by alpha). Conics must be positive definite.
-    `capacity` is ignored: the memory always suffices.
+    The nearest splat is first; splats of equal depth are in the order of their rows. Returns image
+    (H, W, C) with planar storage, alpha (H, W), and depth (H, W) or None:
+    image = Σ T α c + T_end · background, alpha = 1 − T_end, depth = Σ T α z (not divided by alpha),
+    where T is the transmittance of the splats in front. Conics must be positive definite.
+    `capacity` is ignored, because the memory always suffices.
     """
     order = torch.argsort(splats.depths.detach(), stable=True)
     splats = Splats2D(splats.packed[order], None, splats.channels)
@@ -248,7 +249,7 @@ def rasterize(
         a, b, c = conics.unbind(dim=1)
         variances = torch.stack([c, a], dim=1) / (a * c - b * b)[:, None]  # Σ'xx, Σ'yy
         half_extent = _half_extents(variances, opacities).nan_to_num(nan=torch.inf)
-        # a margin of 1e-3, so that no pixel is missed
+        # With a margin of 1e-3, because of rounding.
         low, high = means2d - half_extent - 1e-3, means2d + half_extent + 1e-3
 
     bands = []
@@ -273,7 +274,7 @@ def rasterize(
 
 
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
-    """(H, W) the number of splats that `rasterize` blends into each pixel."""
+    """(H, W): the number of splats that `rasterize` blends into each pixel."""
     order = torch.argsort(splats.depths.detach(), stable=True)
     means2d, conics, opacities = (
         values[order] for values in (splats.means2d, splats.conics, splats.opacities)
@@ -295,15 +296,15 @@ def _pixel_centres(left: int, top: int, width: int, height: int) -> Tensor:
 def _blend_weights(
     pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """α, T before each splat, both (P, M), and T_end (P, 1) of P pixels and M sorted splats.
+    """For P pixels and M sorted splats: α (P, M), T before each splat (P, M), and T_end (P, 1).
 
-    α is 0 where a splat is not blended.
+    α is 0 if a splat is not blended.
     """
     dx, dy = (pixels[:, None, :] - means2d).unbind(dim=2)  # (P, M) each
     a, b, c = conics.unbind(dim=1)
     alpha = opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
     alpha = torch.where(alpha < ALPHA_MIN, 0, alpha.clamp(max=ALPHA_MAX))
-    # T only decreases: a pixel is finished from the first splat on that would make it too small.
+    # T decreases: a pixel is finished before the first splat that would make T too small.
     unfinished = torch.cumprod(1 - alpha, dim=1) >= TRANSMITTANCE_MIN
     alpha = torch.where(unfinished, alpha, 0)
     ones = alpha.new_ones(len(pixels), 1)
@@ -358,9 +359,10 @@ def _as_unit(target: Tensor, like: Tensor) -> Tensor:
 
 
 def neighbours(points: Tensor, k: int = 3) -> Tensor:
-    """Distances (N, k), ascending, from each of points (N, 3) to its k nearest others.
+    """Distances (N, k), ascending, from each of points (N, 3) to its k nearest other points.
 
-    A different point at the same place counts, with distance 0. Missing neighbours are inf.
+    Another point with the same coordinates counts, with distance 0. If there are fewer than k other
+    points, the remaining distances are inf.
     """
     count = len(points)
     found = points.new_full((count, k), torch.inf)
@@ -389,8 +391,8 @@ def accumulate_screen_statistics(
 ) -> None:
     """Adds one view to the statistics of the visible Gaussians for density control (section 5.2).
 
-    The gradient of the position (M, 2) is scaled to a screen that spans [-1, 1] in x and y.
-    Rows with a non-finite gradient are skipped; if `valid` (1,) is False, all rows are.
+    The gradient of the 2D mean, (M, 2), is scaled to a screen that spans [-1, 1] in x and y. Rows
+    with a non-finite gradient are skipped. If `valid` (1,) is False, all rows are skipped.
     """
     if valid is not None and not valid:
         return
@@ -432,22 +434,23 @@ def adam_step(
     valid: Tensor | None = None,
     nonfinite_rows: Tensor | None = None,
 ) -> None:
-    """Backpropagates the splats' gradient through `project` and takes one Adam step, in place.
+    """Propagates the gradient of the splats through `project` and takes one Adam step, in place.
 
-    params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, shaped as for `project`. A
-        `.grad` that is not None (of a regulariser) is added to the gradient.
+    params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of `project`.
+        If `.grad` is not None (from a regulariser), it is added to the gradient.
     exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
     ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns).
-    lr: a rate for each name. step: counts from 1.
-    visible_only: rows that are not in `ids` keep their values and moments. Otherwise their
+    lr: the learning rate of each parameter.
+    step: the number of this step, from 1 on.
+    visible_only: whether rows that are not in `ids` keep their values and moments. If False, their
         gradient is 0 (plus `.grad`), and their moments decay.
-    valid: (1,) bool; False: changes nothing.
-    nonfinite_rows: (6,) int32 counts, one per parameter. Values that the step would make infinite
-        or NaN keep their value and moments, and the rows with such values are added to the counts.
+    valid: (1,) bool; False: nothing is changed.
+    nonfinite_rows: (6,) int32 counts, one per parameter. If the step would make a value infinite or
+        NaN, the value and its moments stay unchanged, and its row is counted.
 
     Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
-    p −= lr · m̂ / √(v̂ + eps²), where the paper has √v̂ + eps. The two agree for v̂ ≫ eps² and at
-    m̂ = v̂ = 0, and this one is a single reciprocal square root.
+    p −= lr · m̂ / √(v̂ + eps²); the paper has the denominator √v̂ + eps. The two agree for v̂ ≫
+    eps² and for m̂ = v̂ = 0. The former needs only one reciprocal square root.
     """
     if valid is not None and not valid:
         return

@@ -1,8 +1,9 @@
 """Reuses memory: `empty` returns tensors from a pool of blocks.
 
 Every frame needs the same few large arrays. New memory from the operating system causes a page
-fault every 4 kB, which takes longer than the sorting that uses it. Therefore a block returns to the
-pool when its last tensor is deleted, and the next frame uses it. Large blocks request huge pages.
+fault every 4 kB; for the arrays of a sort, this takes longer than the sort itself. Therefore a
+block of memory returns to the pool when its last tensor is deleted, and the next frame uses it.
+Large blocks request huge pages.
 """
 
 from __future__ import annotations
@@ -18,23 +19,24 @@ from torch import Tensor
 
 _HUGE = 2 << 20  # bytes of a huge page
 _PAGE = 4096
-_KEEP = 24  # free blocks; more than a frame forward and backward needs
-# Blocks begin at different offsets in a page. If a value and its moments were a multiple of 4 kB
-# apart, loads would wait for stores whose addresses only have the same lower bits.
+_KEEP = 24  # maximum number of free blocks; the two passes of a frame need fewer
+# Blocks begin at different offsets in a page. Otherwise the distance between a value and its
+# moments could be a multiple of 4 kB, and loads would wait for stores to addresses with the same
+# lower bits.
 _STAGGER = 17 * 64
 
 _free: list[np.ndarray] = []
-_made = 0  # blocks so far
+_made = 0  # number of blocks created
 _lock = threading.Lock()
 
 
-class _Loan(np.ndarray):
-    """A block on loan to a tensor, which holds a reference to this; returns it when dropped."""
+class _BlockInUse(np.ndarray):
+    """Memory of a block in use. The tensor refers to this array; its deletion frees the block."""
 
     block: np.ndarray | None = None
 
     def __array_finalize__(self, source: Any) -> None:
-        self.block = None  # a view of a loan is not a loan itself
+        self.block = None  # a view does not free the block
 
     def __del__(self) -> None:
         if self.block is None:
@@ -42,14 +44,14 @@ class _Loan(np.ndarray):
         with _lock:
             _free.append(self.block)
             _free.sort(key=len)
-            # The smallest are freed first: they are the cheapest to allocate again.
+            # The smallest blocks are removed first: they are the fastest to allocate again.
             del _free[: max(0, len(_free) - _KEEP)]
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
-    """An uninitialised contiguous tensor on `device` (default: CPU), 64-byte aligned.
+    """An uninitialised contiguous tensor on `device` (default: CPU), aligned to 64 bytes.
 
-    On a GPU, torch's own allocator reuses memory.
+    On a GPU it is allocated by torch, whose own allocator reuses memory.
     """
     if device is not None and device.type != "cpu":
         return torch.empty(shape, dtype=dtype, device=device)
@@ -57,9 +59,9 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | Non
     if size < _PAGE:
         return torch.empty(shape, dtype=dtype)
     block = _take(size)
-    loan = block[:size].view(_Loan)
-    loan.block = block
-    return torch.from_numpy(loan).view(dtype).view(shape)
+    array = block[:size].view(_BlockInUse)
+    array.block = block
+    return torch.from_numpy(array).view(dtype).view(shape)
 
 
 def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
@@ -67,7 +69,7 @@ def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
 
 
 def _take(size: int) -> np.ndarray:
-    """The smallest free block that holds `size` bytes and is not several times too large."""
+    """The smallest free block of at least `size` bytes that is not several times too large."""
     with _lock:
         for i, block in enumerate(_free):
             if size <= len(block) <= 4 * size + _HUGE:
@@ -92,8 +94,9 @@ def _make(size: int) -> np.ndarray:
 def take_rows(tensor: Tensor, index: Tensor) -> Tensor:
     """`tensor[index]` along the first dimension, for long-lived tensors: parameters, moments.
 
-    The memory has huge pages and page offsets like the blocks of the pool, but does not belong to
-    the pool: it returns to the operating system, since the next size will be different.
+    The memory has huge pages and page offsets as the blocks of the pool have, but is not part of
+    the
+    pool: it is returned to the operating system, because the next size will be different.
     """
     if tensor.requires_grad or tensor.device.type != "cpu" or index.dtype == torch.bool:
         return tensor[index]

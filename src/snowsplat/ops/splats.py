@@ -1,8 +1,8 @@
 """`Splats2D`: the interface between projection and rasterization.
 
-One packed tensor contains everything that the rasterizer reads, one row per splat, so that its
-gradient is one tensor too and a row is one or two cache lines. `project` creates it from 3D
-Gaussians; fitting an image with 2D Gaussians creates it directly with `Splats2D.pack`.
+One packed tensor contains everything that the rasterizer reads, with one row per splat. So the
+gradient is one tensor, too, and a row is one or two cache lines. `project` creates the tensor from
+3D Gaussians. A program that fits 2D Gaussians to an image creates it with `Splats2D.pack`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from snowsplat.ops.layout import PACKED_HEADER, PACKED_STRIDE
 
-# Columns of a packed row. C colours follow at COLORS; zeros pad the row to a multiple of
+# Columns of a packed row. The C colours begin at COLORS. Zeros pad the row to a multiple of
 # PACKED_STRIDE.
 MEANS2D = slice(0, 2)
 CONICS = slice(2, 5)
@@ -25,7 +25,7 @@ COLORS = PACKED_HEADER
 
 
 def packed_width(channels: int) -> int:
-    """Columns of a packed row with `channels` colour or feature channels."""
+    """Number of columns of a packed row with `channels` colour or feature channels."""
     return -(-(COLORS + channels) // PACKED_STRIDE) * PACKED_STRIDE
 
 
@@ -37,13 +37,13 @@ class Splats2D:
               0:2 `means2d`   x, y
               2:5 `conics`    a, b, c of the inverse covariance [[a, b], [b, c]]
               5   `opacities` in [0, 1]
-              6   `depths`    camera z: the order, nearest first, equal depths by row
-              7   `radii`     3 σ of the major axis (information only, never has a gradient)
+              6   `depths`    camera z; splats are ordered by it, nearest first, then by row
+              7   `radii`     3 σ of the major axis (information only, without gradient)
               8:8+C `colors`; the rest is padding (zero)
-    ids:      (M,) int32: the Gaussian that each row came from; ascending, except for −1, which
-              marks an empty row, which is not drawn. On a GPU `project` returns a row for every
-              Gaussian, because counting the visible ones would require waiting; on the CPU no row
-              is empty. None: the rows are the Gaussians themselves (2D fitting).
+    ids:      (M,) int32: the index of the Gaussian of each row, ascending. −1 marks an empty row,
+              which is not drawn. On a GPU, `project` returns a row for every Gaussian, because the
+              CPU would have to wait for the number of visible ones. On the CPU no row is empty.
+              None: there are no 3D Gaussians (2D Gaussians fitted to an image).
     channels: C, at least 1.
 
     The properties are views of `packed`; autograd flows through them.
@@ -74,7 +74,7 @@ class Splats2D:
         return self.packed.shape[0]
 
     def without_empty_rows(self) -> Splats2D:
-        """The same splats without the empty rows; waits for a GPU."""
+        """The same splats without the empty rows. Waits for a GPU."""
         if self.ids is None or self.packed.device.type == "cpu":
             return self
         rows = (self.ids >= 0).nonzero()[:, 0]
@@ -158,16 +158,16 @@ class Splats2D:
 
 
 def radii_of_conics(conics: Tensor) -> Tensor:
-    """3 σ of the major axis, (M,), of inverse covariances (M, 3); carries no gradient.
+    """3 σ of the major axis, (M,), of inverse covariances (M, 3); without gradient.
 
-    σ² of the major axis is the larger eigenvalue of the covariance: the inverse of the conic's
-    smaller one.
+    σ² of the major axis is the larger eigenvalue of the covariance, which is the inverse of the
+    smaller eigenvalue of the conic.
     """
     if conics.dim() != 2 or conics.shape[1] != 3:
         raise ValueError(f"conics must be (M, 3), got {tuple(conics.shape)}")
     a, b, c = conics.detach().unbind(dim=1)
     half_gap = torch.hypot((a - c) / 2, b)
-    # Vieta: the smaller eigenvalue as det / larger one, which does not cancel for long thin splats.
+    # The smaller eigenvalue is det / larger (Vieta); this has no cancellation for long thin splats.
     larger = (a + c) / 2 + half_gap
     smaller = (a * c - b * b) / larger
     return 3 * smaller.rsqrt()

@@ -21,13 +21,14 @@ def accumulate_screen_statistics(
     max_radii: Tensor | None = None,
     valid: Tensor | None = None,
 ) -> None:
-    """Adds one view to the statistics of the N Gaussians, in place, for visible rows.
+    """Adds one view to the statistics of the visible ones of N Gaussians, in place.
 
-    With the gradient in `splats.packed.grad` and distinct `splats.ids`:
+    The gradient is `splats.packed.grad`; `splats.ids` must be distinct.
     norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|, views (N,) += 1, and
-    max_radii (N,) = max(max_radii, `splats.radii`) unless None. The factor scales the gradient to
-    a screen that spans [-1, 1], to which the paper's threshold refers (section 5.2). Rows of id −1
-    and rows with a non-finite gradient are skipped; if `valid`, (1,) bool, is False, all rows are.
+    max_radii (N,) = max(max_radii, `splats.radii`) unless it is None.
+    The factor scales the gradient to a screen that spans [-1, 1], as the threshold of the paper
+    requires (section 5.2). Rows with id −1 or a non-finite gradient are skipped. If `valid`, (1,)
+    bool, is False, all rows are skipped.
 
     Raises ValueError if there are no gradients or ids, or shapes or dtypes do not match.
     """

@@ -36,7 +36,7 @@ class TrainResult:
         gaussians: their number.
         seconds: duration of the steps of this run.
         memory: the peak of the steps, as text.
-        given_up: what more memory would have allowed, as text.
+        reductions: what more memory would have allowed, as text.
         evaluation: figures of the last evaluation on held-out photos, and its step.
         time: seconds spent in all runs and seconds given; None without a time budget.
     """
@@ -48,7 +48,7 @@ class TrainResult:
     gaussians: int
     seconds: float
     memory: str
-    given_up: tuple[str, ...]
+    reductions: tuple[str, ...]
     evaluation: tuple[int, Evaluation] | None
     time: tuple[float, float] | None
 
@@ -243,7 +243,7 @@ class TrainingRun:
             gaussians=len(self.trainer.gaussians),
             seconds=seconds,
             memory=memory,
-            given_up=self.memory.plan.given_up,
+            reductions=self.memory.plan.reductions,
             evaluation=self.evaluation,
             time=time_used,
         )

@@ -3,8 +3,8 @@
 A checkpoint is a set of named tensors (parameters, optimiser moments, random states, statistics,
 the order of the views) and a JSON value in one safetensors file, a format that contains only
 numbers and cannot execute code. The file appears under its name only when it is complete and on
-disk, so a kill at any moment leaves the previous one. Checksums are verified when a file is loaded,
-to detect damaged or truncated files; see `checkpoint_file`.
+disk. So if the process is killed at any moment, the previous checkpoint is intact. When a file is
+loaded, checksums are verified to detect damaged or truncated files; see `checkpoint_file`.
 """
 
 import re
@@ -42,10 +42,10 @@ def save(
     *,
     keep: int = 2,
 ) -> Path:
-    """Write ``folder/step_000500.safetensors`` atomically, then `remove_old`.
+    """Write ``folder/step_000500.safetensors`` atomically, then call `remove_old`.
 
     Args:
-        tensors: any shapes, 0-dimensional and empty ones too; dtypes that NumPy has.
+        tensors: of any shape, including 0-dimensional and empty tensors; of dtypes that NumPy has.
         meta: JSON values.
 
     Raises:
@@ -58,7 +58,7 @@ def save(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"step_{step:06d}.safetensors"
-    # Contiguous: safetensors writes the memory of an array without regard to its strides.
+    # The arrays must be contiguous, because safetensors ignores strides.
     arrays = {name: t.detach().cpu().contiguous().numpy() for name, t in tensors.items()}
     checkpoint_file.write(path, step, arrays, meta)
     remove_old(folder, step, keep=keep)
@@ -66,9 +66,10 @@ def save(
 
 
 def remove_old(folder: Path | str, step: int, *, keep: int = 2) -> None:
-    """Remove all but the ``keep`` newest checkpoints up to ``step``, and files of killed saves.
+    """Remove all but the ``keep`` newest checkpoints up to ``step``, and temporary files.
 
-    Newer ones are kept: they are damaged if a training run resumes from ``step``.
+    Checkpoints of later steps are not removed. They exist if training resumed from ``step`` because
+    they were damaged. Temporary files remain if a process was killed while it saved.
     """
     folder = Path(folder)
     for leftover in folder.glob(".*tmp*"):
@@ -92,7 +93,7 @@ def load(path: Path | str) -> Checkpoint:
 
 
 def latest(folder: Path | str) -> Checkpoint | None:
-    """The newest valid checkpoint of ``folder``, or None; warns of each newer, damaged one.
+    """The newest valid checkpoint of ``folder``, or None. Warns about each newer, damaged one.
 
     Raises:
         UserError: a file cannot be read (permissions, open files); it may be valid.

@@ -1,7 +1,7 @@
 """The file of a checkpoint: NumPy arrays and a JSON value in a safetensors file; without torch.
 
-The header contains the CRC-32 of each array and of itself, and the dtype and shape of each array.
-`read` verifies all of them.
+The header contains the CRC-32, the dtype and the shape of each array, and the CRC-32 of the header
+itself. `read` verifies all of them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def write(path: Path, step: int, arrays: Mapping[str, np.ndarray], meta: Mapping
     """Write a checkpoint atomically.
 
     Args:
-        arrays: contiguous, of any shapes, also () and empty ones, and of dtypes that safetensors
+        arrays: contiguous; of any shape, including () and empty; of dtypes that safetensors
             supports.
         meta: JSON values.
 
@@ -90,7 +90,8 @@ def read(path: Path) -> CheckpointFile:
                 )
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         intact = header["crc32"] == {name: _crc32(array) for name, array in arrays.items()}
-        # Older files lack the next two, and may have an undetected error in the header.
+        # Older files do not have the next two values. In them, an error in the header may not be
+        # found.
         intact = intact and header.get("layout", _layout(arrays)) == _layout(arrays)
         intact = intact and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
         if not isinstance(header["meta"], dict):
@@ -98,7 +99,7 @@ def read(path: Path) -> CheckpointFile:
         content = CheckpointFile(path, int(header["step"]), arrays, header["meta"])
     except (
         safetensors.SafetensorError,
-        AttributeError,  # a dtype that NumPy lacks, for example floats of one byte
+        AttributeError,  # a dtype that NumPy does not have, for example floats of one byte
         KeyError,
         TypeError,
         ValueError,
@@ -116,7 +117,7 @@ def read(path: Path) -> CheckpointFile:
 
 
 def _layout(arrays: Mapping[str, np.ndarray]) -> dict[str, list[Any]]:
-    """Name → dtype and shape. The dtypes are written as torch names them, as in earlier files."""
+    """Name → dtype and shape. Dtypes have the names of torch, as in earlier files."""
     return {name: [f"torch.{array.dtype}", list(array.shape)] for name, array in arrays.items()}
 
 

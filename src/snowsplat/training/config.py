@@ -18,19 +18,19 @@ _SEED_LIMIT = 2**61
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """All settings of a training run; the defaults are the paper's.
+    """All settings of a training run; the defaults are those of the paper.
 
-    A moment (`When`) is an int, that step, or a float, that fraction of ``iterations``.
+    A moment (`When`) is a step (int) or a fraction of ``iterations`` (float).
 
     Attributes:
-        iterations: number of steps, one view each.
+        iterations: number of steps; each step uses one view.
         seed: seed of every random choice. On a CPU, the same seed results in a bit-identical scene,
             for any number of threads.
-        background: the colour behind the scene; "random" draws one per step, which prevents fog in
-            datasets with a transparent background.
+        background: the colour behind the scene; "random": a new colour in each step, which prevents
+            fog in datasets with a transparent background.
         sh_degree: final degree of the spherical harmonics, 0 to 3.
-        sh_interval: steps after which the degree in use increases by one, from 0; 0: use
-            ``sh_degree`` from the first step.
+        sh_interval: the degree in use begins at 0 and increases by one after this many steps; 0:
+            use ``sh_degree`` from the first step.
         ssim_weight: λ of (1 − λ) · L1 + λ · D-SSIM.
         initial_points: number of random points for a dataset without points.
         initial_opacity: the opacity of every Gaussian at initialisation.
@@ -38,15 +38,18 @@ class TrainConfig:
             to its three nearest neighbours.
         learning_rates: see `LearningRates`.
         density: settings of density control, one of `DENSITY_CONTROLS`.
-        gaussians_per_pixel: limits the number of Gaussians by the size of the photos, in addition
-            to ``density.max_gaussians``: small photos show no more. 0 is no limit.
-        visible_only: the optimiser skips Gaussians that the view of a step does not see. In the
-            paper their momentum moves them on; skipping is faster, at no measurable loss.
-        coarse_to_fine: the last moments at a quarter and at a half of the resolution; 0 is never.
-        image_memory: bytes for decoded images; 0 is half of the available memory.
+        gaussians_per_pixel: limit of the number of Gaussians relative to the number of pixels of a
+            photo, in addition to ``density.max_gaussians``. More Gaussians would not improve the
+            scene. 0: no limit.
+        visible_only: whether the optimiser skips Gaussians that are not visible in the view of the
+            step. In the paper, their momentum continues to change them. Skipping them is faster,
+            without a measurable loss of quality.
+        coarse_to_fine: until the first moment, images have a quarter of the resolution; until the
+            second one, half of it; 0: never.
+        image_memory: bytes for decoded images; 0: half of the available memory.
         test_iterations: steps after which `Trainer.run` evaluates the test views.
-        checkpoint_every: steps between checkpoints, which the caller of `Trainer.run` writes; 0
-            disables them.
+        checkpoint_every: number of steps between two checkpoints; 0: none. The caller of
+            `Trainer.run` writes them.
 
     Raises:
         SettingError: a value is invalid.
@@ -84,7 +87,7 @@ class TrainConfig:
         if not -_SEED_LIMIT <= self.seed < _SEED_LIMIT:
             raise SettingError("seed", f"{self.seed} is too large; use one closer to 0")
         for name, rate in (("lr_means", rates.means), ("lr_means_final", rates.means_final)):
-            if rate <= 0.0:  # the schedule interpolates their logarithms
+            if rate <= 0.0:  # the schedule interpolates the logarithms of the rates
                 raise SettingError(name, f"{rate:g} is not positive; use e.g. 1e-12 instead of 0")
         for name, when in (
             ("densify_from", density.densify_from),
@@ -95,7 +98,7 @@ class TrainConfig:
                 raise SettingError(name, f"{when} is not a step; use e.g. 500, or a fraction, 0.5")
 
     def capped(self, pixels: int) -> TrainConfig:
-        """With ``gaussians_per_pixel`` applied to photos of ``pixels`` as a limit of Gaussians."""
+        """This configuration with the limit of Gaussians for photos of ``pixels`` pixels."""
         if self.gaussians_per_pixel <= 0:
             return self
         cap = max(1, round(self.gaussians_per_pixel * pixels))
@@ -119,7 +122,7 @@ def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
     Args:
         settings: fields of `TrainConfig`; fields of its density control (``grad_threshold=4e-4``);
             and fields of `LearningRates` with the prefix ``lr_`` (``lr_means=1e-4``). None leaves a
-            setting unchanged. ``max_gaussians`` replaces the limit by ``gaussians_per_pixel``.
+            setting unchanged. ``max_gaussians`` also disables ``gaussians_per_pixel``.
 
     Raises:
         SettingError: the configuration has no such setting, or a value is invalid.

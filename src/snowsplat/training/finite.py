@@ -1,8 +1,8 @@
-"""Detection of values that are not finite: where they are, how many, and the message to the user.
+"""Detection of values that are not finite: their location, their number, the message to the user.
 
-Training stops at the step in which they arise. They never reach the state of the training: a step
-with a non-finite loss changes nothing, and a non-finite update of a value is skipped
-(`ops.adam_step`). So the parameters between two steps are always finite.
+Training stops at the step in which such values occur. They do not change the state of the training:
+a step with a non-finite loss changes nothing, and a non-finite update of a value is skipped
+(`ops.adam_step`). So the parameters are always finite between two steps.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ def rows_not_finite(tensors: Mapping[str, Tensor]) -> dict[str, int]:
     """Name → number of rows with infinity or NaN; names without such rows are left out."""
     found: dict[str, int] = {}
     for name, tensor in tensors.items():
-        # The sum is a fast test. It may overflow for large finite values, so rows are counted then.
+        # The sum is a fast test. Because it may overflow for large finite values, the rows are
+        # counted if it is not finite.
         if tensor.is_floating_point() and not bool(tensor.sum().isfinite()):
             rows = tensor.flatten(1) if tensor.ndim > 1 else tensor.reshape(-1, 1)
             count = int((~rows.isfinite()).any(dim=1).sum())
@@ -47,12 +48,12 @@ def check_finite(what: str, tensors: Mapping[str, Tensor], advice: str) -> None:
 
 
 def check_state(own: Mapping[str, Tensor], given: Mapping[str, Tensor], views: int) -> None:
-    """Whether a trainer can load a state.
+    """Check that a trainer can load a state.
 
     Args:
-        own: its own state, of `Trainer.state_tensors`.
+        own: the state of the trainer, from `Trainer.state_tensors`.
         given: the state to load.
-        views: number of its training views.
+        views: number of training views of the trainer.
 
     Raises:
         UserError: the state has another density control, SH degree or dataset, or is not finite.
@@ -85,10 +86,10 @@ def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussia
     """Check the update of ``step``.
 
     Args:
-        nonfinite_rows: number of rows that it skipped, per parameter; from `ops.adam_step`.
+        nonfinite_rows: for each parameter, the number of rows that `ops.adam_step` skipped.
 
     Raises:
-        Diverged: any of them is not 0.
+        Diverged: rows were skipped.
     """
     if not any(nonfinite_rows):
         return
@@ -103,10 +104,10 @@ def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussia
 def check_loss(
     step: int, loss: float, gaussians: Gaussians, view: View, photo: LoadedImage
 ) -> None:
-    """Check the loss of ``step``; find the cause if it is not finite.
+    """Check the loss of ``step``; if it is not finite, find the cause.
 
     Raises:
-        Diverged: it is not finite.
+        Diverged: the loss is not finite.
     """
     if math.isfinite(loss):
         return
@@ -122,7 +123,7 @@ def check_loss(
 
 
 def listed(counts: Mapping[str, int]) -> str:
-    """As in "means (3 rows), quats (1 row)"."""
+    """Text such as "means (3 rows), quats (1 row)"."""
     return ", ".join(
         f"{name} ({count:,} {'row' if count == 1 else 'rows'})" for name, count in counts.items()
     )

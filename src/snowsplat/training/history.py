@@ -1,4 +1,4 @@
-"""`History`: the curves of a training run, as a few hundred points for any number of steps."""
+"""`History`: the curves of a training run, with a few hundred points for any number of steps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, read_json
 
-#: Maximum number of points of a curve; beyond it, neighbours are merged.
+#: Maximum number of points of a curve. If there are more, adjacent points are merged.
 MOST_POINTS = 400
 #: Larger values in a file are rejected, because sums of them may not be finite.
 _LARGEST_VALUE = 1e30
@@ -17,13 +17,13 @@ _LARGEST_VALUE = 1e30
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive steps.
+    """A number of consecutive steps.
 
     Attributes:
-        step: the last of them.
-        steps: their number.
-        loss: the mean of their losses.
-        seconds: their total time, without the time between steps.
+        step: the last step.
+        steps: number of steps.
+        loss: mean of the losses of the steps.
+        seconds: total time of the steps, without the time between steps.
         gaussians: the number of Gaussians after the last step.
     """
 
@@ -74,7 +74,7 @@ class History:
         self._since = time.perf_counter()
 
     def step_ends(self, step: int, loss: float, gaussians: int, timed: bool = True) -> None:
-        """Record a step; if not ``timed``, with the mean time of the previous stretch."""
+        """Record a step. If not ``timed``, the mean time of the previous stretch is used for it."""
         seconds = time.perf_counter() - self._since
         if not timed and self.stretches:
             seconds = self.stretches[-1].seconds / self.stretches[-1].steps
@@ -104,10 +104,10 @@ class History:
 
     @classmethod
     def read(cls, path: Path, last_step: int) -> History:
-        """Read the file up to ``last_step``: training may resume from a checkpoint before its end.
+        """Read the file, but only up to ``last_step``: the step from which training resumes.
 
-        Returns an empty history if the file is missing or damaged: curves are no reason not to
-        resume a training run.
+        Returns an empty history if the file is missing or damaged, because curves are not needed to
+        resume training.
         """
         try:
             values = read_json(path)

@@ -16,17 +16,20 @@ from snowsplat.training.finite import check_finite
 def initial_gaussians(
     dataset: Dataset, config: TrainConfig, generator: torch.Generator, device: torch.device
 ) -> Gaussians:
-    """One Gaussian per point of the dataset, or random ones, at most ``density.max_gaussians``.
+    """One Gaussian per point of the dataset, or random Gaussians if it has no points.
 
-    Section 5.1 of the paper: isotropic, with the mean distance to the three nearest neighbours as
-    scale (times ``config.initial_scale``), the colour of the point, and ``config.initial_opacity``.
-    The rows are in Morton order.
+    There are at most ``density.max_gaussians``. As in section 5.1 of the paper, they are isotropic.
+    The scale is the mean distance to the three nearest neighbours times ``config.initial_scale``;
+    the colour is that of the point; the opacity is ``config.initial_opacity``. The rows are in
+    Morton order.
 
     Args:
-        generator: on the CPU; draws random points, or which points are used if there are too many.
+        generator: a random generator on the CPU. It draws the random points; if the dataset has too
+            many points, it selects those that are used.
 
     Raises:
-        UserError: points so far apart that single precision cannot represent their Gaussians.
+        UserError: some points are so far apart that single precision cannot represent their
+            Gaussians.
     """
     points = dataset.points
     limit = config.density.max_gaussians or math.inf

@@ -10,10 +10,10 @@ from snowsplat.data.decode import LoadedImage
 
 
 def view_loss(image: Tensor, photo: LoadedImage, background: Tensor, ssim_weight: float) -> Tensor:
-    """(1 − λ) · L1 + λ · (1 − SSIM), λ = ``ssim_weight``, as a scalar; gradient to ``image``.
+    """The scalar (1 − λ) · L1 + λ · (1 − SSIM), λ = ``ssim_weight``, differentiable in ``image``.
 
-    A transparent photo is composited over ``background`` first. Where its mask is False, the image
-    is replaced by the photo: these pixels have no difference and no gradient.
+    A transparent photo is first composited over ``background``. At pixels where the mask is False,
+    the image is replaced with the photo, so that they have no difference and no gradient.
 
     Args:
         image: (H, W, 3) rendering over ``background``.

@@ -10,13 +10,14 @@ from snowsplat.training.step_schedule import Schedule, When
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's learning rate for each parameter; the defaults are the paper's.
+    """Adam's learning rate for each parameter; the defaults are those of the paper.
 
     Attributes:
         means: rate of the positions at the first step, in units of the scene extent.
-        means_final: rate of the positions at step ``means_steps`` and later; log-linear before it.
+        means_final: rate of the positions from step ``means_steps`` on; before that step, the rate
+            is interpolated log-linearly.
         means_steps: a step (int), or a fraction of all iterations (float).
-        log_scales, quats, opacity_logits, sh_dc, sh_rest: constant.
+        log_scales, quats, opacity_logits, sh_dc, sh_rest: constant rates.
     """
 
     means: float = 1.6e-4
@@ -29,12 +30,12 @@ class LearningRates:
     sh_rest: float = 2.5e-3 / 20
 
     def scaled(self, factor: float) -> LearningRates:
-        """All rates except ``means_final`` times ``factor``, for short training runs."""
+        """These rates, multiplied by ``factor`` except ``means_final``; for short training runs."""
         rates = [f.name for f in fields(self) if f.name not in ("means_final", "means_steps")]
         return replace(self, **{name: factor * getattr(self, name) for name in rates})
 
     def at(self, step: int, schedule: Schedule, extent: float) -> dict[str, float]:
-        """The learning rate of each parameter at ``step``; for the means in world units.
+        """The learning rate of each parameter at ``step``; that of the means is in world units.
 
         means(t) = extent · means^(1 − t) · means_final^t, t = step / means_steps, at most 1.
         """

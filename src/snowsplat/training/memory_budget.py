@@ -1,7 +1,7 @@
-"""How much memory a training run takes, estimated before it starts, and how to make it take less.
+"""Estimates the memory of a training run before it starts, and reduces it to a budget.
 
-Counted is what comes on top of a fresh import of PyTorch; on a GPU, on top of what the driver
-allocates for itself.
+The memory that a process needs after importing PyTorch is not included; on a GPU, neither is the
+memory that the driver allocates for itself.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ from snowsplat.util.errors import SettingError
 #: Bytes per pixel of a decoded photo, and of its mask.
 _RGB = 3
 _MASK = 1
-#: Photos that are decoded at any time: the one in use, and those of the next steps.
+#: Minimum number of photos that are decoded at a time: that of the step, and those of the next
+#: steps.
 _FEWEST_PHOTOS = 6
-#: Training a scene of fewer Gaussians than this is not worthwhile.
+#: A budget must suffice for at least this many Gaussians.
 _FEWEST_GAUSSIANS = 1000
-#: Random Gaussians are so large at first that each touches about three times as many tiles.
+#: A random Gaussian is initially so large that it touches about three times as many tiles: the
+#: memory per Gaussian for splats and instances is needed this many times in addition.
 _EXTRA_OF_RANDOM = 2
 
 
@@ -33,7 +35,7 @@ class Cost:
     """Memory that a training run takes on one kind of device.
 
     Attributes:
-        fixed: bytes, for any training.
+        fixed: bytes that do not depend on the scene.
         pixel: bytes per pixel of the largest photo: renderings and their gradients.
         gaussian: bytes per Gaussian besides its parameters and their two moments: its splat, the
             gradient of the splat, its instances, statistics.
@@ -50,13 +52,13 @@ class Cost:
         return self.fixed + self.pixel * pixels + self.of_gaussian(sh_degree) * gaussians
 
     def of_gaussian(self, sh_degree: int) -> int:
-        """Bytes per Gaussian, with its float32 parameters and two moments of each."""
+        """Bytes per Gaussian, with its float32 parameters and two moments of each parameter."""
         parameters = 11 + 3 + 3 * SH_REST_COUNTS[sh_degree]
         return 3 * 4 * parameters + self.gaussian
 
 
-#: Measured: 1.0 to 1.1 kB per Gaussian besides parameters and moments, where each touches some
-#: seven tiles. Photos are decoded by `DECODERS` threads at a time, at 18 bytes per pixel.
+#: Measured with Gaussians that touch about seven tiles each: 1.0 to 1.1 kB per Gaussian besides
+#: parameters and moments. `DECODERS` threads decode photos at a time, at 18 bytes per pixel.
 CPU = Cost(fixed=66_000_000, pixel=170, gaussian=1150, decoding=18 * DECODERS)
 #: Computed from the sizes of the tensors that are allocated. Photos are decoded in the memory of
 #: the CPU.
@@ -68,19 +70,19 @@ class MemoryPlan:
     """The result of `plan_memory`.
 
     Attributes:
-        config: the configuration, with settings that keep the training within its memory.
+        config: the configuration, with settings that keep the memory within the budget.
         scene: bytes for Gaussians.
         images: bytes for renderings and their gradients.
         photos: bytes for photos that stay decoded.
-        given_up: what a larger budget would have allowed, as text.
-        limit: the number of Gaussians; None: there is no limit, and ``scene`` is that of a million.
+        reductions: descriptions of the reductions that a larger budget would not need.
+        limit: maximum number of Gaussians; None: no limit, and ``scene`` is for a million.
     """
 
     config: TrainConfig
     scene: int
     images: int
     photos: int
-    given_up: tuple[str, ...]
+    reductions: tuple[str, ...]
     limit: int | None
 
     @property
@@ -130,15 +132,16 @@ def plan_memory(
 ) -> MemoryPlan:
     """Estimate the memory of training on ``dataset``; with a ``budget``, reduce it to this budget.
 
-    First fewer photos stay decoded, then the number of Gaussians is limited.
+    First, fewer photos stay decoded; then the number of Gaussians is limited.
 
     Args:
-        available: bytes that the device has left, of which photos may have half.
+        available: free bytes of the device; photos may use half of them.
         budget: bytes; None: no limit.
-        present: number of Gaussians of a resumed training run: none of them is removed.
+        present: number of Gaussians of a resumed training run; they are not removed.
 
     Raises:
-        SettingError: ``memory`` is too little for photos of this size, or for what is present.
+        SettingError: ``memory`` is too little for photos of this size, or for the Gaussians that
+            are present.
     """
     sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
     largest, median = sizes[-1], sizes[len(sizes) // 2]
@@ -155,7 +158,7 @@ def plan_memory(
     all_photos = _photo_bytes(dataset)
     photos = min(all_photos, config.image_memory or available // 2)
     limit = config.density.max_gaussians or None
-    given_up = []
+    reductions = []
     if budget is not None:
         fewest_photos = _RGB * sum(sizes[-_FEWEST_PHOTOS:])
         least = images + fewest_photos + scene.of(max(_FEWEST_GAUSSIANS, present))
@@ -164,19 +167,19 @@ def plan_memory(
         fitting = scene.gaussians_in(budget - images - min(photos, fewest_photos))
         if limit is None or limit > fitting:
             before = "no limit" if limit is None else f"{limit:,}"
-            given_up.append(f"at most {fitting:,} Gaussians instead of {before}")
+            reductions.append(f"at most {fitting:,} Gaussians instead of {before}")
             limit = fitting
             config = changed(config, max_gaussians=limit)
         left = max(fewest_photos, budget - images - scene.of(limit))
         if photos > left:
             share = 100 * left // all_photos
-            given_up.append(
+            reductions.append(
                 f"{share}% of the photos stay decoded, the others are decoded each time"
             )
             photos = left
         config = replace(config, image_memory=photos)
     gaussians = 1_000_000 if limit is None else limit
-    return MemoryPlan(config, scene.of(gaussians), images, photos, tuple(given_up), limit)
+    return MemoryPlan(config, scene.of(gaussians), images, photos, tuple(reductions), limit)
 
 
 def _photo_bytes(dataset: Dataset) -> int:
@@ -192,21 +195,23 @@ def _too_little(budget: int, least: int, present: int, files_too_large: bool) ->
     if present > _FEWEST_GAUSSIANS:
         problem = f"to resume with {present:,} Gaussians, which {needed}; use more"
     else:
-        # The resolution does not help where the file is the problem: it is decoded completely.
+        # If the image files are too large, a lower resolution does not help: a file is decoded at
+        # its full size.
         smaller = "smaller image files" if files_too_large else "a lower resolution"
         problem = f"for photos of this size, which {needed}; use more, or {smaller}"
     return SettingError("memory", f"{format_bytes(budget)} is too little {problem}")
 
 
-#: Bytes of the prefixes of decimal units, in ascending order: the exponent of 1024 is the index.
+#: Bytes of the decimal units, by prefix, in ascending order. For units such as GiB, the exponent of
+#: 1024 is the index.
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
 
 def parse_bytes(text: str) -> int:
-    """Bytes of "4GB", "800 MB", "1.5g" or a plain number; "GiB" and similar are powers of 1024.
+    """The number of bytes of "4GB", "800 MB", "1.5g" or a plain number; "GiB" is 1024³ bytes.
 
     Raises:
-        SettingError: ``memory`` is anything else.
+        SettingError: the text of ``memory`` is not a size.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]?)(i?)b?\s*", text.lower())
     if match is None or (match[3] and not match[2]) or float(match[1]) <= 0:
@@ -218,5 +223,5 @@ def parse_bytes(text: str) -> int:
 
 
 def format_bytes(count: int) -> str:
-    """As in "1.3 GB" or "240 MB"."""
+    """Text such as "1.3 GB" or "240 MB"."""
     return f"{count / 1e9:.1f} GB" if count >= 0.95e9 else f"{max(1, round(count / 1e6))} MB"

@@ -1,7 +1,8 @@
-"""`Adam` for Gaussians: moments that follow the rows. Learning rates are in `lr_schedule`.
+"""`Adam` for Gaussians: its moments have the same rows as the Gaussians.
 
-The arithmetic of a step is `ops.adam_step`, which carries the gradient of the splats through the
-projection and updates the parameters in the same pass. This class owns the state between steps.
+`ops.adam_step` computes a step: it propagates the gradient of the splats through the projection and
+updates the parameters in the same pass. `Adam` stores the state between steps. Learning rates are
+in `lr_schedule`.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from snowsplat.training.view_gradient import ViewGradient
 
 
 class Adam:
-    """The first and second moments of every parameter, in the order of the rows.
+    """The first and second moments of every parameter. Row i of a moment belongs to Gaussian i.
 
-    It does not own the Gaussians. Code that changes their rows (density control) makes the same
-    change here with `select`, so that row i of every moment belongs to Gaussian i.
+    The Gaussians themselves are not part of this object. Code that changes their rows (density
+    control) must make the same change here, with `select`.
     """
 
     def __init__(
@@ -35,8 +36,9 @@ class Adam:
     ) -> None:
         """
         Args:
-            extent: extent of the scene, in world units; scales the learning rate of the means.
-            visible_only: a step leaves the Gaussians that its view does not see unchanged.
+            extent: extent of the scene, in world units; the learning rate of the means is
+                multiplied by it.
+            visible_only: whether a step leaves Gaussians unchanged that its view does not see.
         """
         self.rates = rates
         self.schedule = schedule
@@ -47,13 +49,14 @@ class Adam:
         self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in parameters.items()}
 
     def rates_at(self, step: int) -> dict[str, float]:
-        """Learning rate by parameter at ``step``, counted from 1."""
+        """The learning rate of each parameter at ``step``, which counts from 1."""
         return self.rates.at(step, self.schedule, self.extent)
 
     def step(self, gaussians: Gaussians, gradient: ViewGradient, step: int) -> None:
         """Update ``gaussians`` in place; ``step`` counts from 1.
 
-        A ``.grad`` on a parameter (of a regulariser) is added to its gradient, then cleared.
+        If a parameter has a ``.grad`` (from a regulariser), it is added to the gradient and
+        cleared.
         """
         parameters = gaussians.parameters()
         splats, camera = gradient.splats, gradient.camera
@@ -100,7 +103,7 @@ class Adam:
         self.exp_avg_sq[name].zero_()
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """Everything that has to be saved, by name. Not copied."""
+        """The state to save, by name. The tensors are not copied."""
         averages = {f"exp_avg.{name}": tensor for name, tensor in self.exp_avg.items()}
         return averages | {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
 

@@ -21,11 +21,11 @@ from snowsplat.util.errors import SettingError
 def default() -> TrainConfig:
     """The best quality for a few thousand steps on a CPU.
 
-    Learning rates are several times the paper's, that of the scales most of all; view-dependent
-    colour starts early; the first steps use small images; the number of Gaussians is limited to
-    what the photos can show. The training is too short for opacity resets, from which a scene needs
-    hundreds of steps to recover, and for pruning by size. Moments are fractions, so they scale with
-    ``iterations``.
+    The learning rates are several times those of the paper; the rate of the scales is increased
+    most. View-dependent colour starts early. The first steps use small images. The number of
+    Gaussians is limited by the number of pixels of a photo. There are no opacity resets, because a
+    scene needs hundreds of steps to recover from one, and no pruning by size. Moments are
+    fractions, so they scale with ``iterations``.
     """
     return TrainConfig(
         iterations=3000,
@@ -56,10 +56,11 @@ def default() -> TrainConfig:
 def paper() -> TrainConfig:
     """The complete schedule of the paper: 30,000 steps.
 
-    The end of densification (step 15,000) and of the decay of the means' learning rate (step
-    30,000) are fractions here, 0.5 and 1: the same at 30,000 steps, and a shorter training reaches
-    both. Other moments are steps. Pruning by screen size is disabled: its limit in pixels depends
-    on the resolution, and at 270×480 it costs 0.5 dB.
+    Densification ends at step 15,000, and the decay of the means' learning rate at step 30,000.
+    Both are given as fractions, 0.5 and 1, so that a shorter training run also reaches them. The
+    other moments are steps. Pruning by screen size is disabled, because its limit in pixels depends
+    on
+    the resolution: at 270×480 it reduces the PSNR by 0.5 dB.
     """
     return TrainConfig(
         learning_rates=LearningRates(means_steps=1.0),
@@ -71,7 +72,8 @@ def mcmc() -> TrainConfig:
     """The schedule of "3D Gaussian Splatting as Markov Chain Monte Carlo": 30,000 steps and a fixed
     limit of Gaussians.
 
-    The optimiser updates all Gaussians in every step: the regularisers act on invisible ones, too.
+    The optimiser updates all Gaussians in every step, because the regularisers also apply to
+    invisible ones.
     """
     return TrainConfig(
         density=McmcDensity(max_gaussians=200_000), initial_opacity=0.5, initial_scale=0.1
@@ -82,7 +84,7 @@ RECIPES: dict[str, Callable[[], TrainConfig]] = {"default": default, "paper": pa
 
 
 def recipe(name: str = "default", **settings: Any) -> TrainConfig:
-    """A recipe by name, with other values for some settings: see `changed`.
+    """A recipe by name, with other values for some settings; see `changed`.
 
     Raises:
         SettingError: there is no such recipe, it has no such setting, or a value is invalid.

@@ -1,22 +1,23 @@
 """`StepRunner`: runs a training step on a GPU without waiting for the GPU within the step.
 
-The CPU only queues the work of a GPU, which executes it later. Waiting for one of its results in
-the middle of a step would leave the GPU idle until the CPU has queued the rest. But a step depends
-on three results:
+The CPU queues work for the GPU, and the GPU executes it later. If the CPU waited for a result in
+the middle of a step, the GPU would be idle until the CPU has queued the rest of the step. But a
+step depends on three results:
 
-- The rasterizer needs memory for its instances (pairs of a splat and a tile that it touches), and
-  their number is counted on the GPU. Memory for an estimated number is allocated: the *capacity*.
-- A loss that is not finite must not change anything.
-- Values whose update is not finite are skipped and counted (`ops.adam_step`). The next step must
-  not change anything: training stops there.
+- The rasterizer needs memory for its instances (pairs of a splat and a tile that it touches). Their
+  number is computed on the GPU. Memory is allocated for an estimated number, the *capacity*.
+- If the loss is not finite, the step must not change anything.
+- Values whose update is not finite are skipped and counted (`ops.adam_step`). Training stops at the
+  next step, which must not change anything.
 
-All three are combined, on the device, in one bool: whether the step is *valid*. The operations that
-change the state of the training read it there (`ViewGradient`), and do nothing if it is False. The
-CPU reads the three numbers back after it has queued the complete step, while the GPU still works on
-the backward pass. It then repeats a step whose capacity was too small, or raises `Diverged`.
+These three conditions are combined on the device to one bool: whether the step is *valid*. The
+operations that change the state of the training read this bool on the device (`ViewGradient`), and
+do nothing if it is False. After the CPU has queued the complete step, it reads the three numbers
+back, while the GPU still computes the backward pass. If the capacity was too small, it repeats the
+step. If a value was not finite, it raises `Diverged`.
 
-On the CPU every operation is complete when it returns, memory always suffices, and the same code
-runs: the only difference is the initial capacity.
+On the CPU, the same code runs, but every operation is complete when it returns, and the memory
+always suffices. Only the initial capacity is different.
 """
 
 from __future__ import annotations
@@ -40,11 +41,12 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training import finite
 from snowsplat.training.view_gradient import ViewGradient
 
-#: Initial capacity, in instances per Gaussian: a visible Gaussian has about seven, and a view shows
-#: only a part of the scene. A capacity that is too small costs one repeated step.
+#: Initial capacity, in instances per Gaussian. A visible Gaussian has about seven instances, and a
+#: view shows only a part of the scene. If the capacity is too small, one step is repeated.
 INITIAL_INSTANCES_PER_GAUSSIAN = 4
-#: The capacity grows when a step uses more than this fraction of it, before a view exceeds it: the
-#: requirement changes little from step to step, but differs between views.
+#: The capacity grows when a step uses more than this fraction of it. So it usually grows before a
+#: view
+#: exceeds it: the requirement differs between views, but changes slowly during training.
 GROW_ABOVE = 0.9
 #: A new capacity is this multiple of the required instances: enough for one densification, which
 #: adds up to about a quarter of the Gaussians.
@@ -108,11 +110,11 @@ class StepRunner:
         view: View,
         photo: LoadedImage,
     ) -> float:
-        """Run one step, and repeat it with more capacity if that was too small.
+        """Run one step. If the capacity was too small, repeat the step with a larger capacity.
 
         Args:
             optimize: queues the step, through `rasterize` and `backward`.
-            step, gaussians, view, photo: named in an error.
+            step, gaussians, view, photo: used for the message of an error.
 
         Returns:
             The loss.
@@ -122,26 +124,26 @@ class StepRunner:
         """
         while True:
             optimize()
-            # The complete step is queued: a GPU works on it while the CPU waits for the loss.
+            # The complete step is queued. A GPU computes it while the CPU waits for the loss.
             loss, required, *nonfinite_rows = self._readback.wait()
             instances = self.capacity.instances
             if required > GROW_ABOVE * instances:
                 self.capacity = replace(self.capacity, instances=int(GROWTH * required))
             if required <= instances:
                 break
-        # The counts were copied before this step's update: they are those of the previous steps.
+        # The counts were copied before the update of this step, so they are for the previous steps.
         finite.check_updates(step - 1, nonfinite_rows, gaussians)
         finite.check_loss(step, loss, gaussians, view, photo)
         return loss
 
     def finish(self, step: int, gaussians: Gaussians) -> None:
-        """Wait for the device, and check the update of ``step``, the last one that was run.
+        """Wait for the device, and check the update of the last step, ``step``.
 
         Raises:
-            Diverged: it was not finite.
+            Diverged: the update was not finite.
         """
         finite.check_updates(step, self._nonfinite_rows.tolist(), gaussians)
 
     def reset(self) -> None:
-        """Forget rows that earlier steps skipped: the state of the training was replaced."""
+        """Set the counts of skipped rows to 0, after the state of the training was replaced."""
         self._nonfinite_rows.zero_()

@@ -1,25 +1,25 @@
-"""`Schedule`: the number of steps of a training run, and the step that a fraction of it means."""
+"""`Schedule`: the number of steps of a training run, and the steps of fractions of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: A moment of the training: an int is that step, a float that fraction of all steps.
+#: A moment of the training: a step (int), or a fraction of all steps (float).
 When = int | float
 
 
 @dataclass
 class Schedule:
-    """The length of one training run; trainer, optimiser and density control share this object.
+    """The length of a training run. Trainer, optimiser and density control share this object.
 
     `stretch` makes a training run longer or shorter while it runs. It scales the rest of the
     schedule evenly and leaves the past unchanged: learning rates continue from their current
-    values, no stage is repeated, and each still reaches its end.
+    values, no stage is repeated, and every stage is completed.
 
     Attributes:
         iterations: total number of steps.
-        since: the step at which that was changed last.
-        passed: the fraction of the schedule that was completed at that step.
+        since: the step at which ``iterations`` was last changed.
+        passed: the fraction of the schedule that was completed at step ``since``.
     """
 
     iterations: int
@@ -27,7 +27,7 @@ class Schedule:
     passed: float = 0.0
 
     def step_of(self, when: When) -> int:
-        """The step that ``when`` means; for a past moment, a step in the past."""
+        """The step of the moment ``when``; a past moment has a step in the past."""
         if not isinstance(when, float):
             return when
         if when < self.passed:
@@ -36,7 +36,7 @@ class Schedule:
         return self.since + round((when - self.passed) / (1.0 - self.passed) * ahead)
 
     def share(self, step: int, when: When = 1.0) -> float:
-        """The fraction of the way to ``when`` that is completed after ``step``, 0 to 1."""
+        """The completed fraction, 0 to 1, of the schedule up to ``when``, after ``step``."""
         if not isinstance(when, float):
             return min(1.0, step / max(1, when))
         start = min(1.0, self.passed / when) if when > 0.0 else 1.0

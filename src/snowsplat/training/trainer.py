@@ -1,4 +1,4 @@
-"""`Trainer`: Algorithm 1 of the paper. A `Dataset` goes in, `Gaussians` come out."""
+"""`Trainer`: Algorithm 1 of the paper. It creates `Gaussians` from a `Dataset`."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import interrupts_between_steps, single_threaded
 
-#: Photos are decoded by other threads this many views ahead of their step.
+#: Other threads decode the photos of this many following steps.
 LOOKAHEAD = 16
 
-#: One random generator for each kind of random choice, so that additional choices of one kind do
-#: not change the others. The names are part of the checkpoint format. The position of a name
+#: There is one random generator for each kind of random choice, so that additional choices of one
+#: kind do not change the others. The names are part of the checkpoint format. The index of a name
 #: determines the seed of its generator, so the order must not change.
 GENERATORS = ("start", "views", "background", "density")
 
@@ -40,10 +40,10 @@ FIXED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 @dataclass(frozen=True)
 class Progress:
-    """What `Trainer.run` reports after each step.
+    """The report of `Trainer.run` after each step.
 
-    ``downscale`` is the factor by which the photos of the step were reduced, ``metrics`` the
-    evaluation of the test views at ``test_iterations``.
+    ``downscale`` is the factor by which the photos of the step were reduced. ``metrics`` is the
+    evaluation of the test views, in the steps ``test_iterations``.
     """
 
     step: int
@@ -61,12 +61,12 @@ class Trainer:
         trainer.run()
         trainer.gaussians
 
-    Between two steps, `state_tensors` is the complete state: a trainer that loads it produces
+    Between two steps, `state_tensors` is the complete state. A trainer that loads it produces
     bit-identical results. ``schedule`` may be stretched between two steps.
 
     Attributes:
         gaussians: the scene after ``step`` steps, on ``device``.
-        within_step: an error or a second Ctrl-C ended a step in the middle; the state is
+        within_step: True after an error or a second Ctrl-C in the middle of a step: the state is
             inconsistent and must not be saved.
     """
 
@@ -80,10 +80,10 @@ class Trainer:
         """
         Args:
             schedule: the schedule of a resumed training run; default: ``config.iterations`` steps.
-            device: the device to train on; default: the CPU.
+            device: the device for training; default: the CPU.
 
         Raises:
-            UserError: the dataset has no training views, or points that cannot be represented.
+            UserError: the dataset has no training views, or has points that cannot be represented.
         """
         if not dataset.train:
             raise UserError("the dataset has no training views; check its folder and its split")
@@ -132,12 +132,12 @@ class Trainer:
     def run(
         self, on_progress: Callable[[Progress], None] | None = None, until: int | None = None
     ) -> None:
-        """Run the steps up to ``until`` (default: the last one), with a report after each.
+        """Run the steps up to ``until`` (default: the last step), with a report after each step.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C, after the step during which it was pressed: the state is
-                consistent. A second Ctrl-C interrupts immediately, see ``within_step``.
-            Diverged: the loss, gradients or parameters are no longer finite; names the step.
+            KeyboardInterrupt: Ctrl-C was pressed. It is raised after the current step, when the
+                state is consistent. A second Ctrl-C interrupts immediately; see ``within_step``.
+            Diverged: the loss, gradients or parameters are not finite; the message names the step.
         """
         last = math.inf if until is None else until
         with interrupts_between_steps() as raise_deferred_interrupt:
@@ -153,10 +153,10 @@ class Trainer:
 
     @torch.no_grad()
     def step_once(self) -> float:
-        """One iteration of Algorithm 1; returns its loss.
+        """Run one iteration of Algorithm 1 and return its loss.
 
         Raises:
-            Diverged: the loss is not finite, or the update of the previous step was not.
+            Diverged: the loss is not finite, or the update of the previous step was not finite.
         """
         self.within_step = True
         with single_threaded():
@@ -184,7 +184,7 @@ class Trainer:
         """Rasterize, compare with the photo, and update the Gaussians."""
         sh_degree = self.config.sh_degree_at(step)
         splats = project(self.gaussians, camera, sh_degree)
-        with torch.enable_grad():  # without `project`, which the optimiser differentiates
+        with torch.enable_grad():  # not for `project`: `ops.adam_step` computes its gradient
             image = self._runner.rasterize(splats, camera, background)
             loss = view_loss(image, photo, background, self.config.ssim_weight)
         gradient = self._runner.backward(loss, splats, camera, sh_degree)
@@ -192,13 +192,13 @@ class Trainer:
         self._optimizer.step(self.gaussians, gradient, step)
 
     def evaluate(self) -> Evaluation:
-        """Metrics of the test views in the current state; a random background is set to black."""
+        """Metrics of the test views in the current state. Black replaces a random background."""
         background = (0.0, 0.0, 0.0) if self._background is None else self._background.tolist()
         with single_threaded():
             return evaluate_views(self.gaussians, self.dataset.test, background=background)
 
     def _next_view(self, step: int) -> tuple[View, Camera, LoadedImage]:
-        """The next view in shuffled order, with camera and photo at the step's resolution."""
+        """The next view in random order, with camera and photo at the resolution of the step."""
         downscale = self._downscale(step)
         if len(self._order) <= LOOKAHEAD:
             while len(self._order) <= LOOKAHEAD:
@@ -212,7 +212,7 @@ class Trainer:
         return view, camera, self._images.get(view, downscale)
 
     def _next_background(self) -> Tensor:
-        """(3,) on the device: the fixed colour, or a random one."""
+        """The background colour, (3,) on the device: the fixed colour, or a random one."""
         if self._background is not None:
             return self._background
         color = torch.rand(3, generator=self._generators["background"])
@@ -225,7 +225,7 @@ class Trainer:
         self._images.prefetch([self.dataset.train[i] for i in self._order], downscale)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """What the next steps depend on, in addition to dataset, config and schedule.
+        """The state on which the next steps depend, besides dataset, configuration and schedule.
 
         The tensors are not copied.
         """
@@ -240,7 +240,7 @@ class Trainer:
         return tensors | {"step": torch.tensor(self.step), "order": order}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Copy what `state_tensors` returned in a trainer of equal dataset, config and schedule.
+        """Copy a state of `state_tensors`, from a trainer with the same dataset and configuration.
 
         Raises:
             UserError: the state has another density control, SH degree or dataset, or is not

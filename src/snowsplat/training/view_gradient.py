@@ -1,4 +1,4 @@
-"""`ViewGradient`: the gradient of the loss of one view, as the backward pass leaves it."""
+"""`ViewGradient`: the gradient of the loss of one view with respect to its splats."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from snowsplat.scene.camera import Camera
 
 @dataclass(frozen=True)
 class ViewGradient:
-    """∂L/∂splats of one view. Density control and the optimiser read a step from this object.
+    """∂L/∂splats of one view: the input of density control and of the optimiser.
 
-    On a GPU it is not known yet whether the step is valid when they do (see `StepRunner`). The
-    answer stays on the device, in ``valid``, and the two operations that change the state of the
-    training read it there: `add_statistics`, for density control, and `ops.adam_step`, for `Adam`.
-    An invalid step changes nothing, and no caller has to handle it.
+    When they run on a GPU, the CPU does not know yet whether the step is valid (see `StepRunner`).
+    This information is in ``valid``, on the device. The two operations that change the state of the
+    training read it there: `add_statistics` (density control) and `ops.adam_step` (`Adam`). An
+    invalid step changes nothing, so their callers need not handle it.
 
     Attributes:
         splats: the splats from `scene.render.project`; the gradient is ``splats.packed.grad``.
-        camera: the camera of the view, at the resolution of the step. Through it the gradient
-            continues from the splats to the parameters of the Gaussians.
+        camera: the camera of the view, at the resolution of the step. It is needed to propagate the
+            gradient from the splats to the parameters of the Gaussians.
         sh_degree: degree of the spherical harmonics used by this step.
         valid: (1,) bool on the device; None is True.
         nonfinite_rows: (6,) int32 on the device, see `ops.adam_step`; None disables counting.
@@ -38,10 +38,10 @@ class ViewGradient:
     def add_statistics(
         self, norm_sum: Tensor, views: Tensor, max_radii: Tensor | None = None
     ) -> None:
-        """Add this view to per-Gaussian statistics, in place: `ops.accumulate_screen_statistics`.
+        """Add this view to statistics of the Gaussians, by `ops.accumulate_screen_statistics`.
 
-        At the rows of visible Gaussians: norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|,
-        views (N,) += 1, and max_radii (N,) = max(max_radii, 3σ radius in pixels) unless None.
+        For each visible Gaussian: norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|,
+        views (N,) += 1, and max_radii (N,) = max(max_radii, 3σ radius in pixels) unless it is None.
         """
         ops.accumulate_screen_statistics(
             self.splats,

@@ -196,7 +196,7 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
         const SplatTerms<T> s = {mean_conic.x,    mean_conic.y,    mean_conic.z, mean_conic.w,
                                  opacity_color.x, opacity_color.y, slope.x,      slope.y};
         const T x = centre<T>(position.left) - s.mean_x,
-                y = centre<T>(position.packed_columnp) - s.mean_y;
+                y = centre<T>(position.top) - s.mean_y;
         const T peak = peak_over_rectangle(s, x, y, x + T(kRectWidth - 1), y + T(kRectHeight - 1));
         touches = peak + s.log2_opacity >= T(kLog2MinAlpha - kCullSlack);
       }
@@ -436,7 +436,7 @@ SNOW_INLINE void sum_over_pixels(const PixelPosition& position, PixelGradient<C,
     if (slot < group) {
       const Four<T> mean_conic = memory.batch.mean_conic[list[done + slot]];
       rows.add_row(row_pairs, row_grads, centre<T>(position.left) - mean_conic.x,
-                   centre<T>(position.packed_columnp + row) - mean_conic.y);
+                   centre<T>(position.top + row) - mean_conic.y);
     }
     sums.add_group(rows, done / kGroup);
     __syncwarp();

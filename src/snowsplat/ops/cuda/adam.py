@@ -28,7 +28,7 @@ KERNELS: dict[str, Kernel] = {
 
 
 def adam_step(run: Run, suffix: str, p: AdamStepParams) -> int:
-    # The ids that `project` returned: a row for each Gaussian, −1 where it is not visible.
+    # If `project` returned all rows, the ids have a row for each Gaussian: −1 if it is not visible.
     splat_of = p.ids
     if p.splats != p.n:
         splat_of = torch.full((p.n,), -1, dtype=torch.int32, device=p.ids.device)

@@ -1,4 +1,4 @@
-"""Checks whether a GPU can be used; if not, the reason and the remedy."""
+"""Checks whether a GPU can be used, and if not, explains the reason and the remedy."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ import torch
 
 OLDEST = (7, 5)  # oldest architecture of the kernels: see CMakeLists.txt
 
-# Errors of cuInit: no GPU, and a stub library, which is only for linking.
+# Errors of cuInit: there is no GPU; the library is a stub, which is only for linking.
 _NO_DEVICE, _STUB_LIBRARY = 100, 34
 
 
 @functools.cache
 def why_unusable(index: int = 0) -> str | None:
-    """Why the kernels cannot run on cuda:`index`, with the remedy, without a full stop; or None."""
+    """The reason why cuda:`index` cannot be used, and the remedy; None: it can be used.
+
+    The text has no full stop at its end.
+    """
     if torch.version.cuda is None:
         return "this PyTorch is built without CUDA; install one with it (see pytorch.org)"
     with warnings.catch_warnings(record=True) as caught:
@@ -49,7 +52,7 @@ def why_unusable(index: int = 0) -> str | None:
 
 
 def gpu_there() -> bool:
-    """Whether the machine has an NVIDIA GPU and a driver, usable or not."""
+    """Whether the machine has an NVIDIA GPU and a driver, even if they cannot be used."""
     found = _driver()
     return found is not None and found.error != _NO_DEVICE
 
@@ -95,7 +98,8 @@ def _why_torch_cannot(torch_cuda: str, messages: list[str]) -> str:
 
 
 def _torch_runs_on(capability: tuple[int, int]) -> bool:
-    # "sm_86" runs on later cards of its major version, "compute_86" on all later cards.
+    # "sm_86" runs on GPUs of the same major version from 8.6 on, "compute_86" on all GPUs from 8.6
+    # on.
     known = [
         re.fullmatch(r"(sm|compute)_(\d+)(\d)[af]?", text) for text in torch.cuda.get_arch_list()
     ]

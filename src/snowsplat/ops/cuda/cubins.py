@@ -1,6 +1,6 @@
-"""The machine code of the kernels for a GPU: from the wheel, or compiled here and cached.
+"""The machine code of the kernels for a GPU: from the wheel, or compiled by NVRTC and cached.
 
-A cubin runs on GPUs of its compute capability, and of later ones of the same major version.
+A cubin runs on GPUs of its compute capability, and of later capabilities of the same major version.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _BUILT = Path(__file__).resolve().parents[2] / "_lib" / "cuda"
 
 
 def candidates(file: str, capability: Capability, cuda_major: int) -> Iterator[bytes]:
-    """Code that may run on this GPU, best first: a built cubin, then code compiled for this GPU.
+    """Code that may run on this GPU: a cubin of the wheel, then code compiled by NVRTC.
 
     Args:
         file: the file of the `Kernel`.
-        cuda_major: newest CUDA version of the driver, which cannot load code of later versions.
+        cuda_major: the CUDA version of the driver, which cannot load code of later versions.
 
     Raises:
-        UserError: there is no built cubin and no compiler.
+        UserError: there is no cubin in the wheel, and no compiler.
     """
     major, minor = capability
     for lower in range(minor, -1, -1):
@@ -43,7 +43,7 @@ def candidates(file: str, capability: Capability, cuda_major: int) -> Iterator[b
 
 @functools.cache
 def _nvrtc(cuda_major: int) -> nvrtc.Nvrtc:
-    # Newest first: it supports the most GPUs.
+    # The newest first, because it supports the most GPUs.
     return nvrtc.Nvrtc(nvrtc.find(range(min(cuda_major, 13), 11, -1)))
 
 
@@ -97,7 +97,7 @@ def _cache_path(file: str, target: str, key: str) -> Path | None:
     return Path(base, "snowsplat", "kernels", f"{file}-{target}-{key}")
 
 
-# A file has the SHA-256 of the code and the code, so that damage is detected.
+# A file contains the SHA-256 of the code, followed by the code, so that damage is detected.
 
 
 def _read(path: Path | None) -> bytes | None:
@@ -114,7 +114,7 @@ def _read(path: Path | None) -> bytes | None:
 def _write(path: Path | None, code: bytes) -> None:
     if path is None:
         return
-    with contextlib.suppress(OSError):  # then it is compiled again next time
+    with contextlib.suppress(OSError):  # if writing fails, the code is compiled again next time
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
             temporary.write_bytes(hashlib.sha256(code).digest() + code)

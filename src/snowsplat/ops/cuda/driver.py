@@ -1,6 +1,6 @@
-"""Runs kernels on a GPU through its driver; memory and streams are torch's.
+"""Runs kernels on a GPU through its driver. Memory and streams are those of torch.
 
-A launch costs a few microseconds of Python and does not wait for the GPU.
+A launch takes a few microseconds in Python and does not wait for the GPU.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.layout import LARGEST_PARAMS, Params, layout_of
 from snowsplat.util.errors import UserError
 
-# Errors of the driver. After a code for another GPU, the next candidate is tried.
+# Errors of the driver. If the code is for another GPU, the next candidate is tried.
 _OUT_OF_MEMORY = 2
 _NOT_FOUND = 500
 _INCOMPATIBLE_CODE = (200, 209, 218, 222)  # invalid image, no binary, invalid or too new PTX
@@ -35,7 +35,7 @@ class _Buffer(threading.local):
     def __init__(self) -> None:
         self.struct = ctypes.create_string_buffer(LARGEST_PARAMS)
         self._pointer = ctypes.c_void_p(ctypes.addressof(self.struct))
-        #: Address of an array with one pointer, to the struct.
+        #: Address of an array with one element: the pointer to the struct.
         self.address = ctypes.addressof(self._pointer)
 
 
@@ -61,7 +61,7 @@ def run(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
     stream = torch.cuda.current_stream(index).cuda_stream
     cuda = gpu.cuda
     launch = (function, blocks, 1, 1, kernel.threads, 1, 1, 0, stream, buffer.address, 0)
-    # The threads that torch creates for backward passes have no context at first.
+    # The threads that torch creates for backward passes initially have no context.
     if int(cuda.cuCtxGetCurrent()[1]) == gpu.context:
         (error,) = cuda.cuLaunchKernel(*launch)
     else:
@@ -80,7 +80,7 @@ def _gpu(index: int) -> _Gpu:
 
 @functools.cache
 def _bindings() -> Any:
-    # Imported when needed: without a GPU it may be missing.
+    # Imported when it is needed, because it may be missing on a machine without a GPU.
     return importlib.import_module("cuda.bindings.driver")
 
 
@@ -96,7 +96,7 @@ class _Gpu:
         self._capability = torch.cuda.get_device_capability(index)
         self._check(self.cuda.cuInit(0))
         self._version = self._check(self.cuda.cuDriverGetVersion())
-        # The context that torch also uses.
+        # The primary context, which torch also uses.
         device = self._check(self.cuda.cuDeviceGet(index))
         self._context = self._check(self.cuda.cuDevicePrimaryCtxRetain(device))
         self.context = int(self._context)
@@ -144,7 +144,7 @@ class _Gpu:
         for code in cubins.candidates(file, self._capability, self._version // 1000):
             error, library = self.cuda.cuLibraryLoadData(code, None, None, 0, None, None, 0)
             if error == 0:
-                # Code for another GPU may be rejected only here.
+                # The driver may reject code for another GPU only at this point.
                 error, function = self._function(library, name)
             if error not in _INCOMPATIBLE_CODE:
                 if error == 0:
@@ -166,13 +166,13 @@ class _Gpu:
 
     def fail(self, error: Any, name: str) -> None:
         """Raises UserError with the driver's error in one line."""
-        said, what = self.cuda.cuGetErrorName(error), self.cuda.cuGetErrorString(error)
-        known = said[0] == 0 and what[0] == 0
-        text = f"{said[1].decode()}, {what[1].decode()}" if known else f"error {int(error)}"
+        name_of, text_of = self.cuda.cuGetErrorName(error), self.cuda.cuGetErrorString(error)
+        known = name_of[0] == 0 and text_of[0] == 0
+        text = f"{name_of[1].decode()}, {text_of[1].decode()}" if known else f"error {int(error)}"
         if error == _NOT_FOUND:
-            do = _OUTDATED
+            remedy = _OUTDATED
         elif error == _OUT_OF_MEMORY:
-            do = "close other programs that use the GPU, or make the scene smaller"
+            remedy = "close other programs that use the GPU, or make the scene smaller"
         else:
-            do = "update the NVIDIA driver, or use device cpu"
-        raise UserError(f"cuda:{self._index}: {name}{': ' if name else ''}{text}; {do}")
+            remedy = "update the NVIDIA driver, or use device cpu"
+        raise UserError(f"cuda:{self._index}: {name}{': ' if name else ''}{text}; {remedy}")

@@ -10,10 +10,10 @@ from snowsplat.ops.layout import Params
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel in `native/cuda/<file>.cu`; the one for float64 has the suffix `_f64`.
+    """A kernel in `native/cuda/<file>.cu`; its variant for float64 has the suffix `_f64`.
 
     params: its struct of parameters.
-    threads: number of threads of a block, as in its SNOW_KERNEL.
+    threads: number of threads of a block, as in the SNOW_KERNEL macro.
     items: number of items that a block processes.
     """
 
@@ -28,6 +28,6 @@ class Kernel:
 
 
 class Run(Protocol):
-    """Queues a kernel behind those before it: its full name, blocks (0: none), parameters."""
+    """Queues a kernel. ``name``: its full name; ``blocks``: 0 queues nothing."""
 
     def __call__(self, name: str, blocks: int, params: Params) -> None: ...

@@ -1,11 +1,11 @@
 """The native functions on a GPU and their kernels.
 
-Most are one kernel of the same name and parameters; a few are a sequence of kernels. Each module
-(`projection`, `tiling`, …) declares its own:
+Most native functions are one kernel with the same name and parameters; a few are a sequence of
+kernels. Each module (`projection`, `tiling`, …) declares its own:
 
 KERNELS    name → `Kernel`: its file, struct of parameters, and block size.
-SEQUENCES  name → a function `(run, suffix, params) -> int` that runs kernels one after the other;
-           `suffix` is "" or "_f64", for those that exist in both.
+SEQUENCES  name → a function `(run, suffix, params) -> int` that runs several kernels. `suffix` is
+           "" or "_f64": the suffix of the kernels that exist in both variants.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SEQUENCES: dict[str, Callable[..., int]] = {
 }
 
 Execute = Callable[[Kernel, str, int, Params], None]
-"""Runs a kernel: the kernel, its full name, blocks, parameters."""
+"""Runs a kernel. Arguments: the kernel, its full name, the number of blocks, the parameters."""
 
 
 def launch(name: str, params: Params) -> int:

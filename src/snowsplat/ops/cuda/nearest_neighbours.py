@@ -13,9 +13,9 @@ from snowsplat.ops.cuda.sorting import sort_pairs
 from snowsplat.ops.layout import MAX_NEIGHBOURS, Params
 from snowsplat.ops.params import NeighboursParams
 
-_CHUNK = 32  # points of a chunk, chunks of a group
+_CHUNK = 32  # points of a chunk; also chunks of a group
 _CODE_BITS = 63
-_LISTS = (1, 3, 8, MAX_NEIGHBOURS)  # how many neighbours the searches keep
+_LISTS = (1, 3, 8, MAX_NEIGHBOURS)  # numbers of neighbours for which there is a search kernel
 
 
 @dataclass(slots=True, kw_only=True)

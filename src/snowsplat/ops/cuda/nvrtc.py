@@ -1,7 +1,7 @@
-"""Compiles kernels with NVRTC, NVIDIA's compiler library, which needs neither toolkit nor GPU.
+"""Compiles kernels with NVRTC, NVIDIA's compiler library. It needs no CUDA toolkit and no GPU.
 
-Imports nothing of snowsplat and no torch: the build of a wheel runs this file as a script, in an
-environment that has neither (see CMakeLists.txt).
+This module must not import torch or other modules of snowsplat: the build of a wheel runs it as a
+script, in an environment that has neither (see CMakeLists.txt).
 
     python nvrtc.py --find
     python nvrtc.py SOURCE --target sm_90 --output FILE
@@ -17,13 +17,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-# Fast options without a relevant loss of accuracy: denormals are flushed to zero, as on the CPU.
-# Divisions and square roots stay exact. Lambdas in kernels need no __device__.
+# Options that increase the speed without a relevant loss of accuracy: denormal numbers are flushed
+# to zero, as on the CPU, but divisions and square roots stay exact. With the last option, lambdas
+# in kernels need no __device__.
 OPTIONS = ("--std=c++17", "--ftz=true", "--device-as-default-execution-space")
 
 _NATIVE = Path(__file__).resolve().parents[2] / "native"
 
-# Folders of the library in packages, relative to sys.path, and its file names.
+# Folders of the library in Python packages, relative to sys.path, and its file names.
 _FOLDERS = {
     12: ("nvidia/cuda_nvrtc/lib", "nvidia/cuda_nvrtc/bin", "torch/lib"),
     13: ("nvidia/cu13/lib", "nvidia/cu13/bin/x86_64", "nvidia/cu13/bin", "torch/lib"),
@@ -39,7 +40,7 @@ class NotFound(Exception):
 
 
 class CompileError(Exception):
-    """A kernel does not compile; the message is that of the compiler."""
+    """A kernel cannot be compiled; the message is that of the compiler."""
 
 
 def path_of(file: str) -> Path:
@@ -63,7 +64,7 @@ def sources(path: Path) -> list[Path]:
 
 
 def find(majors: Sequence[int] = (12, 13)) -> str:
-    """The library's path, or its name if the loader knows it, of the first of these major versions.
+    """The path of the library of the first available major version, or its name for the loader.
 
     Raises:
         NotFound: none of them is installed.
@@ -99,7 +100,7 @@ class Nvrtc:
         self._check(self._library.nvrtcGetNumSupportedArchs(ctypes.byref(count)))
         numbers = (ctypes.c_int * count.value)()
         self._check(self._library.nvrtcGetSupportedArchs(numbers))
-        self.architectures = tuple(numbers)  # 75, 80, …: those with machine code
+        self.architectures = tuple(numbers)  # 75, 80, …: it generates machine code for them
 
     def compile(self, source: Path, target: str, lineinfo: bool = False) -> tuple[bytes, str]:
         """The compiled file, and the compiler's warnings ("" for none).
@@ -109,7 +110,7 @@ class Nvrtc:
             lineinfo: include source lines for profilers and sanitizers.
 
         Raises:
-            CompileError: the code does not compile; contains the compiler's complete output.
+            CompileError: the code cannot be compiled; contains the complete output of the compiler.
         """
         options = [f"--gpu-architecture={target}", *OPTIONS, f"--include-path={_NATIVE}"]
         if lineinfo:
@@ -151,7 +152,7 @@ def _main() -> int:
     parser.add_argument("--find", action="store_true", help="print the library's path")
     parser.add_argument("--target", help="sm_90 and so on")
     parser.add_argument("--output", type=Path)
-    parser.add_argument("--depfile", type=Path, help="what it was made of, for Ninja")
+    parser.add_argument("--depfile", type=Path, help="list the source files in this file")
     parser.add_argument("--library", help="the NVRTC to use")
     parser.add_argument("--lineinfo", action="store_true")
     asked = parser.parse_args()

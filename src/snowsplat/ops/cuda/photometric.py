@@ -64,7 +64,7 @@ KERNELS: dict[str, Kernel] = {
 
 _TILE_WIDTH = 32
 _TILE_HEIGHT = {"": 24, "_f64": 12}
-_MAPS_BYTES = 32 << 20  # of derivatives at a time; more if one channel needs it
+_MAPS_BYTES = 32 << 20  # maximum size of the maps of derivatives, if at least one channel fits
 
 
 def _photometric(target_suffix: str, run: Run, suffix: str, p: PhotometricParams) -> int:

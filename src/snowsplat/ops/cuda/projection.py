@@ -38,7 +38,7 @@ KERNELS: dict[str, Kernel] = {
 
 
 def project_cull(run: Run, suffix: str, p: ProjectCullParams) -> int:
-    """Keeps all rows: the id of a Gaussian that is not visible is −1."""
+    """Returns the number of all rows; the id of a Gaussian that is not visible is −1."""
     run("project_cull" + suffix, KERNELS["project_cull"].blocks(p.n), p)
     return p.n
 

@@ -24,12 +24,12 @@ KERNELS: dict[str, Kernel] = {
 
 
 def _sums_in_order(run: Run, suffix: str, query: SizeQueryParams) -> int:
-    """Sums in a fixed order need memory and time, so torch's setting has to request them."""
+    """Sums in a fixed order need memory and time, so they are used only if torch is set to it."""
     return int(torch.are_deterministic_algorithms_enabled())
 
 
 def _block_bytes(run: Run, suffix: str, query: SizeQueryParams) -> int:
-    """One bit for each of the eight warps of a tile."""
+    """One byte per instance: one bit for each of the eight warps of a tile."""
     return 1
 
 

@@ -1,7 +1,7 @@
 """Prefix sums and a stable radix sort on a GPU, for the other modules.
 
-A length may be known only on the GPU: `sort_pairs` takes an upper bound and a tensor with the
-actual length. Nothing here waits for the GPU.
+If the number of pairs is known only on the GPU, `sort_pairs` takes an upper bound and a tensor with
+the actual number. These functions do not wait for the GPU.
 """
 
 from __future__ import annotations
@@ -67,9 +67,10 @@ _KEYS = {torch.int16: "u16", torch.int32: "u32", torch.int64: "u64"}
 
 
 def exclusive_scan(run: Run, n: int, values: Tensor, out: Tensor, total: Tensor) -> None:
-    """out[i] = the sum of values[:i], both uint32, possibly the same. total (1,) int64: of all n.
+    """out[i] = the sum of values[:i]; total, (1,) int64, is the sum of all n values.
 
-    Sums that do not fit become 2^32 − 1; the total is exact.
+    `values` and `out` are uint32 and may be the same tensor. A sum that does not fit becomes
+    2^32 − 1; the total is exact.
     """
     blocks = KERNELS["scan_sums"].blocks(n)
     sums = torch.empty(blocks, dtype=torch.int64, device=values.device)
@@ -95,11 +96,11 @@ def sort_pairs(
     count: Tensor | None = None,
     rows: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Sorts unsigned keys of 16, 32 or 64 bits with 32-bit values; stable.
+    """A stable sort of unsigned keys of 16, 32 or 64 bits, with values of 32 bits.
 
     bits: begin and end of the significant bits of a key; at least one bit.
-    count: (1,) int64, the number of pairs, at most n; the pairs behind are left out.
-    rows: the values are the numbers of the pairs, 0, 1, …; the content of `values` is ignored.
+    count: (1,) int64, the number of pairs, at most n; the remaining pairs are ignored.
+    rows: the values are the indices of the pairs, 0, 1, …; the content of `values` is ignored.
 
     Returns the sorted keys and values: keys and values if `sort_passes` is even, else keys2 and
     values2. The other two are overwritten.

@@ -1,9 +1,9 @@
 """Sorting splats into tiles, on a GPU.
 
-The instances, pairs of a tile and a splat that touches it, are listed splat by splat in the order
-of depth; the number of an instance in this list is its slot. A stable sort by tile then gives each
-tile its splats, nearest first. Nothing waits for the GPU, unless the number of instances is
-requested.
+The instances (pairs of a splat and a tile that the splat touches) are listed in the order of the
+depth of their splats; the index of an instance in this list is its slot. A stable sort by tile then
+gives the splats of each tile, nearest first. The CPU does not wait for the GPU, unless the number
+of instances is requested.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ def _workspace_bytes(run: Run, suffix: str, query: SizeQueryParams) -> int:
 def _open_workspace(workspace: Tensor, n: int) -> tuple[Tensor, ...]:
     """The data that tiles_count passes to tiles_fill.
 
-    The number of instances (1,) int64, and for each splat, nearest first: the corner and the size
-    of its rectangle of tiles, the touched tiles in it, and the first slot.
+    These are the number of instances, (1,) int64, and for each splat, nearest first: the corner and
+    the size of its rectangle of tiles, the touched tiles in the rectangle, and the first slot.
     """
     required = workspace[: _HEAD // 2].view(torch.int64)
     return required, *workspace[_HEAD:].view(torch.int32).view(_ARRAYS, n)
@@ -153,11 +153,11 @@ def _tiles_fill(run: Run, suffix: str, p: TilesFillParams) -> int:
     key = torch.int16 if narrow else torch.int32
     keys, keys2, spare = empty(key), empty(key), empty(torch.int32)
     # The values of the sort are the splats. If slots are required, the values are the slots, and
-    # the splats are looked up afterwards.
-    in_slots = p.instance_slot is not None
-    carried = p.instance_splat if p.instance_slot is None else p.instance_slot
-    pair = (carried, spare) if sort_passes(bits) % 2 == 0 else (spare, carried)
-    slot_splat = empty(torch.int32) if in_slots else pair[0]
+    # tiles_gather finds the splats afterwards.
+    sorts_slots = p.instance_slot is not None
+    sort_values = p.instance_splat if p.instance_slot is None else p.instance_slot
+    pair = (sort_values, spare) if sort_passes(bits) % 2 == 0 else (spare, sort_values)
+    slot_splat = empty(torch.int32) if sorts_slots else pair[0]
     run(
         f"tiles_fill{suffix}",
         KERNELS["tiles_fill"].blocks(p.n),
@@ -180,7 +180,7 @@ def _tiles_fill(run: Run, suffix: str, p: TilesFillParams) -> int:
         ),
     )
     keys, _ = sort_pairs(
-        run, capacity, keys, keys2, *pair, (0, bits), count=required, rows=in_slots
+        run, capacity, keys, keys2, *pair, (0, bits), count=required, rows=sorts_slots
     )
     if p.instance_slot is not None:
         run(
@@ -210,7 +210,7 @@ def _tiles_fill(run: Run, suffix: str, p: TilesFillParams) -> int:
 
 
 SEQUENCES: dict[str, Callable[..., int]] = {
-    "splat_record_bytes": _zero,  # the GPU reads the packed rows themselves
+    "splat_record_bytes": _zero,  # the GPU has no records: it reads the packed rows
     "splats_recolor": _zero,
     "tiles_parts": _zero,
     "tiles_workspace_bytes": _workspace_bytes,

@@ -1,9 +1,9 @@
 """Density control: adds and removes Gaussians during training.
 
-A method is a module with two dataclasses: its settings (frozen; part of `TrainConfig`), whose
-``control`` method creates its state, which follows the `DensityControl` protocol. The trainer knows
-only these two. `AdaptiveDensity` is the paper's method, `McmcDensity` that of Kheradmand et al.
-2024.
+A method is a module with two dataclasses: its settings, and its state. The settings are frozen and
+part of `TrainConfig`; their method ``control`` creates the state, which has the `DensityControl`
+protocol. The trainer uses only these two. `AdaptiveDensity` is the method of the paper,
+`McmcDensity` that of Kheradmand et al. 2024.
 """
 
 from __future__ import annotations
@@ -24,29 +24,30 @@ __all__ = ["DENSITY_CONTROLS", "AdaptiveDensity", "DensityConfig", "DensityContr
 
 
 class DensityControl(Protocol):
-    """The state of a density control: statistics in the order of the rows, and two hooks."""
+    """The state of a density control: statistics with one row per Gaussian, and two hooks."""
 
     def after_backward(self, step: int, gaussians: Gaussians, gradient: ViewGradient) -> None:
-        """Before the optimiser: accumulate statistics, or add the gradients of regularisers.
+        """Called before the optimiser: accumulates statistics, or adds gradients of regularisers.
 
         Statistics are accumulated by `ViewGradient.add_statistics`, which changes nothing if the
-        step turns out to be invalid. The gradient of a regulariser is assigned to ``.grad`` of the
-        parameters, which the optimiser adds and clears. On a GPU nothing here may wait for it.
+        step is invalid. The gradient of a regulariser is assigned to ``.grad`` of the parameters;
+        the optimiser adds and clears it. This function must not wait for a GPU.
         """
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
-        """After the optimiser: refine. Returns the Gaussians to continue with, possibly the same.
+        """Called after the optimiser: changes the set of Gaussians. Returns the new Gaussians.
 
-        The trainer calls this as late as possible, at the beginning of step + 1, so that a scene
-        that was just cloned or reset is never evaluated or saved.
+        The trainer calls this at the beginning of step + 1, so that a scene is never evaluated or
+        saved directly after densification or an opacity reset. The returned object may be the
+        argument.
 
         Raises:
-            Diverged: the parameters are not finite at a step that refines.
+            Diverged: the parameters are not finite in a step that densifies.
         """
         ...
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """Statistics, by name, for a checkpoint. Not copied."""
+        """The statistics by name, for a checkpoint. The tensors are not copied."""
         ...
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -60,22 +61,22 @@ class DensityConfig(Protocol):
 
     @property
     def max_gaussians(self) -> int:
-        """Limit of the number of Gaussians, including the initial ones; 0 is no limit."""
+        """Maximum number of Gaussians, including the initial ones; 0: no limit."""
         ...
 
     @property
     def densify_from(self) -> When:
-        """The first moment that may add Gaussians."""
+        """The first moment at which Gaussians may be added."""
         ...
 
     @property
     def densify_until(self) -> When:
-        """The last moment that may add Gaussians."""
+        """The last moment at which Gaussians may be added."""
         ...
 
     @property
     def densify_interval(self) -> int:
-        """Steps between two such moments."""
+        """Number of steps between two densifications."""
         ...
 
     def control(
@@ -93,14 +94,14 @@ class DensityConfig(Protocol):
         Args:
             count: number of Gaussians.
             extent: extent of the scene, in world units.
-            random_init: whether training starts from random points, not those of a dataset.
+            random_init: whether training starts from random points instead of SfM points.
             generator: a random generator on the CPU.
             device: the device of the Gaussians; default: the CPU.
         """
         ...
 
 
-#: The settings of every method by the name of their class, which a stored configuration names.
+#: The settings of every method, by the name of the class; stored configurations contain this name.
 DENSITY_CONTROLS: dict[str, type[DensityConfig]] = {
     settings.__name__: settings for settings in (AdaptiveDensity, McmcDensity)
 }

@@ -20,38 +20,38 @@ from snowsplat.training.optim import Adam
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.training.view_gradient import ViewGradient
 
-#: φ of the paper, determined by experiment: a split divides the scale by this factor.
+#: φ of the paper: a split divides the scale by this factor, which was determined by experiments.
 SPLIT_SHRINK = 1.6
 #: Largest opacity after a reset.
 RESET_OPACITY = 0.01
-#: A scene needs about this many steps to recover from an opacity reset.
+#: Approximate number of steps that a scene needs to recover from an opacity reset.
 RESET_RECOVERY = 500
 
 
 @dataclass(frozen=True)
 class AdaptiveDensity:
-    """Settings of adaptive density control; the defaults are the paper's.
+    """Settings of adaptive density control; the defaults are those of the paper.
 
     Attributes:
         densify_from, densify_until: first and last step of densification (float: fraction of all
             steps).
         densify_interval: number of steps between two densifications.
-        grad_threshold: τ_pos: a Gaussian is densified if the norm of its view-space position
-            gradient, averaged over the views, is larger.
+        grad_threshold: τ_pos of the paper: a Gaussian is densified if the norm of its view-space
+            position gradient, averaged over the views, is larger.
         percent_dense: Gaussians up to this scale, in units of the scene extent, are cloned; larger
             ones are split.
         prune_opacity: Gaussians with a lower opacity are removed.
         prune_world_size: Gaussians with a larger scale, in units of the scene extent, are removed;
-            0 disables this. Use 0 for forward-facing scenes: their extent is small compared to
-            their depth, so that most of the Gaussians would be removed.
+            0 disables this. Use 0 for forward-facing scenes, whose extent is small compared to
+            their depth; otherwise most of the Gaussians would be removed.
         prune_screen_size: Gaussians with a larger 3σ radius, in pixels, are removed; 0 disables
             this. Pruning by either size begins after the first opacity reset.
         opacity_reset_interval: steps between opacity resets; 0 disables them. The last one is at
             least 500 steps before densification ends.
-        reset_random_start: if training started from random points, also reset opacity at
-            ``densify_from``, unless fewer than 500 steps are left. Most random points lie in empty
-            space, where they learn the colour of the background instead of becoming transparent:
-            without the reset, 100,000 of them can remain as a cloud of that colour.
+        reset_random_start: whether to reset opacity also at ``densify_from``, if training started
+            from random points and at least 500 steps are left. Most random points lie in empty
+            space, where they get the colour of the background instead of becoming transparent.
+            Without the reset, 100,000 of them can remain as a cloud of that colour.
         max_gaussians: maximum number of Gaussians; 0: no limit. If it would be exceeded, only the
             Gaussians with the largest gradients are densified.
     """
@@ -98,7 +98,7 @@ class AdaptiveDensityControl:
     Attributes:
         first_reset: whether opacity is also reset at step ``first``.
         grad_sum: (N,) sum over views of |∂L/∂mean2d|, with the image spanning [-1, 1].
-        views: (N,) number of views in that sum: those in which the Gaussian was visible.
+        views: (N,) number of views in this sum, in which the Gaussian was visible.
         max_radii: (N,) largest 3σ radius in these views, in pixels.
     """
 
@@ -152,9 +152,9 @@ class AdaptiveDensityControl:
         alive = gaussians.opacities >= settings.prune_opacity
         dense = self._densified(grads, alive)
         split = dense & (size > settings.percent_dense)
-        # A split Gaussian is replaced by two children. A cloned Gaussian remains and gets a copy.
-        # Children and copies start with zero moments; because its moments differ, a copy moves away
-        # from its original.
+        # A split Gaussian is replaced with two children. A cloned Gaussian remains and gets a copy.
+        # Children and copies start with zero moments. So the moments of a copy and of its original
+        # are different, and the two move apart.
         kept = alive & ~split
         large = torch.zeros_like(alive)
         after_first_reset = 0 < settings.opacity_reset_interval < step
@@ -183,7 +183,7 @@ class AdaptiveDensityControl:
         return gaussians
 
     def _densified(self, grads: Tensor, alive: Tensor) -> Tensor:
-        """(N,) bool: rows to clone or split; each adds one Gaussian, up to ``max_gaussians``.
+        """The rows to clone or split, (N,) bool. Each adds one Gaussian, up to ``max_gaussians``.
 
         Args:
             grads: (N,) mean norm of the view-space position gradient.
@@ -198,7 +198,7 @@ class AdaptiveDensityControl:
         return dense
 
     def _offsets(self, gaussians: Gaussians, parents: Tensor) -> Tensor:
-        """(M, 3) samples of N(0, Σ) of the rows ``parents`` (M,): R S ε, in world units."""
+        """Samples (M, 3) of N(0, Σ) of the rows ``parents`` (M,): R S ε, in world units."""
         scales = gaussians.log_scales[parents].exp()
         offsets = scales * torch.randn(scales.shape, generator=self.generator).to(scales)
         return (rotation_from_quat(gaussians.quats[parents]) @ offsets[:, :, None])[:, :, 0]

@@ -1,11 +1,12 @@
 """Density control as Markov chain Monte Carlo: Kheradmand et al., NeurIPS 2024, "3D Gaussian
 Splatting as Markov Chain Monte Carlo".
 
-The Gaussians are samples of a distribution whose density is high where they explain the photos.
-Noise on their positions makes the optimiser explore (stochastic gradient Langevin dynamics, section
-3.2); dead ones are relocated to live ones such that the rendered image does not change (section
-3.3); and a regulariser of opacity and scale removes those that are not needed (section 3.4). The
-number of Gaussians grows by a fixed fraction up to a limit, so memory is known before training.
+The Gaussians are regarded as samples of a distribution whose density is high where they reproduce
+the photos. Noise is added to their positions, so that they explore the space (stochastic gradient
+Langevin dynamics, section 3.2). Dead Gaussians are moved to the positions of live ones such that
+the rendered image does not change (section 3.3). A regulariser of opacity and scale makes Gaussians
+that are not needed disappear (section 3.4). The number of Gaussians grows by a fixed fraction up to
+a limit, so the memory is known before training.
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.training.view_gradient import ViewGradient
 from snowsplat.util.errors import SettingError
 
-#: Largest number of copies of one Gaussian that eq. 9 is evaluated for; larger numbers are rare.
+#: Maximum number of copies of one Gaussian for which eq. 9 is evaluated; larger numbers are rare.
 MAX_COPIES = 51
 #: Slope k of the sigmoid that restricts noise to nearly transparent Gaussians (eq. 8).
 NOISE_SHARPNESS = 100.0
-#: On the CPU, Gaussians whose sigmoid is below this get no noise, which saves most random numbers.
+#: On the CPU, Gaussians whose sigmoid is below this value get no noise, so that few random numbers
+#: are needed.
 NOISE_NEGLIGIBLE = 1e-4
 
 
@@ -37,12 +39,12 @@ class McmcDensity:
     """Settings of MCMC density control; the defaults are those of its paper.
 
     Attributes:
-        densify_from, densify_until: first and last step that may relocate (float: fraction of all
+        densify_from, densify_until: first and last step of relocation (float: fraction of all
             steps).
-        densify_interval: steps between two relocations.
-        max_gaussians: limit of the number of Gaussians, never exceeded.
-        growth: fraction by which their number grows at each relocation, up to the limit.
-        prune_opacity: Gaussians of this opacity or less are dead, and are relocated.
+        densify_interval: number of steps between two relocations.
+        max_gaussians: maximum number of Gaussians.
+        growth: fraction by which the number of Gaussians grows at each relocation, up to the limit.
+        prune_opacity: Gaussians of this opacity or less are dead; they are relocated.
         noise: scale of the noise on the positions, in units of their learning rate.
         opacity_regularizer, scale_regularizer: weights of the mean opacity and the mean scale in
             the loss.
@@ -68,7 +70,7 @@ class McmcDensity:
         generator: torch.Generator,
         device: torch.device | None = None,
     ) -> McmcDensityControl:
-        """The initial state, which depends only on ``schedule`` and ``generator``.
+        """The initial state. It depends only on ``schedule`` and ``generator``.
 
         Raises:
             SettingError: ``max_gaussians`` is not positive.
@@ -90,12 +92,12 @@ class McmcDensityControl:
 
     @property
     def first(self) -> int:
-        """The first step that may relocate."""
+        """The first step of relocation."""
         return self.schedule.step_of(self.settings.densify_from)
 
     @property
     def last(self) -> int:
-        """The last step that may relocate."""
+        """The last step of relocation."""
         return min(self.schedule.step_of(self.settings.densify_until), self.schedule.iterations)
 
     def after_backward(self, step: int, gaussians: Gaussians, gradient: ViewGradient) -> None:
@@ -106,7 +108,7 @@ class McmcDensityControl:
         gaussians.log_scales.grad = self.settings.scale_regularizer / scales.numel() * scales
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
-        """Noise at every step; relocation and growth at the steps that do."""
+        """Add noise in every step; relocate and add Gaussians if the settings require it."""
         self._add_noise(gaussians, optimizer.rates_at(step)["means"])
         if self.first <= step <= self.last and step % self.settings.densify_interval == 0:
             check_parameters(step, gaussians)
@@ -119,13 +121,13 @@ class McmcDensityControl:
         if gate.device.type == "cpu":
             rows: Tensor | slice = torch.nonzero(gate > NOISE_NEGLIGIBLE)[:, 0]
             eta = torch.randn(len(gate[rows]), 3, 1, generator=self.generator)
-        else:  # noise is cheap on a GPU, and `nonzero` would wait for it
+        else:  # noise takes little time on a GPU, and `nonzero` would wait for the GPU
             rows = slice(None)
             on_device = torch.Generator(gate.device)
             on_device.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             eta = torch.randn(len(gate), 3, 1, generator=on_device, device=gate.device)
         rotations = rotation_from_quat(gaussians.quats[rows])
-        # The clamp keeps the variance finite in single precision for any scale.
+        # With the limit, the variance is finite in single precision for any scale.
         variances = (2.0 * gaussians.log_scales[rows]).clamp(max=40.0).exp()[:, :, None]
         noise = (rotations @ (variances * (rotations.mT @ eta)))[:, :, 0]
         gaussians.means[rows] += rate * self.settings.noise * gate[rows, None] * noise
@@ -140,7 +142,8 @@ class McmcDensityControl:
         moved = max(count, grown) - len(survivors)
         if moved == 0:
             return gaussians
-        # On the CPU, where the generator is, also if the Gaussians are on a GPU.
+        # This is computed on the CPU, because the generator is there, even if the Gaussians are on
+        # a GPU.
         picks = torch.multinomial(
             opacities[survivors].cpu(), moved, replacement=True, generator=self.generator
         )
@@ -167,12 +170,13 @@ class McmcDensityControl:
 
 
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity and scale of N copies of a Gaussian in one place that together look like it (eq. 9).
+    """Opacity and scale of N copies of a Gaussian that together look like the original (eq. 9).
 
         o_new = 1 − (1 − o)^(1/N)
         Σ_new = o² (Σ_{i=1..N} Σ_{k=0..i−1} C(i−1, k) (−1)^k o_new^(k+1) / √(k+1))^(−2) Σ
 
-    The sum over i is evaluated first: Σ_i C(i−1, k) = C(N, k+1), which leaves N terms.
+    The copies have the same position. The sum over i is evaluated first: Σ_i C(i−1, k) = C(N, k+1),
+    so N terms remain.
 
     Args:
         opacities: (M,) o.
@@ -191,7 +195,7 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     )
     k = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64, device=o.device)
     weights = torch.where(k % 2 == 1, 1.0, -1.0) / k.sqrt()
-    # The sum of absolute terms is at most (1 + o_new)^N ~ 5e4 (N = 51, o = 1 − 1e-6): in double
-    # precision the cancellation is harmless.
+    # The sum of the absolute values is at most (1 + o_new)^N ~ 5e4 (N = 51, o = 1 − 1e-6), so the
+    # cancellation is negligible in double precision.
     total = (binomials[copies] * weights * o_new[:, None] ** k).sum(dim=1)
     return o_new.to(opacities), (o / total).to(opacities)

@@ -49,7 +49,8 @@ class Trained:
         name: name of the scene.
         step: the last step.
         background: background colour of the views, RGB in 0..1.
-        evaluation: metrics of the held-out views; without any, some training views are evaluated.
+        evaluation: metrics of the held-out views; if there are none, some training views are
+            evaluated.
         settings: the settings by name, as JSON values.
         peak_bytes: peak memory; 0 if unknown.
     """
@@ -170,7 +171,7 @@ def _curves(history: History) -> str:
 
 
 def _figures(evaluation: Evaluation, held_out: bool) -> str:
-    """The table of views, with a bar of the error of each."""
+    """The table of views. A bar shows the error of each view."""
     errors = [_rms(metrics.psnr) for metrics in evaluation.views]
     largest = max([*errors, 1e-9])
     rows = [
@@ -228,5 +229,5 @@ def _next(name: str) -> str:
 
 
 def _rms(psnr: float) -> float:
-    """Root mean square error, with values in 0..1."""
+    """Root mean square error, for values in 0..1."""
     return 0.0 if math.isinf(psnr) else 10.0 ** (-psnr / 20.0)

@@ -48,7 +48,7 @@ class Work:
     held_out: int
 
     def seconds(self, downscale: int, gaussians: float) -> float:
-        """Of one step, on the machine of docs/performance.md."""
+        """Seconds of one step on the machine of docs/performance.md."""
         megapixels = self.pixels / downscale**2 / 1e6
         return (
             _SECONDS_PER_STEP
@@ -57,11 +57,11 @@ class Work:
         )
 
     def seconds_after(self, step: float, gaussians: float) -> float:
-        """From the last step to the end: test views are evaluated, the scene is written.
+        """Seconds after the last step, for evaluating the test views and writing the scene.
 
         Args:
             step: seconds of a step at full resolution.
-            gaussians: their number at the end.
+            gaussians: number of Gaussians at the end.
         """
         view = _STEPS_PER_VIEW * step + _SECONDS_PER_VIEW_MEGAPIXEL * self.pixels / 1e6
         return self.held_out * view + _SECONDS_PER_MILLION_WRITTEN * gaussians / 1e6
@@ -69,8 +69,8 @@ class Work:
     def parts_ahead(self, schedule: Schedule, step: int, gaussians: int) -> list[tuple[int, float]]:
         """Downscale and number of Gaussians in equal parts of the steps after ``step``.
 
-        The number is assumed to increase linearly until densification ends, up to its limit, or to
-        twice its present value without one.
+        The number of Gaussians is assumed to increase linearly until densification ends. It then is
+        the limit, or without a limit, twice the present number.
         """
         density = self.config.density
         last = min(schedule.step_of(density.densify_until), schedule.iterations)
@@ -86,7 +86,7 @@ class Work:
 
 
 class StepCost:
-    """Predicts the seconds of a training step from those of previous steps."""
+    """Predicts the seconds of a training step from the times of previous steps."""
 
     def __init__(self, work: Work, time_ratio: float, memory: float) -> None:
         """
@@ -96,9 +96,9 @@ class StepCost:
         """
         self._work = work
         self._memory = memory
-        # By downscale: sums of measured and of modelled seconds, with exponentially decreasing
-        # weights. A stage starts with a guess from the previous one, whose weight prevails over its
-        # first steps, which wait for photos to be decoded.
+        # For each downscale: sums of measured and of modelled seconds, with exponentially
+        # decreasing weights. A stage starts with the time ratio of the previous stage. Its weight
+        # is larger than that of the first steps, because these wait until photos are decoded.
         self._measured: dict[int, float] = {}
         self._modelled: dict[int, float] = {}
         self._time_ratio = time_ratio
