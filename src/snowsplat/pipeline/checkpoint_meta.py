@@ -40,16 +40,14 @@ class CheckpointMeta:
         """The checked value of a checkpoint.
 
         Raises:
-            UserError: not the checkpoint of a training run, or damaged.
+            UserError: not a checkpoint of a training run, or damaged.
         """
         try:
             meta = from_json(CheckpointMeta, start.meta)
             if meta.time is not None and meta.time.keys() != {"seconds", "spent"}:
                 raise ValueError("no time")
         except ValueError as error:
-            raise UserError(
-                f"{start.path}: not the checkpoint of a training run ({error})"
-            ) from None
+            raise UserError(f"{start.path}: not a checkpoint of a training run ({error})") from None
         return meta
 
     def as_json(self) -> dict[str, Any]:

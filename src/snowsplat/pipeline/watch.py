@@ -117,4 +117,4 @@ class NewestScene:
         try:
             return Gaussians(**own)
         except (TypeError, ValueError):
-            raise UserError(f"{path}: not the checkpoint of a training run") from None
+            raise UserError(f"{path}: not a checkpoint of a training run") from None
