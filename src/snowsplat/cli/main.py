@@ -32,7 +32,7 @@ SUBCOMMANDS = {
     "evaluate": "Compare a scene with the held-out photos: PSNR, SSIM and, with weights, LPIPS.",
     "render": "Render images at the camera poses of the photos, or a video.",
     "view": "Show a finished scene in the browser.",
-    "watch": "Show an ongoing or finished training run in the browser, with cameras and photos.",
+    "watch": "Show an ongoing or finished training run in the browser, with its photos.",
     "convert": "Write a scene in another file format; crop, decimate, transform or merge scenes.",
     "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }

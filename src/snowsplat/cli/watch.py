@@ -13,7 +13,7 @@ from snowsplat.cli.scene_flags import SceneFlags
 
 @dataclass
 class Watch(SceneFlags):
-    """Show an ongoing or finished training run in the browser, with its cameras and photos.
+    """Show an ongoing or finished training run in the browser, with its photos.
 
     Examples:
       snowsplat watch out/garden

@@ -195,8 +195,7 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
         const Two<T> slope = memory.slopes[index];
         const SplatTerms<T> s = {mean_conic.x,    mean_conic.y,    mean_conic.z, mean_conic.w,
                                  opacity_color.x, opacity_color.y, slope.x,      slope.y};
-        const T x = centre<T>(position.left) - s.mean_x,
-                y = centre<T>(position.top) - s.mean_y;
+        const T x = centre<T>(position.left) - s.mean_x, y = centre<T>(position.top) - s.mean_y;
         const T peak = peak_over_rectangle(s, x, y, x + T(kRectWidth - 1), y + T(kRectHeight - 1));
         touches = peak + s.log2_opacity >= T(kLog2MinAlpha - kCullSlack);
       }
