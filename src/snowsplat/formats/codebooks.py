@@ -6,9 +6,10 @@ The results are deterministic.
 import numpy as np
 
 LEVELS = 256
-_ITERATIONS = 40  # for the levels, which converge to float32 precision long before
+_ITERATIONS = 40  # for the levels; they converge to float32 precision in fewer
 _QUANTILES = 4096
-# The share of one interval between quantiles is limited to this many levels, by so many iterations.
+# The share of an interval between quantiles is limited to _MOST_LEVELS levels, in _CAPPINGS
+# iterations.
 _MOST_LEVELS = 4
 _CAPPINGS = 20
 _PALETTE_ITERATIONS = 6
@@ -22,9 +23,10 @@ def levels_for(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns the levels (256,) float32, ascending, and the uint8 index of the nearest level for each
     value.
 
-    This is Lloyd's iteration with exact steps: over sorted values, the cell of a level is an
-    interval, and its mean follows from cumulative sums. The initial density of levels is the cube
-    root of the density of values, which is optimal for many levels (P. Panter and W. Dite,
+    This is Lloyd's iteration with exact steps: in sorted values, the cell of a level is an
+    interval, and its mean is computed from cumulative sums. Initially, the density of levels is
+    proportional to the cube root of the density of values, which is optimal for many levels (P.
+    Panter and W. Dite,
     "Quantization distortion in pulse-count modulation with nonuniform spacing of levels", 1951).
     Between two quantiles at distance d the density of values is proportional to 1/d, so this
     interval receives a share of levels proportional to d · d^(-1/3).
@@ -58,8 +60,9 @@ def palette_for(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
     Returns the palette (P, D) and the index (N,) of the entry of each row.
 
-    The clustering has two levels, since N · P distances would take minutes: first about √count
-    clusters of the rows, then palette entries for each cluster in proportion to its size.
+    Computing N · P distances would take minutes, so the clustering has two levels: first, the rows
+    are divided into about √count clusters; then each cluster gets a number of palette entries that
+    is proportional to its size.
     """
     if len(rows) <= count:
         return rows, np.arange(len(rows))

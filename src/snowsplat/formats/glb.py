@@ -18,7 +18,7 @@ from snowsplat.util.safe_json import parse_json
 
 MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
-_MOST_NODES = 1 << 16  # each takes several microseconds
+_MOST_NODES = 1 << 16  # a node takes several microseconds
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 #: The NumPy type, and the divisor of normalised values.
 _COMPONENTS = {
@@ -147,7 +147,7 @@ def _local(node: dict[str, Any]) -> np.ndarray:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # column-major
     local = np.eye(4)
     if "rotation" in node:
-        import torch  # such nodes are rare; `snowsplat info` does not wait for torch otherwise
+        import torch  # imported only here, because such nodes are rare and the import takes time
 
         from snowsplat.scene.geometry import rotation_from_quat
 

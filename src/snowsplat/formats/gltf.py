@@ -5,9 +5,9 @@ quaternions xyzw; SCALE, the standard deviations themselves; OPACITY in 0 … 1;
 with the basis and order of our renderer. COLOR_0 lets programs without the extension display
 points. A Gaussian of SH degree 3 takes about 236 bytes.
 
-The frame of glTF is x right, y up, z toward the viewer: ours, rotated by 180° about x. Nodes place
-the splats in the scene, which readers must apply. Specification: Khronos,
-github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
+The frame of glTF is x right, y up, z towards the viewer: our frame, rotated by 180° about x.
+Readers must apply the transforms of the nodes, which place the splats in the scene. Specification:
+Khronos, github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
 """
 
 import logging
@@ -32,9 +32,9 @@ EXTENSION = "KHR_gaussian_splatting"
 _UNDERSTOOD = {EXTENSION, "KHR_mesh_quantization"}
 _SPACES = ("srgb_rec709_display", "lin_rec709_display")
 _LEAST_BYTES = 26  # per Gaussian, with all attributes quantised except the colour
-_MOST_COPIES = 8  # of the splats in the file, by nodes that share a mesh
-_MOST_PRIMITIVES = 1 << 20  # of all nodes
-_MOST_PARTS = 1 << 12  # primitives with splats
+_MOST_COPIES = 8  # maximum number of copies of the splats, by nodes that share a mesh
+_MOST_PRIMITIVES = 1 << 20  # maximum number of primitives of all nodes
+_MOST_PARTS = 1 << 12  # maximum number of primitives with splats
 _OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
 _GLB_LIMIT = (1 << 32) - 1
 _FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
@@ -75,7 +75,7 @@ def read_glb(path: Path | str) -> GaussianArrays:
 def _parts(
     path: Path, document: dict[str, Any], binary: memoryview, most: int
 ) -> list[GaussianArrays]:
-    """The splats of each primitive that has some, in the frame of the glTF scene.
+    """The splats of each primitive that has splats, in the frame of the glTF scene.
 
     Raises:
         Damaged: more than ``most`` splats, or another violation of the specification.

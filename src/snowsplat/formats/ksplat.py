@@ -41,7 +41,7 @@ _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 
 @dataclass
 class _Section:
-    """One section: its numbers of Gaussians and buckets, and their offsets in the file."""
+    """A section: the numbers of its Gaussians and buckets, and their offsets in the file."""
 
     count: int
     sh_degree: int
@@ -50,8 +50,8 @@ class _Section:
     full_buckets: int
     partial_buckets: int
     bucket_count: int
-    step: float  # of a uint16 position, in world units
-    offset: int  # the uint16 that means a position of 0
+    step: float  # world units of one step of a uint16 position
+    offset: int  # the uint16 value of the position 0
     start: int
     centers_start: int
     rows_start: int
@@ -78,7 +78,7 @@ def read_ksplat(path: Path | str) -> GaussianArrays:
     bounds = low or -_DEFAULT_SH_BOUND, high or _DEFAULT_SH_BOUND
     sections = _sections(path, data, section_count, level)
     degree = max((section.sh_degree for section in sections), default=0)
-    # Starts with an empty part, so that a file without sections is an empty scene.
+    # The first part is empty, so that a file without sections gives an empty scene.
     parts = [GaussianArrays.empty(SH_REST_COUNTS[degree])]
     for section in sections:
         parts.append(_unpack(path, data, section, level, bounds, SH_REST_COUNTS[degree]))

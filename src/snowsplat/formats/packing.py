@@ -67,7 +67,8 @@ def spatial_order(means: np.ndarray) -> np.ndarray:
 
 def unit_quats(quats: np.ndarray) -> np.ndarray:
     """Quaternions (N, 4) scaled to unit length; those of length 0 become the identity."""
-    # Divided by the largest entry first: the squares of float32 values overflow and underflow.
+    # Quaternions are first divided by the largest entry, because squares of float32 values may
+    # overflow or underflow.
     largest = np.abs(quats).max(1, keepdims=True)
     scaled = quats / np.where(largest == 0, 1, largest)
     scaled[largest[:, 0] == 0, 0] = 1
@@ -116,8 +117,8 @@ def largest_of_four(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The "smallest three" encoding of unit quaternions (N, 4).
 
     Returns the index (N,) of the largest entry and the three other entries (N, 3) in their order,
-    each within ±1/√2. The sign is chosen such that the largest entry is positive, so that it
-    follows from the three others.
+    each within ±1/√2. The sign is chosen such that the largest entry is positive. So it can be
+    computed from the three others.
     """
     largest = np.abs(quats).argmax(1)
     rows = np.arange(len(quats))

@@ -1,8 +1,7 @@
 """The table of the scene file formats, and how a format is found for a file.
 
-The format of a file to read is recognised by its first bytes, whatever its name is; only formats
-without a signature are recognized by the suffix. The format of a file to write is selected by the
-suffix.
+The format of a file to read is recognised by its first bytes, not by its name. Only formats without
+a signature are recognised by the suffix. The format of a file to write is selected by the suffix.
 """
 
 from __future__ import annotations
@@ -33,13 +32,13 @@ class Format:
     """One format of scene files.
 
     Attributes:
-        name: what users know it as.
+        name: the name for users.
         suffixes: lower case with their dots, as in ".compressed.ply"; the longest match counts.
         recognises: whether a file with these first 16,384 bytes (fewer if it is shorter) has this
             format; None for a format without a signature.
         read: None for a format that cannot be read.
         write: None for a format that cannot be written.
-        loses: what a scene loses in this format, for users.
+        loses: a description, for users, of the data that a scene loses in this format.
         version: the version of a file that ``recognises`` accepts, if the format has several.
     """
 
@@ -52,7 +51,7 @@ class Format:
     version: Callable[[Path], str] | None = None
 
 
-#: In the order in which ``recognises`` is called: a special format before the general one.
+#: ``recognises`` is called in this order: special formats are before general ones.
 FORMATS: list[Format] = [
     Format(
         "compressed PLY",

@@ -20,9 +20,10 @@ from PIL import Image
 from snowsplat.util.safe_json import is_file, parse_json, quoted
 
 _MOST_MEMBERS = 1000
-# Largest size of an unpacked member: WebP is compressed already, so deflate gains little.
-_MOST_INFLATION = 4  # times its packed size, plus
-_INFLATION_FREE = 1 << 20  # bytes
+# Maximum size of an unpacked member: _MOST_INFLATION times its packed size, plus _INFLATION_FREE
+# bytes. WebP images are already compressed, so the zip compression hardly reduces them.
+_MOST_INFLATION = 4
+_INFLATION_FREE = 1 << 20
 
 
 class Damaged(Exception):
@@ -85,7 +86,7 @@ class Bundle:
         raise Damaged(f"its image {name} has {width}×{height} pixels; expected {least}")
 
     def bytes_with(self, names: Iterable[str]) -> int:
-        """Bytes of a folder's scene with these members; of a zip file, its size."""
+        """Number of bytes of these members of a folder; for a zip file, the size of the file."""
         if self._zip is not None:
             return self.size
         found = [path for path in {self._beside(name) for name in names} if is_file(path)]

@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 #: Folders inside the folder of `make`: the dataset, and the output folder of its training.
 CAPTURE, SCENE = "capture", "scene"
-# A string, a name or number, or a sign; and the literals whose value is used.
-# The expression has no spaces: trying each of a million spaces takes quadratic time.
+# _WORD: a string, a name or number, or a sign. _LITERAL: a literal whose value is used.
+# _WORD does not match spaces: with an expression that does, a million spaces take quadratic time.
 _WORD = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S""", re.DOTALL)
 _LITERAL = re.compile(r"""['"].*['"]|True|False|None|-?[\d.]+(?:e[+-]?\d+)?""", re.DOTALL)
 _NAMESPACE_LIMIT = 1 << 20  # characters
-_PART = 4  # words of a part that are stored: one more than are used
+_PART = 4  # maximum number of stored words of a part; parts of three words are used
 _SCENE = re.compile(r"iteration_(\d+)")
 _RESULTS = ("point_cloud", "checkpoints", "train", "test", "videos", "films")
 _REPORTS = ("metrics.json", "history.json", "report.html")
@@ -143,7 +143,7 @@ class OutputFolder:
         self.describe(dataset, settings, config)
 
     def describe(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
-        """Write what is known before the first step."""
+        """Write the files whose content is known before the first step."""
         from snowsplat.scene.camera_json import write_cameras
 
         self.path.mkdir(parents=True, exist_ok=True)
@@ -158,7 +158,7 @@ class OutputFolder:
         write_cameras(self.path / "cameras.json", cameras)
 
     def write_config(self, settings: DatasetSettings, config: TrainConfig) -> None:
-        """Write `config.json` and `cfg_args`; remove what a kill has left of earlier ones."""
+        """Write `config.json` and `cfg_args`; remove unfinished files of a killed process."""
         from snowsplat.training.config import config_to_json
 
         remove_temporaries(self.path, _FILES)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def check_minutes(minutes: float) -> None:
-    """Raises: UserError: not a positive, finite number."""
+    """Raises UserError if ``minutes`` is not a positive, finite number."""
     if not 0.0 < 60.0 * minutes < float("inf"):
         raise SettingError("minutes", f"{minutes:g} is not a duration; use a number above 0")
 
@@ -30,7 +30,7 @@ class TimeBudget:
     """The time of one training run, from the start of the command to its end.
 
     Attributes:
-        seconds: in total, including earlier runs.
+        seconds: total time, including earlier runs.
         spent: seconds in earlier runs, up to the checkpoint.
         started: when this run started, by `time.monotonic`.
     """
@@ -76,8 +76,8 @@ class TimeBudget:
 
         ``dataset`` has full resolution; ``may``: see `make_plan`.
 
-        The speed is measured by a small sample training, since the plan decides the resolution,
-        the cap and the schedule that a trainer is built with.
+        The speed is measured with a separate, short training run, because a trainer is created
+        with the resolution, the limit of Gaussians and the schedule of the plan.
         """
         from snowsplat.training.time_budget.plan import make_plan, measure_time_ratio
 

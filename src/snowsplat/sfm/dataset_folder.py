@@ -2,7 +2,7 @@
 
     DATASET/input/                the photos or video frames, upright
     DATASET/distorted/            COLMAP database, models of the original photos, log of COLMAP
-    DATASET/images/, sparse/0/    input of the training: undistorted images and their cameras
+    DATASET/images/, sparse/0/    the input of training: undistorted images and their cameras
     DATASET/masks/                masks, if there are any
     DATASET/images_2/, _4, _8     smaller copies, if requested
     DATASET/capture.json          settings and results of each stage
@@ -43,11 +43,11 @@ _OURS = ("distorted", *_IMAGE_FOLDERS, RECORD, REPORT)
 
 @dataclass(frozen=True)
 class DatasetOptions:
-    """How photos become a dataset.
+    """Options for making a dataset from photos.
 
     Attributes:
-        gather: which frames of a video are used, and the image size.
-        sfm: how the poses are estimated.
+        gather: selection of the frames of a video, and the image size.
+        sfm: options of the pose estimation.
         resize: also make images_2, images_4 and images_8.
         skip_matching: use the existing model in distorted/sparse/0 instead of estimating poses.
     """
@@ -62,7 +62,7 @@ class Watcher(Protocol):
     """Receives the progress of the stages."""
 
     def begin(self, stage: str) -> Report:
-        """Called when a stage begins, or is skipped as finished; returns its progress callback."""
+        """Called when a stage begins or is found finished; returns its progress callback."""
 
     def end(self, stage: str, outcome: Outcome) -> None:
         """Called when the stage has finished."""
@@ -87,12 +87,13 @@ def make_dataset(
         overwrite: replace a dataset in ``folder`` that was made from other inputs.
 
     Returns:
-        the outcome of each stage. The results are JSON values: of a `Gathered` for "photos", an
-        `SfmResult` for "poses", an `Undistorted` for "images"; the file name for "report".
+        The outcome of each stage. Its result is a JSON value: a `Gathered` for "photos", an
+        `SfmResult` for "poses", an `Undistorted` for "images", the file name for "report".
 
     Raises:
         UserError: the photos cannot be used, ``folder`` contains other files, or no poses were
-            found; then the files that this run created are removed. Or the disk is full.
+            found. The files that this run created are then removed. Also if the disk is full; then
+            the files remain.
         OSError: a file cannot be read or written.
     """
     sources = find_inputs(inputs)
@@ -180,7 +181,7 @@ def _run(
 def _gather(
     inputs: Sequence[Path], folder: Path, options: GatherOptions, report: Report, in_place: bool
 ) -> dict[str, Any]:
-    """Gather into a temporary folder, then replace the older `input/` by it."""
+    """Gather the photos into a temporary folder, which then replaces the older `input/`."""
     masks = Path("distorted") / "masks"
     if in_place:
         shutil.rmtree(folder / masks, ignore_errors=True)

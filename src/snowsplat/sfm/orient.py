@@ -1,7 +1,7 @@
 """Orientation, origin and scale of the scene, estimated from the camera poses alone.
 
-SfM determines the scene only up to a similarity transform. Viewers need more: up should be up, and
-the photographed object should be at the origin.
+SfM determines the scene only up to a similarity transform. A viewer also needs the up direction,
+the scale, and the photographed object at the origin.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-_POINTS_SAMPLED = 5000  # enough for medians
+_POINTS_SAMPLED = 5000  # number of points from which medians are computed
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """The parts of a model that are needed here, in the world frame of SfM; cameras by name."""
+    """The required parts of a model, in the world frame of SfM; cameras are sorted by name."""
 
     rotations: np.ndarray  # (N, 3, 3) of cam_from_world: the rows are the cameras' x, y, z axes
     centres: np.ndarray  # (N, 3)
@@ -38,7 +38,7 @@ class _Seen:
 
 
 def orientation(model: pycolmap.Reconstruction) -> Similarity:
-    """``scene_from_sfm``: y points down, z along the mean viewing direction, centre at the origin.
+    """``scene_from_sfm``. In the scene, y is down, z the mean viewing direction, the centre at 0.
 
     Up is the direction that makes the photos level. The centre is the point that the cameras look
     at. If they look outwards or all in the same direction, it is the median of the points. The
@@ -133,7 +133,7 @@ def _meeting_point(seen: _Seen) -> np.ndarray | None:
 
 
 def _distance(seen: _Seen) -> float:
-    """Median distance from a camera to the points it sees; without points, between the cameras."""
+    """Median distance from a camera to its points; without points, to the median camera."""
     distances = seen.distances[np.isfinite(seen.distances)]
     if not len(distances):
         distances = np.linalg.norm(seen.centres - np.median(seen.centres, axis=0), axis=1)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _MAP_ERROR = 0.02  # pixels: largest error of the bilinear interpolation between nodes
 _CELLS = (64, 32, 16, 8, 4)  # pixels: approximate cell sizes, tried in this order
-_SMALLEST = 0.2  # of the photo's width and height: if less remains, the calibration is wrong
+_SMALLEST = 0.2  # fraction of width and height: if less remains, the calibration is wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +24,8 @@ class Pinhole:
     """A camera without distortion, and the map from its pixels to those of the distorted photo.
 
     The undistorted image is divided into n × m equal cells. ``nodes`` (n + 1, m + 1, 2) holds the
-    positions x, y in the photo, in pixels, of the corners of the cells. Positions in between are
-    interpolated bilinearly. None if there is no distortion.
+    positions x, y in the photo, in pixels, of the corners of the cells. Positions within a cell are
+    interpolated bilinearly. ``nodes`` is None if there is no distortion.
     """
 
     width: int  # pixels
@@ -36,14 +36,15 @@ class Pinhole:
 
 
 def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
-    """The pinhole camera of a distorted one: same focal lengths, no blank borders.
+    """The pinhole camera for a distorted one: the same focal lengths, no blank borders.
 
     Raises:
         ValueError: the calibration is valid only for a small part of the photo.
     """
     import pycolmap
 
-    # A fisheye lens with zero coefficients counts as "undistorted", but it is no pinhole camera.
+    # COLMAP regards a fisheye lens with zero coefficients as undistorted, but it is not a pinhole
+    # camera.
     if camera.is_perspective_pinhole() and camera.is_undistorted():
         params = (
             camera.focal_length_x,
@@ -56,9 +57,9 @@ def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
     whole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     made, cropped = whole, False
     if not _is_sound(camera, whole):
-        # Beyond some radius the distortion polynomial may turn back, so that the image is folded
-        # there. An image at a bound of its size may have blank borders. Search for the largest
-        # part around the principal point that has neither.
+        # Beyond some radius the distortion polynomial may decrease, so that the image is folded
+        # there. If COLMAP limits the size of the image, it may have blank borders. Search for the
+        # largest part around the principal point without folds and blank borders.
         cropped = True
         low, high = 0.0, 1.0
         while high - low > 1e-3:
@@ -89,7 +90,7 @@ def _to_photo(
 
 
 def _shrunk(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera | None:
-    """The part around the principal point, scaled by ``factor`` in size; same focal lengths."""
+    """The part around the principal point whose size is ``factor`` times the size of the image."""
     import pycolmap
 
     width, height = int(factor * camera.width), int(factor * camera.height)
@@ -106,12 +107,13 @@ def _is_sound(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
     source = _to_photo(camera, pinhole, x, y)
     if not np.isfinite(source).all():
         return False
-    # Sizes are rounded: allow one pixel outside, where the outermost pixels are repeated.
+    # Because sizes are rounded, one pixel outside is allowed; there the border pixels are repeated.
     if (source < -1).any() or (source > [camera.width + 1, camera.height + 1]).any():
         return False
     right, down = source[:-1, 1:] - source[:-1, :-1], source[1:, :-1] - source[:-1, :-1]
     area = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
-    # At least 1% of the area at the centre: what is stretched more has no usable detail.
+    # A cell must have at least 1% of the area of the central cell: if it is stretched more, it has
+    # no usable detail.
     return bool(area.min() > 0.01 * area[32, 32] > 0)
 
 

@@ -22,7 +22,7 @@ from snowsplat.util.safe_json import printable
 _FILE = "capture_report.html"
 _THUMBNAILS = 24  # at most, evenly spaced over the photos
 _THUMBNAIL_HEIGHT = 110  # pixels
-_NAMED = 200  # unused photos that are listed; the rest is counted
+_NAMED = 200  # maximum number of listed unused photos; of the others, only the number is shown
 _ERROR_HIGH = 1.5  # pixels; a good reconstruction is below 1
 
 _FOCAL_FROM = {"exif": "from EXIF, refined", "guessed": "estimated from the photos"}
@@ -211,7 +211,7 @@ def _timing(facts: dict[str, Any]) -> str:
 
 
 def _name(inputs: Sequence[str]) -> str:
-    """A name for the dataset: that of the input; of the folder above if that is ``input``."""
+    """The name of the dataset: that of the input, or if it is ``input``, of its parent folder."""
     first = Path(inputs[0])
     return first.parent.name if first.name == "input" else first.stem
 

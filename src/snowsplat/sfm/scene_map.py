@@ -1,4 +1,4 @@
-"""Cameras and points of a dataset as SVG drawings: from above and from the side, at one scale.
+"""Cameras and points of a dataset as SVG drawings from above and from the side, at one scale.
 
 The frame is that of `orient`: x right, y down, z forward. The median distance from a camera to the
 points is about `VIEWING_DISTANCE` units.
@@ -17,13 +17,13 @@ from snowsplat.scene.orientation import VIEWING_DISTANCE
 _WIDTH = 520  # of the largest drawing, in SVG units
 _HEIGHT = 400
 _MARGIN = 16
-_MOST_POINTS = 6000  # per view; more make the file large and the drawing no clearer
+_MOST_POINTS = 6000  # per drawing; with more points, the file is larger but the drawing not clearer
 _SHADES = 12  # levels of red, green and blue: all points of one colour become one SVG path
 
 
 @dataclass(frozen=True)
 class PlacedPhoto:
-    """A photo as the drawing shows it."""
+    """The data of a photo that a drawing shows."""
 
     name: str
     sequence: str | None  # photos of one sequence are joined by a line, in the given order
@@ -73,7 +73,7 @@ def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) 
     low, high = _box(centres, xyz)
     inside = ((xyz >= low) & (xyz <= high)).all(axis=1)
     shown = np.flatnonzero(inside)
-    # A random choice: a regular one could follow a pattern in the order of the points.
+    # Random points, because evenly chosen ones could follow a pattern in the order of the points.
     shown = shown[np.random.default_rng(0).permutation(len(shown))[:_MOST_POINTS]]
     extents = [np.abs((high - low) @ np.stack([side.right, side.down], 1)) for side in _SIDES]
     scale = min(_fit(extent) for extent in extents)
@@ -89,7 +89,7 @@ def _fit(extent: np.ndarray) -> float:
 
 
 def _box(centres: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest coordinates (3,) of the drawing; outliers and far points are outside."""
+    """Lowest and highest coordinates (3,) of the drawing, without outliers and distant points."""
     low, high = centres.min(axis=0), centres.max(axis=0)
     if len(xyz):
         reach = 3 * VIEWING_DISTANCE
@@ -101,7 +101,7 @@ def _box(centres: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _frustum_depth(centres: np.ndarray, size: np.ndarray) -> float:
-    """Large enough to show the viewing direction, small enough not to overlap neighbours."""
+    """A depth at which frustums show the viewing direction but do not overlap much."""
     large = 0.06 * float(size.max())
     if len(centres) < 2:
         return large
@@ -147,7 +147,7 @@ def _draw(
 
 
 def _points(xy: np.ndarray, rgb: np.ndarray) -> list[str]:
-    """Dots, one path for each colour; dark colours are lightened, as the background is dark."""
+    """The points, one path for each colour. Dark colours are lightened: the background is dark."""
     shades = np.rint(rgb.astype(np.float64) * ((_SHADES - 1) / 255)).astype(np.int64)
     lines = []
     for shade in np.unique(shades, axis=0):

@@ -44,7 +44,7 @@ logger = logging.getLogger(__name__)
 
 _DIVISORS = (2, 4, 8)
 _BYTES_PER_PIXEL = 50  # peak memory per photo, reached while it is resized
-# How each format is saved: without a loss that training could notice.
+# Options for saving each format, without a loss that affects training.
 _SAVING: dict[str, dict[str, Any]] = {
     "JPEG": {"quality": 95, "subsampling": 0},
     "PNG": {"compress_level": 3},
@@ -85,15 +85,15 @@ def undistort(
     """Make ``images/``, ``masks/`` and ``sparse/0`` of a dataset whose poses are known.
 
     Photos without a pose are left out. Files keep their names and formats: JPEG is saved at quality
-    95 without chroma subsampling, all others without loss, with transparency. Where the camera has
-    no distortion, photos are copied. A mask is written for each photo that has one, unless all that
-    it leaves out is transparent in the image anyway. The model is written last.
+    95 without chroma subsampling, all others without loss, with transparency. If a camera has no
+    distortion, its photos are copied. A mask is written for each photo that has one, unless all
+    masked pixels are transparent in the image. The model is written last.
 
     Args:
         photos: the photos in ``input/``.
         resize: also make ``images_2``, ``images_4`` and ``images_8``.
-        threads: number of threads; None uses one per core, at most 4. Fewer are used if the
-            available memory is not enough for photos of this size.
+        threads: number of threads; None: one per core, at most 4. Fewer threads are used if the
+            available memory is not sufficient for photos of this size.
 
     Raises:
         UserError: a photo is missing, damaged or changed; the calibration is implausible.
@@ -157,7 +157,7 @@ def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> li
     After the first error or Ctrl-C, running jobs finish and the others are cancelled.
     """
     report(0, len(jobs), "photos")
-    # Pillow and torch release the GIL while they work; each job uses torch with one thread.
+    # Pillow and torch release the GIL while they compute. Each job uses torch with one thread.
     pool = ThreadPoolExecutor(threads, "snowsplat-undistort", torch.set_num_threads, (1,))
     try:
         results = []
@@ -202,7 +202,7 @@ def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> bool
     with _opened(path, job) as opened:
         mask = _decoded(opened, path).convert("L")
     if opaque is not None:
-        # SfM ignores transparent pixels. Training uses them: as empty space.
+        # SfM ignores transparent pixels; training uses them as empty space.
         counts = (np.asarray(mask) >= 128) | ~opaque
         if counts.all():
             return False
@@ -246,7 +246,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 
 
 def _divided(image: Image.Image, divisor: int) -> Image.Image:
-    """1/divisor of the size, rounded as `snowsplat.data` rounds; each pixel is a mean over area."""
+    """The image at 1/``divisor`` of its size, averaged over areas; rounded as in `data`."""
     width, height = (max(1, round(side / divisor)) for side in image.size)
     # Colours are multiplied by alpha, so that transparent pixels do not bleed into others.
     mode = "RGBa" if image.mode == "RGBA" else image.mode

@@ -1,6 +1,6 @@
 """Illumination of surfaces: a lamp with soft shadows, and ambient light with occlusion.
 
-Computed on a coarse grid, since soft shadows vary slowly.
+The light is computed on a coarse grid, because soft shadows vary slowly.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ _RAYS = 1 << 14  # per batch, which fits the processor's cache
 
 @dataclass(frozen=True)
 class Lamp:
-    """A rectangular lamp that emissive downwards, and ambient light."""
+    """A rectangular lamp that radiates downwards, and ambient light."""
 
     middle: tuple[float, float, float]
     size: tuple[float, float]  # metres, along x and y
-    power: float  # irradiance 1 m below the lamp, if it were small
+    power: float  # irradiance 1 m below a small lamp of this power
     ambient: float  # irradiance of a face without occlusion
 
 
 def irradiance(
     shape: Shape, face: int, size: tuple[int, int], lamp: Lamp, blockers: Sequence[Shape]
 ) -> np.ndarray:
-    """Irradiance (H, W, 3) of a face, ``size`` (H, W); the radiance of white matt paint there."""
+    """Irradiance (H, W, 3) of a face of ``size`` (H, W), as the radiance of white matt paint."""
     spacing = max(_SPACING, max(shape.sizes[face]) / _MOST_POINTS)
     rows, columns = (
         int(min(pixels, max(6, round(metres / spacing))))
@@ -82,7 +82,7 @@ def _direct(
 def _indirect(
     lamp: Lamp, blockers: Sequence[Shape], positions: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Ambient irradiance (3, P): cold white light, warm light reflected from near objects.
+    """Ambient irradiance (3, P): cold white light, and warm light that near objects reflect.
 
     The directions are cosine-distributed, so all samples have the same weight.
     """

@@ -24,7 +24,7 @@ from snowsplat.util.files import atomic_path
 _RAYS = 2  # along each side of a pixel
 _TILE = 64  # pixels along each side; the rays of a tile hit few shapes
 _FOCAL_35MM = 28  # in EXIF, mm; typical of a phone
-_FOCAL_TRUE = 1.013  # the true focal length over that in EXIF: EXIF is inexact
+_FOCAL_TRUE = 1.013  # the true focal length divided by the one in EXIF, which is inexact
 _DISTORTION = (-0.062, 0.021, 0.00015, -0.0001)  # of COLMAP's model OPENCV: k1, k2, p1, p2
 _WALK_RADIUS = 1.42  # metres, around the centre of the table
 _WALK_HEIGHTS = (0.46, 0.92)  # metres above the table, first and second round

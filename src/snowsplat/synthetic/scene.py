@@ -29,7 +29,7 @@ class SceneObject:
     shape: Shape
     paint: Sequence[np.ndarray]  # one for each face, or one for all: sRGB (H, W, 3), 0 to 1
     gloss: float = 0.0  # reflectance at normal incidence (Schlick's approximation)
-    emissive: bool = False  # radiates its texture's colour, unlit; casts no shadow
+    emissive: bool = False  # whether it radiates the colour of its texture; then it casts no shadow
 
 
 class Scene:
@@ -58,7 +58,7 @@ class Scene:
         self._store(textures)
 
     def _store(self, textures: Sequence[np.ndarray]) -> None:
-        """Store all textures at all levels in one array, so one look-up serves all rays."""
+        """Store all textures at all levels in one array, so that one look-up serves all rays."""
         texels: list[np.ndarray] = []
         starts, widths, heights = (np.zeros((len(textures), _LEVELS), np.int32) for _ in range(3))
         total = 0

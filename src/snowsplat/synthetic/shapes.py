@@ -230,7 +230,7 @@ class Frustum:
 class Ring:
     """A torus whose axis is vertical, or horizontal in the direction ``angle`` if ``upright``.
 
-    Intersected by sphere tracing: a ray may always advance by the distance to the surface.
+    Rays are intersected by sphere tracing: a ray can always advance by the distance to the surface.
     """
 
     _STEPS = 60

@@ -232,7 +232,7 @@ def spines(size: Size, shelves: int, random: np.random.Generator) -> np.ndarray:
 def paste(
     base: np.ndarray, sheet: np.ndarray, middle: tuple[float, float], width: float, angle: float
 ) -> np.ndarray:
-    """``sheet`` pasted on ``base``: centre (u, v), width as a share of base's, angle in degrees."""
+    """``sheet`` pasted on ``base``: centre (u, v), width relative to ``base``, angle in degrees."""
     target = Image.fromarray(np.rint(255 * base).astype(np.uint8))
     columns = max(2, round(width * target.width))
     size = (columns, max(2, round(columns * sheet.shape[0] / sheet.shape[1])))

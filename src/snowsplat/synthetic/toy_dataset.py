@@ -28,7 +28,7 @@ Format = Literal["colmap-bin", "colmap-txt", "blender"]
 
 
 class _Scene:
-    """Balls (centre, radius); the colour of each is a sum of a few slow waves."""
+    """Balls (centre, radius). The colour of a ball is a sum of a few waves of low frequency."""
 
     def __init__(self, seed: int, surroundings: bool) -> None:
         random = np.random.default_rng(seed)

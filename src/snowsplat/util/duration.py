@@ -4,7 +4,7 @@ import math
 
 
 def duration(seconds: float) -> str:
-    """Such as "5.1 s", "2 min 10 s" or "1 h 40 min"; "?" for a number that is not finite."""
+    """Text such as "5.1 s", "2 min 10 s" or "1 h 40 min"; "?" if the number is not finite."""
     if not math.isfinite(seconds):
         return "?"
     if seconds < 100:

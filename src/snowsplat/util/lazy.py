@@ -23,7 +23,7 @@ def lazy_names(
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         value = getattr(import_module(f"{package}.{modules[name]}"), name)
-        namespace[name] = value  # the next use does not come here
+        namespace[name] = value  # the next use finds this value
         return value
 
     def names() -> list[str]:

@@ -1,4 +1,4 @@
-"""The memory of this process: what it holds now, and the most that it has held."""
+"""The memory of this process: the present resident memory and its peak."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def resident_bytes() -> int:
-    """Resident memory now; where the system does not report it, the same as `peak_bytes`."""
+    """The present resident memory; if the system does not report it, the same as `peak_bytes`."""
     try:
         import resource
 
@@ -21,9 +21,9 @@ def resident_bytes() -> int:
 
 
 def peak_bytes() -> int:
-    """The largest resident memory so far, or since `reset_peak`; 0 where it is not reported."""
+    """The largest resident memory so far, or since `reset_peak`; 0 if it is not reported."""
     try:
-        # Not getrusage, which on Linux starts with the peak of the parent process.
+        # getrusage is not used, because on Linux it starts with the peak of the parent process.
         lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
         return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) << 10
     except (OSError, StopIteration, ValueError, IndexError):
@@ -37,10 +37,10 @@ def peak_bytes() -> int:
 
 
 def reset_peak() -> None:
-    """Free what is unused and let `peak_bytes` start again from the resident memory (on Linux).
+    """Return unused memory to the system, and reset `peak_bytes` to the resident memory (on Linux).
 
-    The allocator of the C library keeps freed memory for later; without returning it to the system
-    first, memory of an earlier task would count for the next one.
+    The allocator of the C library keeps freed memory. If it were not returned to the system first,
+    memory of an earlier task would count for the next one.
     """
     gc.collect()
     with suppress(OSError, AttributeError, TypeError):  # another C library

@@ -150,7 +150,7 @@ def _shown(path: Path, folder: Path) -> str:
 
 
 def _count(path: Path) -> int:
-    """Number of files: of a folder those in it, 1 for a file, 0 if ``path`` does not exist."""
+    """Number of files in a folder; 1 for a file; 0 if ``path`` does not exist."""
     if path.is_dir():
         return sum(1 for entry in path.rglob("*") if not entry.is_dir())
     return int(path.is_file())

@@ -1,8 +1,8 @@
 """Checks of the Host and Origin headers of requests, for both servers.
 
-A web page elsewhere can make a domain name resolve to this machine (DNS rebinding), and any page
-can make a browser connect to this machine. Browsers write the Host and Origin headers themselves,
-so these reveal both attacks.
+The owner of a domain can make its name resolve to this machine (DNS rebinding), and any web page
+can make a browser connect to this machine. A page cannot change the Host and Origin headers, which
+the browser writes. So these headers reveal both attacks.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ ANY_HOST = ("", "0.0.0.0", "::")
 def is_own_host(header: str, listening: str) -> bool:
     """Whether the Host header is a valid name of this machine for a server at ``listening``.
 
-    The port is not compared, since it differs with SSH forwarding. A server on the loopback
-    interface accepts loopback names only. Other servers also accept any IP address, since DNS
+    The port is not compared, because it differs with SSH forwarding. A server on the loopback
+    interface accepts only loopback names. Other servers also accept all IP addresses, because DNS
     rebinding needs a domain name.
     """
     match = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^:\[\]]+)(?::\d*)?", header.strip())
@@ -36,12 +36,12 @@ def is_own_host(header: str, listening: str) -> bool:
 
 
 def is_own_page(origin: str, host: str) -> bool:
-    """Whether the requesting page was loaded from this server, by the Origin and Host headers."""
+    """Whether, by the Origin and Host headers, the requesting page comes from this server."""
     return origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a server at ``host`` is reachable from this machine only."""
+    """Whether a server at ``host`` can be reached only from this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -2,8 +2,9 @@
 
     python -m snowsplat.sfm.colmap.check_model FOLDER BYTES
 
-COLMAP trusts the counts in its files: a damaged count makes it allocate all memory or run for
-hours. The child process is limited to BYTES of additional memory and to a time, so only it fails.
+COLMAP does not check the counts in its files. With a damaged count it may allocate all memory or
+run for hours. Therefore the child process has a time limit and a limit of BYTES of additional
+memory, and only the child process fails.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from snowsplat.sfm.colmap.child import child_environment
 
-_SECONDS = 10.0  # to start Python and COLMAP
+_SECONDS = 10.0  # time to start Python and COLMAP
 _BYTES_A_SECOND = 1_000_000  # a low estimate of the reading speed
 _MEMORY = 1 << 30  # bytes of address space, for a model of any size
 _RATIO = 16  # additional bytes of address space per byte of the files

@@ -99,7 +99,7 @@ def estimate_poses(
 
 
 def _check_disk(folder: Path) -> None:
-    """Raises OSError if files in ``folder`` cannot grow: the likely reason of a crash."""
+    """Raises OSError if files in ``folder`` cannot grow, which is the likely cause of a crash."""
     try:
         largest = max(path.stat().st_size for path in folder.iterdir())
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -174,7 +174,7 @@ def _communicate(
         answer = json.loads(line)
         if "progress" in answer:
             report(*answer["progress"])
-    # Closed only now: when its stdin closes, the child ends.
+    # stdin is closed only now, because the child ends when it is closed.
     with contextlib.suppress(BrokenPipeError):
         child.stdin.close()
     return answer
@@ -183,7 +183,7 @@ def _communicate(
 def _report_rows(report: Report, database: str, table: str, total: int, what: str) -> None:
     address = f"{Path(database).as_uri()}?mode=ro"
     with (
-        contextlib.suppress(sqlite3.Error),  # locked while it is written: count next time
+        contextlib.suppress(sqlite3.Error),  # the database is locked: rows are counted next time
         contextlib.closing(sqlite3.connect(address, uri=True)) as connection,
     ):
         (rows,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()

@@ -1,8 +1,8 @@
 """The COLMAP database of a dataset: features and matches, reused after an interrupted run.
 
-Photo number i of the list has image id and frame id i + 1, independent of thread timing, so the
-same photos always lead to the same database. The database stores a fingerprint of photos and
-settings. Its features and matches are reused only if the fingerprint is unchanged.
+Photo number i of the list has image id and frame id i + 1. The ids do not depend on the timing of
+threads, so the same photos always lead to the same database. The database stores a fingerprint of
+photos and settings. Its features and matches are reused only if the fingerprint is unchanged.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from snowsplat.sfm.ingest.photo import Photo
 
 # With fewer photos the eight parameters of OPENCV are not well determined.
 MIN_PHOTOS_FOR_OPENCV = 8
-# Times the longest side, if there is no EXIF: a 29 mm lens on 35 mm film. This is between a phone's
-# photos and its cropped videos. The focal length is then refined together with the poses.
+# Initial focal length without EXIF, as a multiple of the longest side: a 29 mm lens on 35 mm film.
+# This is between the values of a phone's photos and of its cropped videos. The focal length is then
+# refined together with the poses.
 GUESSED_FOCAL = 0.8
 
 _PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
@@ -33,19 +34,19 @@ _PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
 
 @dataclass(frozen=True)
 class Pair:
-    """Two photos, by index into the list of photos, and the result of matching them."""
+    """Two photos, given by their indices in the list of photos, and the result of matching them."""
 
     first: int
     second: int
     inliers: int  # matches that are consistent with one relative pose
-    flat: bool  # also consistent with a plane, or with a pure rotation of the camera
+    flat: bool  # the matches are also consistent with a plane or with a pure rotation
 
 
 def open_database(path: Path, photos: list[Photo], camera_model: str, fingerprint: str) -> None:
     """Open or create the database ``path`` of ``photos``; keep features and matches if valid.
 
-    They are valid if the database is intact and has the same ``fingerprint``. Names and cameras are
-    always rewritten, since features do not depend on the camera model.
+    Features and matches are valid if the database is intact and has the same ``fingerprint``. Names
+    and cameras are always rewritten, because features do not depend on the camera model.
     """
     if not _is_sound(path, fingerprint):
         remove_database(path)
@@ -204,9 +205,10 @@ def verified_pairs(path: Path) -> list[Pair]:
 
 
 def trim_features(path: Path, limit: int) -> None:
-    """Keep the ``limit`` largest features of each photo: matching time grows with their square.
+    """Keep the ``limit`` largest features of each photo.
 
-    COLMAP's own limit is approximate: it keeps whole octaves, up to four times as many features.
+    The time for matching is quadratic in the number of features. The limit of COLMAP itself is only
+    approximate: it keeps complete octaves, which may be four times as many features.
     """
     with closing(sqlite3.connect(path)) as connection:
         query = "SELECT image_id FROM keypoints WHERE rows > ?"
@@ -251,8 +253,8 @@ def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
 def displacement_of(path: Path, pairs: Sequence[Pair]) -> float:
     """Typical distance in pixels between the positions of a match in the two photos.
 
-    The median over the matches of a pair, then the 90% quantile over the pairs: a slow video has
-    many pairs that hardly differ.
+    This is the 90% quantile over the pairs of the median over the matches of a pair. The quantile
+    is high because in a slow video the frames of many pairs are nearly equal.
     """
     medians = []
     with closing_database(path) as database:

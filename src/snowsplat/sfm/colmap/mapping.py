@@ -1,4 +1,4 @@
-"""Camera poses and points from matches, and the removal of unreliable ones afterwards."""
+"""Estimates camera poses and points from matches, and removes unreliable ones."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from snowsplat.sfm.progress import Report
 # A camera that sees fewer points has no reliable pose.
 MIN_POINTS = 15
 MIN_PHOTOS = 3
-# In pixels of the scaled photo in which features were detected: at the end, observations with a
-# larger reprojection error are removed.
+# At the end, observations with a larger reprojection error are removed. In pixels of the scaled
+# photo in which features were detected.
 _MAX_REPROJECTION_ERROR = 3.0
-# The result of COLMAP's mapper depends on thread timing: first the choice of the initial pair, and
-# so the frame and small differences everywhere. With fewer photos than this, threads do not make it
-# faster, so one thread is used and the poses are always the same.
+# The result of COLMAP's mapper depends on the timing of threads: the choice of the initial pair,
+# therefore the coordinate frame, and small differences of all poses. With fewer photos than this,
+# more threads do not make it faster, so one thread is used, and the poses are always the same.
 _MANY_PHOTOS = 150
 _MIN_ANGLE = 1.5  # degrees between the rays of a point
 
@@ -52,7 +52,7 @@ class Mapping:
     def extend(self, models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
         """Try to add photos to the first of ``models``, accepting weaker matches.
 
-        Photos of the other models are tried, too, so separate groups may be joined.
+        Photos of the other models are tried, too, so that separate groups may be joined.
         """
         grown = self._map_incrementally(self._options(relaxed=True), start=models[0])
         if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():

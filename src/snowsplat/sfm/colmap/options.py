@@ -1,4 +1,4 @@
-"""Settings and result of structure from motion, and the numbers behind each effort level."""
+"""Settings and result of structure from motion, and the parameters of each effort level."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CAMERA_MODELS = (
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """How poses are estimated."""
+    """Options of the pose estimation."""
 
     # One of `CAMERA_MODELS`, or "auto": OPENCV if enough photos share a camera to determine its
     # eight parameters, else SIMPLE_RADIAL.
@@ -55,17 +55,17 @@ class SfmResult:
 
 @dataclass(frozen=True)
 class Effort:
-    """The numbers behind an effort level: features per photo and pairs to match."""
+    """The parameters of an effort level: features per photo and pairs to match."""
 
     image_size: int  # pixels of the longest side at which features are detected
     features: int  # approximate number per photo
-    first_octave: int  # -1: also in the photo enlarged twice, which has small, precise features
+    first_octave: int  # -1: also detect small, precise features in the photo enlarged twice
     exhaustive: int  # up to this number of photos, all pairs are matched
     overlap: int  # number of following frames with which a frame of a video is matched
     neighbours: int  # number of similar photos with which a photo is matched
 
     def stronger(self) -> Effort:
-        """More of everything, for photos without enough matches: about 4 times the work."""
+        """More features and pairs, for photos without enough matches; about 4 times the work."""
         return dataclasses.replace(
             self,
             image_size=self.image_size * 3 // 2,
@@ -77,7 +77,7 @@ class Effort:
         )
 
     def reduced(self) -> Effort:
-        """About a third of the memory, for a second run after a crash."""
+        """An effort that needs about a third of the memory, for a second run after a crash."""
         return dataclasses.replace(
             self,
             image_size=self.image_size * 2 // 3,

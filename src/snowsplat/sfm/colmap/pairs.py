@@ -1,12 +1,12 @@
-"""Chooses the pairs of photos to match. Matching all pairs is quadratic and rarely needed.
+"""Chooses the pairs of photos to match. Matching all pairs takes quadratic time.
 
     few photos           all pairs
     frames of a video    the following frames, in growing steps, and frames that look similar:
                          these close a loop when the camera returns to a place
-    photos with GPS      the nearest, and some that look similar
+    photos with GPS      the nearest photos, and some that look similar
     many photos          those that look similar
 
-In a mix of these, every rule that applies is used, so that all parts are connected.
+If several rules apply, all of them are used, so that all parts are connected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from snowsplat.sfm.colmap.retrieval import nearest
 from snowsplat.sfm.ingest.photo import Photo
 
 _METRES_PER_DEGREE = 111_320.0
-# Share of `Effort.neighbours` if the order in time or GPS determines most pairs already.
+# Share of `Effort.neighbours` that is used if the order in time or GPS already determines most
+# pairs.
 _LOOP_SHARE = 0.4
 
 Pairs = set[tuple[int, int]]
@@ -32,7 +33,7 @@ Pairs = set[tuple[int, int]]
 
 @dataclass(frozen=True)
 class PairChoice:
-    """Pairs (i < j) of indices into the list of photos, sorted, and how they were chosen."""
+    """Sorted pairs (i < j) of indices in the list of photos, and the rules that chose them."""
 
     pairs: list[tuple[int, int]]
     description: str
@@ -43,7 +44,7 @@ def choose_pairs(
 ) -> PairChoice:
     """Choose the pairs to match.
 
-    ``similarity`` returns the visual similarity of the photos, (N, N); called only if needed.
+    ``similarity`` returns the visual similarity of the photos, (N, N). It is called only if needed.
     """
     count = len(photos)
     if count <= effort.exhaustive:
@@ -95,8 +96,8 @@ def _along(sequence: Sequence[int], overlap: int) -> Pairs:
 def _look_alike(
     photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], count: int, overlap: int
 ) -> Pairs:
-    # A frame is most similar to its neighbours in time, which are paired already. They are
-    # excluded, as otherwise no loop would be found.
+    # A frame is most similar to its neighbours in time, which are already paired with it. They are
+    # excluded; otherwise no loop would be found.
     similarity = similarity.copy()
     for sequence in _sequences(photos):
         for position, i in enumerate(sequence):

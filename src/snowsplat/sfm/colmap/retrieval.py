@@ -2,8 +2,9 @@
 
 VLAD (Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010),
 with the residuals of each visual word normalised (Arandjelović and Zisserman, "All about VLAD",
-CVPR 2013). The visual words are learned from the photos themselves: nothing is downloaded, and a
-dataset shows one scene. All sums have a fixed order: the same features have the same neighbours.
+CVPR 2013). The visual words are learned from the photos of the dataset, which show one scene; so
+nothing has to be downloaded. All sums have a fixed order, so the result depends only on the
+features.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating[Any]]
 
 WORDS = 64
-FEATURES = 1000  # per photo; the largest ones, which are also found from another distance
+FEATURES = 1000  # per photo: the largest features, which are also detected from other distances
 _SAMPLE = 64 * WORDS * 4  # descriptors for k-means
 _ROUNDS = 12  # of k-means
 
@@ -32,7 +33,7 @@ def similarity(descriptors: Sequence[Floats]) -> Floats:
         return np.eye(len(descriptors), dtype=np.float32)
     words = _learn_words(np.concatenate([_unit(d) for d in descriptors if len(d)]))
     vectors = np.stack([_describe(_unit(d), words) for d in descriptors])
-    # What all photos of the scene have in common does not distinguish them.
+    # Subtract the mean: the features that all photos have in common do not distinguish them.
     seen = np.array(counts) > 0
     vectors[seen] = _unit(vectors[seen] - vectors[seen].mean(0))
     alike = vectors @ vectors.T

@@ -4,8 +4,8 @@
 
 The job is one line of JSON on stdin. Lines of JSON on stdout are progress, database tables whose
 rows the parent may count, and at the end the result or a user error. Stdin stays open as long as
-the parent lives; when it closes, the child ends at once. The child ignores Ctrl-C, which the parent
-handles. The output of COLMAP goes to stderr, which the parent writes to a log.
+the parent runs; when it closes, the child ends immediately. The child ignores Ctrl-C, which the
+parent handles. The output of COLMAP goes to stderr, which the parent writes to a log.
 """
 
 from __future__ import annotations
@@ -49,14 +49,15 @@ def main() -> None:
 
 
 def _redirected_stdout() -> TextIO:
-    # C++ code prints to stdout, too. Redirect that to stderr, so that it does not mix with JSON.
+    # C++ code also prints to stdout. Its output is redirected to stderr, separate from the JSON.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return answers
 
 
 def _end_with_parent() -> None:
-    # Not sys.stdin: a thread blocked in it would prevent a regular exit of Python.
+    # os.read is used because a thread that waits in sys.stdin would prevent a regular exit of
+    # Python.
     while os.read(0, 4096):
         pass
     os._exit(1)

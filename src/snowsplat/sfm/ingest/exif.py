@@ -35,7 +35,7 @@ class ExifInfo:
     """The metadata that is used. ``focal`` is in pixels of the photo as stored."""
 
     orientation: int = 1  # EXIF value, 1 to 8
-    camera: str = ""  # make, model and focal lengths: identifies a lens at one zoom
+    camera: str = ""  # make, model and focal lengths, which identify a lens and its zoom
     focal: float | None = None
     location: tuple[float, float, float] | None = None  # latitude, longitude (°), altitude (m)
 
@@ -57,9 +57,10 @@ def read_exif(exif: Image.Exif, width: int, height: int) -> ExifInfo:
 def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
     """Focal length in pixels, or None if it is unknown or implausible.
 
-    Cameras store it in one of two ways. The 35 mm equivalent is converted by the diagonals, as
-    COLMAP does. Otherwise, it is the focal length over the pixel size. The pixel size belongs to
-    the stored original width: if a photo was resized later, its metadata may still be the original.
+    Cameras store it in one of two ways. A 35 mm equivalent is converted by the ratio of the
+    diagonals, as in COLMAP. Otherwise, the focal length is divided by the pixel size. The pixel
+    size refers to the original width, which is stored, too: if a photo was resized, its metadata
+    may still be that of the original.
     """
     focal = None
     equivalent, length = _number(details.get(_FOCAL_35MM)), _number(details.get(_FOCAL_LENGTH))
@@ -99,7 +100,7 @@ def _degrees(value: Any, side: Any, negative: str) -> float | None:
 
 
 def _number(value: Any, zero: bool = False) -> float | None:
-    """A positive finite number (or 0 if ``zero``), else None: tags may hold anything."""
+    """A positive finite number (or 0 if ``zero``); None for all other values of a tag."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):

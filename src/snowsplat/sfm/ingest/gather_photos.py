@@ -1,4 +1,4 @@
-"""Photos -> ``input/``: names are chosen from the headers, then files are checked and copied."""
+"""Photos -> ``input/``: chooses names from the headers, then checks and copies the files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def write_photos(
     skipped: list[tuple[str, str]],
     report: Report,
 ) -> list[Photo]:
-    """Write photos to ``input/`` in a few threads, each with one photo in memory; keeps the order.
+    """Write photos to ``input/`` in a few threads, each with one photo in memory; keep the order.
 
     Photos that cannot be used are appended to ``skipped``, with the reason.
     """

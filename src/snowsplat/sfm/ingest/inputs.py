@@ -27,7 +27,7 @@ from snowsplat.util.files import shown
 
 logger = logging.getLogger(__name__)
 
-_FEWEST = 3  # photos: two do not determine a common scale with a third
+_FEWEST = 3  # minimum number of photos
 _SMALLEST_SIZE = 128  # pixels
 
 
@@ -49,7 +49,7 @@ class GatherOptions:
 
 
 def find_inputs(inputs: Sequence[Path]) -> list[Path]:
-    """All files that `gather` would read, with masks. Fast: mostly names are checked.
+    """All files that `gather` would read, with masks. It is fast: mostly names are checked.
 
     Raises:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
@@ -193,7 +193,7 @@ def _check_disk_space(
 
 
 def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
-    """The error that helps most: by the most frequent reason why images were skipped."""
+    """The error for too few photos; it explains the most frequent reason for skipping images."""
     reasons = Counter(reason for _, reason in skipped)
     reason, often = reasons.most_common(1)[0] if reasons else ("", 0)
     everything = usable == 0 and often == len(skipped)

@@ -14,12 +14,12 @@ from snowsplat.util.files import shown
 
 
 def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool, True where the photo is used; upright, in ``size``, that of ``input/``.
+    """The mask (H, W) bool, True for used pixels; upright, at the ``size`` of the copied photo.
 
-    The mask may be upright, by its pixels or by its own EXIF orientation, or it may be oriented as
-    the photo's stored pixels are. If the size does not distinguish these cases (photos rotated by
-    180°, square photos), it is taken as stored. A pixel of a smaller copy is used if all pixels
-    that it covers are used.
+    The mask file may be upright (by its pixels or by its own EXIF orientation), or have the
+    orientation of the stored pixels of the photo. If the size does not distinguish these cases
+    (photos rotated by 180°, square photos), the mask is not rotated. A pixel of a smaller copy is
+    used if all pixels that it covers are used.
 
     Raises:
         UserError: the mask cannot be decoded, or its size is not that of the photo.

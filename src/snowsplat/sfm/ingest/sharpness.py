@@ -1,6 +1,7 @@
 """Sharpness of an image, tests for images without content, and a test for camera motion.
 
-All functions use small grey copies (H, W) uint8, which contain what SfM needs and little noise.
+All functions use small grey copies, (H, W) uint8. They contain the detail that SfM needs, and
+little noise.
 """
 
 from __future__ import annotations
@@ -14,14 +15,15 @@ FRAME_SIDE = 640
 #: Longest side in pixels of the copies that are tested for content and motion.
 PICTURE_SIDE = 320
 
-# Fine detail below which an image is unusable, by the longest side of the copy; see `_fine_detail`.
-# Measured with pycolmap's SIFT on three real datasets of 1000 to 1280 pixels, blurred by Gaussians
-# and saved as JPEG of quality 75 and 95: at σ = 8 pixels neighbours have 21 to 107 inlier matches,
-# at 12 they have 0 to 20, at 16 none.
+# An image with less fine detail (`_fine_detail`) is unusable. The limits are given for the longest
+# side of the copy. Measured with pycolmap's SIFT on three real datasets of 1000 to 1280 pixels,
+# blurred by Gaussians and saved as JPEG with quality 75 and 95. Neighbouring photos have 21 to 107
+# inlier matches at σ = 8 pixels, 0 to 20 at σ = 12, and none at σ = 16.
 #          longest side      sharp        σ = 8        12           16           24 and 32
 #                   160    0.60 to 0.74  0.18 to 0.24  0.09 to 0.14  0.06 to 0.12  0.04 to 0.15
 #                    80    0.60 to 0.75  0.39 to 0.47  0.24 to 0.32  0.17 to 0.23  0.07 to 0.14
-# The rise of heavily blurred images at 160 is due to JPEG blocks, which are not visible at 80.
+# At 160, the values increase again for heavily blurred images because of JPEG blocks, which are not
+# visible at 80.
 _BLURRED = {160: 0.09, 80: 0.16}
 _BLANK = 8.0  # range of grey levels (0.5% to 99.5% quantile); a lens cap has 2 to 5
 # Pixels of the copy, 0.6% of its longest side. A static camera measures 0 or 1, even with noise; a
@@ -48,11 +50,10 @@ def grey_copy(image: Image.Image, side: int) -> np.ndarray:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Variance of the Laplacian. Compares frames of one scene; it has no absolute meaning.
+    """Variance of the Laplacian, for comparing frames of one scene; it has no absolute meaning.
 
-    Compared with the energy of the gradients, with the product of both axes, and with a mean of
-    these: this measure selects an unblurred frame most often in a real video with half of its
-    frames motion-blurred.
+    In a real video with motion blur in half of its frames, this measure selected an unblurred frame
+    more often than the energy of the gradients, the product of both axes, or a mean of these.
     """
     g = grey.astype(np.float32)
     return float(
@@ -61,7 +62,7 @@ def sharpness(grey: np.ndarray) -> float:
 
 
 def why_useless(grey: np.ndarray) -> str | None:
-    """Why an image is certainly unusable for SfM, or None. ``grey``: a copy of `PICTURE_SIDE`."""
+    """The reason why an image is unusable for SfM, or None. ``grey``: a copy of `PICTURE_SIDE`."""
     low, high = np.quantile(grey, [0.005, 0.995])
     if high - low < _BLANK:
         return BLACK if high < 64 else WHITE if low > 191 else FLAT
@@ -72,8 +73,8 @@ def why_useless(grey: np.ndarray) -> str | None:
 def _fine_detail(grey: np.ndarray, side: int) -> float:
     """The share of the gradient energy, 0..1, that a blur at the scale of 1/``side`` removes.
 
-    Independent of contrast and nearly independent of the content: images of real scenes have detail
-    at all scales, unless it was removed by defocus or motion blur.
+    It does not depend on the contrast, and hardly on the content, because images of real scenes
+    have detail at all scales, unless defocus or motion blur removes it.
     """
     small = grey_copy(Image.fromarray(grey), side).astype(np.float32)
     if min(small.shape) < 8:
@@ -85,7 +86,7 @@ def _fine_detail(grey: np.ndarray, side: int) -> float:
         before = float((np.diff(small[1:-1, 1:-1], axis=axis) ** 2).mean())
         after = float((np.diff(blurred, axis=axis) ** 2).mean())
         shares.append(1 - after / before if before > 0 else 0.0)
-    return max(shares)  # motion blur keeps the detail across its direction
+    return max(shares)  # motion blur keeps the detail perpendicular to its direction
 
 
 def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
@@ -123,6 +124,6 @@ def _blocks(grey: np.ndarray) -> np.ndarray:
 
 
 def _windowed(blocks: np.ndarray) -> np.ndarray:
-    """Blocks without their mean, fading out to the edges, which would correlate otherwise."""
+    """Blocks minus their mean, faded out at the edges; otherwise the edges would correlate."""
     fade = np.hanning(_BLOCK + 2)[1:-1].astype(np.float32)
     return (blocks - blocks.mean(axis=(1, 2), keepdims=True)) * fade[:, None] * fade

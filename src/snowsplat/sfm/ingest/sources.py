@@ -49,10 +49,10 @@ class Found:
 def find_sources(inputs: Sequence[Path]) -> Found:
     """Find photos and videos in files and folders; folders are searched recursively.
 
-    Hidden files, ``masks`` folders and output folders of this program are skipped. So are videos in
-    a folder with photos, since phones save a video of three seconds with every photo. The names in
-    a single input are kept. With several inputs, each folder and video gets its own folder, so that
-    equal names do not collide.
+    Hidden files, ``masks`` folders and output folders of this program are skipped. Videos in a
+    folder with photos are also skipped, because some phones save a video of three seconds with
+    every photo. The names in a single input are kept. With several inputs, each folder and video
+    gets its own folder, so that equal names do not collide.
 
     Raises:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
@@ -116,7 +116,7 @@ def _scan(root: Path) -> tuple[list[str], list[str]]:
 
 
 def _files_below(root: Path, leave_out: Sequence[str] = (MASKS,)) -> list[str]:
-    """Files that are not hidden; relative with "/", sorted. Follows links, but each folder once."""
+    """Files that are not hidden; relative, with "/", sorted. Links are followed, but only once."""
 
     def fail(error: OSError) -> None:
         raise error
@@ -144,7 +144,8 @@ def _files_below(root: Path, leave_out: Sequence[str] = (MASKS,)) -> list[str]:
 class Masks:
     """The masks of a folder of photos: ``masks/IMG.jpg.png`` or ``masks/IMG.png``.
 
-    For a photo in a sub-folder also ``sub/masks/…``. Any image format, extension in any case.
+    For a photo in a subfolder, also ``sub/masks/…``. All image formats are accepted; the extension
+    may be in upper or lower case.
     """
 
     def __init__(self, root: Path) -> None:
@@ -185,7 +186,7 @@ class Masks:
 
 
 def kind_of_file(path: Path) -> Literal["photo", "video"]:
-    """The kind of a file that was given by name, by its content.
+    """The kind of a file that was given as an input; it is determined by the content.
 
     Raises:
         UserError: neither photo nor video, or the file cannot be read.
@@ -236,7 +237,7 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
 
 
 def free_names(names: Sequence[str]) -> Iterator[str]:
-    """The names, with a suffix where an earlier one is equal if letter case is ignored."""
+    """The names. A name that equals an earlier one, ignoring letter case, gets a suffix."""
     taken: set[str] = set()
     for name in names:
         yield _free(name, taken)

@@ -1,9 +1,9 @@
 """Video -> frames: the sharpest frame of each time window, without repeated views.
 
-Decoding is the expensive part, so all frames are decoded in a single pass. It keeps the sharpest
-frame of the current window in memory, and writes this frame when the window ends. The length of the
-video is computed before, from the times of the packets, because the length in the header is missing
-in streams recorded by browsers and wrong in truncated files.
+Decoding takes most of the time, so all frames are decoded in a single pass. The sharpest frame of
+the current window is kept in memory and written when the window ends. The length of the video is
+computed before from the times of the packets, because the length in the header is missing in
+streams that browsers record, and wrong in truncated files.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def extract_frames(
             for frame in decoded_frames(container):
                 timed = frame.time is not None
                 seconds = frame.time - clip.start if timed else frames.read / rate
-                # Slightly later, so that rounding does not put two frames into one window.
+                # A small time is added, so that rounding does not put two frames into one window.
                 place = (max(seconds, 0.0) + 1e-6) / clip.seconds
                 index = min(int(place * windows), windows - 1)
                 if index > window:
@@ -126,7 +126,7 @@ def extract_frames(
 
 
 class _SharpestFrame:
-    """The sharpest of the frames that were offered since the last reset."""
+    """The sharpest frame since the last reset."""
 
     def __init__(self) -> None:
         self.reset()

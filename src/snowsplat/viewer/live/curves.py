@@ -20,7 +20,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded
 from snowsplat.viewer.live.display import fit
 
-_POINTS = 512  # maximum number of points per curve; beyond it, neighbours are merged
+_POINTS = 512  # maximum number of points per curve; if there are more, adjacent ones are merged
 _VIEWS = 4  # number of views whose PSNR is averaged
 _LONGEST = 480  # pixels: longer side of these views
 
@@ -59,10 +59,10 @@ class Curve:
 
 
 class SampledPsnr:
-    """PSNR of a few fixed views, one at a time, since rendering interrupts the training."""
+    """PSNR of a few fixed views, measured one at a time, because it interrupts the training."""
 
     def __init__(self, views: Sequence[View], background: Tensor) -> None:
-        """``views``: from which a few are chosen."""
+        """``views``: a few of them are used."""
         self._background = background
         chosen = [views[i * len(views) // _VIEWS] for i in range(_VIEWS)] if views else []
         unique = list(dict.fromkeys(chosen))
@@ -72,7 +72,7 @@ class SampledPsnr:
         self.can_measure = bool(unique)
 
     def measure(self, gaussians: Gaussians) -> float:
-        """Measure the next view (at first all views); returns the mean of the latest PSNRs, dB.
+        """Measure the next view (the first time: all views); return the mean of the PSNRs in dB.
 
         NaN if a photo cannot be read.
         """

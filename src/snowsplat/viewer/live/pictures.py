@@ -22,8 +22,8 @@ from snowsplat.viewer.live.display import DisplaySettings, Placed
 _DOT = 0.8  # pixels: standard deviation of the dot of a point
 _ELLIPSOID_END = 1.5  # standard deviations at which ellipsoids end
 _ELLIPSOID_OPACITY = 0.1  # Gaussians below this opacity are not shown as ellipsoids
-# exp(this) is the opacity that makes a Gaussian a disc: α is at its maximum up to ½ d² = this, and
-# vanishes at ½ d² = this + 5.5, which is within 3% of the radius.
+# A Gaussian with the opacity exp(_DISC) is a disc: α has its maximum up to ½ d² = _DISC and is 0
+# from ½ d² = _DISC + 5.5 on. The two radii differ by 3%.
 _DISC = 80.0
 _WORST = 0.25  # mean absolute colour difference at the end of the palette
 _MANY = 256.0  # number of Gaussians at the end of the palette
@@ -33,11 +33,11 @@ _AROUND = 0.35  # brightness of the render around a photo
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo to compare with.
+    """A photo with which a render is compared.
 
     Attributes:
-        pixels: (h, w, 3) uint8, of the size of ``placed``.
-        placed: its rectangle in the image.
+        pixels: (h, w, 3) uint8, at the size of ``placed``.
+        placed: the rectangle of the photo in the image.
     """
 
     pixels: Tensor
@@ -168,7 +168,7 @@ def _recolored(splats: Splats2D, colors: Tensor) -> Splats2D:
 def _normals(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Tensor:
     """Red: right, green: up, blue: towards the camera."""
     axes, _ = _axes(splats, gaussians, camera)
-    # Blend the axes, then normalise: the direction of the mean.
+    # The axes are blended, then normalised: this gives the direction of the mean axis.
     image, alpha, _ = ops.rasterize(_recolored(splats, axes), camera.width, camera.height)
     length = image.permute(2, 0, 1).square().sum(0).sqrt_().clamp_min_(1e-9)  # plane by plane
     normals = image / length[:, :, None] * image.new_tensor([0.5, -0.5, -0.5])
@@ -176,7 +176,7 @@ def _normals(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def _as_points(splats: Splats2D) -> Splats2D:
-    """Each Gaussian as a dot of its colour."""
+    """Shows each Gaussian as a dot of its colour."""
     packed = splats.packed.clone()
     packed[:, CONICS] = packed.new_tensor([1.0, 0.0, 1.0]) / _DOT**2
     packed[:, OPACITIES] = 1.0
@@ -184,7 +184,7 @@ def _as_points(splats: Splats2D) -> Splats2D:
 
 
 def _as_ellipsoids(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Splats2D:
-    """Opaque discs with a sharp edge, darker if their surface is seen at an angle."""
+    """Shows each Gaussian as an opaque disc with a sharp edge; oblique surfaces are darker."""
     assert splats.ids is not None
     _, straight = _axes(splats, gaussians, camera)
     shortest, middle = gaussians.log_scales[splats.ids.long()].sort(1).values[:, :2].unbind(1)
@@ -200,7 +200,7 @@ def _as_ellipsoids(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Sp
 
 
 def _error(image: Tensor, photo: Photo) -> Tensor:
-    """The colour difference inside the photo; around it the render."""
+    """The colour difference inside the photo; the render around it."""
     picture = _bytes(image)
     at = photo.placed
     rows, columns = slice(at.top, at.top + at.height), slice(at.left, at.left + at.width)

@@ -20,7 +20,7 @@ from snowsplat.viewer.web.page import settings, whole_page
 #: Browsers support strings of about 500 million characters; base64 makes 4 characters of 3 bytes.
 _LARGEST = 360_000_000
 
-# Passed to the viewer as a blob URL, since browsers limit the length of data URLs.
+# The scene is passed to the viewer as a blob URL, because browsers limit the length of data URLs.
 _SCENE = """        <script type="text/plain" id="scene">{scene}</script>
         <script>
             const scene = document.getElementById('scene');
@@ -42,7 +42,7 @@ _SCENE = """        <script type="text/plain" id="scene">{scene}</script>
 
 
 def write_html(path: Path | str, gaussians: Gaussians, start: InitialView | None = None) -> None:
-    """Write the page atomically; its first view is ``start``, else an overview of the scene.
+    """Write the page atomically. Its first view is ``start``; default: an overview of the scene.
 
     Raises:
         UserError: no Gaussians, or too many for one page.

@@ -85,7 +85,7 @@ def page(title: str, bootstrap: Mapping[str, Any]) -> str:
     text = _replaced(
         text, "<title>SuperSplat Viewer</title>", f"<title>{html.escape(title)}</title>"
     )
-    # An empty icon, since browsers would request one.
+    # An empty icon; otherwise browsers would request one.
     text = _replaced(text, '<base href="" />', '<link rel="icon" href="data:," />')
     # No animation until the user moves the camera or presses Play.
     text = _replaced(text, "noanim: url.searchParams.has('noanim')", "noanim: true")
@@ -102,7 +102,7 @@ def whole_page(title: str, bootstrap: Mapping[str, Any], body: str) -> str:
     """
     css, script = asset("index.css"), asset("index.js")
     script = re.sub(r"\n//# sourceMappingURL=\S+\s*$", "\n", script)
-    # The HTML parser would treat these as markup; the viewer's bundle does not contain them.
+    # The HTML parser would interpret these as markup. The files of the viewer do not contain them.
     assert "</style" not in css.lower()
     assert not re.search(r"</script|<!--|<script", script, re.IGNORECASE)
     text = page(title, bootstrap)
@@ -120,7 +120,8 @@ def whole_page(title: str, bootstrap: Mapping[str, Any], body: str) -> str:
 def content_policy(page: str, sources: str) -> str:
     """The strictest Content-Security-Policy under which the page works.
 
-    Inline scripts are allowed by their hashes. ``sources``: from where the page may load.
+    Inline scripts are allowed by their hashes. ``sources``: the sources from which the page may
+    load.
     """
     scripts = [*_INLINE_SCRIPT.findall(page), *sorted(set(_HANDLER.findall(asset("index.js"))))]
     digests = [hashlib.sha256(script.encode()).digest() for script in scripts]

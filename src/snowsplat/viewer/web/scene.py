@@ -23,7 +23,7 @@ from snowsplat.viewer.web.server import ServedFile
 
 _SCENE = "scene.compressed.ply"
 _LEVEL_ENOUGH = math.radians(3)  # a smaller tilt of the horizon is not visible
-_TOO_LARGE = 3.0  # factor between the scene's and the usual distances that is still accepted
+_TOO_LARGE = 3.0  # maximum factor between the distances of the scene and the usual ones
 
 
 def site(
@@ -107,7 +107,7 @@ def _depth_ahead(gaussians: Gaussians, camera: Camera) -> float:
     solid = alpha > 0.5
     if bool(solid.any()):
         return float((depth[solid] / alpha[solid]).median())
-    # The centre is empty: use the median distance to the Gaussians.
+    # There are no Gaussians at the centre: use the median distance to all Gaussians.
     distances = (gaussians.means.double() - camera.position).norm(dim=1)
     distances = distances[distances.isfinite()]
     found = float(distances.median()) if len(distances) else 0.0

@@ -40,8 +40,8 @@ _REQUEST = 16 << 10  # maximum size of a request, bytes
 # Maximum number of open connections. A new connection replaces the oldest one that has not made a
 # valid request; if there is none, the new connection is closed.
 _CONNECTIONS = 256
-# The request line and headers, exactly as in the protocol: other parsers might disagree about where
-# a request with unusual line ends or characters ends.
+# The request line and headers, exactly as the protocol defines them. For a request with unusual
+# line ends or characters, other parsers could find another end of the request.
 _HEAD = re.compile(
     rb"[!-~]+ [!-~]+ HTTP/1\.[01](\r\n[!#$%&'*+.^_`|~0-9A-Za-z-]+:[\t -~\x80-\xff]*)*\r\n\r\n"
 )
@@ -231,9 +231,9 @@ class _Handler(BaseHTTPRequestHandler):
         self._send_empty(status, {"Connection": "close"})
 
     def _receive(self) -> bytes | None:
-        """The next request up to its empty line; None if none arrives.
+        """The next request up to its empty line; None if there is no request.
 
-        If a request is too long, the part of it that has been received.
+        If a request is too long, the received part of it is returned.
         """
         started: float | None = time.monotonic() if self._received else None
         while (end := self._received.find(b"\r\n\r\n")) < 0:
@@ -307,7 +307,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _refusal(self) -> HTTPStatus | None:
         """The status with which a request is rejected; None accepts it."""
         hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
-        # A body, or data that another parser regards as a body, could be read as a second request.
+        # A body, or data that another parser considers to be a body, could be read as a second
+        # request.
         bodies = (
             self.headers.get_all("Content-Length", []),
             self.headers.get_all("Transfer-Encoding", []),
@@ -323,7 +324,7 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def _file(self) -> ServedFile | None:
-        """The file at the requested path. Nothing is decoded, since all names are plain ASCII."""
+        """The file at the requested path. The path is not decoded, because all names are ASCII."""
         path = self.path.partition("?")[0]
         prefix = self._ours.prefix
         start, name = path[: len(prefix)], path[len(prefix) :]
