@@ -205,7 +205,7 @@ def test_the_driver_is_queried_directly(monkeypatch):
         if driver is not None:
             assert (driver.error, driver.cuda) == (error, (12, 8))
         monkeypatch.setattr(availability, "_driver", lambda found=driver: found)
-        assert availability.gpu_there() == (error in (0, 999))
+        assert availability.has_gpu() == (error in (0, 999))
 
     def absent(name: str) -> None:
         raise OSError(f"{name}: cannot open shared object file")

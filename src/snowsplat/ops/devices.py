@@ -21,7 +21,7 @@ def default_device(note: Callable[[str], None] | None = None) -> torch.device:
     why = availability.why_unusable(index)
     if why is None:
         return torch.device("cuda", index)
-    if note is not None and availability.gpu_there():
+    if note is not None and availability.has_gpu():
         note(f"the GPU cannot be used: {why}; computing on the CPU")
     return torch.device("cpu")
 

@@ -52,7 +52,7 @@ def describe(path: Path | str) -> dict[str, Any]:
         else:
             return _scene(path, format)
     folder = training_folder(path)
-    if folder.is_one() or folder.scenes():
+    if folder.is_output_folder() or folder.scenes():
         return _output(folder)
     return _dataset(path)
 
@@ -146,7 +146,7 @@ def _checkpoint(path: Path) -> dict[str, Any]:
 
 def _output(folder: OutputFolder) -> dict[str, Any]:
     facts: dict[str, Any] = {"kind": "output folder", "path": str(folder.path)}
-    if folder.is_one():
+    if folder.is_output_folder():
         settings, background = folder.settings()
         facts["capture"] = settings.path
         facts["background"] = list(background)

@@ -108,7 +108,7 @@ class OutputFolder:
     def videos(self) -> Path:
         return self.path / "videos"
 
-    def is_one(self) -> bool:
+    def is_output_folder(self) -> bool:
         """Whether a training run of snowsplat or of the reference has written here."""
         return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))
 
@@ -126,9 +126,9 @@ class OutputFolder:
         if not self.path.is_dir():
             raise UserError(f"{self.path}: is a file; use a folder for the output")
         others = (entry for entry in self.path.iterdir() if not is_temporary(entry, _FILES))
-        if any(others) and not self.is_one():
+        if any(others) and not self.is_output_folder():
             raise UserError(f"{self.path}: contains other files; use a new or an empty folder")
-        if self.is_one() and not resume and not overwrite:
+        if self.is_output_folder() and not resume and not overwrite:
             raise UserError(
                 f"{self.path}: already contains a training run; use `resume` to continue it, "
                 "`overwrite` to replace it, or use another folder"
@@ -147,7 +147,7 @@ class OutputFolder:
         from snowsplat.scene.camera_json import write_cameras
 
         self.path.mkdir(parents=True, exist_ok=True)
-        self.write_config(settings, config)  # from here on `is_one`
+        self.write_config(settings, config)  # from now on, `is_output_folder` is true
         if dataset.points is not None:
             from snowsplat.data.points_ply import write_points
 

@@ -169,5 +169,5 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
             raise UserError("`iteration` selects a scene of an output folder; leave it out")
         file, gaussians = path, read_gaussians(path)
         folder = folder_around(path)
-    background = folder.settings()[1] if folder.is_one() else (0.0, 0.0, 0.0)
+    background = folder.settings()[1] if folder.is_output_folder() else (0.0, 0.0, 0.0)
     return ViewableScene(file, gaussians, cameras_of(folder), background)

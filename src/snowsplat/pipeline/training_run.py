@@ -154,7 +154,7 @@ class TrainingRun:
                 progress.step, progress.iterations, progress.loss, self.trainer.gaussians
             )
             if self.pace is not None and self.budget is not None:
-                self.pace.put_off(paused)
+                self.pace.postpone(paused)
                 self.budget.started += paused
         if self.pace is not None:
             schedule = self.trainer.schedule
@@ -185,7 +185,7 @@ class TrainingRun:
 
     def _restore_folder(self) -> None:
         """Create the folder again if it was moved or removed, so that the training is not lost."""
-        if not self.out.is_one():
+        if not self.out.is_output_folder():
             warnings.warn(f"{self.out.path}: was removed; it is created again", stacklevel=2)
             self.out.describe(self.trainer.dataset, self.settings, self.config)
 

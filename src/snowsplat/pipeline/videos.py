@@ -186,7 +186,7 @@ def _load(scene: Path, iteration: int | None, name: str) -> _Source:
     if scene.is_file():
         file = scene.with_name(f"{scene.stem}_{name}.mp4")
         folder, gaussians = folder_around(scene), read_gaussians(scene)
-        if not folder.is_one():
+        if not folder.is_output_folder():
             return _Source(gaussians, None, (0.0, 0.0, 0.0), file)
     else:
         folder = existing_folder(scene)

@@ -56,7 +56,7 @@ def watched_folder(path: Path) -> OutputFolder:
     """As `existing_folder`; also finds the training run of `make` if it has no scene yet."""
     folder = existing_folder(path)
     made = OutputFolder(folder.path / SCENE)
-    return made if made.is_one() and not folder.is_one() else folder
+    return made if made.is_output_folder() and not folder.is_output_folder() else folder
 
 
 class NewestScene:

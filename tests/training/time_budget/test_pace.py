@@ -139,7 +139,7 @@ def test_a_pause_moves_the_deadline():
             clocks[i] += 0.023
             if i and step == 200:
                 clocks[i] += 60.0
-                each.put_off(60.0)
+                each.postpone(60.0)
             now = clocks[i]
             lengths.append(each.iterations_after(schedule, step, 1, 10_000))
         assert lengths[1] == (lengths[0] and pytest.approx(lengths[0], abs=1)), step

@@ -51,7 +51,7 @@ def why_unusable(index: int = 0) -> str | None:
     return None
 
 
-def gpu_there() -> bool:
+def has_gpu() -> bool:
     """Whether the machine has an NVIDIA GPU and a driver, even if they cannot be used."""
     found = _driver()
     return found is not None and found.error != _NO_DEVICE

@@ -67,8 +67,8 @@ class Pace:
         fewest = math.ceil((1.0 - schedule.share(step)) * step / _HURRY)
         return step + max(steps, fewest, 1)
 
-    def put_off(self, seconds: float) -> None:
-        """Move the deadline by a pause of ``seconds`` since the last step."""
+    def postpone(self, seconds: float) -> None:
+        """Postpone the deadline by a pause of ``seconds`` since the last step."""
         self.deadline += seconds
         self._last_step += seconds
         self._last_estimate += seconds

@@ -23,7 +23,7 @@ class DisplaySettings:
     """How Gaussians are displayed.
 
     Attributes:
-        mode: what a pixel shows: colour, depth …; "error" is the difference from a photo.
+        mode: the quantity that is displayed: colour, depth …; "error": the difference from a photo.
         sh_degree: degree of the spherical harmonics that are used for colours.
         scale: factor on the size of every Gaussian.
         crop: lower and upper corner (x, y, z, world) of a box; Gaussians outside are hidden.
@@ -42,9 +42,10 @@ class Pose:
     """The camera pose of a browser.
 
     Attributes:
-        quat: (4,) wxyz and position: (3,) of world_from_cam, float64; x right, y down, z forward.
-        fov: vertical field of view, radians.
-        width, height: of the window, pixels.
+        quat: (4,) wxyz, float64, rotation of world_from_cam; x right, y down, z forward.
+        position: (3,) float64, camera centre in the world frame.
+        fov: vertical field of view in radians.
+        width, height: size of the window in pixels.
     """
 
     quat: Tensor = field(repr=False)
@@ -68,14 +69,14 @@ class Pose:
 
 
 def fit(width: int, height: int, longest: int) -> tuple[int, int]:
-    """The size reduced so that its longer side is at most ``longest``; never enlarged."""
+    """The size, reduced if necessary, so that its longer side is at most ``longest``."""
     scale = min(1.0, longest / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 @dataclass(frozen=True)
 class Placed:
-    """The rectangle of a photo in an image: as large as possible, centred, same aspect ratio."""
+    """The largest centred rectangle in an image that has the aspect ratio of a photo."""
 
     left: int
     top: int

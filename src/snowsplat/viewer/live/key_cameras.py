@@ -14,8 +14,8 @@ from snowsplat.viewer.live.page import in_server_thread, note
 from snowsplat.viewer.live.session import Visitor
 
 FILE = "cameras.json"
-_MOST = 500  # views that a browser may store
-_PAUSE = 2.0  # seconds between two downloads
+_MOST = 500  # maximum number of views that a browser may store
+_PAUSE = 2.0  # minimum time in seconds between two downloads
 _NONE = "Store two or more views to make a video."
 
 

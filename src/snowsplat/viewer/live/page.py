@@ -1,4 +1,4 @@
-"""The controls of the page: those of the training are shared, all others are per browser."""
+"""The controls of the page: training controls for all browsers, and controls of each browser."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ def note(text: str) -> str:
 def in_server_thread(run: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
     """A callback of a control that runs in the server's thread instead of a thread pool.
 
-    So events are processed in order, and the next message is read only when one is processed.
+    So events are processed in order, and the next message is read when the previous one is
+    processed.
     """
 
     async def called(_: Any) -> None:
@@ -191,7 +192,7 @@ class Controls:
         self._client, self._session, self._visitor = client, session, visitor
         self._photos = photos
         self._photo_index: int | None = None
-        self._next: int | None = None  # the photo to go to when it has been read
+        self._next: int | None = None  # the photo to which to go when it has been read
         self._going: asyncio.Task[None] | None = None
         self._hidden: viser.FrameHandle | None = None  # hides all frustums in this browser
         self._add_picture()
@@ -328,7 +329,7 @@ class Controls:
         self._show_legend()
 
     def _show_frustums(self) -> None:
-        """Show or hide frustums; at a photo its own frustum would cover the view."""
+        """Show or hide frustums. At a photo they are hidden: its frustum would cover the view."""
         shown = self._shown.value and self._photo_index is None
         if shown and self._hidden is not None:
             self._hidden.remove()

@@ -120,7 +120,7 @@ class Photos:
             register(index, frustum)
 
     async def read(self, visitor: Visitor, index: int) -> PhotoView:
-        """Read a photo; one at a time, for all browsers.
+        """Read a photo. Only one photo is read at a time, for all browsers together.
 
         Raises:
             UserError: the photo is missing or damaged.
@@ -153,7 +153,7 @@ class Photos:
         return Pose(quat_from_rotation(pose[:, :3]), pose[:, 3], fov, width, height)
 
     def _look_at(self, camera: Camera) -> Tensor:
-        """The point on the optical axis nearest to the centre of the scene, in front."""
+        """The point on the optical axis, in front of the camera, nearest to the scene centre."""
         pose = camera.world_from_cam.detach().to(torch.float64)
         axis, position = pose[:, 2], pose[:, 3]
         distance = max(float(axis @ (self._centre - position)), 0.1 * self._extent)
@@ -176,7 +176,7 @@ class Photos:
             try:
                 planes = load_image(small, self._background.tolist())
             except UserError:
-                continue  # reported by the training, or when a user goes to the photo
+                continue  # training reports the error, or it is shown when a user goes to the photo
             if self._closed.is_set():
                 return
             pixels = planes.permute(1, 2, 0).contiguous().numpy()

@@ -1,4 +1,4 @@
-"""Starts a viser server: silent, on one free port, with access control."""
+"""Starts a viser server on a free port, without console output and with access control."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ class RunningServer:
     """A server and its address.
 
     Attributes:
-        url: the URL for browsers on this machine; if a host name was given, also on other machines.
-        others: the URL for other machines, if they can connect at another address.
+        url: the URL for browsers on this machine; if a host name was given, also for other
+        machines.
+        others: the URL for other machines, if it is a different one.
     """
 
     server: viser.ViserServer
@@ -66,7 +67,7 @@ def start_server(host: str, port: int | None, label: str) -> RunningServer:
     if not guard.serves:
         stop_server(server)
         raise RuntimeError(f"viser {viser.__version__} is not supported: it starts differently")
-    if server.get_port() != free:  # in use by now; viser takes the next port silently
+    if server.get_port() != free:  # it is in use now; viser takes the next port without a message
         stop_server(server)
         raise SettingError("port", f"{free} is in use; choose another, e.g. {free + 1}")
     others = address(socket.gethostname(), free, token) if host in ANY_HOST else None
@@ -75,7 +76,7 @@ def start_server(host: str, port: int | None, label: str) -> RunningServer:
 
 @contextlib.contextmanager
 def _guarded(guard: Guard) -> Iterator[None]:
-    """viser has no setting for its listening function, so it is replaced temporarily."""
+    """Replaces the function with which viser listens, because viser has no setting for it."""
     serve = websockets.asyncio.server.serve
     websockets.asyncio.server.serve = guard.serve  # type: ignore[assignment,misc]
     try:
@@ -115,7 +116,7 @@ def free_port(host: str, port: int | None) -> int:
 
 
 def _is_free(host: str, port: int) -> bool:
-    """Raises UserError if this machine cannot listen at ``host``, or not at this port."""
+    """Whether the port is free. Raises UserError if this machine cannot listen at ``host``."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError):
