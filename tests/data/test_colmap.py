@@ -196,7 +196,7 @@ def test_a_count_larger_than_the_file_allocates_nothing(dataset_copy, file, coun
     count += struct.unpack("<Q", path.read_bytes()[:8])[0]
     path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
     kind = {"points3D.bin": "points"}.get(file, file.removesuffix(".bin"))
-    problem = f"{file}: damaged: it promises {count} {kind}, more than fit into it"
+    problem = f"{file}: damaged: it declares {count} {kind}, more than fit into it"
     if kind == "points" and count < 100:  # they would fit if no point had a track
         problem = f"{file}: damaged: it is truncated"
     with pytest.raises(UserError, match=problem):
@@ -214,14 +214,14 @@ def test_damaged_files_raise_one_line_errors(dataset_copy, count_rejected, kind,
     assert rejected >= (20 if kind == "colmap-bin" else 5)
 
 
-def test_a_text_file_shorter_than_its_comment_promises(dataset_copy, caplog):
+def test_a_text_file_with_fewer_records_than_its_comment_declares(dataset_copy, caplog):
     folder = dataset_copy("colmap-txt")
     path = folder / "sparse/0/points3D.txt"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:21]))
     with caplog.at_level(logging.WARNING):
         assert len(load_dataset(folder).points) == 20
-    assert "20 points, but its comment promises 60" in caplog.text
+    assert "20 points, but its comment declares 60" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ class Evaluate(SceneFlags):
     """test: the held-out photos; train: the training photos."""
     lpips: Annotated[Path | None, flag("FILE", default="not measured")] = None
     """File with the weights for LPIPS (of AlexNet or VGG16, and of the linear layers), in the
-    format of safetensors or torch."""
+    safetensors format."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

@@ -32,7 +32,8 @@ class Info:
       metrics. For a checkpoint, it also checks that the file is not damaged.
     """
 
-    # Not `Path | None`, to check which tyro would import another package for a tenth of a second.
+    # The type is not `Path | None`: to check it, tyro would import another package, which takes a
+    # tenth of a second.
     path: Annotated[Optional[Path], tyro.conf.Positional, flag("FILE|OUT|DATASET")] = None  # noqa: UP045
     """A scene file of any format, a checkpoint, an output folder of train or make, or a dataset."""
     json: Annotated[bool, switch()] = False

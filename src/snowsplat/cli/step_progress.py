@@ -110,7 +110,7 @@ class StepProgress:
 
 
 def _whole(total: int) -> Column:
-    """A column that is never truncated: in a narrow terminal, a part of a number is misleading."""
+    """A column that is never truncated, because a truncated number is misleading."""
     return Column(no_wrap=True, min_width=2 * len(str(total)) + 1)
 
 

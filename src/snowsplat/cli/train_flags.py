@@ -68,7 +68,7 @@ class JobFlags:
     """Continue from the newest checkpoint in OUT. The result is the same as without the
     interruption."""
     overwrite: Annotated[bool, switch()] = False
-    """Replace the results of an earlier training in OUT."""
+    """Replace the results of an earlier training run in OUT."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to train on."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None

@@ -40,7 +40,7 @@ class ImageSource:
     width: int  # pixels, after scaling
     height: int  # pixels, after scaling
     apply_orientation: bool = False  # apply the EXIF orientation
-    stored: int = 0  # pixels in the file; 0 if unknown, then width × height is assumed
+    stored: int = 0  # number of pixels in the file; 0: unknown, then it is width × height
 
 
 @dataclass(frozen=True)

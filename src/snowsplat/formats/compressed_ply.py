@@ -13,8 +13,9 @@ packed_color     8, 8, 8, 8    r, g, b between the bounds of the chunk (0 to 1 i
                                none), opacity
 ===============  ============  ==================================================================
 
-``sh`` has f_rest_0, … as in an uncompressed PLY, one byte each, from −4 to 4. The frame is that of
-the uncompressed PLY. The layout was taken from github.com/playcanvas/splat-transform (MIT).
+The element ``sh`` has the properties f_rest_0, … of an uncompressed PLY. Each is one byte, which
+represents the range −4 to 4. The frame is that of the uncompressed PLY. The layout was taken from
+github.com/playcanvas/splat-transform (MIT).
 """
 
 from pathlib import Path
@@ -77,10 +78,11 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
     others = (_fields(words[:, 1], _QUAT) / np.float32(1023) - np.float32(0.5)) * np.sqrt(
         np.float32(2)
     )
+    steps = _largest_integers(_XYZ)
     return decoded(
         path,
-        _dequantize(bounds[:, :3], bounds[:, 3:6], _fields(words[:, 0], _XYZ), _steps(_XYZ)),
-        _dequantize(bounds[:, 6:9], bounds[:, 9:], _fields(words[:, 2], _XYZ), _steps(_XYZ)),
+        _dequantize(bounds[:, :3], bounds[:, 3:6], _fields(words[:, 0], _XYZ), steps),
+        _dequantize(bounds[:, 6:9], bounds[:, 9:], _fields(words[:, 2], _XYZ), steps),
         packing.from_largest_of_four(largest, others),
         packing.opacity_logits(rgba[:, 3]),
         (_dequantize(colors[:, :3], colors[:, 3:], rgba[:, :3], 255)[:, None] - 0.5) / SH_C0,
@@ -121,7 +123,7 @@ def _fields(words: np.ndarray, layout: tuple[tuple[int, int], ...]) -> np.ndarra
     return words[:, None] >> shifts & masks
 
 
-def _steps(layout: tuple[tuple[int, int], ...]) -> np.ndarray:
+def _largest_integers(layout: tuple[tuple[int, int], ...]) -> np.ndarray:
     """(P,) the largest integer that each field can store."""
     return np.array([(1 << bits) - 1 for _, bits in layout], np.float32)
 
@@ -165,11 +167,11 @@ def _encode(path: Path, gaussians: GaussianArrays) -> list[bytes]:
 
     bounds = [_bounds(values) for values in (means, log_scales, colors)]
     words = np.empty((n, 4), "<u4")
-    words[:, 0] = _pack(_quantize(means, bounds[0], _steps(_XYZ)), _XYZ)
+    words[:, 0] = _pack(_quantize(means, bounds[0], _largest_integers(_XYZ)), _XYZ)
     largest, others = packing.largest_of_four(quats)
     ten_bits = np.rint((others * np.sqrt(0.5) + 0.5) * 1023)
     words[:, 1] = _pack(ten_bits, _QUAT) | largest.astype(np.uint32) << np.uint32(30)
-    words[:, 2] = _pack(_quantize(log_scales, bounds[1], _steps(_XYZ)), _XYZ)
+    words[:, 2] = _pack(_quantize(log_scales, bounds[1], _largest_integers(_XYZ)), _XYZ)
     alpha = packing.opacity_bytes(opacity_logits)[:, None]
     words[:, 3] = _pack(
         np.concatenate([_quantize(colors, bounds[2], np.float32(255)), alpha], 1), _RGBA

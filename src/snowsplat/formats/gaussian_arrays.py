@@ -1,4 +1,4 @@
-"""Gaussians as NumPy arrays: what the scene files are read into and written from.
+"""Gaussians as NumPy arrays: the representation from which scene files are written and read.
 
 The modules of the formats use NumPy only, so that a program that inspects a file does not wait
 for the import of torch.
@@ -38,7 +38,7 @@ class GaussianArrays(NamedTuple):
 
     @classmethod
     def empty(cls, rest: int = 0) -> GaussianArrays:
-        """No Gaussians, of ``rest`` SH coefficients beyond the constant one."""
+        """An empty set of Gaussians, with ``rest`` SH coefficients beyond the constant one."""
         shapes = ((0, 3), (0, 3), (0, 4), (0,), (0, 1, 3), (0, rest, 3))
         return cls(*(np.zeros(shape, np.float32) for shape in shapes))
 
@@ -69,7 +69,7 @@ def decoded(path: Path, *arrays: np.ndarray) -> GaussianArrays:
 
 def skip_nonfinite(path: Path, gaussians: GaussianArrays) -> GaussianArrays:
     """The Gaussians whose parameters are all finite; logs a warning if ``path`` has others."""
-    # Nearly always all of them are finite, which the sums show much faster.
+    # In most files all values are finite. Then all sums are finite, which is a much faster test.
     with np.errstate(all="ignore"):
         if all(np.isfinite(array.sum()) for array in gaussians):
             return gaussians

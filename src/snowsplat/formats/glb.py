@@ -20,7 +20,7 @@ MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _MOST_NODES = 1 << 16  # a node takes several microseconds
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-#: The NumPy type, and the divisor of normalised values.
+#: The component types of glTF: code -> NumPy type, and divisor of normalised values.
 _COMPONENTS = {
     5120: ("<i1", 127.0),
     5121: ("<u1", 255.0),

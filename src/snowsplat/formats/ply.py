@@ -43,9 +43,10 @@ def is_scene(table: PlyTable) -> bool:
 
 
 def read_ply(path: Path | str) -> GaussianArrays:
-    """Read a scene of any SH degree; properties in any order and of any type, others ignored.
+    """Read a scene of any SH degree.
 
-    Values are not changed: NaN and infinity are read as they are.
+    The properties may have any order and any type. Unknown properties are ignored. Values are not
+    changed: NaN and infinity are read as they are.
 
     Raises:
         UserError: the file is missing, damaged, truncated, or a PLY file without Gaussians.

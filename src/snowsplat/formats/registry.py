@@ -59,7 +59,7 @@ FORMATS: list[Format] = [
         is_compressed_ply,
         read_compressed_ply,
         write_compressed_ply,
-        "positions and scales have 10 to 11 bits, rotations 10, colours, opacity and SH 8",
+        "precision: positions and scales have 10 to 11 bits, rotations 10, all other values 8",
     ),
     Format(
         "PLY",
@@ -75,7 +75,7 @@ FORMATS: list[Format] = [
         is_spz,
         read_spz,
         write_spz,
-        "positions have 24 bits, rotations 10, all else 8 and SH 4 to 8",
+        "precision: positions have 24 bits, rotations 10, SH 4 to 8, all other values 8",
         spz_version,
     ),
     Format(
@@ -84,7 +84,7 @@ FORMATS: list[Format] = [
         is_sog,
         read_sog,
         write_sog,
-        "positions have 16 bits, all else 8; SH are rows of a palette",
+        "precision: positions have 16 bits, all other values 8; SH are rows of a palette",
         sog_version,
     ),
     Format(
@@ -93,7 +93,7 @@ FORMATS: list[Format] = [
         is_glb,
         read_glb,
         write_glb,
-        "nothing but rounding",
+        "nothing except for rounding",
         lambda _: "2, KHR_gaussian_splatting",
     ),
     Format(
@@ -102,7 +102,7 @@ FORMATS: list[Format] = [
         None,
         read_splat,
         write_splat,
-        "SH, all of it; rotations, colours and opacity have 8 bits",
+        "all SH, and precision: rotations, colours and opacity have 8 bits",
     ),
     Format(
         "ksplat",
@@ -110,7 +110,7 @@ FORMATS: list[Format] = [
         None,
         read_ksplat,
         None,
-        "positions and all else have 16 or 32 bits, SH 8 to 32",
+        "precision: SH have 8 to 32 bits, all other values 16 or 32",
     ),
 ]
 

@@ -215,10 +215,14 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
         "version": 2,
         "asset": {"generator": "snowsplat"},
         "count": n,
-        "means": {"mins": low.tolist(), "maxs": high.tolist(), **_named("means_l", "means_u")},
-        "scales": {"codebook": scale_levels.tolist(), **_named("scales")},
-        "quats": _named("quats"),
-        "sh0": {"codebook": color_levels.tolist(), **_named("sh0")},
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            **_files_entry("means_l", "means_u"),
+        },
+        "scales": {"codebook": scale_levels.tolist(), **_files_entry("scales")},
+        "quats": _files_entry("quats"),
+        "sh0": {"codebook": color_levels.tolist(), **_files_entry("sh0")},
     }
     if n and sh_rest.shape[1]:
         sh_rest = np.clip(sh_rest, -_SH_LIMIT, _SH_LIMIT)  # so that squares fit in float32
@@ -230,7 +234,7 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
             "count": len(palette),
             "bands": SH_REST_COUNTS.index(sh_rest.shape[1]),
             "codebook": levels.tolist(),
-            **_named("shN_centroids", "shN_labels"),
+            **_files_entry("shN_centroids", "shN_labels"),
         }
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
         # Not compressed again, because WebP is compressed. ZipInfo has a fixed date, so that equal
@@ -245,7 +249,8 @@ def _palette_size(count: int) -> int:
     return min(_PALETTE_LIMIT, max(64, count // 4))
 
 
-def _named(*names: str) -> dict[str, list[str]]:
+def _files_entry(*names: str) -> dict[str, list[str]]:
+    """The entry of `meta.json` that lists the files of these images."""
     return {"files": [f"{name}.webp" for name in names]}
 
 

@@ -151,7 +151,7 @@ def _unpack_streams(path: Path, data: bytes, header: Header) -> Contents:
         packed, unpacked = struct.unpack_from("<QQ", data, entry)
         if unpacked != size or start + packed > len(data):
             raise _damaged(path)
-        # A reader, since decompress() trusts the size that the stream declares.
+        # A stream reader is used, because decompress() trusts the size that the stream declares.
         unpacker = zstandard.ZstdDecompressor(max_window_size=1 << 27)
         column = unpacker.stream_reader(data[start : start + packed]).read(size + 1)
         if len(column) != size:

@@ -23,7 +23,7 @@ class CheckpointMeta:
 
     Attributes:
         capture: how the dataset was read.
-        recipe: the origin of the configuration.
+        recipe: the recipe from which the configuration was derived.
         training: the configuration, see `config_to_json`.
         time: see `TimeBudget.as_json`; None without a time budget.
         schedule: the schedule, which a time budget may change; None without a time budget.
@@ -45,7 +45,7 @@ class CheckpointMeta:
         try:
             meta = from_json(CheckpointMeta, start.meta)
             if meta.time is not None and meta.time.keys() != {"seconds", "spent"}:
-                raise ValueError("no time")
+                raise ValueError("invalid time budget")
         except ValueError as error:
             raise UserError(f"{start.path}: not a checkpoint of a training run ({error})") from None
         return meta

@@ -155,5 +155,5 @@ def gaussians_to_keep(decimate: int | str, count: int) -> int:
         return int(text)
     match = re.fullmatch(r"(\d+(?:\.\d+)?)%", text)
     if not match or float(match[1]) > 100:
-        raise SettingError("decimate", f"{text!r} is not a share; use a number, or 0% to 100%")
+        raise SettingError("decimate", f"{text!r} is not valid; use a number, or 0% to 100%")
     return round(count * float(match[1]) / 100)

@@ -111,8 +111,8 @@ def _bounds(xyz: np.ndarray) -> dict[str, Any]:
         return {}
     low, high = np.percentile(xyz, [1, 99], axis=0)
     return {
-        "bounds": [_short(xyz.min(0)), _short(xyz.max(0))],
-        "bounds_of_98_percent": [_short(low), _short(high)],
+        "bounds": [_rounded(xyz.min(0)), _rounded(xyz.max(0))],
+        "bounds_of_98_percent": [_rounded(low), _rounded(high)],
     }
 
 
@@ -123,7 +123,8 @@ def _percentiles(values: np.ndarray) -> dict[str, float]:
     return {f"p{p}": float(f"{v:.4g}") for p, v in zip(_PERCENTILES, found, strict=True)}
 
 
-def _short(values: Any) -> list[float]:
+def _rounded(values: Any) -> list[float]:
+    """The values with five significant digits."""
     return [float(f"{float(v):.5g}") for v in values]
 
 
@@ -181,9 +182,9 @@ def _dataset(path: Path) -> dict[str, Any]:
         "photos": len(views),
         "held_out_with_eval": len(dataset.test),
         "sizes": dict(sizes),
-        "focal_length_pixels": _short([focal[0], focal[-1]]),
+        "focal_length_pixels": _rounded([focal[0], focal[-1]]),
         "masks": sum(view.mask is not None for view in views),
         "points": 0 if dataset.points is None else len(dataset.points),
         "extent": float(f"{dataset.extent:.5g}"),
-        "bounds": [_short(corner) for corner in dataset.bounds.tolist()],
+        "bounds": [_rounded(corner) for corner in dataset.bounds.tolist()],
     }

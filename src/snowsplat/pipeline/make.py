@@ -30,7 +30,7 @@ STAGES = ("scene", "pictures")  # the dataset has a record of its own
 RECORD = "make.json"
 HOLD_OUT = 8
 # The fields of a preset that affect the training.
-_OF_TRAINING = ("side", "iterations", "max_gaussians", "densify_interval")
+_TRAINING_FIELDS = ("side", "iterations", "max_gaussians", "densify_interval")
 # Time between checkpoints in seconds: a kill loses at most this much work.
 _CHECKPOINT_SECONDS = 15.0
 # Minimum time of a training run: in seconds, and as a share of the given time.
@@ -49,7 +49,7 @@ class MakeOptions:
             determines only the effort to estimate the camera poses; the training uses the rest of
             the time.
         minutes: finish within this time. Stages that an earlier run has finished are not counted.
-            An interrupted training resumes with the time that remained.
+            An interrupted training run resumes with the time that remained.
         memory: memory limit of the training; see `TrainOptions`.
         compute: device and threads.
 
@@ -184,7 +184,7 @@ class _Job:
 
     @contextmanager
     def _removed_if_empty(self, existed: bool) -> Iterator[None]:
-        """If the job wrote only its record, remove the record, and the folder if it is new."""
+        """If the job wrote only its record, remove it, and the folder if the job created it."""
         try:
             yield
         finally:
@@ -194,9 +194,10 @@ class _Job:
                     self.out.rmdir()
 
     def _quality(self, photos: int, videos: int) -> Quality:
-        """The requested quality, or one chosen for the time, which later runs must not change.
+        """The requested quality. If only a time is requested, the quality is chosen for this time.
 
-        The poses depend on it, so it is recorded.
+        The poses depend on the chosen quality. Therefore it is recorded, and later runs use the
+        recorded quality.
         """
         quality, minutes = self.options.quality, self.options.minutes
         if quality is not None or minutes is None:
@@ -227,7 +228,7 @@ class _Job:
         settings: dict[str, Any] = {"capture": _fingerprint(self.dataset)}
         if self.options.minutes is None:
             preset = PRESETS[self.quality]
-            settings |= {key: getattr(preset, key) for key in _OF_TRAINING}
+            settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
         else:
             settings |= {"minutes": self.options.minutes}
         folder = OutputFolder(self.out / SCENE)

@@ -39,12 +39,15 @@ if TYPE_CHECKING:
 
 #: Folders inside the folder of `make`: the dataset, and the output folder of its training.
 CAPTURE, SCENE = "capture", "scene"
-# _WORD: a string, a name or number, or a sign. _LITERAL: a literal whose value is used.
-# _WORD does not match spaces: with an expression that does, a million spaces take quadratic time.
+# _WORD: a string, a name, a number, or a single character. _LITERAL: a literal whose value is used.
+# _WORD does not match spaces. An expression that matches them would take quadratic time for a file
+# with a million spaces.
 _WORD = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S""", re.DOTALL)
 _LITERAL = re.compile(r"""['"].*['"]|True|False|None|-?[\d.]+(?:e[+-]?\d+)?""", re.DOTALL)
 _NAMESPACE_LIMIT = 1 << 20  # characters
-_PART = 4  # maximum number of stored words of a part; parts of three words are used
+# Maximum number of words that are stored for an argument of Namespace. The arguments that are used
+# have three words, NAME = VALUE; one more word is stored to detect longer arguments.
+_STORED_WORDS = 4
 _SCENE = re.compile(r"iteration_(\d+)")
 _RESULTS = ("point_cloud", "checkpoints", "train", "test", "videos", "films")
 _REPORTS = ("metrics.json", "history.json", "report.html")
@@ -299,9 +302,9 @@ def _namespace(path: Path) -> dict[str, Any]:
                 raise ValueError("a string without an end")
             depth += (word in "([{") - (word in ")]}")
             if depth > 1 or (depth == 1 and word != ","):
-                part = [*part, word][:_PART]
+                part = [*part, word][:_STORED_WORDS]
                 continue
-            if len(part) == _PART - 1 and part[1] == "=" and _LITERAL.fullmatch(part[2]):
+            if len(part) == _STORED_WORDS - 1 and part[1] == "=" and _LITERAL.fullmatch(part[2]):
                 values[part[0]] = ast.literal_eval(part[2])
             part = []
             if depth < 1:

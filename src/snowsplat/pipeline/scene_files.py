@@ -36,4 +36,6 @@ def _write_html(path: Path, gaussians: GaussianArrays) -> None:
     write_html(path, gaussians.to_gaussians())
 
 
-register_format(Format("HTML", (".html",), None, None, _write_html, "what compressed PLY loses"))
+register_format(
+    Format("HTML", (".html",), None, None, _write_html, "the same as in compressed PLY")
+)

@@ -231,7 +231,7 @@ class _Job:
             return self.train(path)
         options, meta = self.options, CheckpointMeta.of(start)
         budget, schedule = None, None
-        if options.iterations is None:  # otherwise `iterations` replaces both
+        if options.iterations is None:  # `iterations` replaces the time budget and its schedule
             budget = TimeBudget.of(options.minutes, meta.time, self.started)
             schedule = meta.schedule
         settings = _resumed_dataset(options, path, start, meta)
@@ -240,7 +240,7 @@ class _Job:
         memory = self._memory(dataset, config, _gaussians_in(start))
         trainer = Trainer(dataset, memory.plan.config, schedule, self.device)
         trainer.load_state(start.tensors)
-        start.tensors.clear()  # the trainer has copied them; the memory plan has no second copy
+        start.tensors.clear()  # the trainer has copied them, and the plan counts only one copy
         self.out.write_config(settings, memory.plan.config)
         self.observer.note(_described(dataset))
         iterations = trainer.schedule.iterations

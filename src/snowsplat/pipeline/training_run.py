@@ -136,8 +136,9 @@ class TrainingRun:
         raise TrainingStopped(f"stopped after step {self.trainer.step}: {scene}", scene)
 
     def _record(self, progress: Progress) -> None:
-        measured = progress.metrics is not None  # the time of the step includes an evaluation
-        self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=not measured)
+        # If there are metrics, the time of the step includes an evaluation and is not counted.
+        timed = progress.metrics is None
+        self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=timed)
         self._after_step(progress)
         self.history.step_begins()
 
@@ -171,7 +172,10 @@ class TrainingRun:
         return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
 
     def _finish_interrupted_writes(self) -> None:
-        """What a kill right after a checkpoint prevented: remove old ones, save the scene."""
+        """Finish what a kill right after a checkpoint prevented.
+
+        Remove old checkpoints, and save the scene.
+        """
         from snowsplat.training import checkpoint
 
         step = self.first_step
@@ -197,7 +201,7 @@ class TrainingRun:
         meta = CheckpointMeta(self.settings, self.recipe, config_to_json(self.config))
         if self.budget is not None:
             meta = replace(meta, time=self.budget.as_json(), schedule=self.trainer.schedule)
-        # First: a run that resumes from the checkpoint needs the curves up to it.
+        # Write the history first: a run that resumes from the checkpoint needs the curves up to it.
         self.history.write(self.out.history)
         path = checkpoint.save(
             self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta.as_json()

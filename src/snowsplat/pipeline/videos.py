@@ -250,7 +250,7 @@ class Video:
     """A video to be rendered.
 
     Attributes:
-        cameras: one per frame, all of one even size.
+        cameras: one per frame. All have the same size, with even width and height.
         file: the file of the video in color; that of the depth has _depth in its name.
         depth: render a video of the depth too.
         side_by_side: one video instead, with color on the left and depth on the right.

@@ -93,7 +93,7 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The Gaussians with SH ``degree`` 0 to 3: drops higher coefficients, adds zeros for others."""
+    """The Gaussians with SH ``degree`` 0 to 3: removes coefficients, or adds zeros."""
     wanted, rest = SH_REST_COUNTS[degree], gaussians.sh_rest
     if wanted > rest.shape[1]:
         rest = torch.cat([rest, rest.new_zeros(len(rest), wanted - rest.shape[1], 3)], 1)

@@ -35,8 +35,8 @@ def view_of_camera(camera: Camera, depth: float) -> InitialView:
     """The view of a photo. The target is ``depth`` world units along the optical axis.
 
     A window of the usual aspect ratio shows the complete photo if the photo is in landscape format.
-    Of a portrait photo it shows the middle. The complete photo would need a wider view, and the
-    photos may not cover what is at its sides.
+    For a portrait photo, the window shows only the middle part: to show the complete photo, the
+    view would have to be wider than the photo, and the photos may not cover the areas at its sides.
     """
     pose = camera.world_from_cam
     short, long = sorted((0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy))

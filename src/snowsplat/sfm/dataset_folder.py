@@ -92,8 +92,8 @@ def make_dataset(
 
     Raises:
         UserError: the photos cannot be used, ``folder`` contains other files, or no poses were
-            found. The files that this run created are then removed. Also if the disk is full; then
-            the files remain.
+            found. In these cases, the files that this run created are removed. This error is also
+            raised if the disk is full; in this case, the files remain.
         OSError: a file cannot be read or written.
     """
     sources = find_inputs(inputs)

@@ -6,9 +6,10 @@ from typing import Protocol
 
 
 class Report(Protocol):
-    """Called repeatedly: ``done`` of ``total`` items are finished; a total of 0 is unknown.
+    """A callback that a long job calls repeatedly.
 
-    ``what`` names the items, e.g. "photos".
+    ``done`` of ``total`` items are finished. If ``total`` is 0, the total is unknown. ``what`` is
+    the name of the items, for example "photos".
     """
 
     def __call__(self, done: int, total: int, what: str = "") -> None: ...

@@ -32,7 +32,7 @@ _STEPS = 4096  # entries of the lookup tables
 
 def rgb_picture(frame: VideoFrame) -> np.ndarray:
     """(H, W, 3) uint8 of a decoded frame, in the stored orientation."""
-    matrix = None  # that of the frame
+    matrix = None  # None: the matrix that the frame declares
     if frame.colorspace == _UNSPECIFIED and frame.height >= 720:
         matrix = _BT709  # what players assume for this size
     transfer = frame.color_trc
@@ -42,7 +42,7 @@ def rgb_picture(frame: VideoFrame) -> np.ndarray:
         matrix = _BT2020
     rgb48 = frame.reformat(format="rgb48le", src_colorspace=matrix)
     deep = rgb48.to_ndarray().astype(np.uint16, copy=False)
-    # In bands of rows, since a whole 4K frame in float32 would take 100 MB.
+    # The frame is converted in bands of rows, because a whole 4K frame in float32 takes 100 MB.
     light = _LIGHT_OF_PQ if transfer == _PQ else _LIGHT_OF_HLG
     out = np.empty(deep.shape, np.uint8)
     for top in range(0, len(deep), 256):
@@ -53,7 +53,8 @@ def rgb_picture(frame: VideoFrame) -> np.ndarray:
 def _shown(light: np.ndarray) -> np.ndarray:
     """(…, 3) float32 linear BT.2020 in units of white, to sRGB 8 bits."""
     colours = np.clip(light @ _TO_709.T, 0, None)
-    # Values above the knee are compressed below 1, by the brightest channel: that keeps the hue.
+    # Pixels whose brightest channel is above the knee are compressed, so that it is below 1. The
+    # three channels are multiplied by the same factor, which keeps the hue.
     peak = np.maximum(colours.max(axis=-1, keepdims=True), 1e-6)
     headroom = 1 - _KNEE
     bent = _KNEE + headroom * (1 - np.exp((_KNEE - peak) / headroom))

@@ -1,4 +1,4 @@
-"""Renders photos along a path around the scene: JPEG files like those of a phone, known poses."""
+"""Renders photos with known poses along a path around the scene; JPEG files like a phone's."""
 
 from __future__ import annotations
 

@@ -117,8 +117,9 @@ class Ellipsoid:
         self.wraps: tuple[bool, ...] = (True,)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        # In units of the radii it is the unit ball. The distance of the line from the centre is
-        # that of the foot of the perpendicular: this avoids cancellation for distant cameras.
+        # In units of its radii, the ellipsoid is a unit ball. The distance of the ray from its
+        # centre is computed from the foot of the perpendicular, which avoids cancellation for
+        # distant cameras.
         direction = directions / self.radii
         length = np.sqrt((direction * direction).sum(axis=0))
         direction /= length

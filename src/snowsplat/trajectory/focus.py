@@ -15,9 +15,11 @@ from snowsplat.scene.orientation import up_direction
 #: The up direction of an oriented scene.
 DEFAULT_UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 
-# Sine of the roll up to which a camera is level. People hold cameras at least as level as this.
+# A camera is considered level if the sine of its roll is at most this. People hold cameras at least
+# as level as this.
 _LEVEL = math.sin(math.radians(5))
-# Optical axes within about this angle of each other are parallel (compared to an eigenvalue).
+# Optical axes within about 8° of each other are considered parallel. This value is the squared sine
+# of the angle; it is compared with an eigenvalue.
 _PARALLEL = math.sin(math.radians(8)) ** 2
 # Number of cameras and points that are used for medians.
 _CAMERAS_SAMPLED = 16

@@ -34,7 +34,7 @@ _LEAST_SWING = math.radians(2)
 _FLATTEST = 0.25
 # Samples per frame for measuring the length of a path.
 _SAMPLES_PER_FRAME = 20
-# Quantiles outside of which values are considered outliers.
+# Values outside of these quantiles are considered outliers.
 _OUTERMOST = torch.tensor([0.1, 0.9], dtype=torch.float64)
 
 # A closed path: parameters (N,) in [0, 1) -> positions (N, 3).

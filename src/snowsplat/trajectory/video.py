@@ -12,8 +12,8 @@ import numpy as np
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
-# In order of preference; the first that this build of FFmpeg has is used. The first two write
-# H.264, which all players support.
+# Encoders in the order of preference. The first one that this build of FFmpeg contains is used. The
+# first two write H.264, which all players support.
 _ENCODERS = ("libx264", "libopenh264", "mpeg4")
 # Quality of libx264. The compression is hardly visible.
 _CRF = "18"

@@ -19,7 +19,7 @@ from snowsplat.util.errors import UserError
 
 # Largest size of a header in bytes.
 _HEADER_LIMIT = 1 << 20
-# Largest size of an ASCII row in bytes: this, and the following for each number.
+# Largest size of an ASCII row in bytes: _LINE_LIMIT plus _NUMBER_LIMIT for each number.
 _LINE_LIMIT = 1 << 12
 _NUMBER_LIMIT = 1 << 10
 # Rows are converted in blocks of this size, which fit into the CPU cache.

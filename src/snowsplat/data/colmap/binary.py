@@ -1,6 +1,6 @@
 """COLMAP's binary files: cameras.bin, images.bin, points3D.bin. All numbers are little-endian.
 
-Counts in the files are not trusted: before anything is allocated, the promised number of records
+Counts in the files are not trusted: before anything is allocated, the declared number of records
 must fit into the file.
 """
 
@@ -51,7 +51,7 @@ class _Cursor:
         self.offset = 0
         (self.count,) = self.take(_COUNT)
         if self.count * least_bytes > len(self.data) - self.offset:
-            raise damaged(path, f"it promises {self.count} {kind}, more than fit into it")
+            raise damaged(path, f"it declares {self.count} {kind}, more than fit into it")
 
     def take(self, layout: struct.Struct) -> tuple:
         if self.offset + layout.size > len(self.data):

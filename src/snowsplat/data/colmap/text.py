@@ -58,14 +58,14 @@ def _warn_if_fewer(path: Path, kind: str, count: int) -> None:
     # a difference is only a warning.
     with open(path, encoding="utf-8", errors="replace") as file:
         head = file.read(1000)
-    promised = re.search(rf"^#.*Number of {kind}: (\d{{1,12}})\b", head, re.MULTILINE)
-    if promised and int(promised[1]) > count:
+    declared = re.search(rf"^#.*Number of {kind}: (\d{{1,12}})\b", head, re.MULTILINE)
+    if declared and int(declared[1]) > count:
         logger.warning(
-            "%s: has %d %s, but its comment promises %s; the file may be truncated",
+            "%s: has %d %s, but its comment declares %s; the file may be truncated",
             path,
             count,
             kind,
-            promised[1],
+            declared[1],
         )
 
 

@@ -169,12 +169,12 @@ def _communicate(
             if "watch" in answer:
                 _report_rows(report, *answer["watch"])
             continue
-        if line is None or not line.endswith("\n"):  # the child has ended, or died in a line
+        if line is None or not line.endswith("\n"):  # the child has ended, perhaps within a line
             break
         answer = json.loads(line)
         if "progress" in answer:
             report(*answer["progress"])
-    # stdin is closed only now, because the child ends when it is closed.
+    # stdin is closed only after the last answer, because the child ends when its stdin is closed.
     with contextlib.suppress(BrokenPipeError):
         child.stdin.close()
     return answer

@@ -15,35 +15,48 @@ from snowsplat.sfm.colmap.database import (
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import UserError
 
-_FEW_FEATURES = 60  # a photo with fewer is too dark, blurred or plain
-_WEAK_PAIR = 50  # matches
-_MANY_FEATURES = 500  # nearly every sharp photo has more
-_STILL = 0.01  # displacement relative to the photo's longest side
-_FLAT_SHARE = 0.8  # of all matches
+# A photo with fewer features is too dark, blurred or plain.
+_FEW_FEATURES = 60
+# A pair of photos with fewer matches is too weak to estimate a pose.
+_WEAK_PAIR = 50
+# Nearly every sharp photo has more features than this.
+_MANY_FEATURES = 500
+# If the displacement of the matches is smaller, the camera did not move. The unit is the longest
+# side of the photo.
+_STILL = 0.01
+# If at least this fraction of all matches fits a plane or a pure rotation, depth is undetermined.
+_FLAT_SHARE = 0.8
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the database contains about the photos, by index."""
+    """The data about the photos that the COLMAP database contains after matching."""
 
-    features: list[int]
-    pairs: list[Pair]
-    displacement: float | None  # of matches between two photos, relative to the longest side
+    features: list[int]  # number of features of each photo
+    pairs: list[Pair]  # the pairs with consistent matches
+    # Typical displacement of a match between two photos, relative to the longest side; None if
+    # there are no matches.
+    displacement: float | None
     compared: int  # number of pairs that were matched
 
     @property
     def compared_all(self) -> bool:
+        """Whether every photo was matched with every other photo."""
         count = len(self.features)
         return self.compared >= count * (count - 1) // 2
 
     @property
     def usable(self) -> int:
-        """Number of photos that could get a pose: they have detail and share it with others."""
+        """Number of photos that could get a pose.
+
+        Such a photo has enough features, and other photos show the same scene.
+        """
         paired = {i for pair in self.pairs for i in (pair.first, pair.second)}
         # If all pairs were matched, a photo with many features but no match shows another scene.
-        alone = _MANY_FEATURES if self.compared_all else float("inf")
+        # With fewer features, or if some pairs were not matched, more effort may find matches.
+        no_match_limit = _MANY_FEATURES if self.compared_all else float("inf")
         return sum(
-            count >= _FEW_FEATURES and (i in paired or count < alone)
+            count >= _FEW_FEATURES and (i in paired or count < no_match_limit)
             for i, count in enumerate(self.features)
         )
 
@@ -55,11 +68,12 @@ class Evidence:
 
     @property
     def still(self) -> bool:
+        """Whether the camera hardly moved between the photos."""
         return self.displacement is not None and self.displacement < _STILL
 
     @property
     def more_effort_is_useless(self) -> bool:
-        """Whether stronger settings would not find a model either, if none was found."""
+        """Whether an attempt with more effort cannot find a model, if no model was found yet."""
         if self.still or self.flat:
             return True
         return self.usable < 3
@@ -78,7 +92,10 @@ def gather_evidence(database: Path, photos: Sequence[Photo], compared: int) -> E
 def explain(
     photos: Sequence[Photo], evidence: Evidence, models: Sequence[set[str]]
 ) -> dict[str, str]:
-    """Name -> reason, for each photo that is not in the first of ``models`` (sets of names)."""
+    """Why photos have no pose: name -> reason, for each photo that is not in the first model.
+
+    ``models`` has the names of the photos in each model, the largest model first.
+    """
     partners: list[list[int]] = [[] for _ in photos]
     for pair in evidence.pairs:
         partners[pair.first].append(pair.inliers)

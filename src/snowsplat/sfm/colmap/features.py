@@ -15,12 +15,14 @@ from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import Report
 
-# Pairs that are matched before they are written: lost by a kill, and the step of the progress.
-_BLOCK = 64
+# Number of pairs that are matched before the results are written to the database. A kill loses at
+# most this many pairs. The progress increases in steps of this number.
+_PAIRS_PER_BLOCK = 64
 
 # A photo has at most this many times the requested number of features.
-_MOST = 2
+_MAX_FEATURE_FACTOR = 2
 
+#: The seed of all random numbers in COLMAP.
 SEED = 1
 
 
@@ -53,15 +55,16 @@ class Folders:
 
 @dataclass(frozen=True)
 class WorkerProgress:
-    """How the worker sends progress to the parent process.
+    """The functions with which the worker sends its progress to the parent process.
 
-    Rows that COLMAP writes into its database are counted by the parent process. COLMAP contains its
-    own copy of SQLite, and two copies of SQLite in one process break each other's locks on a
-    database that both have open.
+    ``report`` sends a number of finished items. ``watch`` names a table of the database: the parent
+    process then counts the rows that COLMAP writes into it. The worker must not count them. COLMAP
+    contains its own copy of SQLite, and two copies of SQLite in one process break each other's
+    locks on a database that both have open.
     """
 
     report: Report
-    watch: Callable[[str, str, int, str], None]  # database, table, final number of rows, name
+    watch: Callable[[str, str, int, str], None]  # database, table, final row count, item name
 
 
 def extract_features(
@@ -80,7 +83,7 @@ def extract_features(
     options.sift.max_num_features = effort.features
     options.sift.first_octave = effort.first_octave
     with _counted(database, "keypoints", len(photos), "features", progress):
-        # With a mask folder COLMAP skips photos without a mask, so these need a separate call.
+        # If a mask folder is set, COLMAP skips photos without a mask. They need a separate call.
         for masked in (False, True):
             names = [photo.name for photo in photos if photo.mask == masked]
             reader = pycolmap.ImageReaderOptions()
@@ -96,7 +99,7 @@ def extract_features(
                     extraction_options=options,
                     device=pycolmap.Device.cpu,
                 )
-    trim_features(database, _MOST * effort.features)
+    trim_features(database, _MAX_FEATURE_FACTOR * effort.features)
 
 
 def match_pairs(
@@ -107,9 +110,10 @@ def match_pairs(
     threads: int,
     progress: WorkerProgress,
 ) -> None:
-    """Match the features of all ``pairs`` (indices of photos) that are not in the database yet.
+    """Match the features of those ``pairs`` that are not in the database yet.
 
-    ``max_error`` in pixels is the largest distance of a match from its epipolar line.
+    A pair consists of two indices of photos. ``max_error`` in pixels is the largest distance of a
+    match from its epipolar line.
     """
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
@@ -118,9 +122,10 @@ def match_pairs(
     verification.ransac.max_error = max_error
     verification.ransac.random_seed = SEED
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.block_size = _BLOCK
+    pairing.block_size = _PAIRS_PER_BLOCK
     pairing.match_list_path = database.with_suffix(".pairs")
-    # COLMAP's list of pairs separates names by blanks, so images temporarily have numbers as names.
+    # The file with the pairs separates names by blanks, and the name of a photo may contain blanks.
+    # Therefore the images are temporarily named by numbers.
     set_names(database, [str(i) for i in range(len(photos))])
     Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
     try:

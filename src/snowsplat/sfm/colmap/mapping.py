@@ -18,12 +18,13 @@ from snowsplat.sfm.progress import Report
 # A camera that sees fewer points has no reliable pose.
 MIN_POINTS = 15
 MIN_PHOTOS = 3
-# At the end, observations with a larger reprojection error are removed. In pixels of the scaled
-# photo in which features were detected.
+# At the end, observations with a larger reprojection error are removed. The unit is a pixel of the
+# scaled photo in which the features were detected.
 _MAX_REPROJECTION_ERROR = 3.0
-# The result of COLMAP's mapper depends on the timing of threads: the choice of the initial pair,
-# therefore the coordinate frame, and small differences of all poses. With fewer photos than this,
-# more threads do not make it faster, so one thread is used, and the poses are always the same.
+# With several threads, the result of COLMAP's mapper depends on their timing. The initial pair and
+# therefore the coordinate frame may differ, and all poses differ a little. With up to this number
+# of photos, several threads are not faster than one. Then one thread is used, and the poses are the
+# same in every run.
 _MANY_PHOTOS = 150
 _MIN_ANGLE = 1.5  # degrees between the rays of a point
 
@@ -162,7 +163,7 @@ class Mapping:
 
 
 def _usable(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    # Largest first; a model whose photos are all in larger ones is dropped.
+    # Sort the models, the largest first. Drop a model if larger models contain all of its photos.
     kept: list[pycolmap.Reconstruction] = []
     placed: set[int] = set()
     for model in sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D())):

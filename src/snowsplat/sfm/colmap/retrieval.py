@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating[Any]]
 
 WORDS = 64
-FEATURES = 1000  # per photo: the largest features, which are also detected from other distances
+# Number of features of a photo that are used: the largest ones, because the same large features are
+# also detected in photos from other distances.
+FEATURES = 1000
 _SAMPLE = 64 * WORDS * 4  # descriptors for k-means
 _ROUNDS = 12  # of k-means
 

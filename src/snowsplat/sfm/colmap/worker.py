@@ -56,8 +56,8 @@ def _redirected_stdout() -> TextIO:
 
 
 def _end_with_parent() -> None:
-    # os.read is used because a thread that waits in sys.stdin would prevent a regular exit of
-    # Python.
+    # os.read is used instead of sys.stdin, because Python cannot exit normally while a thread is
+    # reading from sys.stdin.
     while os.read(0, 4096):
         pass
     os._exit(1)
@@ -67,7 +67,8 @@ def _run(job: dict[str, Any], progress: WorkerProgress) -> SfmResult:
     pycolmap.set_random_seed(SEED)
     pycolmap.logging.alsologtostderr = False
     pycolmap.logging.logtostderr = True
-    # The mapper resets these settings. Without a destination it creates no log files in /tmp.
+    # COLMAP's mapper resets the two settings above. With an empty destination, the logger still
+    # creates no log files in /tmp.
     for level in pycolmap.logging.Level.__members__.values():
         pycolmap.logging.set_log_destination(level, "")
     options = SfmOptions(**job["options"])

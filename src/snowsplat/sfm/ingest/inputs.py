@@ -162,7 +162,7 @@ def _take_frames(
     ]
 
 
-# Refusals
+# Errors
 
 
 def _check_disk_space(

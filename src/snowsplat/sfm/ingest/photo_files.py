@@ -1,8 +1,8 @@
 """Converts a photo from any format that cameras write to one that COLMAP reads, upright.
 
-COLMAP reads pixels as they are stored: pycolmap 4.2 ignores the EXIF orientation and reads neither
-WebP nor HEIC. So every photo that is not upright 8-bit RGB or grey in a JPEG, PNG or TIFF file is
-converted. All others are linked or copied without a change.
+COLMAP reads pixels as they are stored: pycolmap 4.2 ignores the EXIF orientation. It cannot read
+WebP and HEIC. A photo is linked or copied without a change if it is a JPEG, PNG or TIFF file with
+upright pixels in 8-bit RGB or grey. All other photos are converted.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Header:
     format: str  # Pillow's name
     width: int  # pixels, as stored
     height: int
-    plain: bool  # 8 bits a channel: grey, RGB, or RGBA in a PNG
+    plain: bool  # 8 bits per channel; grey, RGB, or RGBA in a PNG
     transparent: bool  # has an alpha channel
     exif: ExifInfo
 
@@ -90,9 +90,9 @@ def read_header(path: Path) -> Header:
     """
     try:
         with open_image(path, header_only=True) as image:
-            # Without an EXIF chunk in front, getexif() would decode the whole PNG to find one.
-            noted = "exif" in image.info or image.format == "TIFF"
-            exif = image.getexif() if noted else Image.Exif()
+            # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
+            has_exif = "exif" in image.info or image.format == "TIFF"
+            exif = image.getexif() if has_exif else Image.Exif()
             transparent = image.mode in _TRANSPARENT or "transparency" in image.info
             plain_modes = ("L", "RGB", "RGBA") if image.format == "PNG" else ("L", "RGB")
             width, height = _stored_size(image)
@@ -114,7 +114,7 @@ def read_header(path: Path) -> Header:
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:
-    """Size of the stored pixels; of TIFF files, Pillow returns the rotated size."""
+    """Width and height of the stored pixels. For a TIFF file, ``image.size`` is already rotated."""
     tags = getattr(image, "tag_v2", {})
     if image.format == "TIFF" and 256 in tags and 257 in tags:
         return tags[256], tags[257]
@@ -122,7 +122,10 @@ def _stored_size(image: Image.Image) -> tuple[int, int]:
 
 
 def _bits(path: Path, image: Image.Image) -> int:
-    """Bits per channel in the file; Pillow converts 16-bit colour to 8 bits silently."""
+    """Bits per channel in the file.
+
+    The image mode does not show them, because Pillow converts 16-bit colours to 8 bits.
+    """
     if image.format == "PNG":
         with open(path, "rb") as file:
             return file.read(25)[24]  # bit depth in the first chunk, IHDR
@@ -157,9 +160,10 @@ def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
 
 
 def decode_small(path: Path, side: int) -> Image.Image:
-    """The photo as stored; a JPEG is reduced to at least twice ``side``, which is much faster.
+    """A small version of the photo, with its pixels as stored.
 
-    Raises as `decode`, since the whole file is read.
+    A JPEG is reduced to at least twice ``side`` while it is decoded, which is much faster. Raises
+    the errors of `decode`, because the whole file is read.
     """
     try:
         with open_image(path) as opened:

@@ -17,7 +17,8 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_text
 from snowsplat.viewer.web.page import settings, whole_page
 
-#: Browsers support strings of about 500 million characters; base64 makes 4 characters of 3 bytes.
+#: Largest scene in bytes. Browsers support strings of about 500 million characters, and base64
+#: makes 4 characters of 3 bytes.
 _LARGEST = 360_000_000
 
 # The scene is passed to the viewer as a blob URL, because browsers limit the length of data URLs.
