@@ -1,13 +1,14 @@
-"""Puts small faults into the package, one at a time, and counts those that its tests notice.
+"""Mutation testing of the Python code: counts the artificial faults that the tests detect.
 
-    python tests/nightly/mutate.py --sample 300              300 random faults in each room
-    python tests/nightly/mutate.py density optim --seed 7    all faults in two rooms
+    python tests/nightly/mutate.py --sample 300              300 random faults in each part
+    python tests/nightly/mutate.py density optim --seed 7    all faults in two parts
 
-Each room is a part of the package with its own tests; only these are run. A test notices a fault
-by failing, or by running three times as long as without it. The faults are mutmut's (see
-mutation/mutants.py); those that change nothing that can be observed are named, with the reason, in
-mutation/equivalents.py. Needs the extra "nightly" and a Linux system. The exit code is 1 where a
-room's tests notice less than 90% of the faults.
+The script puts small faults into the package, one at a time. The package is divided into parts, and
+each part has its own tests: only these run for a fault in the part. A test detects a fault if it
+fails, or if it takes three times as long as without the fault. The faults are made by the operators
+of mutmut, see mutation/mutants.py. Some faults have no observable effect; mutation/equivalents.py
+lists them, with the reason for each. The script needs the extra "nightly" and a Linux system. The
+exit code is 1 if the tests of a part detect less than 90% of the faults in it.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ REQUIRED = 0.9
 
 
 @dataclass(frozen=True)
-class Room:
-    """Source files (patterns in the package) and the tests that are responsible for them."""
+class Part:
+    """Source files (as patterns in the package), and the tests that must detect faults in them."""
 
     sources: tuple[str, ...]
     tests: tuple[str, ...]
@@ -47,31 +48,31 @@ _OPS = (
     "statistic",
     "tiling",
 )
-ROOMS = {
-    "density": Room(("training/density/*.py",), ("tests/training/density",)),
-    "optim": Room(
+PARTS = {
+    "density": Part(("training/density/*.py",), ("tests/training/density",)),
+    "optim": Part(
         ("training/optim.py", "training/lr_schedule.py"),
         ("tests/training/test_optim.py", "tests/training/test_lr_schedule.py"),
     ),
-    "config": Room(("training/config.py",), ("tests/training/test_config.py",)),
-    "losses": Room(("training/losses.py",), ("tests/training/test_losses.py",)),
-    "trainer": Room(
+    "config": Part(("training/config.py",), ("tests/training/test_config.py",)),
+    "losses": Part(("training/losses.py",), ("tests/training/test_losses.py",)),
+    "trainer": Part(
         tuple(f"training/{name}.py" for name in ("trainer", "step_runner", "view_gradient")),
         ("tests/training/test_trainer.py", "tests/training/test_step_runner.py"),
     ),
-    "scene": Room(("scene/*.py",), ("tests/scene",)),
-    "trajectory": Room(("trajectory/*.py",), ("tests/trajectory",)),
-    "reference": Room(("ops/reference.py",), tuple(f"tests/ops/test_{op}.py" for op in _OPS)),
-    "data": Room(("data/**/*.py",), ("tests/data",)),
-    "formats": Room(("formats/*.py",), ("tests/formats",)),
+    "scene": Part(("scene/*.py",), ("tests/scene",)),
+    "trajectory": Part(("trajectory/*.py",), ("tests/trajectory",)),
+    "reference": Part(("ops/reference.py",), tuple(f"tests/ops/test_{op}.py" for op in _OPS)),
+    "data": Part(("data/**/*.py",), ("tests/data",)),
+    "formats": Part(("formats/*.py",), ("tests/formats",)),
 }
 
 
 @dataclass
 class Tally:
-    """What became of the faults of a room."""
+    """The outcomes of the faults in a part."""
 
-    total: int = 0
+    total: int = 0  # number of faults, also those that were not tried
     counts: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -80,7 +81,7 @@ class Tally:
 
     @property
     def share(self) -> float:
-        """Of the faults that were tried, those that were noticed."""
+        """The fraction of the tried faults that was detected."""
         return 1 - self.counts["survived"] / self.tried if self.tried else 1.0
 
 
@@ -88,17 +89,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("rooms", nargs="*", choices=[*ROOMS, []], help="default: all")
-    parser.add_argument("--sample", type=int, help="random faults in each room (default: all)")
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="default: all")
+    parser.add_argument("--sample", type=int, help="random faults in each part (default: all)")
     parser.add_argument("--seed", type=int, default=0, help="of the samples (default: 0)")
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time (default: 1)")
     flags = parser.parse_args()
     tallies = {}
     stale = 0
-    for name in flags.rooms or ROOMS:
+    for name in flags.parts or PARTS:
         mutants = [
             mutant
-            for pattern in ROOMS[name].sources
+            for pattern in PARTS[name].sources
             for path in sorted(PACKAGE.glob(pattern))
             for mutant in mutants_of(str(path.relative_to(PACKAGE)), path.read_bytes())
         ]
@@ -108,7 +109,7 @@ def main() -> int:
             chosen = random.Random(f"{flags.seed} {name}").sample(mutants, flags.sample)
         tallies[name] = Tally(len(mutants))
         started = time.monotonic()
-        outcomes = try_all(ROOMS[name], chosen, flags.jobs)
+        outcomes = try_all(PARTS[name], chosen, flags.jobs)
         for i, (mutant, outcome) in enumerate(outcomes, 1):
             tallies[name].counts[outcome.outcome] += 1
             if i % 25 == 0:
@@ -116,7 +117,7 @@ def main() -> int:
             if outcome.outcome == "survived":
                 print(f"SURVIVED {mutant.diff()}", flush=True)
         print(
-            f"{name}: {100 * tallies[name].share:.1f}% noticed of {tallies[name].tried} faults, "
+            f"{name}: {100 * tallies[name].share:.1f}% of {tallies[name].tried} faults detected, "
             f"{time.monotonic() - started:.0f} s",
             flush=True,
         )
@@ -125,7 +126,7 @@ def main() -> int:
 
 
 def report_stale(mutants: list[Mutant]) -> int:
-    """Prints the entries of mutation/equivalents.py that are none of these; their number."""
+    """Print the entries of mutation/equivalents.py that match no mutant; returns their number."""
     files = {mutant.file for mutant in mutants}
     known = {(mutant.file, mutant.was, mutant.becomes) for mutant in mutants}
     stale = [key for key in EQUIVALENTS if key[0] in files and key not in known]
@@ -134,8 +135,8 @@ def report_stale(mutants: list[Mutant]) -> int:
     return len(stale)
 
 
-def try_all(room: Room, mutants: list[Mutant], jobs: int) -> Iterator[tuple[Mutant, Outcome]]:
-    """Each mutant with what became of it, as they end."""
+def try_all(part: Part, mutants: list[Mutant], jobs: int) -> Iterator[tuple[Mutant, Outcome]]:
+    """Yields each mutant and its outcome, as soon as it is known."""
     unknown = []
     for mutant in mutants:
         if (mutant.file, mutant.was, mutant.becomes) in EQUIVALENTS:
@@ -147,7 +148,7 @@ def try_all(room: Room, mutants: list[Mutant], jobs: int) -> Iterator[tuple[Muta
     free: SimpleQueue[Runner] = SimpleQueue()
     runners = [Runner() for _ in range(jobs)]
     try:
-        coverage = runners[0].coverage(room.tests)
+        coverage = runners[0].coverage(part.tests)
         for runner in runners:
             free.put(runner)
         with ThreadPoolExecutor(jobs) as pool:
@@ -167,10 +168,10 @@ def _try(mutant: Mutant, free: SimpleQueue[Runner], coverage: Coverage) -> Outco
 
 
 def print_table(tallies: dict[str, Tally], seed: int) -> None:
-    """One line a room."""
-    kinds = ("noticed", "timed out", "crashed", "survived", "equivalent")
+    """Print one line per part."""
+    kinds = ("detected", "timed out", "crashed", "survived", "equivalent")
     heads = "".join(f"{kind:>11}" for kind in kinds)
-    print(f"\n{'room':12}{'faults':>8}{heads}{'share':>8}   (seed {seed})")
+    print(f"\n{'part':12}{'faults':>8}{heads}{'share':>8}   (seed {seed})")
     for name, tally in tallies.items():
         counts = "".join(f"{tally.counts[kind]:11}" for kind in kinds)
         print(f"{name:12}{tally.total:8}{counts}{100 * tally.share:7.1f}%")

@@ -1,13 +1,14 @@
-"""Puts faults written by hand into the kernels, one at a time, and counts those that tests notice.
+"""Mutation testing of the kernels: counts the artificial faults that the tests detect.
 
-    python tests/nightly/mutate_kernels.py                    all
-    python tests/nightly/mutate_kernels.py --only cpu/ ssim   those whose file or text contains this
+    python tests/nightly/mutate_kernels.py                    all faults
+    python tests/nightly/mutate_kernels.py --only cpu/ ssim   faults with this in file or text
 
-Each fault (mutation/kernel_faults.py) is put into a copy of the checkout. A fault in a header or in
-native/cpu/ is compiled for the baseline instruction set, one in native/cuda/ by the emulation of
-the tests; then the tests of the operation run until one fails. Needs the extra "nightly", a Linux
-system and a C++ compiler. The exit code is 1 if less than 90% are noticed, or if an entry does not
-fit the sources.
+The faults are written by hand, in mutation/kernel_faults.py. The script puts them into a copy of
+the checkout, one at a time. A fault in a header or in native/cpu/ is compiled for the baseline
+instruction set. A fault in native/cuda/ is compiled by the emulation of the tests. Then the tests
+of the operation run until one fails. The script needs the extra "nightly", a Linux system and a C++
+compiler. The exit code is 1 if less than 90% of the faults are detected, or if an entry does not
+match the sources.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from mutation.kernel_faults import FAULTS, Fault
 from mutation.runner import Broken, Outcome, Runner
 
 REQUIRED = 0.9
-# Not optimised as in the package, since compiling would take longer than the tests.
+# Less optimisation than in the package, because compiling would take longer than the tests.
 _FLAGS = [
     *("-std=c++17", "-O1", "-fPIC", "-fvisibility=hidden", "-pthread"),
     *("-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"),
@@ -41,14 +42,14 @@ class Kernels:
         self._compiler = os.environ.get("CXX", "c++")
         self._objects = runner.root / "build" / "objects"
         self._objects.mkdir(parents=True)
-        # What the tests use of the package's libraries is this one alone.
+        # The tests must use only the library that is compiled here.
         for library in (runner.package / "_lib").glob("*.so"):
             library.unlink()
         self._compile(sorted(self.native.glob("cpu/*.cpp")))
         self._link()
 
     def try_fault(self, fault: Fault) -> Outcome | None:
-        """What became of a fault; None if its text does not occur exactly once."""
+        """The outcome of a fault; None if its text does not occur exactly once."""
         path = self.native / fault.file
         source = path.read_text()
         if source.count(fault.was) != 1:
@@ -67,7 +68,7 @@ class Kernels:
                 self._object(file).write_bytes(content)
 
     def run_tests(self, fault: Fault) -> Outcome:
-        """Runs the tests that must notice a fault on the sources as they are."""
+        """Run the tests that must detect a fault, with the current sources."""
         return self.runner.run(
             [f"tests/ops/test_{fault.tests}.py"],
             marked="emulated" if fault.file.startswith("cuda/") else "not emulated and not gpu",
@@ -80,7 +81,7 @@ class Kernels:
         return self._objects / f"{source.stem}.o"
 
     def _dependent(self, changed: Path) -> list[Path]:
-        """The sources whose objects depend on a file."""
+        """The source files that must be compiled again if a file changes."""
         return [
             source
             for source in sorted(self.native.glob("cpu/*.cpp"))
@@ -94,7 +95,7 @@ class Kernels:
 
     def _link(self) -> None:
         library = self.runner.package / "_lib" / "libsnowsplat_baseline.so"
-        # A new file: the old one may be loaded.
+        # The old file is removed and not overwritten, because a process may have loaded it.
         library.unlink(missing_ok=True)
         objects = sorted(self._objects.glob("*.o"))
         subprocess.run([self._compiler, "-shared", "-pthread", *objects, "-o", library], check=True)
@@ -112,7 +113,7 @@ def main() -> int:
         if any(part in f"{fault.file} {fault.was} {fault.breaks}" for part in flags.only)
     ]
     runner = Runner()
-    noticed = survived = stale = 0
+    detected = survived = stale = 0
     try:
         kernels = Kernels(runner)
         passing: set[tuple[str, bool]] = set()
@@ -120,7 +121,7 @@ def main() -> int:
             tests = fault.tests, fault.file.startswith("cuda/")
             if tests not in passing:
                 outcome = kernels.run_tests(fault)
-                if outcome.noticed:
+                if outcome.detected:
                     raise Broken(f"{fault.tests}: {outcome.outcome} without a fault: {outcome.by}")
                 passing.add(tests)
             name = f"{fault.file}: {fault.breaks}"
@@ -130,17 +131,17 @@ def main() -> int:
             if tried is None:
                 stale += 1
                 print(f"STALE     {name}: {fault.was!r} does not occur exactly once", flush=True)
-            elif tried.noticed:
-                noticed += 1
-                print(f"noticed   {name}, {tried.by or tried.outcome}, {took}", flush=True)
+            elif tried.detected:
+                detected += 1
+                print(f"detected  {name}, {tried.by or tried.outcome}, {took}", flush=True)
             else:
                 survived += 1
                 print(f"SURVIVED  {name}, {took}", flush=True)
     finally:
         runner.close()
-    count = noticed + survived
-    share = noticed / count if count else 1.0
-    print(f"{noticed} of {count} faults noticed ({100 * share:.1f}%), {stale} stale")
+    count = detected + survived
+    share = detected / count if count else 1.0
+    print(f"{detected} of {count} faults detected ({100 * share:.1f}%), {stale} stale")
     return 1 if stale or share < REQUIRED else 0
 
 

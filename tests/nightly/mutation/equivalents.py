@@ -1,12 +1,12 @@
-"""Faults that change nothing that can be observed, with the reason of each.
+"""Faults that have no observable effect, with the reason for each.
 
-A fault is known by its file and by the lines before and after it, so it may move within its file.
-An entry that no fault matches is reported by mutate.py.
+A fault is identified by its file and by the changed lines before and after the change, so its
+position in the file does not matter. mutate.py reports entries that match no fault.
 """
 
 from __future__ import annotations
 
-#: {(file in the package, lines before, lines after): why no test can notice it}
+#: {(file in the package, lines before, lines after): why no test can detect the fault}
 EQUIVALENTS: dict[tuple[str, str, str], str] = {
     (
         "training/losses.py",
@@ -22,12 +22,12 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "training/density/adaptive.py",
         "grads = self.grad_sum / self.views.clamp_min(1.0)",
         "grads = self.grad_sum / self.views.clamp_min(0.9375)",
-    ): "views are whole numbers; where there are none, the sum is 0",
+    ): "the number of views is an integer; where it is 0, the sum is 0",
     (
         "training/density/mcmc.py",
         "NOISE_NEGLIGIBLE = 1e-4",
         "NOISE_NEGLIGIBLE = 9.375e-05",
-    ): "a limit of what is negligible: another one near it is as good",
+    ): "any limit of a similar size is suitable",
     (
         "scene/geometry.py",
         "degenerate = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm(dim=-1, keepdim=True)",
@@ -52,7 +52,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "trajectory/video.py",
         "src_color_range=ColorRange.JPEG,",
         "",
-    ): "FFmpeg takes RGB for full range by itself",
+    ): "FFmpeg assumes the full range for RGB by default",
     (
         "trajectory/spline.py",
         "if count > 2:",
@@ -92,7 +92,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "ops/reference.py",
         "low, high = means2d - half_extent - 1e-3, means2d + half_extent + 1e-3",
         "low, high = means2d - half_extent - 0.0009375, means2d + half_extent + 1e-3",
-    ): "any margin above the rounding does",
+    ): "any margin larger than the rounding error is sufficient",
     (
         "ops/reference.py",
         "low, high = means2d - half_extent - 1e-3, means2d + half_extent + 1e-3",

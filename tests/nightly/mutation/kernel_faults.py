@@ -1,7 +1,7 @@
-"""Faults in the kernels, written by hand: what each breaks, and the tests that must notice it.
+"""Faults in the kernels, written by hand, with a description and the tests that must detect them.
 
-The text before a fault must occur exactly once in its file: mutate_kernels.py reports an entry that
-does not fit the sources any more.
+The original text of a fault must occur exactly once in its file. mutate_kernels.py reports entries
+that no longer match the sources.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Fault:
-    """``becomes`` in the place of ``was`` in a file of ``native/``."""
+    """In a file of ``native/``, the text ``becomes`` replaces the text ``was``."""
 
     file: str
     was: str

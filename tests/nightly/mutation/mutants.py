@@ -1,8 +1,8 @@
 """The mutants of a Python file: copies of it with one small fault each.
 
-mutmut's operators make the faults (``mutmut.mutation.mutators``). mutmut's own runner is not used:
-it leaves out decorated functions, defaults of dataclasses and constants of modules, which is where
-the numbers of a paper stand.
+The faults are made by the operators of mutmut (``mutmut.mutation.mutators``). mutmut's own runner
+is not used, because it omits decorated functions, default values of dataclasses and constants of
+modules. These contain the numbers of the paper.
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ from libcst.metadata import (
 )
 from mutmut.mutation import mutators
 
-#: Never mutated. Annotations and imports do nothing, or break the file at once. What a `raise`
-#: holds is the text of a message: a test checks that an error is raised, not how it reads.
+#: Nodes that are never mutated. A fault in an annotation or an import has no effect, or the file
+#: cannot be imported. A `raise` contains the text of a message: the tests check that an error is
+#: raised, but not its complete text.
 _SKIPPED = (cst.Annotation, cst.Decorator, cst.Import, cst.ImportFrom, cst.Raise, cst.Assert)
-#: Nor are: names for `import *`; `strict=True`, which is an assertion; other texts of messages.
+#: Patterns of nodes that are not mutated either: `__all__`; `strict=True`, which is an assertion;
+#: other texts of messages.
 _NEVER = (
     m.Assign(targets=[m.AssignTarget(m.Name("__all__"))])
     | m.Arg(keyword=m.Name("strict"))
     | m.Call(m.Name(m.MatchRegex(r".*Error")))
     | m.Call(m.Attribute(m.Name("logger")))
 )
-#: Blocks within each other that are expected.
+#: The largest depth of nested blocks that is expected.
 _DEEPEST = 8
 #: Calls whose arguments are not removed or replaced: each such call would fail.
 _WHOLE_CALLS = {"len", "isinstance", "range", "super", "zip"}
@@ -44,10 +46,10 @@ class Mutant:
 
     Attributes:
         file: the file, relative to the package.
-        line: where the fault begins, from 1.
-        lines: the lines of which a test must execute one to be able to notice the fault; None for
-            code outside of functions, which is executed by the import.
-        was, becomes: the changed lines before and after, without indentation.
+        line: number of the first changed line, counted from 1.
+        lines: a test can detect the fault only if it executes one of these lines; None for code
+            outside of functions, which is executed by the import.
+        was, becomes: the changed lines before and after the change, without indentation.
         source: the whole file with the fault.
     """
 
@@ -59,7 +61,7 @@ class Mutant:
     source: bytes
 
     def diff(self) -> str:
-        """The fault as a person reads it."""
+        """The fault as readable text: the place, and the lines before and after."""
         lines = [f"{self.file}:{self.line}"]
         lines += [f"  - {line}" for line in self.was.splitlines()]
         lines += [f"  + {line}" for line in self.becomes.splitlines()]
@@ -67,19 +69,22 @@ class Mutant:
 
 
 def _smaller_number(node: cst.Float) -> Iterator[cst.Float]:
-    """1.6 → 1.5: mutmut adds 1, which a test of a small constant notices too easily."""
+    """1.6 → 1.5. mutmut adds 1 instead, which tests of a small constant detect too easily."""
     if node.evaluated_value:
         yield node.with_changes(value=repr(node.evaluated_value * 0.9375))
 
 
 def _no_statement(node: cst.Expr) -> Iterator[cst.BaseSmallStatement]:
-    """``f(x)`` → ``pass``: a call for its effect alone."""
+    """``f(x)`` → ``pass``, for calls whose result is not used."""
     if isinstance(node.value, cst.Call):
         yield cst.Pass()
 
 
 def _arguments(node: cst.Call) -> Iterator[cst.Call]:
-    """Not ``device=``: without it a tensor is on the CPU, where the tests run."""
+    """Removes or replaces arguments, as mutmut does, but does not remove ``device=``.
+
+    Without this argument, a tensor is on the CPU, where the tests run: no test can detect that.
+    """
     devices = [arg for arg in node.args if arg.keyword and arg.keyword.value == "device"]
     for changed in mutators.operator_arg_removal(node):
         if all(arg in changed.args for arg in devices):
@@ -87,7 +92,10 @@ def _arguments(node: cst.Call) -> Iterator[cst.Call]:
 
 
 def _string(node: cst.BaseString) -> Iterator[cst.BaseString]:
-    """Of mutmut's three changed strings the first, which adds letters; the others change case."""
+    """The first of the three strings that mutmut makes: it adds letters.
+
+    The other two change only upper and lower case.
+    """
     yield from list(mutators.operator_string(node))[:1]
 
 
@@ -125,7 +133,7 @@ def _parses(source: bytes) -> bool:
 
 
 class _Visitor(cst.CSTVisitor):
-    """Collects the nodes with what may stand in their place."""
+    """Collects pairs of a node and a changed node that replaces it."""
 
     METADATA_DEPENDENCIES = (PositionProvider, ByteSpanPositionProvider, ParentNodeProvider)
 
@@ -151,7 +159,7 @@ class _Visitor(cst.CSTVisitor):
 
 
 def _equal(node: cst.CSTNode, changed: cst.CSTNode) -> bool:
-    """1e38 and 1e38 + 1 are one number."""
+    """Whether two float literals have the same value, such as 1e38 and 1e38 + 1."""
     return (
         isinstance(node, cst.Float)
         and isinstance(changed, cst.Float)
@@ -166,7 +174,10 @@ def _is_docstring(node: cst.CSTNode) -> bool:
 
 
 def _asks_for_device(node: cst.CSTNode) -> bool:
-    """``x.device.type == "cpu"``: of its two answers the tests, which run on the CPU, see one."""
+    """Whether a node is a comparison such as ``x.device.type == "cpu"``.
+
+    It is not mutated, because its value is always the same in the tests, which run on the CPU.
+    """
     device = m.Name("device") | m.Attribute(attr=m.Name("device"))
     return m.matches(node, m.Comparison(left=m.Attribute(attr=m.Name("type"), value=device)))
 
@@ -182,15 +193,16 @@ def _branch_of_a_gpu(node: cst.If | cst.IfExp) -> cst.CSTNode | None:
 def _mutated(
     source: bytes, wrapper: MetadataWrapper, node: cst.CSTNode, changed: cst.CSTNode
 ) -> bytes:
-    """The file with ``changed`` in the place of ``node``."""
+    """The file in which ``changed`` replaces ``node``."""
     module = wrapper.module
     spans = wrapper.resolve(ByteSpanPositionProvider)
-    # The span of a node is not always its code, for example if it is in parentheses. Then that of
-    # the node around it is.
+    # The span of a node does not always contain exactly its code, for example if the node is in
+    # parentheses. In this case, the node around it is replaced.
     while node is not module:
         start = spans[node].start if node in spans else 0
         end = start + spans[node].length if node in spans else 0
-        # The code of a node does not have the indentation of the block that it is in.
+        # The generated code of a node does not have the indentation of its block, so every
+        # possible indentation is tried.
         for depth in range(_DEEPEST if end else 0):
             newline = "\n" + depth * module.default_indent
             code, text = (
@@ -208,7 +220,7 @@ def _mutated(
 
 
 def _changed_lines(before: bytes, after: bytes) -> tuple[int, str, str]:
-    """The first line, from 1, that differs, and the lines that differ, before and after."""
+    """Number of the first changed line, from 1, and the changed lines before and after."""
     was, becomes = before.decode().splitlines(), after.decode().splitlines()
     shorter = min(len(was), len(becomes))
     first = next((i for i in range(shorter) if was[i] != becomes[i]), shorter)
@@ -223,7 +235,7 @@ def _stripped(lines: list[str]) -> str:
 
 
 def _executed_lines(wrapper: MetadataWrapper, node: cst.CSTNode) -> range | None:
-    """See `Mutant.lines`: those of the node and of the simple statement around it."""
+    """The value of `Mutant.lines`: the lines of the node and of the simple statement around it."""
     positions = wrapper.resolve(PositionProvider)
     parents = wrapper.resolve(ParentNodeProvider)
     statement: cst.CSTNode | None = None
@@ -232,7 +244,7 @@ def _executed_lines(wrapper: MetadataWrapper, node: cst.CSTNode) -> range | None
         if isinstance(inner, cst.BaseSmallStatement) and statement is None:
             statement = inner
         if isinstance(parent, cst.FunctionDef):
-            # Defaults are evaluated by the import.
+            # Default values of parameters are evaluated by the import.
             if inner is not parent.body:
                 return None
             spans = [positions[n] for n in (node, statement) if n is not None and n in positions]

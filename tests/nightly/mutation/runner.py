@@ -1,4 +1,4 @@
-"""Runs tests on mutants: which of a room's tests can notice a fault, and whether one does."""
+"""Runs tests on mutants: selects the tests that can detect a fault, and runs them."""
 
 from __future__ import annotations
 
@@ -22,38 +22,37 @@ _ON_THE_CPU = "not emulated and not gpu"
 
 
 class Broken(Exception):
-    """The tests fail without a fault."""
+    """The tests fail although there is no fault."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a fault: "noticed", "survived", "timed out" or "crashed", and the test that
-    failed first."""
+    """The outcome of the tests of a fault."""
 
-    outcome: str
-    by: str | None
+    outcome: str  # "detected", "survived", "timed out", "crashed" or "equivalent"
+    by: str | None  # the test that failed first
     seconds: float
 
     @property
-    def noticed(self) -> bool:
+    def detected(self) -> bool:
         return self.outcome != "survived"
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What a run of the tests without a fault executes.
+    """The lines that the tests execute, measured in a run without a fault.
 
     Attributes:
-        seconds: time of the processor of each test.
-        lines: the tests that execute each line of each file; "" stands for what is executed by
-            imports and by fixtures of several tests.
+        seconds: processor time of each test.
+        lines: file -> line -> names of the tests that execute this line. The name "" means that
+            the line is executed by an import or by a fixture that several tests share.
     """
 
     seconds: dict[str, float]
     lines: dict[str, dict[int, list[str]]]
 
     def tests_for(self, mutant: Mutant) -> list[str]:
-        """Those that can notice it, the fastest first."""
+        """The tests that can detect this mutant, the fastest first."""
         if mutant.lines is None:
             found = set(self.seconds)
         else:
@@ -65,7 +64,7 @@ class Coverage:
 
 
 class Runner:
-    """A copy of the checkout, and a process in whose forks the tests run on it."""
+    """A copy of the checkout, and a process whose forks run the tests on this copy."""
 
     def __init__(self) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="snowsplat_mutation_"))
@@ -81,7 +80,8 @@ class Runner:
             elif path.name not in ("build", ".git"):
                 (self.root / path.name).symlink_to(path)
         (self.package / "_viewer").symlink_to(PACKAGE / "_viewer")
-        # Real scenes and datasets, beside the checkout: tests that find none are skipped.
+        # Real scenes and datasets are stored beside the checkout. Tests that do not find them are
+        # skipped.
         if (ROOT.parent / "shared").exists():
             (self._folder / "shared").symlink_to(ROOT.parent / "shared")
         environment = os.environ | {
@@ -99,14 +99,14 @@ class Runner:
         )
 
     def close(self) -> None:
-        """Ends the process and removes the copy."""
+        """End the process and remove the copy."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def coverage(self, tests: Sequence[str]) -> Coverage:
-        """Runs the tests without a fault.
+        """Run the tests without a fault.
 
         Raises:
             Broken: a test fails.
@@ -115,7 +115,7 @@ class Runner:
         outcome = self.run(
             tests, cpu_seconds=_BASELINE_SECONDS, seconds=_BASELINE_SECONDS, coverage=str(path)
         )
-        if outcome.noticed:
+        if outcome.detected:
             raise Broken(f"{' '.join(tests)}: {outcome.outcome} without a fault: {outcome.by}")
         found = json.loads(path.read_text())
         lines = {
@@ -125,7 +125,7 @@ class Runner:
         return Coverage(found["seconds"], lines)
 
     def try_mutant(self, mutant: Mutant, coverage: Coverage) -> Outcome:
-        """Runs the tests that can notice it, until one does."""
+        """Run the tests that can detect the mutant, until one of them fails."""
         order = coverage.tests_for(mutant)
         if not order:
             return Outcome("survived", None, 0.0)
@@ -157,15 +157,16 @@ class Runner:
         isa: str | None = None,
         coverage: str | None = None,
     ) -> Outcome:
-        """Runs tests until one fails: see zygote.py.
+        """Run tests until one fails; see zygote.py.
 
         Args:
             tests: files and folders.
-            cpu_seconds, seconds: the most time of the processor, and in all.
-            order: which of the tests, in this order; default: all.
-            marked: pytest's ``-m``.
-            isa: the instruction set; default: the best.
-            coverage: a file for what they execute; then all of them run.
+            cpu_seconds, seconds: limits of the processor time and of the wall time.
+            order: the names of the tests to run, in this order; default: all.
+            marked: the value of pytest's option ``-m``.
+            isa: the instruction set; default: the best one.
+            coverage: file to which the executed lines are written; if set, all tests run, even if
+                one fails.
         """
         process = self._process
         assert process.stdin is not None

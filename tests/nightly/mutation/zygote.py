@@ -1,12 +1,18 @@
-"""Runs pytest in forks of a process that has imported torch, which takes longer than most tests.
+"""Runs pytest in forks of a process that has imported torch, because the import takes long.
 
-    python zygote.py      one line of JSON per run on stdin, one with its outcome on stdout
+    python zygote.py      one line of JSON per run on stdin, one line with the outcome on stdout
 
-A run is {"tests", "order", "marked", "isa", "cpu_seconds", "seconds", "temporary", "coverage"}:
-files and folders of tests; which of their tests to run, in this order (null: all); pytest's -m; the
-instruction set (null: the best); limits of the processor's time and of the time; a folder for
-temporary files; and a file for the coverage (null: stop at the first failure instead). The package
-itself is imported after the fork, since it differs from run to run.
+A run is a JSON object with these keys:
+
+    tests                   files and folders of tests
+    order                   names of the tests to run, in this order; null: all
+    marked                  the value of pytest's option -m
+    isa                     the instruction set; null: the best one
+    cpu_seconds, seconds    limits of the processor time and of the wall time
+    temporary               a folder for temporary files
+    coverage                a file for the executed lines; null: stop at the first failure instead
+
+The package itself is imported after the fork, because it is different in each run.
 """
 
 from __future__ import annotations
@@ -30,13 +36,13 @@ import coverage
 import pytest
 
 _IMPORTS = ("torch", "numpy", "PIL.Image", "hypothesis", "safetensors.torch", "zstandard", "rich")
-_MOST_MEMORY = 12 << 30  # of addresses; torch alone takes a few GiB of them
-_CRASHED, _SURVIVED, _NOTICED = "crashed", "survived", "noticed"
+_MOST_MEMORY = 12 << 30  # bytes of address space; torch alone uses a few GiB
+_CRASHED, _SURVIVED, _DETECTED = "crashed", "survived", "detected"
 _TIMED_OUT = "timed out"
 
 
 class _Plugin:
-    """Runs tests in the order given, and remembers the first that fails and the time of each."""
+    """Runs the tests in the given order; records the first failed test and all times."""
 
     def __init__(self, order: list[str] | None, recorded: coverage.Coverage | None) -> None:
         self.order = order
@@ -51,7 +57,7 @@ class _Plugin:
         if self.order is None:
             return
         by_name = {item.nodeid: item for item in items}
-        # Where a fault changes the names of tests, all of them are run.
+        # If a fault has changed the names of tests, all tests run.
         if all(name in by_name for name in self.order):
             items[:] = [by_name[name] for name in self.order]
 
@@ -72,7 +78,7 @@ class _Plugin:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: pytest.FixtureDef) -> Iterator[None]:
-        """What a fixture of several tests executes belongs to no test alone."""
+        """Record the lines of a fixture that several tests share under the name ""."""
         context = self.context
         if fixturedef.scope != "function":
             self._switch("")
@@ -93,7 +99,7 @@ class _Plugin:
 
 
 def _cpu_seconds() -> float:
-    """Of this process and of those that it waited for."""
+    """Processor time of this process, and of its child processes that have ended."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
 
@@ -107,7 +113,8 @@ def _child(run: dict, answer: int) -> None:
     null = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
         os.dup2(null, descriptor)
-    # A fault may keep its line's length and its second: a cached .pyc would hide it.
+    # Python compares the size and the modification time (in seconds) of a source file with those
+    # in its .pyc file. A fault may change neither, so no .pyc files are written.
     sys.dont_write_bytecode = run["coverage"] is None
     recorded = None
     if run["coverage"]:
@@ -122,12 +129,12 @@ def _child(run: dict, answer: int) -> None:
         recorded.stop()
         _write_coverage(Path(run["coverage"]), plugin, recorded.get_data())
     passed = (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
-    outcome = _SURVIVED if code in passed else _NOTICED
+    outcome = _SURVIVED if code in passed else _DETECTED
     os.write(answer, json.dumps({"outcome": outcome, "by": plugin.failed}).encode())
 
 
 def _write_coverage(path: Path, plugin: _Plugin, data: coverage.CoverageData) -> None:
-    """{"seconds": {test: of the processor}, "lines": {file: {line: [tests]}}}"""
+    """Write {"seconds": {test: processor time}, "lines": {file: {line: [tests]}}}."""
     ran = {name: s for name, s in plugin.seconds.items() if name not in plugin.skipped}
     lines = {
         os.path.relpath(file, os.path.join(os.environ["PYTHONPATH"], "snowsplat")): {
@@ -155,7 +162,7 @@ def _run(run: dict) -> dict:
     in_time = bool(select.select([handle], [], [], run["seconds"])[0])
     os.close(handle)
     with contextlib.suppress(OSError):
-        os.killpg(pid, signal.SIGKILL)  # also what the tests have started
+        os.killpg(pid, signal.SIGKILL)  # also the processes that the tests have started
     _, status = os.waitpid(pid, 0)
     with os.fdopen(reading, "rb") as pipe:
         text = pipe.read()
@@ -169,14 +176,15 @@ def _run(run: dict) -> dict:
 
 
 def serve() -> None:
-    """Answer until stdin ends."""
+    """Execute runs until stdin is closed."""
     for name in _IMPORTS:
         importlib.import_module(name)
     with contextlib.redirect_stdout(io.StringIO()):
         pytest.main(["--version"])  # imports its plugins
     gc.collect()
-    gc.freeze()  # pytest collects garbage at the end of a run: not again what is alive here
-    # It must not outlive the script.
+    # pytest collects garbage at the end of a run. The objects that exist now are excluded.
+    gc.freeze()
+    # Linux ends this process if its parent ends (1 is PR_SET_PDEATHSIG).
     ctypes.CDLL(None).prctl(1, signal.SIGTERM)
     for line in sys.stdin:
         print(json.dumps(_run(json.loads(line))), flush=True)
