@@ -2,10 +2,10 @@
 
 The operations are counted in `native/cpu/rasterize.cpp` for 3 channels, as vector operations per
 step (a vector of W pixels, one splat). Loads, broadcasts, mask logic and branches use other ports
-of the processor and are not counted. Neither is the work per (tile, splat): the quadratics of the
-rows, the test which blocks are touched, the final sum over lanes. AVX2 and narrower instruction
-sets need more operations per step (masks, 2^x, no FMA in the baseline); these are not part of the
-bound.
+of the processor and are not counted. The work per (tile, splat) is not counted either: the
+quadratics of the rows, the test of which blocks are touched, the final sum over lanes. AVX2 and
+narrower instruction sets need more operations per step (masks, 2^x, no FMA in the baseline); these
+are not part of the bound.
 
     floor per pair = OPERATIONS / (W · lane use) / (operations per clock · clock)
 

@@ -4,8 +4,8 @@
     python benchmarks/gpu.py --out OUT --only device stages        some of the parts
 
 The parts are: tests that need a GPU; compute-sanitizer over every op; the stages of a training step
-with their lower bounds, its memory, and the cost of sums in a fixed order; trainings compared with
-the CPU; and the same step with gsplat. benchmarks/README.md explains the measurements.
+with their lower bounds, its memory, and the cost of sums in a fixed order; training runs compared
+with the CPU; and the same step with gsplat. benchmarks/README.md explains the measurements.
 
 Each part is a process with a time limit, so a part that crashes or hangs does not affect others.
 The page OUT/gpu.md is rewritten after each finding, and printed at the end. OUT/gpu.json has all
@@ -103,7 +103,7 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         part = ["train", *datasets, "--iterations", "7000"]
         late.append(job("train on the GPU, 7000 steps", part, 90, alone=True))
     wanted = {group: found[group] if group in flags.only else [] for group in GROUPS}
-    # First the sanitizers, which take longest, then the tests, which are many.
+    # The sanitizers start first, because they take longest. The tests follow; there are many.
     parallel = [*found["untimed"], *wanted["sanitizer"], *wanted["tests"]]
     timed = [*wanted["train"], *wanted["stages"], *wanted["peer"]]
     return [*wanted["device"], *parallel, *timed, *late]
@@ -198,7 +198,7 @@ def _flags() -> argparse.Namespace:
     )
     parser.add_argument("--only", nargs="+", default=list(GROUPS), choices=GROUPS)
     parser.add_argument("--minutes", type=float, default=8.8, help="time limit of the run")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="of the trainings")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="of the training runs")
     parser.add_argument("--width", type=int, default=8, help="number of parallel parts")
     parser.add_argument("--peer", type=Path, metavar="DIR", help="gsplat's checkout, built here")
     parser.add_argument("--arch", default="9.0", help="of the card, to build the peer for")

@@ -2,9 +2,9 @@
 
 Bytes are the least that device memory must transfer: each float32 is read once and written once. If
 only some columns of a splat's row (16 numbers) are read, 32 bytes are counted, the smallest access.
-Data that a stage leaves for the next one is counted, though it may be in a cache. Operations are
+Data that a stage leaves for the next one is counted, although it may be in a cache. Operations are
 those of one lane, without loads, index arithmetic and idle lanes; a multiply-add counts as one.
-They are left out if they are few compared with the bytes.
+Operations are left out for stages that have few of them compared with the bytes.
 
     floor of a stage = max(bytes / copy bandwidth, operations / rate of multiply-adds)
 
@@ -80,6 +80,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class Work:
+    """What a stage must do at least: bytes to transfer and operations to compute."""
+
     bytes: int
     operations: int = 0
 
@@ -89,16 +91,20 @@ class Work:
 
 
 def works(frame: Frame) -> dict[str, Work]:
-    """The work by native function, in the order of a step."""
+    """The work by native function, in the order of a step.
+
+    The comment above each entry lists the data that its bytes count.
+    """
     n, seen, instances, pixels = frame.gaussians, frame.seen, frame.instances, frame.pixels
     found = {
-        # Geometry; ids.
+        # Geometry; an id.
         "project_cull": Work(n * (4 * GEOMETRY + 4)),
-        # Ids and a row each; all numbers of the Gaussians that are seen.
+        # An id and a row; for visible Gaussians, all numbers.
         "project_fwd": Work(n * (4 + ROW) + seen * 4 * NUMBERS),
         # Columns of a row; a key.
         "splats_prepare": Work(n * (SECTOR + 4)),
-        # A histogram of the keys; then keys and values, read and written. First values: 0, 1, ….
+        # The keys, for a histogram; then keys and values, read and written in each pass. The first
+        # pass does not read the values, which are 0, 1, ….
         "splats_sort": Work(n * (4 + SORT_PASSES * 16 - 4)),
         # The order and columns of a row; four numbers for tiles_fill, one of them a running sum.
         "tiles_count": Work(n * (4 + SECTOR + 16 + 8)),
@@ -108,9 +114,10 @@ def works(frame: Frame) -> dict[str, Work]:
             instances * (4 + 1) + frame.tiles * 8 + seen * ROW + pixels * 16,
             frame.pairs * sum(FORWARD.values()),
         ),
-        # Image and photo (8 bits); the gradient.
+        # Image and photo (8 bits); the gradient of the image.
         "photometric_u8": Work(pixels * (12 + 3 + 12), pixels * 3 * SSIM),
-        # The same lists, rows, image, its gradient and alpha; the sums, in rows or in slots.
+        # The same lists and rows; the image, its gradient and alpha; the sums of the gradients, in
+        # rows or in slots.
         "rasterize_bwd": Work(
             instances * (4 + 1)
             + frame.tiles * 8
@@ -119,9 +126,9 @@ def works(frame: Frame) -> dict[str, Work]:
             + (instances * (4 + ROW) if frame.in_order else seen * ROW),
             frame.pairs * sum(BACKWARD.values()),
         ),
-        # Ids; for visible Gaussians columns of the gradient, and two sums read and written.
+        # An id; for visible Gaussians, columns of the gradient, and two sums, read and written.
         "accumulate_screen_statistics": Work(n * 4 + seen * (SECTOR + 16)),
-        # Values and two moments read and written; ids; gradients of the splats.
+        # Values and two moments, read and written; an id; the gradients of visible splats.
         "adam_step": Work(n * (NUMBERS * 4 * 6 + 4) + seen * ROW),
     }
     if frame.in_order:
@@ -138,7 +145,8 @@ def works(frame: Frame) -> dict[str, Work]:
 
 
 def _fill_bytes(frame: Frame) -> int:
-    """Output of tiles_count, the order, part of the rows; instances written, sorted by tile."""
+    """Bytes of tiles_fill: it reads the output of tiles_count, the order and part of the rows, and
+    writes the instances and sorts them by tile."""
     n, instances = frame.gaussians, frame.instances
     bits = frame.tiles.bit_length()
     key, passes = (2 if bits <= 16 else 4), -(-bits // 8)

@@ -23,7 +23,7 @@ _LOG_BYTES = 1 << 20  # in the log, per job
 
 
 def finding(kind: str, **values: Any) -> None:
-    """Called in a child: report a finding to the parent."""
+    """Report a finding to the parent; to be called in a child."""
     print(MARK + json.dumps({"kind": kind, **values}), flush=True)
 
 

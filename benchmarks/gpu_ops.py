@@ -1,7 +1,7 @@
 """Runs every op once, forward and backward: the program for compute-sanitizer.
 
-Scenes are small and have odd sizes, so blocks, warps and tiles are incomplete everywhere. Both
-dtypes, with gradient sums by atomics and in a fixed order, then a training step.
+Scenes are small and have odd sizes, so blocks, warps and tiles are incomplete everywhere. The ops
+run in both dtypes, with gradient sums by atomics and in a fixed order. Then a training step runs.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The parts of `gpu.py`, each in its own process: `python gpu_parts.py PART …` prints findings.
 
-Of the package, only modules that need PyTorch, numpy, Pillow and cuda-bindings are imported.
+It imports only those modules of the package that need no other packages than PyTorch, numpy, Pillow
+and cuda-bindings.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Compares our training step with gsplat's (Apache 2.0), if installed, on the same tensors.
 
-Three comparisons: an image; an image and the gradients of the parameters, by autograd; and a
-complete training step. There, ours is the trainer's, and gsplat's uses our fused loss and PyTorch's
-fused Adam. The faster of gsplat's two layouts counts.
+There are three comparisons: an image; an image and the gradients of the parameters, by autograd;
+and a complete training step. In the third comparison, our step is that of the trainer, and gsplat's
+step uses our fused loss and PyTorch's fused Adam. gsplat has two memory layouts; the faster one
+counts.
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ def _our_image(step: Step) -> Tensor:
 
 
 def _each(work: Callable[[], object], repeats: int) -> float:
-    """Milliseconds per call of many in a row, as in a training."""
+    """Milliseconds per call, for many calls in a row, as in a training run."""
     for _ in range(3):
         work()
     times = []

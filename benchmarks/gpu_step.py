@@ -1,8 +1,8 @@
 """Times a training step on a GPU: that of the trainer, on a scene that does not change.
 
-There are three times. `host`: the CPU queues a step. `gpu`: the GPU runs a step that is already
-queued. `wall`: a step in a training, where the CPU waits for each loss. The longer of the first two
-limits the last.
+Three times are measured. `host` is the time in which the CPU queues a step. `gpu` is the time in
+which the GPU runs a step that is already queued. `wall` is the time of a step in a training run,
+where the CPU waits for each loss; it is at least the longer of the other two.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ from snowsplat.training.trainer import Trainer
 GPU = torch.device("cuda")
 EXTENT = 4.0
 
-#: The paper's, with learning rates so small that all repetitions compute the same.
+#: The configuration of the paper, with learning rates so small that all repetitions do the same
+#: work.
 CONFIG = TrainConfig(
     sh_interval=0,
     learning_rates=replace(LearningRates().scaled(1e-30), means_final=1e-36, means_steps=1.0),

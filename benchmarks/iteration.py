@@ -104,7 +104,7 @@ class Iteration:
         self.ops = reference if use_reference else ops
         self.parameters = workload.gaussians.parameters()
         count = len(workload.gaussians)
-        # Parameters are rows of larger tensors, as density control leaves them in a training.
+        # Parameters are rows of larger tensors, as after density control in a training run.
         rows = torch.arange(count)
         self.exp_avg, self.exp_avg_sq = (
             {name: take_rows(torch.zeros_like(p), rows) for name, p in self.parameters.items()}

@@ -40,7 +40,7 @@ class Worker:
         script = Path(__file__).with_name("worker.py")
         if source is not None:
             environment["PYTHONPATH"] = str(source.resolve())
-            # Another checkout may have other names inside, which its own worker knows.
+            # The modules of another checkout may have other names, so its own worker.py is used.
             own = source.resolve().parent / "benchmarks" / "worker.py"
             script = own if own.is_file() else script
         self._process = subprocess.Popen(
@@ -76,7 +76,7 @@ class Worker:
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         if not line:
-            raise UserError("the measuring process died; its output is above")
+            raise UserError("the measuring process has ended; its output is above")
         answer: Measured = json.loads(line)
         if "error" in answer:
             raise UserError(answer["error"])

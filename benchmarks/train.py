@@ -4,8 +4,8 @@
     python benchmarks/train.py DATASET -o OUT --recipe default paper --iterations 7000
     python benchmarks/train.py DATASET -o OUT --set max_gaussians=50000 sh_interval=100
 
-Writes OUT/DATASET.csv, .json and .svg. The clock is stopped while held-out views are evaluated. It
-includes the initialisation of the Gaussians.
+Writes OUT/DATASET.csv, .json and .svg. The clock is stopped while held-out views are evaluated. The
+time includes the initialisation of the Gaussians.
 """
 
 from __future__ import annotations

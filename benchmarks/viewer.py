@@ -1,8 +1,8 @@
-"""Times of the live viewer: rendering, response to a moving camera, and its cost for a training.
+"""Times of the live viewer: rendering, response to a moving camera, and slowdown of training.
 
     python benchmarks/viewer.py                      200k Gaussians at 960×540
-    python benchmarks/viewer.py --dataset DIR        also a training: alone, watched, and watched
-                                                     with a camera that always moves
+    python benchmarks/viewer.py --dataset DIR        also a training run: alone, watched, and
+                                                     watched with a camera that always moves
 
 The browser is replaced by a client that receives the images but does not draw them, since a real
 browser may run on another machine.
@@ -145,9 +145,9 @@ def answers(name: str, repeats: int) -> None:
 
 
 def training(path: Path, seconds: float, rounds: int) -> None:
-    """Steps per second of one training, alternately without viewer, without browser, …"""
+    """Steps per second of one training run, measured alternately with and without viewers."""
     dataset = load_dataset(path)
-    # After its first steps, the speed of a training of this length is constant.
+    # With these settings, the speed of training is constant after the first steps.
     config = recipe("default", iterations=1_000_000, coarse_to_fine=(1, 2), densify_until=900)
     trainer = Trainer(dataset, config)
     trainer.run(until=1000)
@@ -202,7 +202,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", default="200k", choices=SIZES)
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--dataset", "--capture", type=Path, help="also measure a training on it")
+    parser.add_argument("--dataset", "--capture", type=Path, help="also measure training on it")
     parser.add_argument(
         "--seconds", type=float, default=8.0, help="of each measurement of the training"
     )

@@ -3,7 +3,7 @@
 A request is a line of JSON on standard input, the response is a line on standard output:
 {"size", "threads", "repeats", "visible_only", "reference", "count"} →
 {"size", "threads", "isa", "source", "gaussians", "wall", "cpu", "counts"}, or {"error"}.
-Between requests it sleeps.
+Between requests, the process sleeps.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Workloads for measurements: scenes similar to trained ones, without a training.
+"""Workloads for measurements: scenes that are similar to trained scenes, but not trained.
 
 The points are those of a real garden (`../shared/captures/garden_points.npz` beside the checkout,
 or the file named by SNOWSPLAT_GARDEN). Each Gaussian is a flat disc on the surface of its
@@ -27,7 +27,7 @@ from snowsplat.scene.geometry import look_at, morton_order, quat_from_rotation
 GARDEN = Path(__file__).resolve().parents[2] / "shared" / "captures" / "garden_points.npz"
 
 #: name -> Gaussians, width, height. "small" has more Gaussians than pixels: most SIMD lanes are
-#: idle, as in the first steps of a coarse-to-fine training.
+#: idle, as in the first steps of coarse-to-fine training.
 SIZES = {
     "tiny": (2_000, 96, 54),
     "10k": (10_000, 240, 135),
@@ -64,13 +64,13 @@ def workload(name: str, seed: int = 0) -> Workload:
     """The workload of one of `SIZES`; deterministic on every machine."""
     count, width, height = SIZES[name]
     cloud = _cloud()
-    gaussians = _leaves(count, np.random.default_rng(seed))
+    gaussians = _gaussians_on_surface(count, np.random.default_rng(seed))
     fx, fy = (focal * width for focal in cloud.focal)
     camera = Camera(width, height, fx, fy, width / 2, height / 2, cloud.cam_from_world)
     return Workload(name, cloud.source, gaussians.select(morton_order(gaussians.means)), camera)
 
 
-def _leaves(count: int, random: np.random.Generator) -> Gaussians:
+def _gaussians_on_surface(count: int, random: np.random.Generator) -> Gaussians:
     """``count`` Gaussians of SH degree 3 along the surface of the cloud.
 
     If there are more Gaussians than points, points are used several times, with random offsets in
@@ -118,8 +118,8 @@ def _surface() -> tuple[Tensor, Tensor]:
 def _surface_axes(xyz: Tensor, k: int = 8, window: int = 16) -> Tensor:
     """(P, 3, 3) rotations whose columns are the principal axes of near points, normal first.
 
-    Uses the k nearest of the 2 · ``window`` neighbours along a Morton curve: these are nearly the
-    nearest of all, which is enough for the surface.
+    Near points are the k nearest of the 2 · ``window`` neighbours along a Morton curve. They are
+    nearly the nearest of all points, which is sufficient to estimate the surface.
     """
     order = morton_order(xyz)
     along = xyz[order]
