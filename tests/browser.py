@@ -95,7 +95,7 @@ class Browser:
         with contextlib.suppress(BrowserError, OSError, subprocess.TimeoutExpired):
             self.call("Browser.close", timeout=5)
             self._process.wait(5)
-        # If it is still running: the whole group, including renderers and the GPU process.
+        # If it is still running, kill its whole group, with the renderers and the GPU process.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()

@@ -15,8 +15,9 @@ import pytest
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    # There is one process per core. Torch's threads spin while they wait, so several per process
-    # would compete for the cores. Set before torch is imported; results do not depend on it.
+    # There is one process per core. Torch's threads spin while they wait, so several threads per
+    # process would compete for the cores. The variable is set before torch is imported. Results
+    # do not depend on it.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 _HERE = Path(__file__).parent

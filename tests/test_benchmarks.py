@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 
 def benchmark(script: str, *arguments: object) -> str:
-    """The output of a script. Without the garden's points, so that it is the same everywhere."""
+    """The output of a script. It never uses the garden, so it is the same everywhere."""
     environment = os.environ | {"SNOWSPLAT_GARDEN": "none", "PYTHONPATH": str(ROOT / "src")}
     run = subprocess.run(
         [sys.executable, str(BENCHMARKS / script), *map(str, arguments)],
@@ -92,7 +92,7 @@ def test_two_libraries_are_measured_alternately():
 
 
 def test_pairs_are_those_of_the_reference(monkeypatch):
-    """Counted from the lists of the kernels, and from the alphas of the reference."""
+    """The pairs are counted from the lists of the kernels and from the alphas of the reference."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     monkeypatch.setenv("SNOWSPLAT_GARDEN", "none")
     import pairs
@@ -116,7 +116,7 @@ def test_pairs_are_those_of_the_reference(monkeypatch):
         pixels = reference._pixel_centres(0, top, camera.width, 6)
         alpha, _, _ = reference._blend_weights(pixels, rows[:, :2], rows[:, 2:5], rows[:, 5])
         expected += int((alpha > 0).sum())
-        # At the thresholds, rounding decides.
+        # At the thresholds, the results depend on rounding.
     found = pairs.count_pairs(splats, frame, camera.width, camera.height)
     assert found == pytest.approx(expected, rel=1e-4)
     counts = pairs.count_steps(frame)
@@ -450,7 +450,7 @@ all ops ran
             log.read(line)
         assert (log.errors, log.first, log.finished) == (0, [], False)
 
-    # A program instead of the sanitizer, which does not run ours to its end.
+    # This program replaces the sanitizer. It does not run our program to its end.
     fake = tmp_path / "compute-sanitizer"
     fake.write_text("#!/bin/sh\nprintf '%s\\n' \"$*\" '========= COMPUTE-SANITIZER' 'ops: first'\n")
     fake.chmod(0o755)
@@ -606,7 +606,7 @@ def test_the_jobs_of_a_run(gpu_modules, tmp_path):
 
 
 class FakeEvent:
-    """A GPU event, implemented by the time of the CPU."""
+    """A GPU event that records the time of the CPU."""
 
     def __init__(self, enable_timing=False):
         self.time = 0.0
@@ -626,7 +626,7 @@ class FakeEvent:
 
 @pytest.fixture
 def fake_gpu(gpu_modules, monkeypatch):
-    """The emulation instead of a GPU: checks that the parts run, not their speed."""
+    """The emulation replaces the GPU. The tests check that the parts run, not their speed."""
     import gpu_peer
     import gpu_step
 
@@ -681,7 +681,7 @@ def page_of(found):
 
 @pytest.mark.emulated
 def test_the_measuring_parts_run(fake_gpu, capsys, tmp_path):
-    """From their output to the page."""
+    """All parts run, and the page shows their output."""
     import gpu_ops
     import gpu_parts
 

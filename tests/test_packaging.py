@@ -103,7 +103,7 @@ def test_source_distribution_contains_all_files_of_a_build(tmp_path):
 
 
 def test_without_nvrtc_gpu_kernels_are_omitted_with_a_message(tmp_path):
-    """Only the configuration by CMake; nothing is compiled."""
+    """Only CMake's configuration runs; nothing is compiled."""
     cmake = shutil.which("cmake", path=f"{Path(sys.executable).parent}{os.pathsep}/usr/bin")
     ninja = shutil.which("ninja", path=f"{Path(sys.executable).parent}{os.pathsep}/usr/bin")
     if cmake is None or ninja is None:

@@ -18,7 +18,7 @@ _FILE = re.compile(r"(Create|Change)\s+`([^`]+)`:\s*$")
 
 
 class Mismatch(Exception):
-    """A block does not fit the files that it is applied to."""
+    """A block cannot be applied to the files, because their content is different."""
 
 
 @dataclass

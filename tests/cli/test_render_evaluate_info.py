@@ -92,7 +92,7 @@ def test_evaluate_with_lpips(run, refused, trained, tmp_path):
 
 
 def test_a_folder_of_the_reference_implementation(run, trained, dataset, tmp_path):
-    """It has cfg_args but no config.json. Its content is not executed."""
+    """Such a folder has cfg_args but no config.json. The content of cfg_args is not executed."""
     theirs = tmp_path / "theirs"
     shutil.copytree(trained / "point_cloud", theirs / "point_cloud")
     (theirs / "cfg_args").write_text(

@@ -56,7 +56,7 @@ def test_the_output_folder(run, dataset, tmp_path):
     assert metrics["psnr"] > 12
     assert set(metrics["views"]) == {"view_00.png", "view_08.png"}
     assert b"element vertex 300" in (out / "input.ply").read_bytes()[:200]
-    # Standard output is not a terminal: complete lines, the last one has the result.
+    # Standard output is not a terminal, so complete lines are printed. The last one has the result.
     lines = result.out.splitlines()
     assert "7 photos to train on, 2 held out, 48x36, 300 points" in lines[0]
     assert any(line.startswith("step 30/30 (100%)") and "it/s" in line for line in lines)
@@ -195,7 +195,7 @@ def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path):
 
 
 def test_a_second_ctrl_c_saves_no_incomplete_step(run, dataset, tmp_path, monkeypatch):
-    """The files are as after a kill, and the training resumes to the same scene."""
+    """The files are the same as after a kill, and the resumed run produces the same scene."""
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     flags = ("--recipe", "mcmc", *QUICK, "--checkpoint-every", 10)
     assert run("train", dataset, "-o", whole, *flags).code == 0
@@ -226,7 +226,7 @@ def test_resume_rejects_other_settings(refused, run, dataset, tmp_path):
     assert "recipe" in refused("train", "-o", out, "--resume", "--recipe", "paper")
     assert "after --iterations 10" in refused("train", "-o", out, "--resume", "--iterations", 10)
     assert "cannot be combined" in refused("train", dataset, "-o", out, "--resume", "--overwrite")
-    # Other photos, or another split, which would test on photos that were trained on.
+    # With other photos or another split, the run would be tested on photos that it was trained on.
     (tmp_path / "tests.txt").write_text("view_04\n")
     for flags in (["-r", 2], ["--eval"], ["--test-list", tmp_path / "tests.txt"], ["-i", "more"]):
         assert "other settings" in refused("train", "-o", out, "--resume", *flags)
@@ -300,7 +300,7 @@ def test_minutes(run, dataset, tmp_path):
     assert training["iterations"] == step > 1
     assert training["density"]["max_gaussians"] == 864
 
-    # The training is finished; --iterations continues it by steps.
+    # The training run is finished; --iterations adds steps to it.
     assert run("train", "-o", out, "--resume", "--iterations", step + 50).code == 0
     assert len(scene(out, step + 50)) > 1000
 
@@ -400,7 +400,7 @@ def test_invalid_datasets_write_no_files(refused, dataset, tmp_path):
 
 
 def test_divergence_names_the_last_good_checkpoint(refused, run, dataset, tmp_path):
-    """A scene can be made from it; no diverged value is stored."""
+    """A scene can be saved from this checkpoint; no diverged value is stored."""
     out = tmp_path / "out"
     # The learning rate grows 60-fold per step, until it exceeds the range of float32.
     rates = ["--lr-means-final", 1e40, "--lr-means-steps", 25]

@@ -29,8 +29,8 @@ def dataset_copy(pristine, tmp_path) -> Callable[[str], Path]:
 def count_rejected() -> Callable[[Path, Callable[[], object]], int]:
     """A function that damages a file in many ways and reads each version.
 
-    Reading must succeed or raise `UserError`. Returns the number of rejected versions. Any other
-    exception passes through and fails the test.
+    Reading must succeed or raise `UserError`. The function returns the number of rejected versions.
+    Any other exception passes through and fails the test.
     """
 
     def count_rejected(path: Path, read: Callable[[], object]) -> int:

@@ -139,7 +139,7 @@ def test_the_model_with_most_images_is_used(dataset_copy, caplog, kind):
     model = read_model(folder / "sparse/0")
     (folder / "sparse/0").rename(folder / "sparse/3")
     nothing = np.empty((0, 3))
-    for number in (0, 1):  # first by name, but with fewer images
+    for number in (0, 1):  # these models are first by name, but have fewer images
         some = model.images[: 2 + number]
         write_model(folder / f"sparse/{number}", model.cameras, some, nothing, nothing)
     with caplog.at_level(logging.WARNING):

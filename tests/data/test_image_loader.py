@@ -250,7 +250,7 @@ def test_an_image_that_a_thread_decodes_is_awaited(views, monkeypatch):
 
 
 def test_images_decoded_ahead_are_removed_if_nothing_else_is_cached(tmp_path):
-    """Their estimated size may be too small: 3 pixels divided by 4 are 0, but become 1."""
+    """The estimated size may be too small: 3 // 4 is 0 pixels, but the image has 1 pixel."""
     pixels = np.full((3, 3, 3), 9, np.uint8)
     views = [make_view(tmp_path / f"{i}.png", pixels) for i in range(3)]
     with ImageLoader(views, budget_bytes=0, threads=3) as loader:

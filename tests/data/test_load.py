@@ -40,7 +40,10 @@ def test_extent_is_computed_from_the_training_cameras(pristine):
 
 
 def test_files_that_are_read_once_give_the_dataset_at_any_resolution(pristine, tmp_path):
-    """Bit-identical to reading them again, also if the photos are smaller than their cameras."""
+    """The dataset is the same as if the files were read again.
+
+    This also holds if the photos are smaller than their cameras.
+    """
     half = write_toy_dataset(tmp_path / "half", "colmap-bin", 9, 66, 50)
     resize_folder(half / "images", half / "images", (33, 25))
     for root in (pristine["colmap-bin"], half):
@@ -243,7 +246,7 @@ def test_paths_that_are_not_datasets(tmp_path):
 def test_the_extent_of_cameras_in_one_place_is_one(pristine):
     cameras = [view.camera for view in load_dataset(pristine["colmap-bin"]).train]
     assert scene_extent(cameras[:1]) == 1.0
-    # Half of the way: 1.1 times the distance from the middle, however small.
+    # The extent is 1.1 times the distance from the middle, however small this distance is.
     pose = cameras[0].cam_from_world.clone()
     pose[0, 3] += 0.5
     pair = [cameras[0], dataclasses.replace(cameras[0], cam_from_world=pose)]

@@ -31,7 +31,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def make_scene() -> Make:
-    """``make_scene(n, degree)``: like a trained scene: small, thin, from faint to opaque."""
+    """``make_scene(n, degree)``: small, thin, faint to opaque Gaussians as in trained scenes."""
 
     def make(n: int, degree: int = 3, seed: int = 0) -> Gaussians:
         generator = torch.Generator().manual_seed(seed)
@@ -90,8 +90,9 @@ def one_line() -> Callable[[Path], str]:
 
 @pytest.fixture(scope="session")
 def survives() -> Callable[[Path], None]:
-    """``survives(path)``: a damaged file is a one-line error, or a plausible number of finite
-    Gaussians.
+    """``survives(path)``: reads a damaged file.
+
+    The result must be a one-line error or a plausible number of finite Gaussians.
     """
 
     def read(path: Path) -> None:

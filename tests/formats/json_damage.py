@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 ODD = [None, True, -1, 0, 1, 7, 2**31, 10**18, 1e308, -0.5, "", "a", "meta.json", [], {}, [0], [[]]]
 ODD += [float("nan"), float("inf"), {"a": 1}, [0.0] * 300]
 
-#: Where in the document (a share of all places) and which of `ODD`; None drops it.
+#: The place in the document (as a fraction of all places), and the index of the new value in `ODD`;
+#: None removes the element.
 changes = st.lists(
     st.tuples(st.floats(0, 0.999), st.one_of(st.none(), st.integers(0, len(ODD) - 1))),
     min_size=1,
@@ -17,7 +18,7 @@ changes = st.lists(
 
 
 def places(value: Any) -> list[tuple[Any, Any]]:
-    """Container and key of every element of ``value``; of long lists of numbers, of the first."""
+    """Container and key of every element of ``value``; of lists, only the first four elements."""
     found: list[tuple[Any, Any]] = []
     keys: list[Any] = []
     if isinstance(value, dict):

@@ -6,7 +6,7 @@ from snowsplat.formats.codebooks import LEVELS, levels_for
 
 
 def test_every_level_is_the_mean_of_its_values():
-    """And every value has the nearest level: what Lloyd's iteration converges to."""
+    """Every value also has the nearest level. Lloyd's iteration converges to this state."""
     random = np.random.default_rng(0)
     values = np.concatenate([random.normal(size=3000), random.normal(8, 0.1, 1000)])
     values = values.astype(np.float32)
@@ -19,7 +19,7 @@ def test_every_level_is_the_mean_of_its_values():
     means = np.array([values[index == i].mean(dtype=np.float64) for i in np.unique(index)])
     off = np.abs(levels[np.unique(index)] - means)
     assert off.mean() < 2e-4
-    # Not worse than the best uniform levels would be.
+    # The error is not larger than with the best uniform levels.
     uniform = (values.max() - values.min()) / LEVELS / 12**0.5
     assert np.sqrt((chosen**2).mean()) < 0.5 * uniform
 

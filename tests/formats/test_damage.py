@@ -31,7 +31,8 @@ FUZZ = settings(
 READ_AND_WRITTEN = [f for f in FORMATS if f.read and f.write]
 WORDS = [0, 1, 2, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 0x7F800000, 0x7FC00000]
 
-#: Position (a fraction of the file or, half of the time, of its first 200 bytes), change, values.
+#: Position, kind of change, and values. The position is a fraction of the file or, in half of the
+#: cases, of its first 200 bytes.
 changes = st.lists(
     st.tuples(
         st.booleans(),

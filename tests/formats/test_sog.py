@@ -48,7 +48,7 @@ def test_round_trip(tmp_path, make_scene, rotation_error, degree, n):
 
 
 def test_a_palette_has_no_more_rows_than_requested():
-    """Each of many small clusters has one row, and the large one must not exceed the total."""
+    """Each of many small clusters has one row; the large cluster gets at most the other rows."""
     random = np.random.default_rng(0)
     rows = np.zeros((40_000, 3), np.float32)
     rows[:300] = random.normal(0, 1000, (300, 3))
@@ -144,7 +144,7 @@ def test_deflated_members_and_a_folder(tmp_path, files):
 
 
 def test_version_1(tmp_path, files):
-    """Even steps between mins and maxs, logits of the opacity, a palette without a count."""
+    """The levels are evenly spaced between mins and maxs, and the palette has no count."""
 
     def older(meta):
         meta["means"]["shape"] = [meta.pop("count"), 3]
@@ -238,7 +238,7 @@ def test_decompression_bombs(tmp_path, files, one_line):
 
 
 def test_the_number_of_members_is_limited(tmp_path, one_line):
-    """More than 1000 are refused before the directory of the zip file is read."""
+    """More than 1000 members are refused before the directory of the zip file is read."""
     names = {f"{number}": b"" for number in range(1001)}
     assert "implausible number of members" in one_line(bundle(tmp_path / "a.sog", names))
     del names["0"]
@@ -246,7 +246,7 @@ def test_the_number_of_members_is_limited(tmp_path, one_line):
 
 
 def test_the_size_of_a_folder_is_that_of_its_files(tmp_path, files):
-    """Of those that exist, each once; a zip file has its own size."""
+    """Each existing file counts once. The size of a zip file is the size of the file itself."""
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
     names = [name for name in files if name != "meta.json"]

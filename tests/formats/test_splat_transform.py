@@ -23,12 +23,12 @@ def assert_same(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
     torch.testing.assert_close(a.sh_dc, b.sh_dc, rtol=0, atol=tolerance)
     torch.testing.assert_close(a.sh_rest, b.sh_rest, rtol=0, atol=tolerance)
     cosine = (a.rotations * b.rotations).sum(1).abs()
-    # It reads the bytes of a .splat as 127.5 + 127.5 q.
+    # splat-transform reads the bytes of a quaternion in .splat as 127.5 + 127.5 q.
     assert (1 - cosine).max() < 1e-4
 
 
 def as_it_reads_spz(scene: Gaussians) -> Gaussians:
-    """It reads the numbers of an .spz file like those of a PLY, without converting the frame."""
+    """The scene as splat-transform reads it from an .spz file: it does not convert the frame."""
     turned = flip_axes(scene.means.numpy(), scene.quats.numpy(), scene.sh_rest.numpy(), UP_BACK)
     means, quats, sh_rest = (torch.from_numpy(array) for array in turned)
     return Gaussians(means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
@@ -95,8 +95,10 @@ def test_we_read_its_sog(tmp_path, make_scene, splat_transform, degree):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_we_read_its_glb(tmp_path, make_scene, splat_transform, degree):
-    """It converts a PLY to y up by 180° about z, snowsplat by 180° about x; the difference is 180°
-    about the vertical."""
+    """splat-transform rotates a PLY by 180° about z, snowsplat by 180° about x.
+
+    The difference is a rotation by 180° about the vertical axis.
+    """
     scene = make_scene(300, degree)
     write_gaussians(tmp_path / "a.ply", scene)
     splat_transform(tmp_path / "a.ply", tmp_path / "a.glb")

@@ -222,7 +222,8 @@ def test_false_counts_are_one_line_errors_without_memory(tmp_path, one_line):
     assert "declares 4294967295 Gaussians" in one_line(path)
     path.write_bytes(gzip.compress(head(3, 1000, 3) + b"".join(COLUMNS)))
     assert "damaged" in one_line(path)
-    # Decompression bombs: a file that unpacks to more than it declares, and one that declares it.
+    # Decompression bombs: one file unpacks to more bytes than it declares, the other declares
+    # too many.
     path.write_bytes(gzip.compress(head(3, 1, 1) + b"".join(COLUMNS) + bytes(50 << 20)))
     assert "damaged" in one_line(path)
     path.write_bytes(gzip.compress(head(3, 5_000_000, 0) + bytes(100 << 20)))

@@ -180,7 +180,7 @@ def guarded(read: Callable[[], Any], home: Path, size: int, extra: int = 0) -> A
             raise Broken(f"long message: {line[:500]!r}")
     limit = MEMORY + RATIO * (size + bytes_of(result)) + extra
     if used > limit:
-        # Pages of libraries that were loaded from disk also count, but only in the first run.
+        # Memory pages of libraries that are loaded from disk also count, but only in the first run.
         used = min(used, measured(run)[1])
     if used > limit:
         raise Broken(f"took {used >> 20} MB for a file of {size} bytes; allowed: {limit >> 20} MB")

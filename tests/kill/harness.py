@@ -106,7 +106,7 @@ class Zygote:
         Args:
             at: kill it before the at-th change of a file, or ``delay`` seconds after that.
             after: kill it this many seconds after its start.
-            limits: RLIMIT_… values; for open files, relative to the number of open files.
+            limits: RLIMIT_… values; the limit of open files is added to the current number.
             columns: width of its terminal; None: no terminal.
             while_it_runs: called with its process id once it is started.
         """
@@ -156,7 +156,7 @@ def _kill(group: int) -> None:
 
 
 def _wait_for_the_group(pid: int) -> None:
-    """Wait until the children of a killed process have ended: then they write no more."""
+    """Wait until the children of a killed process have ended and can no longer write files."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         try:
@@ -252,7 +252,10 @@ def names_in(folder: Path) -> set[str]:
 
 
 def digest(path: Path) -> str:
-    """A digest of its bytes; of a checkpoint, whose header has no fixed order, of its content."""
+    """A digest of the bytes of a file.
+
+    The header of a checkpoint has no fixed order, so its digest is that of its content.
+    """
     if path.suffix != ".safetensors":
         return hashlib.sha256(path.read_bytes()).hexdigest()
     with safetensors.safe_open(path, framework="np") as file:
@@ -391,7 +394,7 @@ class Killer:
 
 
 def _moment(moments: random.Random, undisturbed: Ended) -> dict[str, float]:
-    """Half of the kills at random times, the others near a change of a file."""
+    """Half of the kills are at random times, the others near a change of a file."""
     kind = moments.random()
     if kind < 0.5:
         return {"after": moments.uniform(0.0, undisturbed.seconds)}
@@ -400,7 +403,7 @@ def _moment(moments: random.Random, undisturbed: Ended) -> dict[str, float]:
 
 
 def convert_jobs(scene: Path, other: Path) -> list[Job]:
-    """Into each format; over an existing file, and with edits."""
+    """Convert into each format, over an existing file, and with edits."""
     targets = ["ply", "compressed.ply", "spz", "sog", "glb", "splat", "html"]
 
     def job(suffix: str) -> Job:
@@ -441,10 +444,10 @@ _PLAIN = (
 
 
 def train_jobs(dataset: Path) -> list[Job]:
-    """With checkpoints, then --resume; with --memory; with --minutes; over an older training."""
+    """Train with checkpoints and --resume, --memory, --minutes, and over older results."""
 
     def check_same(output: Path, whole: Path) -> None:
-        # Without times, which are in the curves and on the page, and without the folder's path.
+        # The comparison excludes the times in the curves and on the page, and the folder's path.
         expected = names_in(whole)
         if names_in(output) != expected:
             raise Defect(f"files differ: {sorted(names_in(output) ^ expected)}")
@@ -506,7 +509,7 @@ def _older_training(folder: Path, dataset: Path) -> Path:
 
 
 def sfm_jobs(photos: Path) -> list[Job]:
-    """From photos, with smaller copies."""
+    """Make a dataset from photos, with smaller copies."""
 
     def command(output: Path, _: bool) -> list[object]:
         return ["sfm", photos, "-o", output, "--quality", "draft", "--threads", 1, "--resize"]
@@ -515,7 +518,7 @@ def sfm_jobs(photos: Path) -> list[Job]:
 
 
 def make_jobs(photos: Path) -> list[Job]:
-    """From photos to rendered images."""
+    """Make a scene from photos, with rendered images."""
 
     def command(output: Path, _: bool) -> list[object]:
         arguments = ["make", photos, "-o", output, "--quality", "draft", "--threads", 1]
@@ -537,7 +540,7 @@ def make_jobs(photos: Path) -> list[Job]:
 
 
 def _check_dataset(output: Path, whole: Path) -> None:
-    """The same files, and the same cameras except for rounding."""
+    """Check that the files are the same, and the cameras are the same except for rounding."""
     if names_in(output) != names_in(whole):
         raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
     record = json.loads((output / "capture.json").read_text())

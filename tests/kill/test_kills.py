@@ -47,7 +47,7 @@ def test_make(killer, photos):
 
 
 def test_train_killed_at_its_start(zygote, dataset):
-    """Before each of the first changes of files: the folder is recognised from the first one."""
+    """It is killed before each of the first changes of files, and the folder is recognised."""
     out = zygote.folder / "begun"
     command = ["train", dataset, "-o", out, "--iterations", 3, "--device", "cpu", "--threads", 1]
     for at in range(1, 8):
@@ -59,7 +59,7 @@ def test_train_killed_at_its_start(zygote, dataset):
 
 
 def test_a_scene_is_written_after_a_kill_prevented_it(zygote, dataset, tmp_path):
-    """Killed between the checkpoint of step 20 and the scene of step 20."""
+    """The run is killed after the checkpoint of step 20 and before the scene of step 20."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
     command += ["--save-iterations", 20, "--device", "cpu", "--threads", 1]
@@ -74,7 +74,7 @@ def test_a_scene_is_written_after_a_kill_prevented_it(zygote, dataset, tmp_path)
 
 
 def test_an_old_checkpoint_left_by_a_kill_is_removed(zygote, dataset, tmp_path):
-    """Killed between writing the last checkpoint and removing the third last."""
+    """The run is killed after writing the last checkpoint and before removing the third last."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
     command += ["--device", "cpu", "--threads", 1]
@@ -119,7 +119,7 @@ def test_a_timed_training_with_more_steps_than_planned(zygote, dataset, tmp_path
 
 
 def test_make_keeps_checkpoints_until_the_scene_is_recorded(zygote, photos, tmp_path):
-    """Killed as soon as they are removed: the stage must be recorded as finished."""
+    """The run is killed as soon as they are removed; the stage must be recorded as finished."""
     out = tmp_path / "made"
     command = ["make", photos, "-o", out, "--quality", "draft", "--device", "cpu", "--threads", 1]
     checkpoints = out / "scene/checkpoints"

@@ -41,7 +41,7 @@ def place(zygote, tmp_path) -> Iterator[Path]:
 
 @contextmanager
 def mounted(folder: Path, *options: str) -> Iterator[None]:
-    """With a file system mounted over ``folder``; skipped without permission."""
+    """Mount a file system over ``folder``; the test is skipped without permission."""
     done = subprocess.run(["mount", *options, folder], capture_output=True, text=True)
     if done.returncode:
         pytest.skip(f"needs the right to mount: {done.stderr.strip()}")
@@ -73,7 +73,7 @@ def fill(folder: Path) -> None:
 
 
 def refused(ended: Ended, pattern: str) -> None:
-    """It ended with one line on stderr and the exit code of a user error."""
+    """Check that the command printed one line on stderr and ended with the code of a user error."""
     assert ended.code == 2, ended.text
     lines = [line for line in ended.text.splitlines() if line.startswith("snowsplat: ")]
     assert len(lines) == 1, ended.text
@@ -129,7 +129,7 @@ def test_a_full_disk(subcommand, zygote, place, trained, dataset, photos):
 
 
 def test_a_disk_that_becomes_full_during_a_training(zygote, place, dataset):
-    """The last checkpoint stays valid; with free space it resumes to the same scene."""
+    """The last checkpoint stays valid. With free space, the resumed run produces the same scene."""
     out = place / "out"
     command = ["train", dataset, "-o", out, "--iterations", 60, "--checkpoint-every", 10, *CPU]
     assert zygote.run(command).code == 0
@@ -152,7 +152,7 @@ def test_a_disk_that_becomes_full_during_a_training(zygote, place, dataset):
 
 
 def test_a_disk_too_full_for_the_first_scene(zygote, place, dataset):
-    """The training has no result, so nothing is kept, and the same command starts again."""
+    """The training run has no result, so nothing is kept, and the same command starts again."""
     out = place / "out"
     command = ["train", dataset, "-o", out, "--iterations", 20, "--save-iterations", 10, *CPU]
     with full(place, 90):
@@ -200,7 +200,7 @@ def has_checkpoint(out: Path) -> Callable[[], bool]:
 
 
 def test_a_training_whose_folder_is_moved_continues(zygote, place, dataset):
-    """It creates a new folder, so that hours of work are not lost."""
+    """The training run creates a new folder, so that hours of work are not lost."""
     out, elsewhere = place / "out", place / "elsewhere"
     command = ["train", dataset, "-o", out, "--iterations", 400, "--checkpoint-every", 10, "--eval"]
     ended = zygote.run(
@@ -218,7 +218,7 @@ def test_a_training_whose_folder_is_moved_continues(zygote, place, dataset):
 
 
 def test_a_training_whose_photos_are_removed(zygote, place, dataset):
-    """At the start, and before it resumes: saved files are kept."""
+    """The photos are removed at the start or before the run resumes. Saved files are kept."""
     mine, out = place / "capture", place / "out"
     shutil.copytree(dataset, mine)
     command = ["train", mine, "-o", out, "--iterations", 40, "--checkpoint-every", 10, *CPU]
@@ -276,7 +276,7 @@ def test_a_limit_of_the_size_of_files(subcommand, zygote, place, trained, datase
 
 @pytest.mark.parametrize("subcommand", SUBCOMMANDS)
 def test_a_limit_of_open_files(subcommand, zygote, place, trained, dataset, photos):
-    """So low that hardly any file can be opened."""
+    """The limit is so low that hardly any file can be opened."""
     shutil.copytree(trained, place / "trained")
     before = names_in(place)
     ended = zygote.run(
@@ -330,7 +330,7 @@ def test_a_narrow_terminal(zygote, place, trained, dataset, photos):
 
 
 def test_view_of_a_missing_scene(zygote, place, trained):
-    """The only subcommand that writes nothing: a folder without a scene is a one-line error."""
+    """`view` is the only subcommand that writes nothing: a missing scene is a one-line error."""
     shutil.copytree(trained, place / "trained")
     shutil.rmtree(place / "trained" / "point_cloud")
     refused(zygote.run(["view", place / "trained", "--no-browser"]), "contains no scene")

@@ -47,7 +47,7 @@ def _import_all() -> None:
     import snowsplat.viewer.web.scene
     import snowsplat.viewer.web.server
 
-    # After Python's zlib, since pycolmap would replace it by its own.
+    # Imported after Python's zlib, because pycolmap would replace zlib by its own.
     importlib.import_module("pycolmap")
     for name in snowsplat.cli.main.SUBCOMMANDS:
         snowsplat.cli.main.parse([name])
@@ -136,7 +136,7 @@ def _child(run: dict) -> None:
 
 
 def serve() -> None:
-    """Answer until stdin ends."""
+    """Execute runs until stdin is closed."""
     _import_all()
     for line in sys.stdin:
         run = json.loads(line)

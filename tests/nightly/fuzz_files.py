@@ -163,7 +163,7 @@ class _Child:
     def _one_input(self, data: bytes) -> None:
         if self.runs >= self.flags.runs or time.monotonic() > self.end:
             self._report("")
-            os._exit(0)  # libFuzzer can only be ended by a failure
+            os._exit(0)  # libFuzzer ends by itself only after a failure
         self.try_out(data)
 
     def damaged(self, data: bytes, generator: random.Random) -> bytes:

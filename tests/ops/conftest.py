@@ -50,8 +50,8 @@ def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
 def variants(*among: Variant) -> list:
     """Parameters of a fixture, with the marks of their engines.
 
-    Only the CPU's kernels depend on the instruction set, so only they are marked `isa`: the
-    reference and the kernels of a GPU would repeat the same check.
+    Only the CPU's kernels depend on the instruction set, so only they are marked `isa`. The
+    reference and the kernels of a GPU would only repeat the same check.
     """
     marks = {"native": pytest.mark.isa, "cuda": pytest.mark.gpu, "emulated": pytest.mark.emulated}
     return [
@@ -65,7 +65,7 @@ KERNELS = (NATIVE_FLOAT32, EMULATED_FLOAT32, CUDA_FLOAT32, *FLOAT64)
 
 
 def _running(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
-    """The requested variant, with the launcher of its engine instead of the CPU's."""
+    """The requested variant. The launcher of its engine replaces that of the CPU."""
     variant: Variant = request.param
     if variant.engine in ("emulated", "cuda"):
         monkeypatch.setitem(LAUNCHERS, "cpu", launcher(variant.engine))

@@ -182,7 +182,7 @@ class Compared:
         return Compared(self.value[rows], self.spread[rows])
 
     def in_rows(self) -> Compared:
-        """Uses the spread of the row for each number: few input changes affect all."""
+        """Use the spread of a row for each of its numbers: few input changes affect all."""
         return Compared(self.value, _of_rows(self.spread))
 
     def check(
@@ -419,7 +419,7 @@ def check_harm(variant: Variant, extreme: Extreme, value: float, picks: Sequence
         rows |= {f"gradient of {n}": p.grad for n, p in leaf.params.items() if p.grad is not None}
         seen = {"ids": ids[healthy[ids]], "packed": splats.packed.detach()[healthy[ids]]}
         results.append(seen | {n: t[healthy] for n, t in rows.items()})
-        # This only has to terminate.
+        # The result is not checked; the call only has to terminate.
         drawn = Splats2D(splats.packed.detach().requires_grad_(), splats.ids, 3)
         image, _, _ = variant.ops.rasterize(drawn, *extreme.size, with_depth=True)
         image.sum().backward()

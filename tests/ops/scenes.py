@@ -1,7 +1,7 @@
 """Scenes, variants and comparisons for the tests of the ops.
 
-All scenes are float64 tensors that float32 represents exactly: what a float32 op and its float64
-reference differ by is then the op's own rounding.
+All scenes are float64 tensors that float32 represents exactly. The difference between a float32 op
+and its float64 reference is then only the rounding error of the op.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def uniform(g: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
 
 
 def as_float32(values: Tensor) -> Tensor:
-    """float64 values rounded to what float32 represents."""
+    """float64 values, rounded to the nearest values that float32 represents."""
     return values.float().double()
 
 

@@ -1,4 +1,4 @@
-"""`adam_step`: what Adam is known to do, and native against the reference."""
+"""`adam_step`: known properties of Adam, and native against the reference."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def test_native_agrees_with_the_reference(
         grad = packed_grads(step, len(states[0].visible()))
         for state in states:
             for k, (name, p) in enumerate(state.params.items()):
-                # Not for all: a parameter without a regulariser has no .grad.
+                # Only some parameters have a .grad: those with a regulariser.
                 wanted = regularised and name in ("means", "opacity_logits", "sh_rest")
                 p.grad = 0.1 * normal(generator(100 * step + k), *p.shape).to(p) if wanted else None
             state.step(grad, step, visible_only=visible_only)
@@ -167,7 +167,7 @@ def test_native_agrees_with_the_reference_for_any_count(native: Variant, count: 
 
 
 def test_options_reach_the_step(native: Variant) -> None:
-    """Other betas, a large eps, and rates of zero."""
+    """Other betas, a large eps, and learning rates of zero have the expected effect."""
     states = [Optimised(v, random_scene(2, 20)) for v in (REFERENCE, native)]
     before = states[0].copy()
     grad = packed_grads(1, len(states[0].visible()))

@@ -46,7 +46,7 @@ def compiler() -> nvrtc.Nvrtc:
 def elf_sections(elf: bytes) -> dict[str, bytes]:
     (start,) = struct.unpack_from("<Q", elf, 0x28)
     size, count, names = struct.unpack_from("<HHH", elf, 0x3A)
-    # Of a header: name, type, …, offset, size
+    # The fields of a section header: name, type, …, offset, size
     headers = [struct.unpack_from("<IIQQQQ", elf, start + i * size) for i in range(count)]
 
     def text(offset: int) -> str:
@@ -258,7 +258,7 @@ def test_a_compile_error_has_the_message_and_the_line(compiler, tmp_path):
 
 
 def test_the_script_needs_only_python(compiler, tmp_path):
-    """As in the build of a wheel: neither torch nor snowsplat can be imported."""
+    """As in the build of a wheel, neither torch nor snowsplat can be imported."""
     source, cubin = nvrtc.path_of("statistic"), tmp_path / "in a folder" / "statistic.cubin"
     library = nvrtc.find((12,))
     script = [sys.executable, "-I", "-S", nvrtc.__file__, source, "--target", "sm_86"]

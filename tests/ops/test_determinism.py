@@ -88,7 +88,7 @@ def test_rasterize(dtype: torch.dtype, channels: int, count: int) -> None:
 @pytest.mark.usefixtures("sums_in_order")
 @pytest.mark.parametrize("channels", [3, 5])
 def test_rasterize_with_sums_in_order(native: Variant, channels: int) -> None:
-    """Also on a GPU, gradients are summed in a fixed order if torch's setting requests it."""
+    """Gradients are summed in a fixed order, also on a GPU, if torch's setting requests it."""
     made = random_splats(2, 400, 60, 45, channels)
     results = []
     for _ in range(3):

@@ -216,7 +216,7 @@ def test_the_driver_reads_the_struct(gpus):
     ("function", "error"), [(None, 0), ("cuLibraryGetGlobal", 500), ("cuMemcpyDtoH", 1)]
 )
 def test_a_kernel_with_another_struct_is_rejected(function, error, gpus):
-    """Before the launch. Kernels older than the structs have no layout."""
+    """It is rejected before the launch. Kernels older than the structs have no layout."""
     if function is None:
         gpus.layout += 1
     gpus.fails[function] = error
@@ -301,7 +301,7 @@ def test_threads_have_separate_arguments(gpus):
 
 
 def test_launching_costs_little(gpus):
-    """The time of Python for a struct of eight tensors, without that of the driver."""
+    """Only the time of Python is measured, without the driver, for a struct of eight tensors."""
     names = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest", "grad", "ids")
     tensors = {name: on_gpu(torch.zeros(1)) for name in names}
     params = ManyParams(**tensors, n=5, width=0.5, height=1.5, rows=4, degree=3)

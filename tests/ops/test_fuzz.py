@@ -139,7 +139,7 @@ def test_one_extreme(variant: Variant, name: str, case: str) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_extremes_together(variant: Variant, seed: int) -> None:
-    """Every parameter of every Gaussian is from another case."""
+    """Every parameter of every Gaussian is taken from a random case."""
     scene, cases = random_scene(seed, COUNT), wild(seed)
     g = generator(1000 + seed)
     for name, listed in NAMES.items():
@@ -259,7 +259,7 @@ def test_random_extremes(native: Variant, name: str) -> None:
 
 @pytest.mark.parametrize("size", LONG)
 def test_long_images(native: Variant, size: tuple[int, int]) -> None:
-    """16384×3 and 3×16384 pixels: the loss, and the image at both ends."""
+    """The loss, and the image at both ends, are correct for 16384×3 and 3×16384 pixels."""
     if native.dtype == torch.float32:
         check_photometric(native, (1, size, "noise", True), 0.2)
     width, height = size

@@ -276,7 +276,7 @@ def test_native_agrees_with_the_reference(
 
 
 def test_native_agrees_with_the_reference_on_flat_images(native: Variant) -> None:
-    """Without structure the variances are differences of equal numbers, and their rounding counts.
+    """Without structure, the variances are differences of equal numbers, which are rounding errors.
 
     In float32 this is 1e-7 compared with C2 = 9e-4, so the tolerance is larger in this test.
     """

@@ -37,7 +37,7 @@ def flat_stack(
 ) -> Splats2D:
     """Splats so wide that α is the opacity in all pixels of a small image.
 
-    The i-th has the i-th of `colors`, by default only channel i.
+    The i-th splat has the i-th color of `colors`; by default, only channel i is not 0.
     """
     count = len(opacities)
     wide = 1e-9

@@ -57,7 +57,7 @@ def test_native_agrees_with_the_reference(native: Variant, with_radii: bool) -> 
 
 
 def test_rows_without_a_gaussian(native: Variant) -> None:
-    """Splats of the id -1 are skipped; if `valid` is False, all are."""
+    """Splats with the id -1 are skipped. If `valid` is False, all splats are skipped."""
     packed, grad = torch.ones(2, 3, 16, dtype=native.dtype)
     packed[::2], grad[::2] = math.nan, math.nan
     splats = splats_of(torch.tensor([-1, 2, -1]), packed, grad)

@@ -72,7 +72,7 @@ def unsigned(keys: Tensor) -> list[int]:
 def sort(
     run: Run, keys: Tensor, bits: tuple[int, int], count: int | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The sorted keys and the numbers they had, in memory with a margin that stays unchanged."""
+    """The sorted keys and their original indices; the memory around the results stays unchanged."""
     n = len(keys)
     dtypes = (keys.dtype, keys.dtype, torch.int32, torch.int32)
     a, b, c, d = (torch.full((n + 8,), 99, dtype=dtype) for dtype in dtypes)
@@ -182,7 +182,7 @@ def bin_splats(
     capacity: int = -1,
     with_slots: bool = True,
 ) -> Binned:
-    """As `rasterize` does, in memory with a margin that stays unchanged."""
+    """Sort splats into tiles as `rasterize` does; the memory around the results stays unchanged."""
     suffix = "" if native.dtype == torch.float32 else "_f64"
     packed = packed.to(native.dtype).contiguous()
     m, stride = packed.shape
@@ -274,8 +274,9 @@ def least_on_edge(a: float, b: float, c: float, fixed: float, low: float, high: 
 def touched_tiles(row: list[float], width: int, height: int, margin: float) -> set[int]:
     """The definition: tiles whose pixel centres span a rectangle in which α reaches about 1/255.
 
-    Only tiles of the rectangle of the ellipse α ≥ 1/255; a single such tile counts as touched.
-    A margin > 0 adds tiles that are nearly touched; < 0 removes tiles that are barely touched.
+    Only the tiles of the rectangle around the ellipse α ≥ 1/255 are considered. If this is a single
+    tile, it counts as touched. A margin > 0 adds tiles that are nearly touched; a margin < 0
+    removes tiles that are barely touched.
     """
     x, y, a, b, c, opacity = row[:6]
     tiles_x = -(-width // TILE)
@@ -341,7 +342,7 @@ def test_tiles_of_images_of_any_size(native: Variant, width: int, height: int) -
 
 @pytest.mark.parametrize("pixels", [15.0, 60.0, 400.0])
 def test_tiles_of_large_splats(native: Variant, pixels: float) -> None:
-    """Ellipses of many tiles at different angles, between small ones; more of them than warps."""
+    """Large ellipses at different angles, between small ones; there are more of them than warps."""
     splats = random_splats(6, 40, 320, 240, pixels=pixels).packed
     small = random_splats(7, 40, 320, 240).packed
     mixed = torch.stack([splats, small], dim=1).flatten(0, 1)
@@ -350,7 +351,7 @@ def test_tiles_of_large_splats(native: Variant, pixels: float) -> None:
 
 
 def test_tiles_are_those_of_the_cpu(native: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Except for rounding where a splat barely touches a tile; in order of depth."""
+    """The lists are equal, except for rounding where a splat barely touches a tile."""
     splats = random_splats(15, 6000, 640, 368, pixels=8.0).packed
     got = bin_splats(native, splats, 640, 368)
     monkeypatch.setitem(natives.LAUNCHERS, "cpu", CPU)
@@ -383,7 +384,7 @@ def test_tiles_beyond_16_bits(native: Variant) -> None:
 
 
 def test_tiles_order_of_depths(native: Variant) -> None:
-    """Equal depths are ordered by row; negative and infinite depths."""
+    """Splats of equal depth are ordered by row. Depths may be negative or infinite."""
     splats = random_splats(9, 300, 48, 32, pixels=6.0).packed
     depths = torch.tensor([2.0, 1.0, -3.0, math.inf, -math.inf, 1e-30, 1e30], dtype=torch.float64)
     splats[:, 6] = depths[torch.randint(0, len(depths), (300,), generator=generator(0))]
@@ -418,7 +419,7 @@ def test_tiles_all_invisible(native: Variant) -> None:
 
 @pytest.mark.parametrize("capacity", [0, 1, 100, 137, 10_000])
 def test_tiles_with_a_small_capacity(native: Variant, capacity: int) -> None:
-    """Only the instances whose slots are within the capacity."""
+    """Only the instances whose slots are within the capacity are stored."""
     splats = random_splats(11, 70, 64, 80, pixels=8.0).packed
     splats[:3, 2:5] = 1e-9 * torch.tensor([1.0, 0.0, 1.0])
     splats[0, 6] = 0.1
@@ -436,7 +437,7 @@ def test_tiles_with_a_small_capacity(native: Variant, capacity: int) -> None:
 
 @pytest.mark.parametrize("size", [64, 300])
 def test_tiles_without_slots(native: Variant, size: int) -> None:
-    """If gradients are summed in no fixed order, there are no slots; the order is the same."""
+    """If the order of gradient sums is not fixed, there are no slots; the lists are the same."""
     if native.engine == "native":
         pytest.skip("the CPU always has slots")
     splats = random_splats(12, 200, size, size, pixels=5.0).packed

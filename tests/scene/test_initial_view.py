@@ -66,7 +66,10 @@ def row_along_x(last: float, count: int) -> torch.Tensor:
 
 
 def distance_that_shows(radius: float) -> float:
-    """At 60° along the longer side, 1.6 times the shorter, which is to show the radius."""
+    """The distance at which the shorter side shows ``radius``.
+
+    The field of view is 60° along the longer side, which is 1.6 times as long as the shorter.
+    """
     return 1.6 * radius / math.tan(math.radians(30))
 
 
@@ -75,12 +78,12 @@ def distance_that_shows(radius: float) -> float:
     [
         # Distances 0, 0.1, 0.1, …, 2, 2: the radius of 95% is 1.9.
         (row_along_x(2.0, 41), 1.9),
-        # The same with a background: half of all is within 1.5, and 2.5 times that is shown.
+        # With a background: half of the points are within 1.5, and 2.5 times that is shown.
         (torch.cat([row_along_x(2.0, 41), row_along_x(1000.0, 2).repeat(10, 1)]), 3.75),
     ],
     ids=["object", "background"],
 )
-def test_overview_contains_what_it_promises(means: torch.Tensor, radius: float):
+def test_overview_contains_the_stated_radius(means: torch.Tensor, radius: float):
     shift = torch.tensor([10.0, 20.0, 30.0])
     hidden = balls(torch.full((100, 3), 77.0), opacity_logit=math.log(0.19 / 0.81))
     seen = balls(means + shift, opacity_logit=math.log(0.21 / 0.79))
@@ -101,7 +104,7 @@ def test_overview_of_a_scene_without_opaque_gaussians_shows_the_others():
 
 
 def test_overview_without_an_extent():
-    """No Gaussians: a radius of 1 around the origin. All in one place: not quite 0."""
+    """Without Gaussians, the radius is 1. If all are in one place, it is slightly above 0."""
     nothing = overview(balls(torch.zeros(0, 3)))
     assert nothing.target == (0, 0, 0)
     assert math.dist(nothing.position, nothing.target) == pytest.approx(distance_that_shows(1.0))

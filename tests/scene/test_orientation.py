@@ -50,8 +50,9 @@ def test_photos_rolled_by_90_degrees_have_little_weight():
 
 @pytest.mark.parametrize("sector", [0.05, 0.5, 3.0])
 def test_the_result_is_the_most_likely_direction(sector):
-    """Of those near it: roll r has the density (σ² + (r/3)²)^(-9/2), the mean pitch a normal one.
+    """It is more likely than the directions near it.
 
+    The roll r has the density (σ² + (r/3)²)^(-9/2); the mean pitch is normally distributed.
     The log-likelihood of ``up`` is −9/2 Σ log(σ² + (x·up / 3)²) + mean·up / σ_pitch².
     """
     found = rotations(0.4, math.radians(4), sector)

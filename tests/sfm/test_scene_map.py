@@ -100,7 +100,7 @@ def test_every_camera_is_inside_and_outliers_are_not_drawn():
             assert (corners > -1).all()
             assert (corners < [width + 1, height + 1]).all()
         assert 1500 < len(dots(root)) <= 1980
-        # The outliers did not reduce the scale of the rest.
+        # The outliers did not change the scale of the drawing.
         spread = np.ptp(np.array([c[5] for c in shown.values()]), axis=0)
         assert spread.max() > 0.5 * max(width, height)
 

@@ -98,7 +98,7 @@ def test_truncated_at_any_length_falls_back_with_a_warning(tmp_path):
 
 
 def test_an_unreadable_file_is_not_treated_as_damaged(tmp_path):
-    """Resuming from an older one would repeat steps without need."""
+    """Otherwise the run would resume from an older checkpoint and repeat steps without need."""
     checkpoint.save(tmp_path, 500, some_tensors(), {})
     checkpoint.save(tmp_path, 1000, some_tensors(), {})
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -182,7 +182,7 @@ while True:
 
 @pytest.mark.slow
 def test_kill_9_during_a_save(tmp_path):
-    """Killed at different moments of a save of 16 MB: a file under its final name is complete."""
+    """The process is killed at different moments of a save of 16 MB. All final files are whole."""
     cut = 0
     for attempt in range(2):
         folder = tmp_path / str(attempt)

@@ -72,7 +72,7 @@ def one_line(error: pytest.ExceptionInfo[BaseException]) -> str:
 
 
 def test_a_nonfinite_gradient_is_skipped(begun) -> None:
-    """The loss of its step is finite: training stops one step later, in a finite state."""
+    """The loss of that step is finite. Training stops one step later, in a finite state."""
     trainer = begun(HUGE_GRADIENTS)
     trainer.gaussians.log_scales[3, 1] = 60.0
     trainer.gaussians.log_scales[7] = 90.0
@@ -120,7 +120,7 @@ def test_nonfinite_parameters(begun, name: str, value: float) -> None:
     with pytest.raises(Diverged, match=rf"Gaussians, .*{name} \(3 rows\)") as error:
         trainer.run(until=5)
     assert re_step(one_line(error)) == 3
-    # They do not spread.
+    # The non-finite values do not spread to other rows.
     for n, found in other.items():
         assert rows_not_finite({n: trainer.state_tensors()[n]}) == found, n
 
@@ -131,7 +131,7 @@ def re_step(text: str) -> int:
 
 @every_density_control
 def test_an_invisible_nonfinite_gaussian_is_found_by_the_refinement(dataset, config) -> None:
-    """Adam of visible Gaussians only does not read it."""
+    """If Adam updates only visible Gaussians, it does not read this one."""
     trainer = Trainer(dataset, config)
     trainer.run(until=2)
     trainer.gaussians.quats[5] = math.nan
@@ -212,7 +212,7 @@ def test_an_invalid_extent(dataset: Dataset, extent: float) -> None:
 
 @pytest.mark.parametrize("far", [1e18, 1e20, 3e38])
 def test_extremely_distant_points(dataset: Dataset, far: float) -> None:
-    """Training runs, or names them."""
+    """Training either runs or reports these points."""
     assert dataset.points is not None
     xyz = dataset.points.xyz.clone()
     xyz[3] = far

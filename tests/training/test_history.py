@@ -46,7 +46,7 @@ def test_only_the_time_of_steps_counts(monkeypatch):
 
 
 def test_it_continues_from_a_checkpoint(tmp_path):
-    """The file may be of a later step than the checkpoint: the steps between are repeated."""
+    """The file may have later steps than the checkpoint. The resumed run repeats these steps."""
     history = filled(1000)
     for step in (400, 800):
         history.measure(step, 20.0 + step / 100, 0.5)

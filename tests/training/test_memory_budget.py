@@ -168,7 +168,7 @@ def test_a_million_gaussians_take_less_than_a_gigabyte_on_a_gpu() -> None:
 
 @pytest.mark.parametrize("random", [20_000, 200_000])
 def test_random_gaussians_are_larger(random: int) -> None:
-    """The initial ones touch three times as many tiles; those added later do not."""
+    """Random initial Gaussians touch three times as many tiles; Gaussians added later do not."""
     with_points = dataset_of(9, 1000, 500)
     config = recipe("default", max_gaussians=140_000, initial_points=random)
     budget = 450_000_000

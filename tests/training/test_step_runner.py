@@ -149,7 +149,7 @@ def test_an_invalid_step_changes_neither_statistics_nor_parameters_nor_moments()
 
 
 def test_a_gradient_is_valid_and_counts_nothing_by_default() -> None:
-    """On images of 8 x 6 pixels, with a gradient of (1, 1) per pixel: |(8/2, 6/2)| = 5."""
+    """The image has 8 x 6 pixels and the gradient is (1, 1) per pixel: |(8/2, 6/2)| = 5."""
     gaussians = GAUSSIANS.clone()
     adam = Adam(gaussians, LearningRates(), schedule=Schedule(10), extent=1.0)
     splats = splats_with_gradient_one()

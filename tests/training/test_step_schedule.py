@@ -26,7 +26,10 @@ def test_fractions():
 
 @pytest.mark.parametrize("iterations", [501, 600, 1000, 1600, 9000])
 def test_stretching(iterations):
-    """At half of 1000 steps: fractions are continuous and monotonic, future moments are reached."""
+    """The schedule is stretched at step 500 of 1000.
+
+    Fractions are continuous and monotonic, and future moments are reached.
+    """
     schedule = Schedule(1000)
     moments = (0.2, 0.4999, 0.5, 0.7, 1.0)
     before = [schedule.share(500, when) for when in moments]

@@ -162,7 +162,7 @@ def test_another_seed_gives_another_scene(dataset):
 @every_density_control
 @pytest.mark.parametrize("stop", [30, 37])
 def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
-    """Before a step that densifies (30), and before one that does not."""
+    """The run is interrupted before step 30, which densifies, or before a step that does not."""
     uninterrupted = trained(dataset, config)
     first = Trainer(dataset, config)
     first.run(until=stop)
@@ -216,7 +216,7 @@ def test_a_checkpoint_of_another_configuration_is_rejected(dataset):
 
 
 def test_a_checkpoint_of_inconsistent_tensors_is_rejected(dataset):
-    """The kernels take one number of rows for all tensors and would read out of bounds."""
+    """The kernels assume equal numbers of rows in all tensors and would read out of bounds."""
     trainer = Trainer(dataset, BUSY)
     trainer.run(until=1)
     state = trainer.state_tensors()
@@ -238,7 +238,7 @@ def test_a_checkpoint_of_inconsistent_tensors_is_rejected(dataset):
 
 
 def test_refinement_waits_for_the_next_step(dataset):
-    """Step 20 densifies; the scene after it is evaluated and saved without that."""
+    """Step 20 densifies, but the scene that is evaluated and saved after it is not densified."""
     counts = []
     Trainer(dataset, BUSY).run(lambda progress: counts.append(progress.gaussians), until=21)
     assert counts[19] == counts[10]
@@ -309,7 +309,7 @@ def test_photos_are_decoded_ahead_in_order_at_the_resolution_of_their_step(datas
 
 
 def test_the_loss_of_a_step(dataset):
-    """Over the background, at the SH degree of the step."""
+    """The image is rendered over the background and with the SH degree of the step."""
     alone = replace(dataset, train=dataset.train[:1])
     trainer = Trainer(alone, replace(CALM, background="white", ssim_weight=0.3))
     trainer.gaussians.sh_rest[:] = 0.2  # of degree 1 to 3, not in use before step 100
@@ -327,7 +327,7 @@ def test_the_background_of_an_evaluation(dataset, background, color):
 
 
 def test_a_fixed_background_is_put_behind_transparent_photos_once(dataset, tmp_path):
-    """A photo over a background is (H, W, 3) uint8; with random ones, its alpha is needed."""
+    """With a fixed background, a photo is stored as (H, W, 3) uint8; a random one needs alpha."""
     Image.new("RGBA", (WIDTH, HEIGHT), (200, 100, 0, 0)).save(tmp_path / "a.png")
     source = ImageSource(tmp_path / "a.png", WIDTH, HEIGHT)
     alone = replace(dataset, train=[replace(dataset.train[0], image=source)])
@@ -352,7 +352,7 @@ def test_the_memory_for_images(dataset):
 
 
 def test_the_generators_of_a_seed(dataset):
-    """What a seed means: a change would give other scenes for the same seed."""
+    """If a generator changes, the same seed produces another scene."""
     seeds = {
         n: g.initial_seed() for n, g in Trainer(dataset, replace(CALM, seed=5))._generators.items()
     }

@@ -55,7 +55,10 @@ def test_resized_cameras_have_square_pixels_and_the_same_area_of_view():
 
 
 def ahead() -> Camera:
-    """At the origin, along z; it sees x / z from −32/60 to 32/60, y / z from −24/60 to 24/60."""
+    """A camera at the origin that looks along z.
+
+    It sees x / z from −32/60 to 32/60 and y / z from −24/60 to 24/60.
+    """
     return Camera(64, 48, 60.0, 60.0, 32.0, 24.0, torch.eye(3, 4, dtype=torch.float64))
 
 

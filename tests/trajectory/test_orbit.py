@@ -125,7 +125,7 @@ def test_orbit_surrounds_most_of_the_points():
 
 
 def test_orbit_is_a_circle_at_three_times_the_median_distance():
-    """15° above the middle. It starts in front of the scene and goes to the right."""
+    """The circle is 15° above the middle. It starts in front of the scene and goes to the right."""
     focus = torch.tensor([1.0, 2.0, 3.0])
     axes = torch.cat([torch.eye(3), -torch.eye(3)])
     # Weighted, the median distance is 2: without weights it would be 50.
@@ -164,7 +164,7 @@ def elevations(path: list[Camera]) -> torch.Tensor:
 
 @pytest.mark.parametrize("turn", [1.0, 3.0])
 def test_an_oval_covers_the_range_of_the_cameras(turn):
-    """Without 10% of them at each end, and at least a quarter as high as wide."""
+    """10% of the cameras at each end are ignored. The height is at least a quarter of the width."""
     cameras = ring(21, 4.0, 4.0, turn)
     path = ellipse_path(cameras, 400, math.hypot(4.0, 1.0))
     middle, swing = turn * 20 / 21 / 2, turn * 20 / 21 / 2 * 0.8
@@ -179,7 +179,7 @@ def test_an_oval_covers_the_range_of_the_cameras(turn):
 
 
 def test_an_oval_is_in_the_middle_of_the_outer_cameras():
-    """Most cameras are on one side: the middle of the 10% and 90% quantiles counts."""
+    """If most cameras are on one side, the middle of the 10% and 90% quantiles is used."""
     cameras = [*ring(31, 4.0, 4.0, 2.0), *ring(30, 4.0, 4.0, 0.2)]
     given = azimuths(cameras)
     low, high = torch.quantile(given, torch.tensor([0.1, 0.9]).double()).tolist()
@@ -237,13 +237,13 @@ def test_axes_of_an_ellipse_are_those_of_the_cameras():
 
 
 def test_spiral_reaches_the_outer_cameras():
-    """80% of the cameras are within its radii. It passes through its middle at its start."""
+    """80% of the cameras are within its radii. The path starts at the middle of the spiral."""
     cameras = wall(21, 11)  # x from 0 to 4, y from 0 to 1.5
     path = spiral_path(cameras, 1000, 5.0)
     places = positions(path) - torch.tensor([2.0, 0.75, 0.0])
     assert float(places[0].norm()) < 1e-6
-    # In the middle of the path it is above its own middle, by the radius in y, 0.6. In x it
-    # reaches sin(0.4 π) of the radius, 1.6.
+    # At half of its length, the path is above the middle of the spiral by the radius in y, 0.6. In
+    # x it reaches sin(0.4 π) of the radius, 1.6.
     assert float(places[500, 1]) == pytest.approx(-0.6, rel=0.01)
     assert float(places[:, 1].abs().max()) == pytest.approx(0.6, rel=0.01)
     assert float(places[:, 0].abs().max()) == pytest.approx(1.6 * math.sin(0.4 * math.pi), rel=0.03)

@@ -14,8 +14,8 @@ from snowsplat.util.process_memory import peak_bytes, reset_peak, resident_bytes
 SOURCES = Path(snowsplat.__file__).parents[1]
 
 
-def test_the_most_that_a_process_held_is_not_its_parents() -> None:
-    """On Linux getrusage would begin with what the parent held when it started the process."""
+def test_the_peak_of_a_process_does_not_include_its_parent() -> None:
+    """On Linux, the peak from getrusage includes the memory of the parent at the start."""
     held = np.ones(50_000_000)  # 400 MB
     code = "from snowsplat.util.process_memory import peak_bytes; print(peak_bytes())"
     environment = os.environ | {"PYTHONPATH": str(SOURCES)}

@@ -6,7 +6,7 @@
 
     HOSTILE["pings"](url)
 
-Nothing here looks at what the servers are made of.
+The clients do not depend on the implementation of the servers.
 """
 
 from __future__ import annotations
@@ -333,13 +333,13 @@ HOSTILE_TO_ANY = ("half open", "long head", "strangers")
 
 
 def hostile(kind: str, url: str, seconds: float) -> None:
-    """Run for a time, or until the server disconnects."""
+    """Run a hostile client for a time, or until the server disconnects."""
     with contextlib.suppress(OSError):
         HOSTILE[kind](url, seconds)
 
 
 def crowd(url: str, seconds: float, kinds: dict[str, int]) -> None:
-    """Run this number of each kind, at once."""
+    """Run several hostile clients at the same time; ``kinds`` has the number of each kind."""
     threads = [
         threading.Thread(target=hostile, args=(kind, url, seconds), daemon=True)
         for kind, count in kinds.items()

@@ -175,7 +175,7 @@ def test_errors_in_the_child_are_in_the_log(tmp_path, photos):
 
 
 def test_files_that_cannot_grow_are_reported(tmp_path, photos):
-    """As on a full disk, where COLMAP crashes; simulated by a limit of the file size."""
+    """COLMAP crashes on a full disk. The test simulates this by a limit of the file size."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
     try:

@@ -58,7 +58,8 @@ def test_more_effort_is_useless_without_overlap_or_motion():
     assert Evidence([0] * 5, [], None, 10).more_effort_is_useless
     assert Evidence([2000] * 5, [], None, 10).more_effort_is_useless
     assert not Evidence([2000] * 5, [], None, 4).more_effort_is_useless  # not all pairs matched
-    assert not Evidence([300] * 5, [], None, 10).more_effort_is_useless  # too few features yet
+    # With so few features, more effort may find more of them.
+    assert not Evidence([300] * 5, [], None, 10).more_effort_is_useless
     assert not Evidence([2000] * 5, all_pairs(5), 0.1, 10).more_effort_is_useless
     assert Evidence([2000] * 5, all_pairs(5), 0.001, 10).more_effort_is_useless
     assert Evidence([2000] * 5, all_pairs(5, flat=True), 0.1, 10).more_effort_is_useless

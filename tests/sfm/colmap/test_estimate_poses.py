@@ -179,7 +179,7 @@ def test_photos_of_another_scene_are_named(tmp_path, pictures):
     assert len(result.registered) == 10
     assert "hardly any detail" in result.unregistered["010.png"]
     assert result.unregistered["011.png"] == "it matches no other photo"
-    # More effort cannot add these two: no second attempt.
+    # More effort cannot add these two photos, so there is no second attempt.
     assert len(result.attempts) == 1
 
 

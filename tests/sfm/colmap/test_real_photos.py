@@ -34,7 +34,7 @@ def centres(model):
 
 
 def largest_centre_error(found, given):
-    """Relative to the extent of the given centres, after the best similarity transform."""
+    """The largest error, relative to the extent of the given centres, after the best alignment."""
     names = sorted(found.keys() & given.keys())
     a, b = (torch.tensor([c[name].tolist() for name in names]) for c in (found, given))
     error = (similarity_from_points(a, b).apply(a) - b).norm(dim=1).max()

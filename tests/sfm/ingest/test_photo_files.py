@@ -62,7 +62,7 @@ def test_every_orientation_becomes_upright(ending, orientation, tmp_path):
 
 
 def test_colmap_ignores_the_exif_orientation(tmp_path):
-    """Otherwise, COLMAP would rotate pixels that are already upright."""
+    """If COLMAP applied it, pixels that are already upright would be rotated."""
     stored(photo(), 6).save(tmp_path / "a.jpg", exif=exif({0x0112: 6}))
     assert pycolmap.Bitmap.read(str(tmp_path / "a.jpg"), True).width == HEIGHT
 

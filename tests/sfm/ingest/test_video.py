@@ -112,7 +112,7 @@ def test_a_damaged_video_is_read_as_far_as_possible_with_a_warning(tmp_path, cap
 
 
 def test_colours(tmp_path):
-    """With the colour matrix that is named in the file, and with the default for its size."""
+    """They are correct with the colour matrix of the file, and with the default for its size."""
     colours = np.zeros((720, 1280, 3), np.uint8)
     colours[:360], colours[360:] = (210, 40, 60), (30, 190, 50)
     colours[::16, ::16] = 255  # some detail, as uniform frames are skipped

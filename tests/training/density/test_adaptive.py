@@ -23,7 +23,7 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.view_gradient import ViewGradient
 
 EXTENT = 10.0  # with percent_dense = 0.01: scales up to 0.1 are cloned, larger ones split
-#: φ of section 5.2. Written here, not imported: the tests must notice another value.
+#: φ of section 5.2. It is not imported, so that the tests detect a changed value.
 PHI = 1.6
 
 
@@ -42,7 +42,7 @@ def gaussians_of(scales: list[float], opacity: float = 0.5) -> Gaussians:
 
 
 def names(gaussians: Gaussians) -> list[int]:
-    """The original Gaussians that these came from, in ascending order."""
+    """The indices of the original Gaussians from which these were made, in ascending order."""
     return sorted(int(name) for name in gaussians.sh_dc[:, 0, 0])
 
 
@@ -202,7 +202,8 @@ def test_small_ones_are_cloned_large_ones_are_split_others_unchanged():
     assert not torch.equal(children.means[0], children.means[1])
     torch.testing.assert_close(children.scales, torch.full((2, 3), 0.5 / PHI))
     assert torch.equal(children.quats, before.quats[[1, 1]])
-    # The original of a clone keeps its moments, and so moves away; its copy and children have none.
+    # The original of a clone keeps its moments, so it moves away from its copy. Copies and
+    # children have no moments.
     moments = adam.exp_avg["means"][:, 0]
     assert sorted(moments[rows[0]].tolist()) == [0.0, 1.0]
     assert moments[rows[1]].tolist() == [0.0, 0.0]
@@ -214,7 +215,7 @@ def test_small_ones_are_cloned_large_ones_are_split_others_unchanged():
 
 
 def test_children_are_drawn_from_their_parent():
-    """Whitened by the parent's covariance, 4000 children are standard normal."""
+    """The positions of 4000 children, whitened by the parent's covariance, are standard normal."""
     n = 2000
     parent = gaussians_of([0.5])
     parent.means[0] = torch.tensor([30.0, -20.0, 10.0])
@@ -231,7 +232,7 @@ def test_children_are_drawn_from_their_parent():
 
 
 def test_children_depend_on_the_generator_of_the_control_alone():
-    """Not on that of torch, which other code uses as well."""
+    """They do not depend on the global generator of torch, which other code uses, too."""
     scenes = []
     for seed in (1, 2):
         torch.manual_seed(seed)
@@ -251,7 +252,10 @@ def test_the_first_and_last_step_densify(step):
 
 
 def test_thresholds_are_exclusive():
-    """Gradients above τ, opacities below ε, scales above the limit (all exact in binary)."""
+    """Only gradients above τ, opacities below ε and scales above the limit count.
+
+    All of these values are exact in binary.
+    """
     gaussians = gaussians_of([2.5, 2.5, 3.0, 2.5])
     gaussians.opacity_logits[:] = torch.tensor([0.0, 0.0, 0.0, -1e-3])  # 0.5, and a little less
     gaussians.log_scales[:2] = math.log(2.5)
@@ -271,7 +275,7 @@ def test_nonfinite_parameters_stop_a_refinement():
     gaussians = gaussians_of([0.05, 0.05])
     gaussians.means[1, 2] = math.nan
     control, adam = set_up(gaussians)
-    control.after_step(650, gaussians, adam)  # does not refine
+    control.after_step(650, gaussians, adam)  # not a step with densification
     with pytest.raises(Diverged, match=r"^step 600: non-finite Gaussians, means \(1 row\)"):
         control.after_step(600, gaussians, adam)
 

@@ -54,7 +54,7 @@ def set_up(gaussians: Gaussians, **settings: object) -> tuple[McmcDensityControl
 @pytest.mark.parametrize("copies", [1, 2, 3, 7, 51])
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
 def test_equation_9_as_the_paper_writes_it(opacity, copies):
-    """The double sum, term by term."""
+    """Compared with the double sum of the paper, computed term by term."""
     new, shrink = shared_opacity(
         torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies])
     )
@@ -81,7 +81,7 @@ def test_opaque_gaussians_and_many_copies_stay_finite():
 
 
 def test_equation_9_stays_on_its_device():
-    """With fake tensors: mixing devices is an error."""
+    """The tensors are fake; an operation that mixes devices raises an error."""
     with FakeTensorMode():
         opacities = torch.rand(5, device="cuda")
         copies = torch.ones(5, dtype=torch.int64, device="cuda")
@@ -116,7 +116,7 @@ def test_dead_are_relocated_onto_live_ones():
     assert refined.means.isfinite().all()
     copies = torch.bincount(sources, minlength=200)
     assert (copies[~dead] >= 1).all()
-    # The copies in one place are together as opaque as the original, and have no momentum.
+    # All copies in one place are together as opaque as the original. Their moments are 0.
     together = 1 - (1 - refined.opacities.double()) ** copies[sources]
     torch.testing.assert_close(together, total.new_full((200,), 0.5), atol=1e-5, rtol=0)
     crowded = copies[sources] > 1
@@ -190,7 +190,7 @@ def test_when_gaussians_are_relocated(step, relocates):
 
 
 def test_noise_is_scaled_by_the_learning_rate_of_the_means():
-    """At every step, also those that do not relocate."""
+    """Noise is added at every step, also at steps without relocation."""
     moved = []
     for step in (7, 30_000):
         gaussians = some_gaussians(50, opacity=0.001)
@@ -203,7 +203,7 @@ def test_noise_is_scaled_by_the_learning_rate_of_the_means():
 
 
 def test_gaussians_at_the_opacity_limit_are_dead():
-    """With only dead ones there is nothing to relocate to."""
+    """If all Gaussians are dead, none can be relocated."""
     gaussians = some_gaussians(10)
     gaussians.opacity_logits[:] = 0.0
     control, adam = set_up(gaussians, prune_opacity=0.5)
@@ -221,7 +221,7 @@ def test_nothing_to_relocate_and_no_growth_changes_nothing():
 
 
 def test_the_opacity_of_copies_stays_above_the_limit():
-    """Else they would be dead at once: o_new of eq. 9 is below it for many copies."""
+    """Otherwise the copies would be dead at once: with many copies, o_new of eq. 9 is below it."""
     gaussians = some_gaussians(60)
     gaussians.opacity_logits[1:] = -9.0
     gaussians.opacity_logits[0] = math.log(0.02 / 0.98)

@@ -85,7 +85,8 @@ def test_the_page_contains_the_results(trained, tmp_path):
         f"snowsplat view '{NAME}'",
     ):
         assert expected in content
-    # The worst first; the best first among the best; each view in the table.
+    # The worst views are sorted with the worst first, the best views with the best first. The table
+    # has every view.
     order = sorted(evaluation.views, key=lambda view: view.psnr)
     shown = [f"{view.name}: PSNR" for view in (*order[:3], order[-1], order[-2])]
     places = [content.index(name) for name in shown]
@@ -105,7 +106,7 @@ def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path
 
 
 def test_train_writes_it_and_a_resumed_training_continues_its_curves(tmp_path):
-    """On the command line. The page contains names, but no absolute paths."""
+    """The command line is used. The page contains names, but no absolute paths."""
     from snowsplat.cli.main import main
 
     write_toy_dataset(tmp_path / "photos", n_views=9, width=48, height=36, n_points=300)

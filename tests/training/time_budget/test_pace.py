@@ -112,7 +112,7 @@ def test_the_number_of_steps_converges():
 
 
 def test_one_slow_step_is_an_outlier():
-    """The computer sleeps for ten seconds: they are lost, but later predictions do not change."""
+    """The computer sleeps for ten seconds. This time is lost; later predictions do not change."""
 
     def sleepy(downscale: int, gaussians: int, when: float) -> float:
         asleep = 0.5 < when < 0.5001 or (when > 0.5 and not slept)
@@ -147,7 +147,7 @@ def test_a_pause_moves_the_deadline():
 
 
 def test_no_time():
-    """The schedule is completed in few steps."""
+    """If there is no time, the schedule is completed in few steps."""
     machine = Machine(recipe("default"), usual)
     machine.train(0.01, 3000)
     assert machine.shares[-1] == 1.0

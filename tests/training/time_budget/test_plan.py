@@ -106,7 +106,7 @@ def test_plans_as_text():
 
 
 def test_the_speed_of_this_machine(tmp_path):
-    """It is positive, and measuring it does not change the dataset."""
+    """The measured speed is positive, and measuring does not change the dataset."""
     for format, points in (("colmap-bin", 300), ("blender", None)):
         folder = tmp_path / format
         write_toy_dataset(folder, format, 9, 48, 36, n_points=300)

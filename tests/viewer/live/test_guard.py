@@ -256,7 +256,7 @@ def test_a_client_of_another_version_is_rejected(local, capfd):
 
 
 def test_invalid_messages_are_ignored(local, capfd, caplog):
-    """There is no output, nothing is stored, and the next client is served."""
+    """The server prints nothing, stores nothing, and serves the next client."""
     logging.getLogger("websockets.server").filters.clear()  # viser's own, since its first request
     for garbage in (b"\x16\x03\x01\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n", b""):
         ask(local.url, garbage + b"\r\n")

@@ -82,7 +82,7 @@ def press(page: Page, name: str) -> None:
 
 
 def choose(page: Page, now: str, name: str) -> None:
-    """Another entry of the list that shows ``now``."""
+    """Choose the entry ``name`` of the list that shows ``now``."""
     box = f"[...document.querySelectorAll('input')].find(i => i.value === '{now}')"
     page.wait_for("!!" + box)
     page.evaluate(f"(() => {{ const i = {box}; i.focus(); i.click(); }})()")
@@ -97,7 +97,7 @@ def step_of(page: Page) -> int:
 
 
 def scene(page: Page) -> np.ndarray:
-    """What is to the left of the controls and below the browser's own notes."""
+    """The part of the screenshot left of the controls and below the messages of the browser."""
     return page.screenshot()[200:, :560].astype(int)
 
 

@@ -46,7 +46,7 @@ def test_a_page_is_served_and_the_port_is_released(capfd):
 
 
 def test_a_viser_that_does_not_start_through_the_guard_is_stopped(monkeypatch):
-    """It would accept anyone: no page is better."""
+    """It would accept all clients, which is worse than no page."""
     monkeypatch.setattr(
         "snowsplat.viewer.live.server._guarded", lambda guard: contextlib.nullcontext()
     )

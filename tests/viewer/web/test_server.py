@@ -211,7 +211,7 @@ def test_two_requests_at_once_have_two_responses(server):
 
 
 def test_an_incomplete_request_times_out(monkeypatch):
-    """Also if it arrives byte by byte."""
+    """The time limit also applies if the request arrives byte by byte."""
     monkeypatch.setattr(static_server, "_REQUEST_SECONDS", 0.5)
     with StaticServer(FILES, POLICY) as server, clients.open_socket(server.url) as client:
         began = time.monotonic()
@@ -240,7 +240,7 @@ def test_a_client_that_does_not_read_is_disconnected(monkeypatch):
 
 
 def test_a_thousand_connections(server):
-    """Each sends half a request: others are served, threads and descriptors are limited."""
+    """Each sends half a request. Others are served; threads and descriptors are limited."""
     threads, descriptors = threading.active_count(), len(os.listdir("/proc/self/fd"))
     known = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
     path = "/" + server.url.split("/", 3)[3]
