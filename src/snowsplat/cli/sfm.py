@@ -81,7 +81,7 @@ class Sfm:
         """Returns the exit code, 0."""
         from snowsplat.sfm.dataset_folder import make_dataset
 
-        inputs, folder = self._where()
+        inputs, folder = self._inputs_and_folder()
         options = self._options()
         with TerminalObserver(self.quiet) as observer:
             outcomes = make_dataset(inputs, folder, options, observer, self.overwrite)
@@ -94,7 +94,8 @@ class Sfm:
         print(f"train it with: snowsplat train {folder} -o OUT --eval")
         return 0
 
-    def _where(self) -> tuple[tuple[Path, ...], Path]:
+    def _inputs_and_folder(self) -> tuple[tuple[Path, ...], Path]:
+        """The inputs, and the folder of the dataset. Raises UserError if flags do not match."""
         if self.source_path is not None:
             if self.inputs:
                 raise UserError("-s LOCATION uses the photos in LOCATION/input; leave out INPUT")

@@ -90,15 +90,15 @@ def accessor(document: dict[str, Any], binary: memoryview, index: int, kind: str
     if entry["type"] != kind or entry["componentType"] not in _COMPONENTS or "sparse" in entry:
         raise Damaged(f"its accessor {index} does not have the type of its attribute")
     code, divisor = _COMPONENTS[entry["componentType"]]
-    dtype, width, count = np.dtype(code), _WIDTHS[kind], _natural(entry["count"])
+    dtype, width, count = np.dtype(code), _WIDTHS[kind], _non_negative(entry["count"])
     view = _item(document, "bufferViews", entry["bufferView"])
     buffer = _item(document, "buffers", view["buffer"])
     if view["buffer"] != 0 or "uri" in buffer:
         raise Damaged("its data is in another file, which is not supported")
     row = width * dtype.itemsize
-    stride = _natural(view.get("byteStride", row))
-    start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])
-    offset = _natural(entry.get("byteOffset", 0))
+    stride = _non_negative(view.get("byteStride", row))
+    start, length = _non_negative(view.get("byteOffset", 0)), _non_negative(view["byteLength"])
+    offset = _non_negative(entry.get("byteOffset", 0))
     needed = offset + (stride * (count - 1) + row if count else 0)
     if stride < row or needed > length or start + length > len(binary):
         raise Damaged(f"its accessor {index} exceeds the file")
@@ -160,13 +160,13 @@ def _local(node: dict[str, Any]) -> np.ndarray:
 
 def _item(document: dict[str, Any], name: str, index: Any) -> dict[str, Any]:
     """An element of one of the top-level arrays."""
-    entry = document[name][_natural(index)]
+    entry = document[name][_non_negative(index)]
     if not isinstance(entry, dict):
         raise TypeError
     return entry
 
 
-def _natural(value: Any) -> int:
+def _non_negative(value: Any) -> int:
     if not isinstance(value, int) or value < 0:
         raise ValueError
     return value

@@ -121,11 +121,12 @@ class TrainingRun:
                 if self.trainer.step == 0:
                     raise
                 raise TrainingStopped(
-                    f"stopped within a step, which is not saved; {self._last_good()}", None
+                    f"stopped within a step, which is not saved; {self._last_checkpoint_as_text()}",
+                    None,
                 ) from None
         except Diverged as error:
             self.out.discard()
-            raise UserError(f"{error}; {self._last_good()}") from None
+            raise UserError(f"{error}; {self._last_checkpoint_as_text()}") from None
         except BaseException:
             self.out.discard()
             raise
@@ -209,7 +210,8 @@ class TrainingRun:
         self.last_checkpoint = time.monotonic()
         return path
 
-    def _last_good(self) -> str:
+    def _last_checkpoint_as_text(self) -> str:
+        """The part of an error message that says which checkpoint can be used."""
         from snowsplat.training import checkpoint
 
         saved = checkpoint.files(self.out.checkpoints)

@@ -172,10 +172,12 @@ def render_video(
 
 @dataclass(frozen=True)
 class _Source:
+    """The scene to render, and the default file of the video."""
+
     gaussians: Gaussians
     cameras: tuple[list[str], list[Camera]] | None  # names and cameras of the photos
     background: tuple[float, float, float]
-    file: Path  # of the video
+    file: Path  # where the video is written if the user names no file
 
 
 def _load(scene: Path, iteration: int | None, name: str) -> _Source:

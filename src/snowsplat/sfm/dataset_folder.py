@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 STAGES = ("photos", "poses", "images", "report")
 RECORD, REPORT = "capture.json", "capture_report.html"
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "masks", "sparse")
-_OURS = ("distorted", *_IMAGE_FOLDERS, RECORD, REPORT)
+_OUTPUT_NAMES = ("distorted", *_IMAGE_FOLDERS, RECORD, REPORT)
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def _run(
 
         facts = {
             "inputs": stages.about["inputs"],
-            "settings": _plain(options),
+            "settings": _settings_as_json(options),
             "gathered": outcomes["photos"].result,
             "sfm": outcomes["poses"].result,
             "undistorted": outcomes["images"].result,
@@ -281,7 +281,7 @@ def _remove_on_failure(folder: Path) -> Iterator[None]:
         record = folder / RECORD
         resumable = record.is_file() and Stages(record, STAGES).is_finished("photos")
         if RECORD not in before and (isinstance(error, UserError) or not resumable):
-            for name in {"input", ".new", *_OURS} - before:
+            for name in {"input", ".new", *_OUTPUT_NAMES} - before:
                 _remove(folder / name)
             if not existed and folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
@@ -322,6 +322,7 @@ def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
     return photos
 
 
-def _plain(options: DatasetOptions) -> dict[str, Any]:
+def _settings_as_json(options: DatasetOptions) -> dict[str, Any]:
+    """The options of all stages in one dict, as the report shows them."""
     values = asdict(options)
     return {**values.pop("gather"), **values.pop("sfm"), **values}

@@ -24,8 +24,8 @@ _POINTS_SAMPLED = 5000  # number of points from which medians are computed
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """The required parts of a model, in the world frame of SfM; cameras are sorted by name."""
+class _ModelData:
+    """The data of a model that are used here, in the world frame of SfM; cameras sorted by name."""
 
     rotations: np.ndarray  # (N, 3, 3) of cam_from_world: the rows are the cameras' x, y, z axes
     centres: np.ndarray  # (N, 3)
@@ -47,21 +47,21 @@ def orientation(model: pycolmap.Reconstruction) -> Similarity:
     Raises:
         ValueError: the model has no cameras.
     """
-    seen = _read(model)
-    if not len(seen.centres):
+    data = _read(model)
+    if not len(data.centres):
         raise ValueError("a model without cameras has no orientation")
-    up = up_direction(seen.rotations)
-    forward = _heading(seen, up)
+    up = up_direction(data.rotations)
+    forward = _heading(data, up)
     down = -up
     rotation = np.stack([np.cross(down, forward), down, forward])
-    scale = VIEWING_DISTANCE / _distance(seen)
-    middle = _middle(seen)
+    scale = VIEWING_DISTANCE / _distance(data)
+    middle = _middle(data)
     return Similarity(
         scale, torch.from_numpy(rotation), torch.from_numpy(-scale * rotation @ middle)
     )
 
 
-def _read(model: pycolmap.Reconstruction) -> _Seen:
+def _read(model: pycolmap.Reconstruction) -> _ModelData:
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
     rotations = poses[:, :, :3]
@@ -84,14 +84,14 @@ def _read(model: pycolmap.Reconstruction) -> _Seen:
         of_camera = lengths[pairs[:, 0] == i]
         if len(of_camera):
             distances[i] = np.median(of_camera)
-    return _Seen(rotations, centres, points, distances)
+    return _ModelData(rotations, centres, points, distances)
 
 
-def _heading(seen: _Seen, up: np.ndarray) -> np.ndarray:
+def _heading(data: _ModelData, up: np.ndarray) -> np.ndarray:
     """(3,) horizontal: the mean viewing direction; if it is too short, that of the first camera."""
     level = np.eye(3) - np.outer(up, up)
     # For a camera that looks straight down, use the direction of its upper image edge.
-    candidates = (seen.forward.mean(axis=0), seen.forward[0], -seen.rotations[0, 1])
+    candidates = (data.forward.mean(axis=0), data.forward[0], -data.rotations[0, 1])
     for direction, least in zip(candidates, (0.5, 0.1, 0.0), strict=True):
         horizontal = level @ direction
         length = float(np.linalg.norm(horizontal))
@@ -100,27 +100,27 @@ def _heading(seen: _Seen, up: np.ndarray) -> np.ndarray:
     return horizontal / length
 
 
-def _middle(seen: _Seen) -> np.ndarray:
+def _middle(data: _ModelData) -> np.ndarray:
     """(3,) the point where the optical axes meet; if they do not, the median of the points."""
-    meeting = _meeting_point(seen)
+    meeting = _meeting_point(data)
     if meeting is not None:
         return meeting
-    if len(seen.points):
-        return np.median(seen.points, axis=0)
-    return np.median(seen.centres, axis=0)
+    if len(data.points):
+        return np.median(data.points, axis=0)
+    return np.median(data.centres, axis=0)
 
 
-def _meeting_point(seen: _Seen) -> np.ndarray | None:
+def _meeting_point(data: _ModelData) -> np.ndarray | None:
     """(3,) the point with the least sum of distances to the optical axes.
 
     None if the axes are nearly parallel, if they do not come close to one point, or if that point
     is behind the cameras. Computed by iteratively reweighted least squares.
     """
-    axes, centres = seen.forward, seen.centres
+    axes, centres = data.forward, data.centres
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (N, 3, 3)
     if np.linalg.eigvalsh(across.mean(axis=0))[0] < math.sin(math.radians(10)) ** 2:
         return None
-    typical = _distance(seen)
+    typical = _distance(data)
     weights = np.ones(len(axes))
     for _ in range(30):
         matrix = np.einsum("n,nij->ij", weights, across)
@@ -132,10 +132,10 @@ def _meeting_point(seen: _Seen) -> np.ndarray | None:
     return point if is_met else None
 
 
-def _distance(seen: _Seen) -> float:
+def _distance(data: _ModelData) -> float:
     """Median distance from a camera to its points; without points, to the median camera."""
-    distances = seen.distances[np.isfinite(seen.distances)]
+    distances = data.distances[np.isfinite(data.distances)]
     if not len(distances):
-        distances = np.linalg.norm(seen.centres - np.median(seen.centres, axis=0), axis=1)
+        distances = np.linalg.norm(data.centres - np.median(data.centres, axis=0), axis=1)
     distance = float(np.median(distances))
     return distance if distance > 0 else 1.0

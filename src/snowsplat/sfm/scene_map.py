@@ -44,16 +44,18 @@ class PlacedPhoto:
 
 
 @dataclass(frozen=True)
-class _Side:
+class _Projection:
+    """An orthographic projection of the scene."""
+
     title: str
     right: np.ndarray  # (3,) world direction that points to the right of the drawing
-    down: np.ndarray
+    down: np.ndarray  # (3,) world direction that points down in the drawing
 
 
-_Flat = Callable[[np.ndarray], np.ndarray]  # (n, 3) world to (n, 2) of the drawing
+_Project = Callable[[np.ndarray], np.ndarray]  # (n, 3) world to (n, 2) of the drawing
 
 _X, _Y, _Z = np.eye(3)
-_SIDES = (_Side("From above", _X, -_Z), _Side("From the side", _Z, _Y))
+_PROJECTIONS = (_Projection("From above", _X, -_Z), _Projection("From the side", _Z, _Y))
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Drawing:
 
 
 def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) -> list[Drawing]:
-    """One drawing for each side, of points (P, 3) and their colours (P, 3) uint8.
+    """One drawing for each projection, of points (P, 3) and their colours (P, 3) uint8.
 
     All cameras are inside. Points are drawn if they are near the cameras and not outliers.
     """
@@ -75,12 +77,24 @@ def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) 
     shown = np.flatnonzero(inside)
     # Random points, because evenly chosen ones could follow a pattern in the order of the points.
     shown = shown[np.random.default_rng(0).permutation(len(shown))[:_MOST_POINTS]]
-    extents = [np.abs((high - low) @ np.stack([side.right, side.down], 1)) for side in _SIDES]
+    extents = [
+        np.abs((high - low) @ np.stack([projection.right, projection.down], 1))
+        for projection in _PROJECTIONS
+    ]
     scale = min(_fit(extent) for extent in extents)
     depth = _frustum_depth(centres, high - low)
     return [
-        _draw(side, photos, xyz[shown], rgb[shown], (low + high) / 2, extent * scale, scale, depth)
-        for side, extent in zip(_SIDES, extents, strict=True)
+        _draw(
+            projection,
+            photos,
+            xyz[shown],
+            rgb[shown],
+            (low + high) / 2,
+            extent * scale,
+            scale,
+            depth,
+        )
+        for projection, extent in zip(_PROJECTIONS, extents, strict=True)
     ]
 
 
@@ -110,7 +124,7 @@ def _frustum_depth(centres: np.ndarray, size: np.ndarray) -> float:
 
 
 def _draw(
-    side: _Side,
+    projection: _Projection,
     photos: Sequence[PlacedPhoto],
     xyz: np.ndarray,
     rgb: np.ndarray,
@@ -120,23 +134,23 @@ def _draw(
     depth: float,
 ) -> Drawing:
     width, height = (float(value) + 2 * _MARGIN for value in extent)
-    axes = np.stack([side.right, side.down], 1)
+    axes = np.stack([projection.right, projection.down], 1)
 
-    def flat(points: np.ndarray) -> np.ndarray:
+    def project(points: np.ndarray) -> np.ndarray:
         return (points - middle) @ axes * scale + (width / 2, height / 2)
 
     parts = [
-        f'<svg class="map" xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{side.title}" '
+        f'<svg class="map" xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{projection.title}" '
         f'viewBox="0 0 {width:.0f} {height:.0f}">',
         f'<rect width="{width:.0f}" height="{height:.0f}" rx="6" fill="#1f242c"/>',
-        *_points(flat(xyz), rgb),
-        *_paths(photos, flat),
+        *_points(project(xyz), rgb),
+        *_paths(photos, project),
         '<g fill="#ffb454" fill-opacity="0.12" stroke="#ffb454" stroke-width="0.7" '
         'stroke-linejoin="round">',
     ]
     for i, photo in enumerate(photos):
-        a, b, c, d = (_at(xy) for xy in flat(photo.corners(depth)))
-        eye = _at(flat(photo.centre[None])[0])
+        a, b, c, d = (_svg_position(xy) for xy in project(photo.corners(depth)))
+        eye = _svg_position(project(photo.centre[None])[0])
         first = ' stroke="#ffffff" stroke-width="1.6"' if i == 0 else ""
         parts.append(
             f'<path{first} d="M{a}L{b}L{c}L{d}ZM{a}L{eye}L{b}M{c}L{eye}L{d}">'
@@ -153,20 +167,20 @@ def _points(xy: np.ndarray, rgb: np.ndarray) -> list[str]:
     for shade in np.unique(shades, axis=0):
         here = xy[(shades == shade).all(axis=1)]
         red, green, blue = (int(v) for v in np.rint(45 + shade * (210 / (_SHADES - 1))))
-        dots = "".join(f"M{_at(position)}h0" for position in here)
+        dots = "".join(f"M{_svg_position(position)}h0" for position in here)
         lines.append(f'<path stroke="#{red:02x}{green:02x}{blue:02x}" d="{dots}"/>')
     opening = '<g fill="none" stroke-width="1.7" stroke-linecap="round" stroke-opacity="0.85">'
     return [opening, *lines, "</g>"]
 
 
-def _paths(photos: Sequence[PlacedPhoto], flat: _Flat) -> list[str]:
+def _paths(photos: Sequence[PlacedPhoto], project: _Project) -> list[str]:
     """The camera path of each video."""
     lines = []
     for sequence in dict.fromkeys(photo.sequence for photo in photos):
         if sequence is None:
             continue
         centres = np.array([photo.centre for photo in photos if photo.sequence == sequence])
-        way = " ".join(_at(xy) for xy in flat(centres))
+        way = " ".join(_svg_position(xy) for xy in project(centres))
         lines.append(
             f'<polyline fill="none" stroke="#7cc7ff" stroke-width="1" points="{way}">'
             f"<title>{escape(sequence)}</title></polyline>"
@@ -178,12 +192,13 @@ def _scale_bar(height: float, scale: float) -> str:
     length = next(v for v in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 1e9) if v * scale > 25)
     y, x = height - 10, 12.0
     unit = "unit" if length == 1 else "units"
+    start = _svg_position((x, y))
     return (
-        f'<path d="M{_at((x, y))}h{length * scale:.1f}" stroke="#aab4c0" stroke-width="2"/>'
+        f'<path d="M{start}h{length * scale:.1f}" stroke="#aab4c0" stroke-width="2"/>'
         f'<text x="{x:.0f}" y="{y - 6:.0f}" fill="#aab4c0" font-size="11" '
         f'font-family="sans-serif">{length:g} {unit}</text>'
     )
 
 
-def _at(xy: Sequence[float] | np.ndarray) -> str:
+def _svg_position(xy: Sequence[float] | np.ndarray) -> str:
     return f"{xy[0]:.1f} {xy[1]:.1f}"

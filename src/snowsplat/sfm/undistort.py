@@ -177,14 +177,14 @@ def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> bool:
     """Write the image, its smaller copies and its mask; returns whether a mask was written."""
     source, target = dataset / "input" / job.name, dataset / "images" / job.name
     opaque = None
-    with _opened(source, job) as opened:
+    with _open_photo(source, job) as opened:
         form = "JPEG" if opened.format == "MPO" else str(opened.format)
         if job.pinhole.nodes is None:
-            with _into(target) as temporary:
+            with _atomic_path_in_new_folder(target) as temporary:
                 shutil.copyfile(source, temporary)
         if job.pinhole.nodes is not None or divisors or job.mask:
             profile = opened.info.get("icc_profile")
-            photo = _eight_bit(_decoded(opened, source))
+            photo = _eight_bit(_decode(opened, source))
             opaque = np.asarray(photo)[..., 3] > 0 if photo.mode == "RGBA" else None
         if job.pinhole.nodes is not None or divisors:
             image = undistort_image(photo, job.pinhole)
@@ -192,15 +192,15 @@ def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> bool:
                 _save(image, target, form, profile)
             for divisor in divisors:
                 folder = dataset / f"images_{divisor}"
-                _save(_divided(image, divisor), folder / job.name, form, profile)
+                _save(_reduced(image, divisor), folder / job.name, form, profile)
     return job.mask and _undistort_mask(dataset, job, opaque)
 
 
 def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> bool:
     name = f"{job.name}.png"
     path = dataset / "distorted" / "masks" / name
-    with _opened(path, job) as opened:
-        mask = _decoded(opened, path).convert("L")
+    with _open_photo(path, job) as opened:
+        mask = _decode(opened, path).convert("L")
     if opaque is not None:
         # SfM ignores transparent pixels; training uses them as empty space.
         counts = (np.asarray(mask) >= 128) | ~opaque
@@ -211,7 +211,7 @@ def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> bool
     return True
 
 
-def _opened(path: Path, job: _Job) -> Image.Image:
+def _open_photo(path: Path, job: _Job) -> Image.Image:
     try:
         image = open_image(path, list(_SAVING))
     except FileNotFoundError:
@@ -227,7 +227,7 @@ def _opened(path: Path, job: _Job) -> Image.Image:
     return image
 
 
-def _decoded(opened: Image.Image, path: Path) -> Image.Image:
+def _decode(opened: Image.Image, path: Path) -> Image.Image:
     try:
         opened.load()
     except Exception as error:  # as above
@@ -245,7 +245,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
     return image if image.mode in ("L", "RGB") else image.convert("RGB")
 
 
-def _divided(image: Image.Image, divisor: int) -> Image.Image:
+def _reduced(image: Image.Image, divisor: int) -> Image.Image:
     """The image at 1/``divisor`` of its size, averaged over areas; rounded as in `data`."""
     width, height = (max(1, round(side / divisor)) for side in image.size)
     # Colours are multiplied by alpha, so that transparent pixels do not bleed into others.
@@ -256,12 +256,12 @@ def _divided(image: Image.Image, divisor: int) -> Image.Image:
     return Image.frombytes(mode, (width, height), small.tobytes()).convert(image.mode)
 
 
-def _into(path: Path) -> AbstractContextManager[Path]:
+def _atomic_path_in_new_folder(path: Path) -> AbstractContextManager[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     return atomic_path(path)
 
 
 def _save(image: Image.Image, path: Path, form: str, profile: bytes | None = None) -> None:
     """Save without metadata except the colour profile, which defines the colours."""
-    with _into(path) as temporary:
+    with _atomic_path_in_new_folder(path) as temporary:
         image.save(temporary, form, icc_profile=profile, **_SAVING[form])

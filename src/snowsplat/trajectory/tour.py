@@ -29,7 +29,7 @@ def in_order(cameras: Sequence[Camera], names: Sequence[str], distance: float) -
         names: their names.
         distance: world units from the cameras to what they see.
     """
-    by_name = sorted(range(len(names)), key=lambda i: _natural(names[i]))
+    by_name = sorted(range(len(names)), key=lambda i: _sort_key(names[i]))
     step = -(-len(by_name) // MOST_CAMERAS)
     by_name = by_name[::step]
     chosen = [cameras[i] for i in by_name]
@@ -77,7 +77,7 @@ def _length(lengths: Tensor, tour: list[int]) -> float:
     return float(lengths[tour[:-1], tour[1:]].sum())
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """A sort key with which img_9 comes before img_10."""
+def _sort_key(name: str) -> list[tuple[int, str]]:
+    """The sort key of a name. Numbers are compared by value, so img_9 comes before img_10."""
     parts = re.split(r"(\d+)", name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

@@ -55,18 +55,18 @@ def choose_pairs(
     sequences = _sequences(photos)
     if sequences:
         for sequence in sequences:
-            pairs |= _along(sequence, effort.overlap)
+            pairs |= _pairs_along(sequence, effort.overlap)
         rules.append("frames of a video with the following ones")
     located = [i for i, photo in enumerate(photos) if photo.location is not None]
     if len(located) > effort.neighbours:
-        places = _metres(np.array([photos[i].location for i in located]))
+        places = _positions_in_metres(np.array([photos[i].location for i in located]))
         pairs |= {
             (located[i], located[j]) for i, j in nearest(-_distances(places), effort.neighbours)
         }
         rules.append("photos with the nearest by GPS")
     covered = len(located) == count or sum(map(len, sequences)) == count
     share = _LOOP_SHARE if covered else 1.0
-    pairs |= _look_alike(photos, similarity(), round(share * effort.neighbours), effort.overlap)
+    pairs |= _similar_pairs(photos, similarity(), round(share * effort.neighbours), effort.overlap)
     rules.append("photos with similar ones")
     return PairChoice(sorted(pairs), f"{', '.join(rules)} ({len(pairs)} pairs)")
 
@@ -79,8 +79,9 @@ def _sequences(photos: Sequence[Photo]) -> list[list[int]]:
     return [sorted(frames, key=lambda i: photos[i].name) for frames in by_name.values()]
 
 
-def _along(sequence: Sequence[int], overlap: int) -> Pairs:
-    # Every frame with the next `overlap` frames, then with those 2, 4, 8 … times as far away.
+def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
+    # Pair every frame with the next `overlap` frames, and with frames at distances of 2, 4, 8 …
+    # times `overlap`.
     steps = list(range(1, overlap + 1))
     while steps[-1] * 2 < len(sequence):
         steps.append(steps[-1] * 2)
@@ -93,7 +94,7 @@ def _along(sequence: Sequence[int], overlap: int) -> Pairs:
     return pairs
 
 
-def _look_alike(
+def _similar_pairs(
     photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], count: int, overlap: int
 ) -> Pairs:
     # A frame is most similar to its neighbours in time, which are already paired with it. They are
@@ -106,8 +107,9 @@ def _look_alike(
     return nearest(similarity, count)
 
 
-def _metres(locations: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    # A plane tangent at the mean; the altitude of GPS is too inaccurate to be used.
+def _positions_in_metres(locations: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    # Positions on the plane that is tangent to the earth at the mean location. The altitude of GPS
+    # is too inaccurate to be used.
     latitude, longitude = locations[:, 0], locations[:, 1]
     middle = np.radians(latitude.mean())
     east = (longitude - longitude.mean()) * np.cos(middle)

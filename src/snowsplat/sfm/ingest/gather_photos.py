@@ -30,9 +30,11 @@ from snowsplat.util.files import shown
 
 @dataclass(frozen=True)
 class Planned:
+    """A photo that will be written to ``input/``, and the name that it gets there."""
+
     source: Source
     header: Header
-    name: str  # in input/
+    name: str  # relative to input/
 
 
 def plan_photos(
