@@ -140,8 +140,8 @@ def _draw(
         return (points - middle) @ axes * scale + (width / 2, height / 2)
 
     parts = [
-        f'<svg class="map" xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{projection.title}" '
-        f'viewBox="0 0 {width:.0f} {height:.0f}">',
+        '<svg class="map" xmlns="http://www.w3.org/2000/svg" role="img" '
+        f'aria-label="{projection.title}" viewBox="0 0 {width:.0f} {height:.0f}">',
         f'<rect width="{width:.0f}" height="{height:.0f}" rx="6" fill="#1f242c"/>',
         *_points(project(xyz), rgb),
         *_paths(photos, project),
