@@ -10,7 +10,7 @@ from .walk_throughs import ROOT, Mismatch, WalkThrough, patched, walk_throughs
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
 
-def test_there_are_four():
+def test_there_are_four_walk_throughs():
     titles = [walk.title for walk in walk_throughs(TEXT)]
     assert titles == [
         "Add a scene format",

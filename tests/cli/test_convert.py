@@ -162,7 +162,7 @@ def test_info_reports_versions_and_rejects_other_files(run, refused, ply, tmp_pa
     assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
 
 
-def test_the_page_of_a_training_starts_at_the_view_of_a_photo(run, ply, tmp_path):
+def test_the_page_of_a_training_run_starts_at_the_view_of_a_photo(run, ply, tmp_path):
     folder = tmp_path / "out/point_cloud/iteration_7"
     folder.mkdir(parents=True)
     shutil.copy(ply, folder / "point_cloud.ply")

@@ -183,7 +183,7 @@ def test_out_of_memory_is_a_one_line_error_with_advice(replace_run, refused):
 
 
 @pytest.mark.slow
-def test_a_training_whose_standard_output_is_closed_fails(dataset, tmp_path):
+def test_a_training_run_whose_standard_output_is_closed_fails(dataset, tmp_path):
     """As with `| head -1`. There is no message, but the exit code is not zero."""
     read, write = os.pipe()
     os.close(read)

@@ -305,7 +305,7 @@ def test_minutes(run, dataset, tmp_path):
     assert len(scene(out, step + 50)) > 1000
 
 
-def test_a_resumed_training_keeps_its_time_budget(start, run, dataset, tmp_path):
+def test_a_resumed_run_keeps_its_time_budget(start, run, dataset, tmp_path):
     """The checkpoint has the time used so far and the adapted schedule."""
     out = tmp_path / "out"
     process = start("train", dataset, "-o", out, "--minutes", 2, "--checkpoint-every", 50)

@@ -27,7 +27,7 @@ def frames(path: Path) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("path", ["training", "ellipse"])
-def test_video_of_a_training(run, trained, path):
+def test_video_of_a_training_run(run, trained, path):
     result = run("render", trained, "--path", path, *SHORT)
     assert result.code == 0, result.err
     assert f"{trained}/videos/{path}.mp4: 10 frames 48x36" in result.out

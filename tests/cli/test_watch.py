@@ -77,7 +77,7 @@ def test_host_and_port_need_view(refused, dataset, tmp_path):
         assert "add --view" in refused("make", dataset / "images", "-o", tmp_path / "out", *flags)
 
 
-def test_the_page_of_a_training_stays_until_ctrl_c(start, run, dataset, tmp_path):
+def test_the_page_of_a_training_run_stays_until_ctrl_c(start, run, dataset, tmp_path):
     viewed, plain = tmp_path / "viewed", tmp_path / "plain"
     port = free_port("127.0.0.1", None)
     process = start("train", dataset, "-o", viewed, "--iterations", 30, "--view", "--port", port)

@@ -147,7 +147,7 @@ def test_other_versions_and_short_files_are_reported(tmp_path, make_scene, one_l
     assert "level 3" in one_line(path)
 
 
-def test_it_cannot_be_written(tmp_path, make_scene):
+def test_ksplat_cannot_be_written(tmp_path, make_scene):
     with pytest.raises(UserError, match="selects no scene format"):
         write_gaussians(tmp_path / "a.ksplat", make_scene(1))
 

@@ -255,7 +255,7 @@ def test_ascii_rows_that_are_not_numbers(tmp_path, row):
     one_line(path)
 
 
-def test_random_damage_never_escapes(tmp_path):
+def test_random_damage_gives_a_scene_or_a_one_line_error(tmp_path):
     """Random bytes changed: a scene or a one-line error, never another exception."""
     random = np.random.default_rng(0)
     path = tmp_path / "scene.ply"

@@ -35,7 +35,7 @@ def as_it_reads_spz(scene: Gaussians) -> Gaussians:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_it_reads_what_we_write(tmp_path, make_scene, splat_transform, degree):
+def test_splat_transform_reads_what_we_write(tmp_path, make_scene, splat_transform, degree):
     scene = make_scene(700, degree)
     for name in ("a.ply", "a.compressed.ply", "a.splat"):
         write_gaussians(tmp_path / name, scene)
@@ -49,7 +49,7 @@ def test_it_reads_what_we_write(tmp_path, make_scene, splat_transform, degree):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_we_read_what_it_writes(tmp_path, make_scene, splat_transform, degree):
+def test_we_read_what_splat_transform_writes(tmp_path, make_scene, splat_transform, degree):
     write_gaussians(tmp_path / "a.ply", make_scene(700, degree))
     splat_transform(tmp_path / "a.ply", tmp_path / "a.compressed.ply")
     splat_transform(tmp_path / "a.compressed.ply", tmp_path / "back.ply")
@@ -63,7 +63,9 @@ def test_we_read_what_it_writes(tmp_path, make_scene, splat_transform, degree):
         assert_same(ours, read_gaussians(tmp_path / "back.ply"))
 
 
-def test_both_read_the_same_from_fixtures(tmp_path, shared, splat_transform):
+def test_splat_transform_and_snowsplat_read_the_same_from_fixtures(
+    tmp_path, shared, splat_transform
+):
     for name in ("minimal.splat", "minimal.ksplat", "guitar.compressed.ply"):
         splat_transform(shared / name, tmp_path / "back.ply")
         assert_same(read_gaussians(shared / name), read_gaussians(tmp_path / "back.ply"))
@@ -74,14 +76,14 @@ def test_both_read_the_same_from_fixtures(tmp_path, shared, splat_transform):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_it_reads_our_sog(tmp_path, make_scene, splat_transform, degree):
+def test_splat_transform_reads_our_sog(tmp_path, make_scene, splat_transform, degree):
     write_gaussians(tmp_path / "a.sog", make_scene(300, degree))
     splat_transform(tmp_path / "a.sog", tmp_path / "back.ply")
     assert_same(read_gaussians(tmp_path / "back.ply"), read_gaussians(tmp_path / "a.sog"))
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_we_read_its_sog(tmp_path, make_scene, splat_transform, degree):
+def test_we_read_a_sog_of_splat_transform(tmp_path, make_scene, splat_transform, degree):
     write_gaussians(tmp_path / "a.ply", make_scene(300, degree))
     splat_transform(tmp_path / "a.ply", tmp_path / "a.sog", "--gpu", "cpu")
     splat_transform(tmp_path / "a.sog", tmp_path / "back.ply")
@@ -94,7 +96,7 @@ def test_we_read_its_sog(tmp_path, make_scene, splat_transform, degree):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_we_read_its_glb(tmp_path, make_scene, splat_transform, degree):
+def test_we_read_a_glb_of_splat_transform(tmp_path, make_scene, splat_transform, degree):
     """splat-transform rotates a PLY by 180° about z, snowsplat by 180° about x.
 
     The difference is a rotation by 180° about the vertical axis.

@@ -77,7 +77,9 @@ def assert_same(a: Gaussians, b: Gaussians) -> None:
 
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_it_reads_what_we_write_as_we_do(tmp_path, make_scene, reference, version, degree):
+def test_niantics_reader_agrees_with_ours_on_our_files(
+    tmp_path, make_scene, reference, version, degree
+):
     write_spz(tmp_path / "a.spz", GaussianArrays.from_gaussians(make_scene(300, degree)), version)
     ours = read_gaussians(tmp_path / "a.spz")
     assert_same(from_json(reference("read", tmp_path / "a.spz")), ours)
@@ -85,7 +87,9 @@ def test_it_reads_what_we_write_as_we_do(tmp_path, make_scene, reference, versio
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_we_read_what_it_writes_as_it_does(tmp_path, make_scene, reference, version, degree):
+def test_our_reader_agrees_with_niantics_on_its_files(
+    tmp_path, make_scene, reference, version, degree
+):
     scene = make_scene(300, degree)
     reference("write", version, tmp_path / "a.spz", input=to_json(scene))
     ours = read_gaussians(tmp_path / "a.spz")

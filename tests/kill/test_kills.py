@@ -104,7 +104,7 @@ def test_damaged_checkpoints_are_not_overwritten(zygote, dataset, tmp_path):
     assert {name: (out / name).read_bytes() for name in names_in(out)} == before
 
 
-def test_a_timed_training_with_more_steps_than_planned(zygote, dataset, tmp_path):
+def test_a_timed_run_with_more_steps_than_planned(zygote, dataset, tmp_path):
     """The final checkpoint is beyond the plan that is stored in it."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--minutes", 0.02, "--checkpoint-every", 5]

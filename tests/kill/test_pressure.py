@@ -128,7 +128,7 @@ def test_a_full_disk(subcommand, zygote, place, trained, dataset, photos):
         assert not changed, f"{subcommand} changed {changed}"
 
 
-def test_a_disk_that_becomes_full_during_a_training(zygote, place, dataset):
+def test_a_disk_that_becomes_full_during_training(zygote, place, dataset):
     """The last checkpoint stays valid. With free space, the resumed run produces the same scene."""
     out = place / "out"
     command = ["train", dataset, "-o", out, "--iterations", 60, "--checkpoint-every", 10, *CPU]
@@ -199,7 +199,7 @@ def has_checkpoint(out: Path) -> Callable[[], bool]:
     return lambda: any(out.glob("checkpoints/step_*"))
 
 
-def test_a_training_whose_folder_is_moved_continues(zygote, place, dataset):
+def test_a_training_run_whose_folder_is_moved_continues(zygote, place, dataset):
     """The training run creates a new folder, so that hours of work are not lost."""
     out, elsewhere = place / "out", place / "elsewhere"
     command = ["train", dataset, "-o", out, "--iterations", 400, "--checkpoint-every", 10, "--eval"]
@@ -217,7 +217,7 @@ def test_a_training_whose_folder_is_moved_continues(zygote, place, dataset):
     assert zygote.run(["evaluate", out, *CPU]).code == 0
 
 
-def test_a_training_whose_photos_are_removed(zygote, place, dataset):
+def test_a_training_run_whose_photos_are_removed(zygote, place, dataset):
     """The photos are removed at the start or before the run resumes. Saved files are kept."""
     mine, out = place / "capture", place / "out"
     shutil.copytree(dataset, mine)

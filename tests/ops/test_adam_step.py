@@ -239,7 +239,7 @@ def test_gradient_of_a_regulariser_is_added(variant: Variant) -> None:
         assert_close(state.m[name], 0.1 * p.grad, 1e-6, name)
 
 
-def test_nothing_visible(variant: Variant) -> None:
+def test_no_gaussian_is_visible(variant: Variant) -> None:
     state = Optimised(variant, random_scene(5, 10))
     state.params["means"] += torch.tensor([1e4, 0, 0])
     assert len(state.visible()) == 0
@@ -273,7 +273,7 @@ def test_rows_without_a_gaussian(native: Variant, visible_only: bool) -> None:
         assert torch.equal(states[1].tensors()[name], tensor), name
 
 
-def test_not_valid(variant: Variant) -> None:
+def test_a_step_that_is_not_valid_changes_nothing(variant: Variant) -> None:
     """`valid` is on the device of the tensors."""
     states = [Optimised(variant, random_scene(3, 70)) for _ in range(3)]
     before = states[0].copy()

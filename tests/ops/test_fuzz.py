@@ -131,14 +131,14 @@ def assert_finite(tensors: dict[str, Tensor | None]) -> None:
 
 
 @pytest.mark.parametrize(("name", "case"), SINGLE, ids=[case for _, case in SINGLE])
-def test_one_extreme(variant: Variant, name: str, case: str) -> None:
+def test_one_extreme_parameter(variant: Variant, name: str, case: str) -> None:
     scene = random_scene(0, COUNT)
     scene.params[name] = as_float32(wild(0)[case].double())
     check(variant, scene)
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_extremes_together(variant: Variant, seed: int) -> None:
+def test_extreme_parameters_together(variant: Variant, seed: int) -> None:
     """Every parameter of every Gaussian is taken from a random case."""
     scene, cases = random_scene(seed, COUNT), wild(seed)
     g = generator(1000 + seed)
@@ -180,11 +180,11 @@ def test_nonfinite_gaussians_do_not_affect_others(
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_none_or_one(variant: Variant, count: int) -> None:
+def test_no_gaussian_or_one(variant: Variant, count: int) -> None:
     check(variant, random_scene(3, count))
 
 
-def test_none_visible(variant: Variant) -> None:
+def test_no_gaussian_is_visible(variant: Variant) -> None:
     scene = random_scene(4, 20)
     scene.params["opacity_logits"][:] = -20.0
     leaf = scene.to(variant.dtype)

@@ -237,7 +237,7 @@ def test_broken_library_is_named(fresh, tmp_path, monkeypatch):
         native.isa()
 
 
-def test_best_is_picked_and_every_available_one_can_be_forced(fresh, monkeypatch):
+def test_the_best_isa_is_selected_and_every_available_one_can_be_forced(fresh, monkeypatch):
     best = native.available_isas()[-1]
     assert native.isa() == best
     for name in native.available_isas():

@@ -167,7 +167,7 @@ def test_a_finished_pixel_stays_finished(variant: Variant) -> None:
     assert_close(image[0, 0], torch.tensor([0.99, 0.01 * 0.95, 0, 0]), 1e-5)
 
 
-def test_faint_is_skipped(variant: Variant) -> None:
+def test_faint_splats_are_skipped(variant: Variant) -> None:
     splats = leaf_splats(flat_stack([0.00391, 0.00393, 0.0]), variant.dtype)  # 1/255 = 0.003922
     image, _, _ = variant.ops.rasterize(splats, 1, 1)
     assert_close(image[0, 0], torch.tensor([0, 0.00393, 0]), 1e-5)

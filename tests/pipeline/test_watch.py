@@ -65,7 +65,7 @@ def test_a_checkpoint_of_something_else(trained, tmp_path):
             NewestScene(out, None)()
 
 
-def test_the_folder_of_make_contains_that_of_the_training(trained, tmp_path):
+def test_the_folder_of_make_contains_the_output_folder_of_training(trained, tmp_path):
     shutil.copytree(trained, tmp_path / "made" / "scene")
     assert watched_folder(tmp_path / "made").path == tmp_path / "made" / "scene"
     assert watched_folder(trained).path == trained

@@ -45,7 +45,7 @@ def test_only_the_time_of_steps_counts(monkeypatch):
     assert history.seconds == 8.0
 
 
-def test_it_continues_from_a_checkpoint(tmp_path):
+def test_the_history_continues_from_a_checkpoint(tmp_path):
     """The file may have later steps than the checkpoint. The resumed run repeats these steps."""
     history = filled(1000)
     for step in (400, 800):

@@ -100,7 +100,7 @@ def test_the_median_photo_limits_the_gaussians() -> None:
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_the_least_budget(device: str) -> None:
+def test_the_smallest_possible_budget(device: str) -> None:
     """1000 Gaussians, renderings of the largest photo, and the six largest photos decoded."""
     sides = [300, 100, 200, 500, 400, 350, 250, 450]
     views = [view for side in sides for view in dataset_of(1, side, 100).train]

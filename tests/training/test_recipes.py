@@ -35,7 +35,7 @@ def test_the_default_scales_with_its_length():
     assert config.density.prune_world_size == 0
 
 
-def test_no_such_recipe():
+def test_an_unknown_recipe_is_rejected():
     with pytest.raises(
         SettingError, match="^recipe: 'fast' does not exist; use one of default, paper, mcmc"
     ):

@@ -110,7 +110,7 @@ def assert_identical(a: Gaussians, b: Gaussians) -> None:
 
 
 @pytest.mark.slow
-def test_it_learns_and_is_the_same_training_in_float64(dataset, monkeypatch):
+def test_training_learns_and_has_the_same_losses_in_float64(dataset, monkeypatch):
     """300 steps with the native ops and with the reference in double precision: the same losses."""
 
     def losses(trainer: Trainer) -> torch.Tensor:
@@ -175,7 +175,7 @@ def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
 
 
 @every_density_control
-def test_a_stretched_training_completes_its_schedule_and_resumes_bitwise(dataset, config, tmp_path):
+def test_a_stretched_run_completes_its_schedule_and_resumes_bitwise(dataset, config, tmp_path):
     """60 steps become 90 after step 20, and 45 after step 40."""
     rates = LearningRates(means_steps=1.0)
     config = replace(config, coarse_to_fine=(0.2, 0.5), learning_rates=rates)

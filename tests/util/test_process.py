@@ -27,7 +27,7 @@ def done_before_interrupt(*actions: Callable[[], None]) -> int:
     raise AssertionError("no KeyboardInterrupt was raised")
 
 
-def test_it_is_deferred_until_let_interrupt():
+def test_ctrl_c_is_deferred_until_interrupts_are_allowed():
     raise_deferred_interrupt()
     assert (
         done_before_interrupt(
@@ -39,19 +39,19 @@ def test_it_is_deferred_until_let_interrupt():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_the_second_one_is_not_deferred():
+def test_a_second_ctrl_c_is_not_deferred():
     assert done_before_interrupt(press, press) == 1
 
 
-def test_the_function_of_the_context_raises_it():
-    with interrupts_between_steps() as let:
-        let()
+def test_the_function_of_the_context_raises_a_deferred_ctrl_c():
+    with interrupts_between_steps() as raise_deferred:
+        raise_deferred()
         press()
         with pytest.raises(KeyboardInterrupt):
-            let()
+            raise_deferred()
 
 
-def test_a_pending_one_is_dropped_at_the_end_of_the_context():
+def test_a_deferred_ctrl_c_is_dropped_at_the_end_of_the_context():
     with interrupts_between_steps():
         press()
     raise_deferred_interrupt()
@@ -61,8 +61,8 @@ def test_nothing_is_deferred_in_other_threads():
     found = []
 
     def run() -> None:
-        with interrupts_between_steps() as let:
-            let()
+        with interrupts_between_steps() as raise_deferred:
+            raise_deferred()
             found.append(True)
 
     thread = threading.Thread(target=run)

@@ -183,7 +183,7 @@ def test_statistics_are_loaded_as_copies():
         assert tensor.any()
 
 
-def test_small_ones_are_cloned_large_ones_are_split_others_unchanged():
+def test_small_gaussians_are_cloned_large_ones_are_split_others_unchanged():
     gaussians = gaussians_of([0.05, 0.5, 0.05, 0.5])
     before = gaussians.clone()
     control, adam = set_up(gaussians)
@@ -289,7 +289,7 @@ def test_nothing_happens_outside_of_the_schedule(step):
     assert control.views.any()
 
 
-def test_transparent_ones_are_removed():
+def test_transparent_gaussians_are_removed():
     gaussians = gaussians_of([0.05] * 4)
     gaussians.opacity_logits[1:3] = math.log(0.004 / 0.996)
     control, adam = set_up(gaussians)

@@ -101,7 +101,7 @@ def test_copies_keep_the_integral_along_a_line():
     torch.testing.assert_close(torch.trapezoid(together, x), torch.trapezoid(alone, x))
 
 
-def test_dead_are_relocated_onto_live_ones():
+def test_dead_gaussians_are_relocated_to_live_ones():
     gaussians = some_gaussians(200)
     dead = torch.arange(200) % 4 == 0
     gaussians.opacity_logits[dead] = -6.0

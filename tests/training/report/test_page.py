@@ -105,7 +105,7 @@ def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path
     assert "8 to train on, 0 held out" in content
 
 
-def test_train_writes_it_and_a_resumed_training_continues_its_curves(tmp_path):
+def test_train_writes_the_report_and_a_resumed_run_continues_its_curves(tmp_path):
     """The command line is used. The page contains names, but no absolute paths."""
     from snowsplat.cli.main import main
 
@@ -128,7 +128,7 @@ def test_train_writes_it_and_a_resumed_training_continues_its_curves(tmp_path):
     assert sum(stretch["steps"] for stretch in history["stretches"]) == 10
 
 
-def test_the_next_training_removes_temporary_files_of_a_kill(tmp_path):
+def test_the_next_run_removes_temporary_files_of_a_kill(tmp_path):
     from snowsplat.cli.main import main
 
     write_toy_dataset(tmp_path / "photos", n_views=9, width=48, height=36, n_points=300)

@@ -146,8 +146,7 @@ def test_a_pause_moves_the_deadline():
     assert paused.deadline == pace.deadline + 60.0
 
 
-def test_no_time():
-    """If there is no time, the schedule is completed in few steps."""
+def test_without_time_the_schedule_is_completed_in_few_steps():
     machine = Machine(recipe("default"), usual)
     machine.train(0.01, 3000)
     assert machine.shares[-1] == 1.0

@@ -78,7 +78,7 @@ def test_the_number_of_gaussians():
     assert plan.config.density.max_gaussians == 50_000
 
 
-def test_a_short_training_densifies_more_often():
+def test_a_short_run_densifies_more_often():
     for seconds, interval in ((3, 25), (3600, 100)):
         density = planned(seconds, 552, 986).config.density
         assert (density.densify_interval, density.densify_from) == (interval, interval)

@@ -25,7 +25,7 @@ def test_the_camera_of_a_browser():
     assert 2 * math.atan(120 / camera.fy) == pytest.approx(1.0)
 
 
-def test_is_near_only_ignores_rounding():
+def test_is_near_ignores_only_rounding():
     here = pose()
     same = Pose(-here.quat, here.position + 1e-6, here.fov, 10, 10)
     assert here.is_near(same)

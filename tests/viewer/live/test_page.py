@@ -124,7 +124,7 @@ def settled(page: Page) -> np.ndarray:
     raise AssertionError("the image did not become still")
 
 
-def test_it_shows_a_running_training(training, page):
+def test_the_page_shows_a_running_training_run(training, page):
     lines = "".join(training.lines)
     assert f"watch it in a browser: {training.url}\n" in lines
     assert "ssh -L" in lines

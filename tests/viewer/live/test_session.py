@@ -43,7 +43,7 @@ def serve(session: Session, clock: Clock, scene: int, seconds: float, training=T
     return request.kind
 
 
-def test_small_while_moving_then_full_size_then_when_the_scene_changes(session, clock):
+def test_images_are_small_while_the_camera_moves_and_then_full_size(session, clock):
     visitor = session.enter(1)
     assert session.next_request(0, training=False) is None  # its pose is unknown
     session.move(visitor, pose())

@@ -57,7 +57,7 @@ def test_html_files_cannot_be_read(tmp_path):
         read_gaussians(tmp_path / "scene.html")
 
 
-def test_it_is_listed_among_the_formats_to_write(tmp_path):
+def test_the_page_is_listed_among_the_formats_to_write(tmp_path):
     with pytest.raises(UserError, match=r"use one of .*\.html"):
         write_gaussians(tmp_path / "scene.obj", three_balls())
 
