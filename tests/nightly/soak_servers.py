@@ -1,11 +1,17 @@
 """Runs both servers for an hour, with visitors that connect, look around and disconnect.
 
-A small real training with --view and a `view` of a scene run as separate processes. Some visitors
+`train --view` on a small dataset and `view` of a scene run as separate processes. Some visitors
 disconnect abruptly, some are hostile. Memory, threads and file descriptors of the servers are
-recorded every few seconds. At the end each server must be running, memory must be flat (its
-least-squares slope over the last half below BOUND), threads and descriptors within LIMITS, the
-training must have made steps all the time, and the terminal must have no unexpected output. Before
-that, a thousand connections must leave the training RATIO of its steps per second.
+recorded every few seconds. At the end,
+
+- each server must still be running;
+- its memory must be constant: the least-squares slope over the last half must be below BOUND;
+- the numbers of threads and descriptors must be within LIMITS;
+- the training must have made steps all the time;
+- the terminal must have no unexpected output.
+
+Before the visitors start, the script opens a thousand connections. The speed of training must then
+be at least RATIO of the speed without connections.
 
     python tests/nightly/soak_servers.py DATASET --minutes 60
 """

@@ -227,7 +227,8 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
         shown = ", ".join(f"{key} = {value:g}" for key, value in distortion.items() if value)
         raise UserError(
             f"{where}: the camera has lens distortion ({shown}), but Gaussians are rendered "
-            "without; make a new dataset from the photos: snowsplat sfm PHOTOS -o DATASET"
+            "without distortion; make a new dataset from the photos: snowsplat sfm PHOTOS -o "
+            "DATASET"
         )
     width, height = _number(where, values, "w"), _number(where, values, "h")
     if width is None or height is None:

@@ -113,8 +113,8 @@ class Lpips:
             if value is None or tuple(value.shape) != shape:
                 found = "missing" if value is None else f"of shape {tuple(value.shape)}"
                 raise UserError(
-                    f"{path}: not LPIPS weights: {name} is {found}; the file should hold the state "
-                    "of lpips.LPIPS(net='alex') or net='vgg'"
+                    f"{path}: not LPIPS weights: {name} is {found}; the file must contain the "
+                    "state of lpips.LPIPS(net='alex') or net='vgg'"
                 )
             return value.to(torch.float32).contiguous()
 

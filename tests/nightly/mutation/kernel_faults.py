@@ -13,11 +13,11 @@ from dataclasses import dataclass
 class Fault:
     """In a file of ``native/``, the text ``becomes`` replaces the text ``was``."""
 
-    file: str
+    file: str  # relative to native/
     was: str
     becomes: str
-    breaks: str
-    tests: str  # a file of tests/ops, without test_ and .py
+    breaks: str  # what is wrong with the fault, for the report
+    tests: str  # the tests that must detect it: a file of tests/ops, without test_ and .py
 
 
 FAULTS = (
@@ -170,7 +170,7 @@ FAULTS = (
         "sh.h",
         "(four * zz - xx - yy);\n  Y[12]",
         "(three * zz - xx - yy);\n  Y[12]",
-        "Y₁₁",
+        "spherical harmonic Y₁₁",
         "project",
     ),
     Fault("sh.h", "Y[1] = c(-kSH1) * y", "Y[1] = c(kSH1) * y", "sign of Y₁", "project"),

@@ -147,7 +147,7 @@ def test_a_mask_of_the_wrong_size_and_a_mask_without_a_photo(tmp_path, caplog):
     Image.new("L", (WIDTH, HEIGHT), 255).save(root / "masks" / "7.png")
     with caplog.at_level(logging.WARNING, "snowsplat"):
         gathered(root, tmp_path / "out")
-    assert "7.png: unused mask, no such photo" in caplog.text
+    assert "7.png: mask not used, there is no such photo" in caplog.text
     Image.new("L", (99, 99)).save(root / "masks" / "1.png")
     with pytest.raises(UserError, match=r"1.png: the mask is 99x99, but its photo is 320x240"):
         gathered(root, tmp_path / "other")
@@ -286,7 +286,7 @@ def test_too_few_photos(tmp_path):
     for name in ("0.jpg", "1.jpg"):
         (root / name).write_text("no photo")
     with pytest.raises(
-        UserError, match=r"no usable image; all 3 images, .*0.jpg first, cannot be decoded"
+        UserError, match=r"no usable image; all 3 images .*0.jpg, which cannot be decoded"
     ):
         gathered(root, tmp_path / "out3")
 

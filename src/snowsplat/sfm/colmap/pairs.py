@@ -6,7 +6,7 @@
     photos with GPS      the nearest photos, and some that look similar
     many photos          those that look similar
 
-If several rules apply, all of them are used, so that all parts are connected.
+If several rules apply, all of them are used, so that all groups of photos are connected.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ _NO_COUNTS = (b"mdat", b"free", b"skip", b"wide")  # boxes of frame data and pad
 # Boxes that begin with a count: of frames, of frames in a fragment (trun), or of edits (elst). Each
 # edit may repeat all frames. A compressed header (cmov) could contain such counts.
 _COUNTS = re.compile(rb"stsz|stz2|trun|elst|cmov")
-_FEW_EDITS = 16  # up to this number of edits, they are not counted as repetitions
+_FEW_EDITS = 16  # this number of edits counts as one repetition of all frames
 _ALWAYS_ALLOWED = 1 << 16  # frames that a file of any size may declare
 
 if TYPE_CHECKING:

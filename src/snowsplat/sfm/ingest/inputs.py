@@ -97,7 +97,9 @@ def gather(
             ) from None
         raise
     for mask in found.unused_masks:
-        logger.warning("%s: unused mask, no such photo; masks are named IMG.jpg.png", shown(mask))
+        logger.warning(
+            "%s: mask not used, there is no such photo; masks are named IMG.jpg.png", shown(mask)
+        )
     if len(photos) < _FEWEST:
         raise _too_few(len(photos), skipped)
     return Gathered(sorted(photos, key=lambda photo: photo.name), skipped)
@@ -221,9 +223,10 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
             f"photos: {who} are too blurred to be matched; hold the camera still for each photo, "
             "in good light and in focus"
         )
+    first = next(source for source, why in skipped if why == reason)
     return UserError(
-        f"photos: {_count(usable)}; {who}, {skipped[0][0]} first, {reason}; use at least "
-        f"{_FEWEST}, better 20 or more"
+        f"photos: {_count(usable)}; {who} cannot be used, e.g. {first}, which {reason}; use at "
+        f"least {_FEWEST}, better 20 or more"
     )
 
 
