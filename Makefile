@@ -29,11 +29,10 @@ unexport PYTHONDONTWRITEBYTECODE
 BUILD := build/native
 # Only one build at a time in a checkout.
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
-# One precision is enough: both have the same source.
-SANITIZED := emulated-float32
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo quick test dev format native compiler lint types layers pytest-quick pytest sanitized clean
+.PHONY: demo quick test dev format native compiler lint types layers clean
+.PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized
 
 demo: native
 	$(PYTHON) examples/demo.py out/demo
@@ -41,7 +40,8 @@ demo: native
 quick: lint
 	@$(MAKE) --no-print-directory -j2 types layers pytest-quick
 
-test: lint types layers pytest
+test: lint
+	@$(MAKE) --no-print-directory -j2 types layers pytest
 
 dev: native
 
@@ -96,29 +96,46 @@ ISA := isa and not (emulated or gpu)
 pytest-quick: native
 	$(PYTEST) -m '$(QUICK)'
 
-# All tests on the best instruction set; on each other one, the tests that depend on it; then the GPU
-# kernels on the CPU again, under sanitizers.
+# All tests on the best instruction set. At the same time, since some of them wait for browsers and
+# servers: the tests that depend on the instruction set on each other one, and the GPU kernels on the CPU
+# under sanitizers, which replaces their run without.
 pytest: native
-	$(PYTEST)
+	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
+
+SANITIZERS := $(foreach name,libasan.so libubsan.so,$(wildcard $(shell g++ -print-file-name=$(name) 2>&1)))
+# One precision is enough: both have the same source.
+SANITIZED := emulated-float32
+REPEATED := build/pytest-repeated.log
+
+pytest-best:
+	$(PYTEST) $(if $(SANITIZERS),-k 'not $(SANITIZED)')
+
+# Prints everything if a test fails, else only the counts.
+pytest-repeated:
+	@if $(MAKE) --no-print-directory pytest-isas sanitized >$(REPEATED) 2>&1; \
+	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|[0-9]+ passed)' $(REPEATED); \
+	    else cat $(REPEATED); exit 1; fi
+
+pytest-isas:
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
 	    for isa in $$isas; do \
 	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training"; \
 	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training || exit 1; \
 	    done
-	@$(MAKE) --no-print-directory sanitized
 
 # The GPU kernels on the CPU under AddressSanitizer and UndefinedBehaviorSanitizer, with the threads of a
-# block in the reverse order: a missing barrier may have an effect in only one of the two orders. These are
-# the sanitizers of GCC, which can be loaded into a Python that was built without them.
+# block in the reverse order: a missing barrier may have an effect in only one of the two orders, and the
+# other precision runs in the usual order. These are the sanitizers of GCC, which can be loaded into a
+# Python that was built without them.
 sanitized: native
-	@if [ -f "$$(g++ -print-file-name=libasan.so)" ]; then \
-	    echo "sanitized: $(PYTEST) tests/ops -m emulated -k $(SANITIZED)"; \
-	    LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" \
-	    ASAN_OPTIONS=detect_leaks=0 CXX=g++ SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
-	        $(PYTEST) tests/ops -m emulated -k $(SANITIZED); \
-	else \
-	    echo "sanitized: skipped; it needs g++ with its sanitizers"; \
-	fi
+ifneq ($(SANITIZERS),)
+	@echo "sanitized: $(PYTEST) tests/ops -m emulated -k $(SANITIZED)"
+	@LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0 CXX=g++ \
+	    SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
+	    $(PYTEST) tests/ops -m emulated -k $(SANITIZED)
+else
+	@echo "sanitized: skipped; it needs g++ with its sanitizers"
+endif
 
 clean:
 	rm -rf build dist src/snowsplat/_lib src/snowsplat/_viewer .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

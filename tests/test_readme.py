@@ -3,6 +3,7 @@
 import re
 import runpy
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import pytest
 from snowsplat.cli import main as cli
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.quality import PRESETS
-from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+
+from .cache import still_life_photos
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -25,7 +27,7 @@ def test_photos_to_scene_from_python(tmp_path, monkeypatch, capsys):
     assert len(EXAMPLES[0].split("\n\n")[1].splitlines()) == 5  # "in five lines"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=100))
-    write_synthetic_photos(tmp_path / "photos", n_views=20, width=320, height=240)
+    shutil.copytree(still_life_photos(), tmp_path / "photos")
     example, changes = re.subn("seconds=5", "seconds=0.1", EXAMPLES[0])
     assert changes == 1
     (tmp_path / "example.py").write_text(example)

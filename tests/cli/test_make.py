@@ -13,14 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat import synthetic
 from snowsplat.pipeline import make as make_module
 from snowsplat.pipeline.make import RECORD, STAGES
 from snowsplat.pipeline.quality import PRESETS
-from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.util.stages import Stages
 
-from ..cache import cached
+from ..cache import still_life_photos
 
 QUICK = replace(PRESETS["draft"], iterations=120)
 #: The command as a separate process, with the same short training and frequent checkpoints.
@@ -39,11 +37,7 @@ sys.exit(main())
 def photos(tmp_path_factory) -> Path:
     """20 photos, 320×240; read-only for the tests. The name has spaces and an umlaut."""
     folder = tmp_path_factory.mktemp("make") / "Häuser am See"
-    sources = Path(synthetic.__file__).parent.glob("*.py")
-    photos = cached(
-        "photos-20", sources, lambda out: write_synthetic_photos(out, 20, width=320, height=240)
-    )
-    return Path(shutil.copytree(photos, folder))
+    return Path(shutil.copytree(still_life_photos(), folder))
 
 
 @pytest.fixture

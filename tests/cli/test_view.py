@@ -7,7 +7,9 @@ import threading
 import urllib.request
 import webbrowser
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -73,7 +75,8 @@ def served(run, monkeypatch):
         site = static_scene.site
         monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), done.set()))
         monkeypatch.setattr(static_scene, "site", lambda *a: (sites.append(a), site(*a))[1])
-        monkeypatch.setattr(view, "wait_for_interrupt", lambda: done.wait(0.3))
+        interrupted = SimpleNamespace(wait=lambda _: done.wait(0.3) or True)
+        monkeypatch.setattr(view, "interrupts", lambda: nullcontext(interrupted))
         result = run("view", *arguments)
         assert result.code == 0, result.err
         return result, opened, sites[0]

@@ -7,6 +7,8 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -58,7 +60,10 @@ class View:
             raise UserError(f"{scene.file}: contains no Gaussians; there is nothing to see")
         title = f"{self.path.resolve().name} - snowsplat"
         files, headers = site(title, scene.gaussians, scene.cameras, scene.background)
-        with StaticServer(files, headers, self.host, self.port) as server:
+        with (
+            interrupts() as interrupted,
+            StaticServer(files, headers, self.host, self.port) as server,
+        ):
             print(f"{scene.file}: {len(scene.gaussians):,} Gaussians")
             print(server.url, flush=True)
             if self.host in ANY_HOST:
@@ -67,7 +72,8 @@ class View:
                 print(f"from your computer: {forwarding(server.port)}", flush=True)
             if not self.no_browser and has_screen():
                 open_browser(server.url)
-            wait_for_interrupt()
+            while not interrupted.wait(1.0):  # on Windows Ctrl-C arrives only between two waits
+                pass
         return 0
 
 
@@ -97,14 +103,14 @@ def open_browser(url: str) -> None:
     threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 
-def wait_for_interrupt() -> None:
-    """Returns at Ctrl-C, or at SIGTERM."""
-    ended = threading.Event()
-    before = signal.signal(signal.SIGTERM, lambda *_: ended.set())
+@contextmanager
+def interrupts() -> Iterator[threading.Event]:
+    """An event that is set by Ctrl-C or SIGTERM, which do not end the process meanwhile."""
+    interrupted = threading.Event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]
     try:
-        while not ended.wait(1.0):  # on Windows Ctrl-C arrives only between two waits
-            pass
-    except KeyboardInterrupt:
-        pass
+        yield interrupted
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

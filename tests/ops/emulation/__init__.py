@@ -23,7 +23,7 @@ _ROOT = _HERE.parents[2]
 _NATIVE = _ROOT / "src" / "snowsplat" / "native"
 _FLAGS = {
     "": ["-O2", "-g1"],
-    "sanitized": ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"],
+    "sanitized": ["-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"],
 }
 
 
