@@ -86,33 +86,32 @@ types: $(ENVIRONMENT)
 layers: $(ENVIRONMENT)
 	lint-imports --no-logo
 
-# Tests run in one process per core; make test JOBS=1 runs them one after another. Slow tests have a mark,
-# and `quick` excludes these marks (listed in pyproject.toml).
-JOBS ?= auto
+# Number of processes for tests: one more than there are cores, since some tests wait for browsers and
+# servers.
+JOBS ?= $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)')
 PYTEST = $(PYTHON) -m pytest -n $(JOBS) --dist worksteal
+# Slow tests have a mark, and `quick` excludes these marks (listed in pyproject.toml).
 QUICK := not (sfm or browser or build or emulated or gpu or kill or slow)
 ISA := isa and not (emulated or gpu)
+# Under sanitizers, one precision is enough: both have the same source.
+SANITIZED := emulated-float32
+REPEATED := build/pytest-repeated.log
 
 pytest-quick: native
 	$(PYTEST) -m '$(QUICK)'
 
-# All tests on the best instruction set. At the same time, since some of them wait for browsers and
-# servers: the tests that depend on the instruction set on each other one, and the GPU kernels on the CPU
-# under sanitizers, which replaces their run without.
+# All tests on the best instruction set. At the same time, with half as many processes: on each other
+# instruction set, the tests that depend on it; and the GPU kernels on the CPU under sanitizers. Tests that
+# run under sanitizers are not repeated without them.
 pytest: native
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
-
-SANITIZERS := $(foreach name,libasan.so libubsan.so,$(wildcard $(shell g++ -print-file-name=$(name) 2>&1)))
-# One precision is enough: both have the same source.
-SANITIZED := emulated-float32
-REPEATED := build/pytest-repeated.log
 
 pytest-best:
 	$(PYTEST) $(if $(SANITIZERS),-k 'not $(SANITIZED)')
 
-# Prints everything if a test fails, else only the counts.
+# Prints everything if a test fails, otherwise only the numbers of tests.
 pytest-repeated:
-	@if $(MAKE) --no-print-directory pytest-isas sanitized >$(REPEATED) 2>&1; \
+	@if $(MAKE) --no-print-directory pytest-isas sanitized JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
 	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
@@ -127,15 +126,14 @@ pytest-isas:
 # block in the reverse order: a missing barrier may have an effect in only one of the two orders, and the
 # other precision runs in the usual order. These are the sanitizers of GCC, which can be loaded into a
 # Python that was built without them.
+SANITIZERS = $(strip $(foreach name,libasan.so libubsan.so,$(wildcard $(shell g++ -print-file-name=$(name) 2>&1))))
+
 sanitized: native
-ifneq ($(SANITIZERS),)
-	@echo "sanitized: $(PYTEST) tests/ops -m emulated -k $(SANITIZED)"
-	@LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0 CXX=g++ \
+	@$(if $(SANITIZERS),echo "sanitized: $(PYTEST) tests/ops -m emulated -k $(SANITIZED)"; \
+	    LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0 CXX=g++ \
 	    SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
-	    $(PYTEST) tests/ops -m emulated -k $(SANITIZED)
-else
-	@echo "sanitized: skipped; it needs g++ with its sanitizers"
-endif
+	    $(PYTEST) tests/ops -m emulated -k $(SANITIZED), \
+	    echo "sanitized: skipped; it needs g++ with its sanitizers")
 
 clean:
 	rm -rf build dist src/snowsplat/_lib src/snowsplat/_viewer .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

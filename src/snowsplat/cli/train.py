@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 
 from snowsplat.cli.flags import with_flags
@@ -64,6 +64,7 @@ class Train(TrainFlags):
                 print(f"resume with: snowsplat train -o {self.output} --resume")
                 return 130
             if page is not None:
-                print(f"the scene stays at {page.url} until Ctrl-C", flush=True)
-                page.show_result()
+                with suppress(KeyboardInterrupt):  # also right after this line is printed
+                    print(f"the scene stays at {page.url} until Ctrl-C", flush=True)
+                    page.show_result()
         return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,8 +49,9 @@ def watch(
     data, background = load_dataset_of(folder, dataset, resolution)
     newest = NewestScene(folder, iteration, (compute or Compute()).apply())
     newest()  # a scene that cannot be shown is reported before the page opens
-    page.open(data, background, folder.path.absolute().name, observer)
-    page.show(newest)
+    with suppress(KeyboardInterrupt):  # from the moment at which the observer knows the address
+        page.open(data, background, folder.path.absolute().name, observer)
+        page.show(newest)
 
 
 def watched_folder(path: Path) -> OutputFolder:
