@@ -60,10 +60,14 @@ class BrowserError(Exception):
 
 
 class Browser:
-    """A process of Chromium with a temporary profile; both are removed at the end."""
+    """A process of Chromium with a temporary profile; both are removed at the end.
 
-    def __init__(self, width: int = 640, height: int = 480) -> None:
-        self.width, self.height = width, height
+    Tabs have ``width`` × ``height`` CSS pixels, of ``scale`` pixels of the screen. Without a GPU,
+    the time to draw a page is proportional to the number of pixels of the screen.
+    """
+
+    def __init__(self, width: int = 640, height: int = 480, scale: float = 1.0) -> None:
+        self.width, self.height, self.scale = width, height, scale
 
     def __enter__(self) -> Browser:
         program = chromium()
@@ -113,7 +117,7 @@ class Browser:
             "Emulation.setDeviceMetricsOverride",
             width=self.width,
             height=self.height,
-            deviceScaleFactor=1,
+            deviceScaleFactor=self.scale,
             mobile=False,
         )
         page.navigate(url, timeout)

@@ -66,6 +66,7 @@ class Kernels:
             path.write_text(source)
             for file, content in objects.items():
                 self._object(file).write_bytes(content)
+            self._link()
 
     def run_tests(self, fault: Fault) -> Outcome:
         """Run the tests that must detect a fault, with the current sources."""

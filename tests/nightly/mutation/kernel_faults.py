@@ -404,7 +404,7 @@ FAULTS = (
         "return is_finite(v + p);",
         "return is_finite(p);",
         "rows whose moments are not finite",
-        "adam_step",
+        "fuzz",
     ),
     Fault(
         "cpu/adam.cpp",
@@ -425,7 +425,7 @@ FAULTS = (
         "if (nonfinite) t.count_nonfinite(1);",
         "if (nonfinite) t.count_nonfinite(2);",
         "count of rows that are not finite",
-        "adam_step",
+        "fuzz",
     ),
     Fault(
         "cpu/adam.cpp",
@@ -447,7 +447,7 @@ FAULTS = (
         "if (!is_finite(norm)) return;",
         "",
         "gradients that are not finite",
-        "statistic",
+        "fuzz",
     ),
     Fault(
         "statistic.h",
@@ -483,7 +483,7 @@ FAULTS = (
         "nonfinite[threadIdx.x] >> k & 1",
         "nonfinite[threadIdx.x] & 1",
         "count of rows that are not finite",
-        "adam_step",
+        "fuzz",
     ),
     Fault(
         "cuda/project.cu",

@@ -22,6 +22,7 @@ from ...browser import Browser, Page
 pytestmark = pytest.mark.browser
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
+SCALE = 0.5  # a quarter of the pixels
 BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() === '{}')"
 
 
@@ -64,7 +65,7 @@ def training(tmp_path_factory) -> Iterator[Training]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with Browser(900, 1300) as browser:
+    with Browser(900, 1300, SCALE) as browser:
         yield browser
 
 
@@ -98,7 +99,7 @@ def step_of(page: Page) -> int:
 
 def scene(page: Page) -> np.ndarray:
     """The part of the screenshot left of the controls and below the messages of the browser."""
-    return page.screenshot()[200:, :560].astype(int)
+    return page.screenshot()[int(200 * SCALE) :, : int(560 * SCALE)].astype(int)
 
 
 def differ(a: np.ndarray, b: np.ndarray) -> float:
