@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.viewer.live.server import free_port
+from ..ports import unused_port
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_host_and_port_need_view(refused, dataset, tmp_path):
 
 def test_the_page_of_a_training_run_stays_until_ctrl_c(start, run, dataset, tmp_path):
     viewed, plain = tmp_path / "viewed", tmp_path / "plain"
-    port = free_port("127.0.0.1", None)
+    port = unused_port()
     process = start("train", dataset, "-o", viewed, "--iterations", 30, "--view", "--port", port)
     url = url_of(process)
     while not (line := process.stdout.readline()).startswith("the scene stays at"):

@@ -107,7 +107,7 @@ def test_damaged_checkpoints_are_not_overwritten(zygote, dataset, tmp_path):
 def test_a_timed_run_with_more_steps_than_planned(zygote, dataset, tmp_path):
     """The final checkpoint is beyond the plan that is stored in it."""
     out = tmp_path / "out"
-    command = ["train", dataset, "-o", out, "--minutes", 0.02, "--checkpoint-every", 5]
+    command = ["train", dataset, "-o", out, "--minutes", 0.02, "--checkpoint-every", 1]
     command += ["--device", "cpu", "--threads", 1]
     assert zygote.run(command).code == 0
     newest = checkpoint.latest(out / "checkpoints")

@@ -18,6 +18,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.viewer.live.server import free_port
 
 from ...browser import Browser, Page
+from ...ports import unused_port
 
 pytestmark = pytest.mark.browser
 
@@ -30,7 +31,7 @@ class Training:
     """A training run in a separate process, with a page."""
 
     def __init__(self, dataset: Path, out: Path) -> None:
-        port = free_port("127.0.0.1", None)
+        port = unused_port()
         self.url, self.lines, self.out = f"http://127.0.0.1:{port}", [], out
         flags = ["--iterations", "500000", "--threads", "1", "--view", "--port", str(port)]
         self.process = subprocess.Popen(
