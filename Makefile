@@ -86,9 +86,8 @@ types: $(ENVIRONMENT)
 layers: $(ENVIRONMENT)
 	lint-imports --no-logo
 
-# Number of processes for tests: one more than there are cores, since some tests wait for browsers and
-# servers.
-JOBS ?= $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)')
+# Number of processes for tests.
+JOBS ?= $(shell $(PYTHON) -c 'import os; print(os.cpu_count())')
 PYTEST = $(PYTHON) -m pytest -n $(JOBS) --dist worksteal
 # Slow tests have a mark, and `quick` excludes these marks (listed in pyproject.toml).
 QUICK := not (sfm or browser or build or emulated or gpu or kill or slow)
@@ -100,9 +99,9 @@ REPEATED := build/pytest-repeated.log
 pytest-quick: native
 	$(PYTEST) -m '$(QUICK)'
 
-# All tests on the best instruction set. At the same time, with half as many processes: on each other
-# instruction set, the tests that depend on it; and the GPU kernels on the CPU under sanitizers. Tests that
-# run under sanitizers are not repeated without them.
+# All tests on the best instruction set. Some of them wait for browsers and servers. Therefore, at the same
+# time and with half as many processes: on each other instruction set, the tests that depend on it; and the
+# GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not repeated without them.
 pytest: native
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
 

@@ -223,6 +223,7 @@ def test_files_outside_of_the_folder_are_refused(tmp_path, files, one_line):
         one_line(inner / "meta.json")
 
 
+@pytest.mark.slow
 def test_decompression_bombs(tmp_path, files, one_line):
     zeros = bytes(200 << 20)
     path = bundle(tmp_path / "a.sog", files | {"quats.webp": zeros}, zipfile.ZIP_DEFLATED)

@@ -60,6 +60,8 @@ def variants(*among: Variant) -> list:
     ]
 
 
+#: Finite differences of the reference take a second or two.
+SLOW_REFERENCE = pytest.param(REFERENCE, id=str(REFERENCE), marks=pytest.mark.slow)
 FLOAT64 = (NATIVE_FLOAT64, EMULATED_FLOAT64, CUDA_FLOAT64)
 KERNELS = (NATIVE_FLOAT32, EMULATED_FLOAT32, CUDA_FLOAT32, *FLOAT64)
 
@@ -84,7 +86,7 @@ def native(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> V
     return _running(request, monkeypatch)
 
 
-@pytest.fixture(params=variants(REFERENCE, *FLOAT64))
+@pytest.fixture(params=[SLOW_REFERENCE, *variants(*FLOAT64)])
 def double(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
     """The float64 implementations: for finite differences."""
     return _running(request, monkeypatch)

@@ -263,7 +263,11 @@ def expected(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize(
-    ("height", "width"), [*SIZES, *TILES, (3, 2000), (3, 16384), (1100, 2), (560, 140)]
+    ("height", "width"),
+    [
+        *(*SIZES, *TILES, (3, 2000), (1100, 2)),
+        *(pytest.param(*size, marks=pytest.mark.slow) for size in [(3, 16384), (560, 140)]),
+    ],
 )
 @pytest.mark.parametrize("name", ["ssim", "photometric_loss"])
 def test_native_agrees_with_the_reference(

@@ -132,6 +132,7 @@ def test_a_single_position_without_points(photos):
         assert len(list(root.iter(f"{SVG}title"))) == len(photos)
 
 
+@pytest.mark.slow
 def test_a_large_scene_is_drawn_fast_and_is_small():
     start = time.process_time()
     drawings = draw_scene(ring(1000), *cloud(300_000))

@@ -24,6 +24,8 @@ F64 = torch.float64
 NAMES = ["a/dos ñandúes.JPG", "a/one.jpg", "b/cut out.png", "b/three.png", "four.webp", "five.tif"]
 WIDTH, HEIGHT = 322, 242  # not divisible by 4
 
+pytestmark = pytest.mark.slow  # resamples photos
+
 
 def lens(strength: float = -0.12) -> pycolmap.Camera:
     params = [260.0, 258.0, 164.0, 119.0, strength, 0.02, 0.001, -0.002]

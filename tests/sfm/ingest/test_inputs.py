@@ -16,6 +16,8 @@ from snowsplat.util.errors import UserError
 
 from ..pictures import HEIGHT, WIDTH, blurred, exif, pan, photo, wall, write_photos, write_video
 
+pytestmark = pytest.mark.slow  # decodes and writes photos and videos
+
 
 def gathered(inputs, dataset, report=silent, **options):
     dataset.mkdir(exist_ok=True)

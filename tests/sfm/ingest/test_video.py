@@ -19,6 +19,8 @@ from ..pictures import HEIGHT, WIDTH, blurred, pan, wall, write_video
 
 REAL = Path(__file__).resolve().parents[4] / "shared" / "captures" / "walkaround.mp4"
 
+pytestmark = pytest.mark.slow  # decodes videos
+
 
 def extract(path, folder, windows, size=None, report=silent):
     folder.mkdir(exist_ok=True)

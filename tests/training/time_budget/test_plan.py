@@ -105,6 +105,7 @@ def test_plans_as_text():
     assert str(plan) == "552x986, at most 120,000 Gaussians, about 9,000 steps"
 
 
+@pytest.mark.slow
 def test_the_speed_of_this_machine(tmp_path):
     """The measured speed is positive, and measuring does not change the dataset."""
     for format, points in (("colmap-bin", 300), ("blender", None)):
@@ -116,6 +117,7 @@ def test_the_speed_of_this_machine(tmp_path):
         assert (small.points is None) if points is None else (len(small.points) == points)
 
 
+@pytest.mark.slow
 def test_the_speed_is_measured_on_photos_of_at_most_the_largest_size(tmp_path, monkeypatch):
     """Steps on the original photos may take many times the memory of the training."""
     random = np.random.default_rng(0)
