@@ -203,6 +203,7 @@ def test_a_count_larger_than_the_file_allocates_nothing(dataset_copy, file, coun
         load_dataset(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_damaged_files_raise_one_line_errors(dataset_copy, count_rejected, kind, name):

@@ -62,6 +62,7 @@ def damaged(data: bytes, changes: list[tuple[bool, float, str, int, int]]) -> by
     return data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", READ_AND_WRITTEN, ids=lambda format: format.name)
 @FUZZ
 @given(changes=changes)

@@ -126,6 +126,7 @@ def test_neighbours(dtype: torch.dtype) -> None:
     assert_same_bits(results)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("visible_only", [False, True])
 def test_training_steps(dtype: torch.dtype, visible_only: bool) -> None:

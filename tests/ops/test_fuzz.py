@@ -257,6 +257,7 @@ def test_random_extremes(native: Variant, name: str) -> None:
     check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", LONG)
 def test_long_images(native: Variant, size: tuple[int, int]) -> None:
     """The loss, and the image at both ends, are correct for 16384×3 and 3×16384 pixels."""

@@ -374,6 +374,7 @@ def test_tiles_of_a_splat_as_wide(native: Variant, across: int) -> None:
         assert got.needed == 2 * len(got.rows)
 
 
+@pytest.mark.slow
 def test_tiles_beyond_16_bits(native: Variant) -> None:
     size = 16 * 260
     packed = random_splats(8, 60, size, size, pixels=20.0).packed

@@ -15,6 +15,8 @@ from snowsplat.training.history import History
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.trainer import Trainer
 
+pytestmark = pytest.mark.slow  # trains
+
 NAME = "mon <château>"
 
 
