@@ -72,6 +72,30 @@ def test_many_photos_are_matched_with_similar_ones():
     assert "similar" in choice.description
 
 
+def test_numbered_photos_are_matched_with_the_next_ones_by_name():
+    """The order is that of the numbers, not of the text, and each prefix is a series of its own."""
+    names = [f"walk/IMG_{i}.JPG" for i in range(2, 102)] + [f"other{i}.png" for i in range(100)]
+    photos = [
+        Photo(name, name, 640, 480, "phone", None, None, None, False, False) for name in names
+    ]
+    unlike = np.random.default_rng(0).random((200, 200))
+    choice = choose_pairs(photos, EFFORT, lambda: unlike)
+    chosen, overlap = set(choice.pairs), EFFORT.overlap // 2
+    assert all((i, i + step) in chosen for i in range(90) for step in range(1, overlap + 1))
+    assert all((i, i + 1) in chosen for i in range(100, 199))
+    assert "next ones by name" in choice.description
+    assert len(choice.pairs) <= 200 * (EFFORT.neighbours + overlap)
+
+
+def test_photos_without_numbers_are_matched_with_similar_ones_only():
+    names = [f"{a}{b}.jpg" for a in "abcdefghijklmnopqrst" for b in "abcdefghij"]
+    photos = [
+        Photo(name, name, 640, 480, "phone", None, None, None, False, False) for name in names
+    ]
+    choice = choose_pairs(photos, EFFORT, lambda: ring(200, 200))
+    assert "by name" not in choice.description
+
+
 def test_two_videos_and_photos_are_connected():
     photos = (
         [photo(i, "a.mp4") for i in range(60)]

@@ -26,6 +26,13 @@ _MAX_REPROJECTION_ERROR = 3.0
 # of photos, several threads are not faster than one. Then one thread is used, and the poses are the
 # same in every run.
 _MANY_PHOTOS = 150
+# With at least this number of photos, the whole model is adjusted less often: after it has grown by
+# 40% (default of COLMAP: 10%), and then at most twice (5 times) with at most 20 iterations. Between
+# these adjustments, each new photo and its neighbours are adjusted, as with fewer photos.
+_LARGE_MODEL = 40
+_GROWTH = 1.4
+_ADJUSTMENTS = 2
+_ITERATIONS = 20
 _MIN_ANGLE = 1.5  # degrees between the rays of a point
 
 
@@ -65,8 +72,12 @@ class Mapping:
 
     def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()
-        many = count_rows(self.database, "images") > _MANY_PHOTOS
-        options.num_threads = self.threads if many else 1
+        photos = count_rows(self.database, "images")
+        options.num_threads = self.threads if photos > _MANY_PHOTOS else 1
+        if photos >= _LARGE_MODEL:
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
+            options.ba_global_max_refinements = _ADJUSTMENTS
+            options.ba_global_max_num_iterations = _ITERATIONS
         options.random_seed = SEED
         options.min_model_size = MIN_PHOTOS
         mapper, triangulation = options.mapper, options.triangulation

@@ -4,7 +4,8 @@
     frames of a video    the following frames, in growing steps, and frames that look similar:
                          these close a loop when the camera returns to a place
     photos with GPS      the nearest photos, and some that look similar
-    many photos          those that look similar
+    many photos          those that look similar, and those with the next numbers in their names,
+                         which were usually taken next
 
 If several rules apply, all of them are used, so that all groups of photos are connected.
 """
@@ -12,6 +13,7 @@ If several rules apply, all of them are used, so that all groups of photos are c
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +29,10 @@ _METRES_PER_DEGREE = 111_320.0
 # Share of `Effort.neighbours` that is used if the order in time or GPS already determines most
 # pairs.
 _LOOP_SHARE = 0.4
+# Share of `Effort.overlap` that is used for numbered photos. They are farther apart than the frames
+# of a video, and the similar photos usually include the next ones.
+_NUMBERED_SHARE = 0.5
+_NUMBERED_NAME = re.compile(r"(.*?)([0-9]+)\.[^./]*")
 
 Pairs = set[tuple[int, int]]
 
@@ -57,6 +63,11 @@ def choose_pairs(
         for sequence in sequences:
             pairs |= _pairs_along(sequence, effort.overlap)
         rules.append("frames of a video with the following ones")
+    overlap = round(_NUMBERED_SHARE * effort.overlap)
+    numbered = [_following(series, range(1, overlap + 1)) for series in _numbered_series(photos)]
+    if numbered:
+        pairs |= set().union(*numbered)
+        rules.append("photos with the next ones by name")
     located = [i for i, photo in enumerate(photos) if photo.location is not None]
     if len(located) > effort.neighbours:
         places = _positions_in_metres(np.array([photos[i].location for i in located]))
@@ -79,12 +90,26 @@ def _sequences(photos: Sequence[Photo]) -> list[list[int]]:
     return [sorted(frames, key=lambda i: photos[i].name) for frames in by_name.values()]
 
 
+def _numbered_series(photos: Sequence[Photo]) -> list[list[int]]:
+    # Photos whose names differ only in the last number, such as IMG_0017.jpg, in its order.
+    by_prefix: dict[str, list[tuple[int, int]]] = {}
+    for i, photo in enumerate(photos):
+        parts = _NUMBERED_NAME.fullmatch(photo.name)
+        if photo.sequence is None and parts is not None:
+            by_prefix.setdefault(parts[1], []).append((int(parts[2]), i))
+    return [[i for _, i in sorted(series)] for series in by_prefix.values() if len(series) > 1]
+
+
 def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
     # Pair every frame with the next `overlap` frames, and with frames at distances of 2, 4, 8 …
     # times `overlap`.
     steps = list(range(1, overlap + 1))
     while steps[-1] * 2 < len(sequence):
         steps.append(steps[-1] * 2)
+    return _following(sequence, steps)
+
+
+def _following(sequence: Sequence[int], steps: Sequence[int]) -> Pairs:
     pairs = set()
     for position, i in enumerate(sequence):
         for step in steps:
