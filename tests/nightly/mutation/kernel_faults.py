@@ -346,7 +346,7 @@ FAULTS = (
     Fault(
         "simd_math.h",
         "p = p * t2 + V(0.96179669f);",
-        "p = p * t2 + V(0.9617f);",
+        "",
         "log2",
         "rasterize",
     ),
