@@ -224,7 +224,7 @@ def _file_sizes(posed: list[PosedImage], headers: list[Header]) -> list[tuple[in
 
 
 def _shrink_factor(image: PosedImage, header: Header) -> tuple[int | None, bool]:
-    """How many times smaller than its camera a file is, and whether to apply its orientation.
+    """The image size of the camera divided by that of the file; whether to apply EXIF orientation.
 
     The factor is None if the size of the file does not match the camera. Like COLMAP, this ignores
     the EXIF orientation, unless the image matches its camera only with the orientation applied.

@@ -14,9 +14,9 @@ which has these images:
 - shN_centroids: the palette: 64 entries per row, one pixel per SH coefficient, as indices into a
   codebook.
 
-Version 1 has evenly spaced levels between mins and maxs instead of codebooks. Usually it is a
-folder; its path is that of `meta.json`. The frame is that of the PLY files. Specification:
-developer.playcanvas.com, "The SOG Format".
+Version 1 has evenly spaced levels between mins and maxs instead of codebooks. A scene of version 1
+is usually a folder; `read_sog` takes the path of its `meta.json`. The frame is that of the PLY
+files. Specification: developer.playcanvas.com, "The SOG Format".
 """
 
 import io
@@ -276,6 +276,6 @@ def _palette_image(codes: np.ndarray, coefficients: int) -> np.ndarray:
 
 def _webp(pixels: np.ndarray) -> bytes:
     data = io.BytesIO()
-    # exact preserves the colours of pixels whose alpha is 0.
+    # `exact=True` preserves the colours of pixels whose alpha is 0.
     Image.fromarray(pixels).save(data, format="WEBP", lossless=True, exact=True)
     return data.getvalue()

@@ -8,8 +8,8 @@
 //   log₂ α = A dx² + B dx dy + C dy² + log₂ o,
 //   A = −½ log₂e · a,  B = −log₂e · b,  C = −½ log₂e · c
 //
-// Along a row of pixels, x = X + x₀, this is a quadratic function of X. Its coefficients depend
-// only on the row.
+// Along a row of pixels, dy is constant and dx = X + x₀. Therefore log₂ α is a quadratic function of
+// X, whose coefficients depend only on the row.
 #pragma once
 
 #include "layout.h"

@@ -111,7 +111,7 @@ class _Frame:
 def _bin_splats(
     packed: Tensor, width: int, height: int, columns: Tensor, capacity: Capacity | None
 ) -> _Frame:
-    """Sorts the splats by depth, counts the tiles that each splat touches, and lists them by tile.
+    """Sorts splats by depth, counts the tiles that each splat touches, and lists splats by tile.
 
     columns: (4,) the columns of `packed` for the first group of channels; -1: unused.
     """

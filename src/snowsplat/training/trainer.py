@@ -184,7 +184,7 @@ class Trainer:
         """Rasterize, compare with the photo, and update the Gaussians."""
         sh_degree = self.config.sh_degree_at(step)
         splats = project(self.gaussians, camera, sh_degree)
-        with torch.enable_grad():  # not for `project`: `ops.adam_step` computes its gradient
+        with torch.enable_grad():  # `project` is outside: `ops.adam_step` computes its gradient
             image = self._runner.rasterize(splats, camera, background)
             loss = view_loss(image, photo, background, self.config.ssim_weight)
         gradient = self._runner.backward(loss, splats, camera, sh_degree)

@@ -200,7 +200,8 @@ struct TileWork {
   }
 };
 
-struct SmallOffsets {  // at[width][k]: offset of the tile of bit k in a TileSpan of this width
+// at[width][k]: in a TileSpan of this width, the index of the tile of bit k minus that of the first.
+struct SmallOffsets {
   uint32_t at[17][16];
   explicit SmallOffsets(int64_t tiles_x) {
     for (int w = 1; w <= 16; w++)

@@ -98,7 +98,7 @@ class AdaptiveDensityControl:
     Attributes:
         first_reset: whether opacity is also reset at step ``first``.
         grad_sum: (N,) sum over views of |∂L/∂mean2d|, with the image spanning [-1, 1].
-        views: (N,) number of views in this sum, in which the Gaussian was visible.
+        views: (N,) number of views in this sum: those in which the Gaussian was visible.
         max_radii: (N,) largest 3σ radius in these views, in pixels.
     """
 
@@ -187,7 +187,7 @@ class AdaptiveDensityControl:
 
         Args:
             grads: (N,) mean norm of the view-space position gradient.
-            alive: (N,) bool: rows that are not pruned because of their opacity.
+            alive: (N,) bool: rows whose opacity is at least ``prune_opacity``.
         """
         dense = alive & (grads > self.settings.grad_threshold)
         if self.settings.max_gaussians > 0:

@@ -30,7 +30,7 @@ _IDLE_SECONDS = 1.0  # minimum time between two idle images
 
 @dataclass(frozen=True, eq=False)
 class PhotoView:
-    """A browser at the position of a photo, so that both can be compared.
+    """The photo at whose pose a browser is, so that its rendering can be compared with the photo.
 
     Attributes:
         index: index of the photo in the viewer's list.
@@ -165,7 +165,7 @@ class Session:
         if photo_view is not None:
             if pose.is_near(photo_view.pose):
                 arrived = True
-            # Poses that the browser sent before it was moved to the photo are ignored here.
+            # Otherwise, the browser may have sent this pose before it was moved to the photo.
             elif arrived or self._clock() - visitor.photo_view_since > _MOVE_SECONDS:
                 photo_view = None
         self.change(visitor, pose=pose, photo_view=photo_view, arrived=arrived)
