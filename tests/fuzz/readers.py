@@ -351,13 +351,18 @@ def _make_mask(folder: Path) -> None:
 # Videos
 
 
+_FAST = Image.Quantize.FASTOCTREE  # a method to choose the colours of a palette
+
+
 def _video(name: str, file: str, **options: Any) -> Reader:
     def make(folder: Path) -> None:
+        # Small frames: if the header is damaged, FFmpeg searches the whole file for another format.
+        pictures = [np.ascontiguousarray(picture[:120, :160]) for picture in pan(8)]
         if file.endswith("gif"):
-            first, *others = [Image.fromarray(picture) for picture in pan(6)]
-            first.save(folder / file, save_all=True, append_images=others, duration=100)
+            images = [Image.fromarray(picture).quantize(method=_FAST) for picture in pictures[:6]]
+            images[0].save(folder / file, save_all=True, append_images=images[1:], duration=100)
         else:
-            write_video(folder / file, pan(8), **options)
+            write_video(folder / file, pictures, **options)
 
     def read(folder: Path) -> Any:
         path = folder / file

@@ -20,6 +20,7 @@ _LIGHT_SAMPLES = 6  # along each side of the lamp
 _AMBIENT_DIRECTIONS = 48  # sampled per point
 _REACH = 1.2  # metres; objects farther away do not occlude the ambient light
 _RAYS = 1 << 14  # per batch, which fits the processor's cache
+_MARGIN = 1e-3  # metres, for rounding errors
 
 
 @dataclass(frozen=True)
@@ -108,35 +109,41 @@ def _blocked(
     blockers: Sequence[Shape], positions: np.ndarray, directions: np.ndarray, within: np.ndarray
 ) -> np.ndarray:
     """Whether (D, P) a shape is in direction (3, D, P), nearer than ``within`` (D, P)."""
-    middle = positions.mean(axis=1, keepdims=True)
-    reach = float(np.linalg.norm(positions - middle, axis=0).max() + within.max())
-    shapes = [s for s in blockers if np.linalg.norm(s.centre - middle) < reach + s.radius]
     blocked = np.zeros(within.shape, bool)
     at_once = max(1, _RAYS // positions.shape[1])
     for start in range(0, len(within), at_once):
         part = slice(start, start + at_once)
-        count = len(within[part])
         blocked[part] = _any_hit(
-            shapes,
-            np.tile(positions, count),
-            directions[:, part].reshape(3, -1),
-            within[part].ravel(),
-        ).reshape(count, -1)
+            blockers, positions, np.ascontiguousarray(directions[:, part]), within[part]
+        )
     return blocked
 
 
 def _any_hit(
-    shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray, within: np.ndarray
+    shapes: Sequence[Shape], positions: np.ndarray, directions: np.ndarray, within: np.ndarray
 ) -> np.ndarray:
-    """Whether (R,) a ray hits one of the shapes nearer than ``within`` (R,)."""
-    blocked = np.zeros(len(within), bool)
+    """`_blocked` for as many directions as fit the cache."""
+    ends = positions[:, None] + within * directions
+    low = np.minimum(positions.min(axis=1), ends.min(axis=(1, 2))) - _MARGIN
+    high = np.maximum(positions.max(axis=1), ends.max(axis=(1, 2))) + _MARGIN
+    blocked = np.zeros(within.shape, bool)
     for shape in shapes:
-        offset = shape.centre - origins
-        along = np.einsum("kr,kr->r", offset, directions)
-        off2 = np.einsum("kr,kr->r", offset, offset) - along * along
-        near = (off2 < shape.radius**2) & (along > -shape.radius) & ~blocked
-        near &= along < within + shape.radius
+        # Most shapes are outside of the bounding box of the rays.
+        middle, radius = shape.centre[:, 0], shape.radius
+        if (middle + radius < low).any() or (middle - radius > high).any():
+            continue
+        offset = shape.centre - positions
+        # Squared distances of the rays from the centre are `offset2` - `along`².
+        along = offset[0] * directions[0]
+        along += offset[1] * directions[1]
+        along += offset[2] * directions[2]
+        offset2 = (offset * offset).sum(axis=0)
+        near = along * along > offset2 - (radius + _MARGIN) ** 2
+        near &= (along > -radius - _MARGIN) & ~blocked
+        near &= along < within + (radius + _MARGIN)
         some = np.flatnonzero(near)
         if len(some):
-            blocked[some] = shape.hit(origins[:, some], directions[:, some]) < within[some]
+            origins = positions.take(some % len(offset2), axis=1)
+            distance = shape.hit(origins, directions.reshape(3, -1).take(some, axis=1))
+            blocked.ravel()[some] = distance < within.ravel()[some]
     return blocked
