@@ -1,4 +1,8 @@
-"""The page in real Chromium during a training run: its images and its controls."""
+"""The page in real Chromium during a training run: its images and its controls.
+
+Loading the page and training take much processor time. Therefore, the tests share a tab, and the
+training is paused between them.
+"""
 
 import os
 import re
@@ -24,6 +28,8 @@ pytestmark = pytest.mark.browser
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
 SCALE = 0.5  # a quarter of the pixels
+PAUSED = "document.body.innerText.includes(', paused')"
+LOADED = "/Step [1-9]/.test(document.body.innerText)"
 BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() === '{}')"
 
 
@@ -66,21 +72,40 @@ def training(tmp_path_factory) -> Iterator[Training]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with Browser(900, 1300, SCALE) as browser:
+    with Browser(640, 480, SCALE) as browser:
         yield browser
 
 
-@pytest.fixture
-def page(training, browser) -> Iterator[Page]:
+@pytest.fixture(scope="module")
+def tab(training, browser) -> Page:
     page = browser.open(training.url)
-    page.wait_for("/Step [1-9]/.test(document.body.innerText)")
-    yield page
-    page.close()
+    page.wait_for(LOADED)
+    return page
+
+
+@pytest.fixture
+def page(tab) -> Iterator[Page]:
+    yield tab
+    pause(tab)
 
 
 def press(page: Page, name: str) -> None:
     page.wait_for("!!" + BUTTON.format(name))
     page.evaluate(BUTTON.format(name) + ".click()")
+
+
+def pause(page: Page) -> None:
+    """Pause the training unless it is paused already."""
+    if not page.evaluate(PAUSED):
+        press(page, "Pause")
+        page.wait_for(PAUSED)
+
+
+def resume(page: Page) -> None:
+    """Resume the training if it is paused."""
+    if page.evaluate(PAUSED):
+        press(page, "Resume")
+        page.wait_for("!" + PAUSED)
 
 
 def choose(page: Page, now: str, name: str) -> None:
@@ -100,7 +125,7 @@ def step_of(page: Page) -> int:
 
 def scene(page: Page) -> np.ndarray:
     """The part of the screenshot left of the controls and below the messages of the browser."""
-    return page.screenshot()[int(200 * SCALE) :, : int(560 * SCALE)].astype(int)
+    return page.screenshot()[int(100 * SCALE) :, : int(300 * SCALE)].astype(int)
 
 
 def differ(a: np.ndarray, b: np.ndarray) -> float:
@@ -142,9 +167,27 @@ def test_the_page_shows_a_running_training_run(training, page):
     assert [url for url in outside if not url.startswith(("data:", "blob:"))] == []
 
 
+def test_two_pages_have_separate_cameras(training, browser, page):
+    """It comes before the tests that move the camera of the first page."""
+    pause(page)
+    other = browser.open(training.url)
+    other.wait_for(PAUSED)
+    here, there = settled(page), settled(other)
+    assert differ(here, there) < 1
+    other.drag(100, 240, 230, 280)
+    wait(lambda: differ(scene(other), there) > 2)
+    assert differ(settled(page), here) < 1
+    choose(other, "Colour", "Depth")
+    assert differ(settled(page), here) < 1
+    paused = step_of(page)
+    press(other, "Resume")  # the training is shared
+    wait(lambda: step_of(page) > paused)
+    other.close()
+
+
 def test_pause_step_and_resume(page):
-    press(page, "Pause")
-    page.wait_for("document.body.innerText.includes(', paused')")
+    resume(page)
+    pause(page)
     paused = step_of(page)
     still = settled(page)
     time.sleep(1.5)
@@ -152,15 +195,14 @@ def test_pause_step_and_resume(page):
     press(page, "One step")
     wait(lambda: step_of(page) == paused + 1)
     # While paused, the camera can still be moved.
-    page.drag(200, 600, 320, 640)
+    page.drag(100, 240, 220, 280)
     assert differ(settled(page), still) > 2
     press(page, "Resume")
     wait(lambda: step_of(page) > paused + 10)
 
 
 def test_display_modes(page):
-    press(page, "Pause")
-    page.wait_for("document.body.innerText.includes(', paused')")
+    pause(page)
     before, seen = "Colour", [settled(page)]
     for name in ("Depth", "Normals", "Points", "Ellipsoids", "Gaussians per pixel"):
         choose(page, before, name)
@@ -169,12 +211,10 @@ def test_display_modes(page):
         before = name
     choose(page, before, "Colour")
     wait(lambda: differ(scene(page), seen[0]) < 1)
-    press(page, "Resume")
 
 
-def test_the_view_at_a_photo(training, page):
-    press(page, "Pause")
-    page.wait_for("document.body.innerText.includes(', paused')")
+def test_the_view_at_a_photo(page):
+    pause(page)
     press(page, "Next")
     page.wait_for("document.body.innerText.includes('At view_01.png')")
     render = settled(page)
@@ -185,9 +225,8 @@ def test_the_view_at_a_photo(training, page):
     press(page, "Next")
     page.wait_for("document.body.innerText.includes('At view_02.png')")
     wait(lambda: differ(scene(page), photo) > 1)
-    page.drag(200, 600, 320, 640)
+    page.drag(100, 240, 220, 280)
     page.wait_for("document.body.innerText.includes('click one to view the scene')")
-    press(page, "Resume")
 
 
 def test_views_are_stored_for_a_video(page, tmp_path):
@@ -198,7 +237,7 @@ def test_views_are_stored_for_a_video(page, tmp_path):
     )
     press(page, "Store this view")
     page.wait_for("document.body.textContent.includes('1 stored')")
-    page.drag(200, 600, 320, 640)
+    page.drag(100, 240, 220, 280)
     settled_after = time.monotonic() + 1.0
     wait(lambda: time.monotonic() > settled_after)  # the browser has sent its pose
     press(page, "Store this view")
@@ -213,45 +252,27 @@ def test_views_are_stored_for_a_video(page, tmp_path):
     page.wait_for("document.body.textContent.includes('1 stored')")
 
 
-def test_two_pages_have_separate_cameras(training, browser, page):
-    press(page, "Pause")
-    page.wait_for("document.body.innerText.includes(', paused')")
-    other = browser.open(training.url)
-    other.wait_for("document.body.innerText.includes(', paused')")
-    here, there = settled(page), settled(other)
-    assert differ(here, there) < 1
-    other.drag(200, 600, 330, 640)
-    wait(lambda: differ(scene(other), there) > 2)
-    assert differ(settled(page), here) < 1
-    choose(other, "Colour", "Depth")
-    assert differ(settled(page), here) < 1
-    press(other, "Resume")  # the training is shared
-    paused = step_of(page)
-    wait(lambda: step_of(page) > paused)
-    other.close()
-
-
 def test_a_page_that_closes_during_a_transfer(training, browser, page):
     first = step_of(page)
     for _ in range(3):
+        pause(page)  # while the other page is loading
         other = browser.open(training.url)
-        other.wait_for("/Step [1-9]/.test(document.body.innerText)")
-        other.drag(200, 600, 400, 700, steps=30)
+        other.wait_for(LOADED)
+        resume(other)
+        other.drag(100, 240, 300, 340, steps=30)
         other.close()
     wait(lambda: step_of(page) > first + 10)
     assert training.process.poll() is None
 
 
-def test_ctrl_c_while_paused_saves_and_closes(training, browser):
-    page = browser.open(training.url)
-    press(page, "Pause")
-    page.wait_for("document.body.innerText.includes(', paused')")
-    paused = step_of(page)
+def test_ctrl_c_while_paused_saves_and_closes(training, tab):
+    pause(tab)
+    paused = step_of(tab)
     out = training.interrupt()
     assert training.process.returncode == 130
     assert f"stopped after step {paused}" in out
     assert "Traceback" not in out
     assert "warning" not in out
     assert (training.out / f"point_cloud/iteration_{paused}/point_cloud.ply").is_file()
-    page.close()
+    tab.close()
     assert free_port("127.0.0.1", int(training.url.rpartition(":")[2]))
