@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import struct
 import subprocess
@@ -18,8 +19,6 @@ from snowsplat.ops.cuda import nvrtc
 from snowsplat.ops.cuda.launches import KERNELS, SEQUENCES
 from snowsplat.ops.layout import layout_of
 from snowsplat.ops.params import ENTRIES
-
-from ..cache import cached
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGE = Path(snowsplat.__file__).parent
@@ -126,36 +125,41 @@ def layouts_in(cubin: bytes) -> dict[str, int]:
     return found
 
 
+def is_current(built: Path, file: str) -> bool:
+    """Whether a file of `make native` matches the sources."""
+    made_of = [*nvrtc.sources(nvrtc.path_of(file)), Path(nvrtc.__file__)]
+    return built.exists() and built.stat().st_mtime > max(p.stat().st_mtime for p in made_of)
+
+
+@functools.cache
+def compiled(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> tuple[bytes, str]:
+    """A new cubin, and the compiler's warnings."""
+    return compiler.compile(nvrtc.path_of(file), f"sm_{architecture}")
+
+
 def cubin_of(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> bytes:
     """The cubin of `make native` if it matches the sources; otherwise a new one."""
-    source = nvrtc.path_of(file)
     built = PACKAGE / "_lib" / "cuda" / f"sm_{architecture}" / f"{file}.cubin"
-    made_of = [*nvrtc.sources(source), Path(nvrtc.__file__)]
-    if built.exists() and built.stat().st_mtime > max(p.stat().st_mtime for p in made_of):
-        return built.read_bytes()
-    return compiler.compile(source, f"sm_{architecture}")[0]
+    return (
+        built.read_bytes() if is_current(built, file) else compiled(file, architecture, compiler)[0]
+    )
 
 
-def compiled_and_cached(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> tuple[bytes, str]:
-    """Cubin and warnings, cached between runs until the sources or the compiler change."""
-    source = nvrtc.path_of(file)
-
-    def compile_into(folder: Path) -> None:
-        cubin, log = compiler.compile(source, f"sm_{architecture}")
-        (folder / "cubin").write_bytes(cubin)
-        (folder / "log").write_text(log)
-
-    name = f"nvrtc-{'.'.join(map(str, compiler.version))}-{file}-{architecture}"
-    made = cached(name, [*nvrtc.sources(source), Path(nvrtc.__file__)], compile_into)
-    return (made / "cubin").read_bytes(), (made / "log").read_text()
+def warnings_of(file: str, architecture: str, compiler: nvrtc.Nvrtc) -> str:
+    """The warnings in `make native` if it had these sources and this compiler; or new ones."""
+    log = REPOSITORY / "build" / "native" / "cuda" / f"sm_{architecture}" / f"{file}.cubin.log"
+    if is_current(log, file):
+        version, _, warnings = log.read_text("utf-8").partition("\n")
+        if version == ".".join(map(str, compiler.version)):
+            return warnings
+    return compiled(file, architecture, compiler)[1]
 
 
 @pytest.mark.parametrize("file", FILES)
 def test_compiles_without_a_warning(file, compiler):
     for architecture in (ARCHITECTURES[0], ARCHITECTURES[-1]):
-        cubin, log = compiled_and_cached(file, architecture, compiler)
-        assert log == ""
-        assert cubin.startswith(b"\x7fELF")
+        assert warnings_of(file, architecture, compiler) == ""
+        assert cubin_of(file, architecture, compiler).startswith(b"\x7fELF")
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
@@ -262,11 +266,13 @@ def test_the_script_needs_only_python(compiler, tmp_path):
     source, cubin = nvrtc.path_of("statistic"), tmp_path / "in a folder" / "statistic.cubin"
     library = nvrtc.find((12,))
     script = [sys.executable, "-I", "-S", nvrtc.__file__, source, "--target", "sm_86"]
-    script += ["--output", cubin, "--depfile", f"{cubin}.d", "--library", library, "--lineinfo"]
+    script += ["--output", cubin, "--depfile", f"{cubin}.d", "--log", f"{cubin}.log"]
+    script += ["--library", library, "--lineinfo"]
     result = subprocess.run(script, capture_output=True, text=True)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
     assert "accumulate_screen_statistics_f64" in kernels_in(cubin.read_bytes())
     assert b".debug_line" in cubin.read_bytes()
+    assert Path(f"{cubin}.log").read_text() == ".".join(map(str, compiler.version)) + "\n"
     target, *names = Path(f"{cubin}.d").read_text().replace(r"\ ", "?").split()
     assert target == f"{cubin}:".replace(" ", "?")
     assert [Path(name).name for name in names] == STATISTIC_SOURCES

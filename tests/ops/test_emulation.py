@@ -111,15 +111,30 @@ def test_shared_memory_is_nan_at_the_start_of_every_block():
     assert out[20:].isnan().all()
 
 
-@pytest.mark.parametrize(
-    ("call", "found"),
-    [
-        ("beyond_shared, 32, 1, zeros(32)", "heap-buffer-overflow"),
-        ("beyond_the_tensor, 32, 1, zeros(32)", "heap-buffer-overflow"),
-        ("shifted_too_far, 32, 40, zeros(32)", "shift exponent 40 is too large"),
-    ],
-)
-def test_the_sanitizers_find_accesses_out_of_bounds(call, found):
+OUT_OF_BOUNDS = {
+    "run('beyond_shared', 32, 1, zeros(32))": "heap-buffer-overflow",
+    "run('beyond_the_tensor', 32, 1, zeros(32))": "heap-buffer-overflow",
+    "run('shifted_too_far', 32, 40, zeros(32))": "shift exponent 40 is too large",
+}
+# A sanitizer ends the process, and Python starts slowly under sanitizers: one process starts, and
+# each call is made in a fork of it.
+EACH_IN_A_FORK = """
+import os, sys
+from tests.ops.test_emulation import run, zeros
+for number, call in enumerate(sys.argv[2:]):
+    child = os.fork()
+    if child == 0:
+        log = os.open(f"{sys.argv[1]}/{number}", os.O_WRONLY | os.O_CREAT)
+        os.dup2(log, 2)
+        eval(call)
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def sanitized(tmp_path_factory) -> dict[str, tuple[int, str]]:
+    """Exit status and standard error of each call of OUT_OF_BOUNDS under the sanitizers."""
     compiler = os.environ.get("CXX", "c++")
     libraries = []
     for name in ("libasan.so", "libubsan.so"):
@@ -128,24 +143,34 @@ def test_the_sanitizers_find_accesses_out_of_bounds(call, found):
         if not os.path.isabs(path):
             pytest.skip(f"needs {name}, which comes with GCC")
         libraries.append(path)
-    name, rest = call.split(", ", 1)
-    code = f"from tests.ops.test_emulation import run, zeros; run('{name}', {rest}); print('ran')"
     environment = os.environ | {
         "LD_PRELOAD": " ".join(libraries),
         "ASAN_OPTIONS": "detect_leaks=0",
         "SNOWSPLAT_EMULATION": "sanitized",
         "PYTHONPATH": os.pathsep.join((str(REPOSITORY), str(REPOSITORY / "src"))),
     }
+    folder = tmp_path_factory.mktemp("sanitized")
     result = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", EACH_IN_A_FORK, folder, *OUT_OF_BOUNDS],
         env=environment,
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
     )
-    assert result.returncode != 0
-    assert found in result.stderr
-    assert "ran" not in result.stdout
+    assert result.returncode == 0, result.stderr
+    return {
+        call: (int(status), (folder / str(number)).read_text(errors="replace"))
+        for number, (call, status) in enumerate(
+            zip(OUT_OF_BOUNDS, result.stdout.split(), strict=True)
+        )
+    }
+
+
+@pytest.mark.parametrize(("call", "found"), OUT_OF_BOUNDS.items())
+def test_the_sanitizers_find_accesses_out_of_bounds(call, found, sanitized):
+    status, log = sanitized[call]
+    assert status != 0
+    assert found in log
 
 
 def test_threads_that_have_ended_do_not_count():

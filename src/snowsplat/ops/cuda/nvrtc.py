@@ -153,6 +153,7 @@ def _main() -> int:
     parser.add_argument("--target", help="sm_90 and so on")
     parser.add_argument("--output", type=Path)
     parser.add_argument("--depfile", type=Path, help="list the source files in this file")
+    parser.add_argument("--log", type=Path, help="write NVRTC's version and warnings to this file")
     parser.add_argument("--library", help="the NVRTC to use")
     parser.add_argument("--lineinfo", action="store_true")
     asked = parser.parse_args()
@@ -169,6 +170,9 @@ def _main() -> int:
     if log:
         print(log, file=sys.stderr)
     asked.output.parent.mkdir(parents=True, exist_ok=True)
+    if asked.log:
+        version = ".".join(map(str, nvrtc.version))
+        asked.log.write_text(f"{version}\n{log}", encoding="utf-8")
     asked.output.write_bytes(code)
     if asked.depfile:
         paths = (asked.output, *sources(asked.source.resolve()))
