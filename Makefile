@@ -124,12 +124,12 @@ pytest-isas:
 # The GPU kernels on the CPU under AddressSanitizer and UndefinedBehaviorSanitizer, with the threads of a
 # block in the reverse order: a missing barrier may have an effect in only one of the two orders, and the
 # other precision runs in the usual order. These are the sanitizers of GCC, which can be loaded into a
-# Python that was built without them.
+# Python that was built without them. Reports need no call stack of each allocation, which costs time.
 SANITIZERS = $(strip $(foreach name,libasan.so libubsan.so,$(wildcard $(shell g++ -print-file-name=$(name) 2>&1))))
 
 sanitized: native
 	@$(if $(SANITIZERS),echo "sanitized: $(PYTEST) tests/ops -m emulated -k $(SANITIZED)"; \
-	    LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0 CXX=g++ \
+	    LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0:malloc_context_size=1 CXX=g++ \
 	    SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
 	    $(PYTEST) tests/ops -m emulated -k $(SANITIZED), \
 	    echo "sanitized: skipped; it needs g++ with its sanitizers")
