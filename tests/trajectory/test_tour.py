@@ -14,15 +14,15 @@ def length(lengths: torch.Tensor, tour: list[int]) -> float:
     return float(lengths[tour[:-1], tour[1:]].sum())
 
 
-@pytest.mark.slow
 def test_short_tours_are_nearly_the_shortest():
+    orders = torch.tensor(list(itertools.permutations(range(8))))
     for seed in range(5):
         random = torch.Generator().manual_seed(seed)
         places = torch.rand(8, 2, generator=random, dtype=torch.float64)
         lengths = torch.cdist(places, places)
         tour = short_tour(lengths)
         assert sorted(tour) == list(range(8))
-        best = min(length(lengths, list(order)) for order in itertools.permutations(range(8)))
+        best = lengths[orders[:, :-1], orders[:, 1:]].sum(1).min()
         assert length(lengths, tour) < 1.15 * best
 
 

@@ -103,7 +103,7 @@ def read_images(path: Path) -> list[ColmapImage]:
     for line in filter(None, lines):
         words = line.split(maxsplit=9)
         try:
-            pose = tuple(float(word) for word in words[1:8])
+            pose = tuple(map(float, words[1:8]))
             image = ColmapImage(words[9], int(words[8]), pose)
         except (ValueError, IndexError):
             raise damaged(path, f"not an image: line {shown(line[:60])!r}") from None
