@@ -24,8 +24,8 @@ def dataset(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory) -> Path:
-    """8 photos, 320×240; read-only for the tests."""
-    return scenes.write_photos(tmp_path_factory.mktemp("kill") / "photos", 8)
+    """6 photos, 320×240; read-only for the tests."""
+    return scenes.write_photos(tmp_path_factory.mktemp("kill") / "photos", 6)
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,8 @@ import os
 import re
 import shutil
 import signal
+import time
+from pathlib import Path
 
 import pytest
 
@@ -112,22 +114,34 @@ def test_a_timed_run_with_more_steps_than_planned(zygote, dataset, tmp_path):
     assert zygote.run(command).code == 0
     newest = checkpoint.latest(out / "checkpoints")
     assert newest is not None
-    newest.meta["training"]["iterations"] = newest.step - 3
-    checkpoint.save(out / "checkpoints", newest.step, newest.tensors, newest.meta)
+    newest.meta["training"]["iterations"] = newest.step
+    checkpoint.save(out / "checkpoints", newest.step + 3, newest.tensors, newest.meta)
     done = zygote.run([*command, "--resume"])
     assert done.code == 0, done.text
 
 
-def test_make_keeps_checkpoints_until_the_scene_is_recorded(zygote, photos, tmp_path):
+def test_make_keeps_checkpoints_until_the_scene_is_recorded(killer, zygote, photos, tmp_path):
     """The run is killed as soon as they are removed; the stage must be recorded as finished."""
+    (job,) = make_jobs(photos)
+    whole, _ = killer.reference(job)
     out = tmp_path / "made"
-    command = ["make", photos, "-o", out, "--quality", "draft", "--device", "cpu", "--threads", 1]
+    shutil.copytree(whole / job.output, out)
+    # Only the poses are kept.
+    shutil.rmtree(out / "scene")
+    record = json.loads((out / "make.json").read_text())
+    record["stages"] = {}
+    (out / "make.json").write_text(json.dumps(record))
+    command = job.command(out, True)
     checkpoints = out / "scene/checkpoints"
+    last = out / "scene/point_cloud/iteration_120/point_cloud.ply"
 
     def kill_when_gone(pid: int) -> None:
-        seen = False
-        while not seen or checkpoints.exists():
-            seen = seen or checkpoints.exists()
+        process = Path(f"/proc/{pid}")
+        while not last.exists() and process.exists():
+            time.sleep(0.005)
+        assert checkpoints.exists()
+        while checkpoints.exists() and process.exists():
+            pass  # without a delay, since the record may be written soon afterwards
         os.killpg(pid, signal.SIGKILL)
 
     assert zygote.run(command, while_it_runs=kill_when_gone).killed

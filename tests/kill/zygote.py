@@ -9,6 +9,7 @@ itself, the number of changes is written to LOG.changes. The responses are {"pid
 """
 
 import fcntl
+import gc
 import importlib
 import json
 import os
@@ -28,6 +29,8 @@ _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
 def _import_all() -> None:
+    from PIL import Image
+
     import snowsplat.cli.main
     import snowsplat.evaluation.metrics
     import snowsplat.formats
@@ -51,6 +54,10 @@ def _import_all() -> None:
     importlib.import_module("pycolmap")
     for name in snowsplat.cli.main.SUBCOMMANDS:
         snowsplat.cli.main.parse([name])
+    Image.init()  # imports the readers of all formats
+    # Runs need not examine, and thereby copy, the objects that exist now.
+    gc.collect()
+    gc.freeze()
 
 
 def _kill_at(at: int | None, delay: float, watched: list[str], changes: list[int]) -> None:
