@@ -10,9 +10,6 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from snowsplat import synthetic
-from snowsplat.synthetic import write_synthetic_photos
-
 _ROOT = Path(__file__).resolve().parents[1]
 _FOLDER = _ROOT / "build" / "tests"
 
@@ -41,9 +38,3 @@ def cached(name: str, sources: Iterable[Path], make: Callable[[Path], object]) -
     for path in outdated:
         shutil.rmtree(path, ignore_errors=True)
     return folder
-
-
-def still_life_photos() -> Path:
-    """20 photos of the procedural still life, 320×240; read-only for the tests."""
-    sources = Path(synthetic.__file__).parent.glob("*.py")
-    return cached("photos-20", sources, lambda out: write_synthetic_photos(out, 20, 320, 240))

@@ -3,7 +3,6 @@
 import re
 import runpy
 import shlex
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
-from .cache import still_life_photos
+from .sfm.colmap import scenes
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -27,7 +26,7 @@ def test_photos_to_scene_from_python(tmp_path, monkeypatch, capsys):
     assert len(EXAMPLES[0].split("\n\n")[1].splitlines()) == 5  # "in five lines"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=100))
-    shutil.copytree(still_life_photos(), tmp_path / "photos")
+    scenes.write_photos(tmp_path / "photos", 9)
     example, changes = re.subn("seconds=5", "seconds=0.1", EXAMPLES[0])
     assert changes == 1
     (tmp_path / "example.py").write_text(example)

@@ -1,19 +1,17 @@
 """A small dataset; the command line, called in this process or as a separate one."""
 
-import os
+import functools
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-import snowsplat
 from snowsplat.cli.main import main
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
+from ..fork_server import Process, popen
 
 
 @dataclass
@@ -62,16 +60,6 @@ def refused(run) -> Callable[..., str]:
 
 
 @pytest.fixture
-def start() -> Callable[..., subprocess.Popen]:
+def start() -> Callable[..., Process | subprocess.Popen]:
     """Start the command as a separate process."""
-
-    def start(*arguments: object) -> subprocess.Popen:
-        return subprocess.Popen(
-            [sys.executable, "-m", "snowsplat", *map(str, arguments)],
-            env=ENVIRONMENT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    return start
+    return functools.partial(popen, "-m", "snowsplat")

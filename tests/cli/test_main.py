@@ -17,7 +17,7 @@ from snowsplat.formats import write_gaussians
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training import checkpoint
 
-from .conftest import ENVIRONMENT
+from ..fork_server import ENVIRONMENT
 
 UNIT_BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 
@@ -200,8 +200,8 @@ def test_a_training_run_whose_standard_output_is_closed_fails(dataset, tmp_path)
     assert not (tmp_path / "out/point_cloud").exists()
 
 
-def test_python_m(start):
-    process = start("info", "/nonexistent")
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert err == "snowsplat: /nonexistent: no such file or folder\n"
+def test_python_m():
+    command = [sys.executable, "-m", "snowsplat", "info", "/nonexistent"]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr == "snowsplat: /nonexistent: no such file or folder\n"

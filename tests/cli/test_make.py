@@ -1,11 +1,9 @@
 """`snowsplat make`, from photos to files: its output, kills, repeated stages."""
 
 import json
-import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.pipeline import make as make_module
 from snowsplat.pipeline.make import RECORD, STAGES
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.util.stages import Stages
 
-from ..cache import still_life_photos
+from ..fork_server import popen
+from ..sfm.colmap import scenes
 
 QUICK = replace(PRESETS["draft"], iterations=120)
 #: The command as a separate process, with the same short training and frequent checkpoints.
@@ -35,9 +33,8 @@ sys.exit(main())
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
-    """20 photos, 320×240; read-only for the tests. The name has spaces and an umlaut."""
-    folder = tmp_path_factory.mktemp("make") / "Häuser am See"
-    return Path(shutil.copytree(still_life_photos(), folder))
+    """9 photos, 320×240; read-only for the tests. The name has spaces and an umlaut."""
+    return scenes.write_photos(tmp_path_factory.mktemp("make") / "Häuser am See", 9)
 
 
 @pytest.fixture
@@ -70,7 +67,7 @@ def test_from_photos_to_files_and_repeated_stages(
     metrics = json.loads((out / "scene/metrics.json").read_text())
     assert metrics["psnr"] > 12
     made = files(out / "scene/test/ours_120")
-    assert made == {f"{kind}/{i:05d}.png" for kind in ("renders", "gt") for i in range(3)}
+    assert made == {f"{kind}/{i:05d}.png" for kind in ("renders", "gt") for i in range(2)}
     assert (out / "capture/capture_report.html").is_file()
     assert not (out / "scene/checkpoints").exists()
     summary = result.out[result.out.index("\nThe scene") :]
@@ -108,7 +105,7 @@ def test_from_photos_to_files_and_repeated_stages(
     # Other photos: the existing output is not replaced.
     fewer = tmp_path / "fewer"
     fewer.mkdir()
-    for photo in sorted(photos.iterdir())[:17]:
+    for photo in sorted(photos.iterdir())[:7]:
         shutil.copy(photo, fewer)
     before = state(out)
     assert "--overwrite" in refused("make", fewer, "-o", out, "--quality", "draft")
@@ -118,17 +115,10 @@ def test_from_photos_to_files_and_repeated_stages(
 @pytest.fixture
 def killed(photos, tmp_path) -> Callable[..., str]:
     """Run the command as a process, kill it when a condition holds; returns its output."""
-    environment = os.environ | {"PYTHONPATH": str(Path(make_module.__file__).parents[2])}
 
     def killed(out: Path, when: Callable[[], bool], with_signal: int) -> str:
-        arguments = ["make", str(photos), "-o", str(out), "--quality", "draft", "--threads", "1"]
-        process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, *arguments],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        arguments = ("make", photos, "-o", out, "--quality", "draft", "--threads", 1)
+        process = popen("-c", PROGRAM, *arguments, stderr=subprocess.STDOUT)
         deadline = time.monotonic() + 120
         while not when() and process.poll() is None:
             assert time.monotonic() < deadline
@@ -167,7 +157,7 @@ def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
     assert result.code == 0, result.err
     assert "resuming from" in result.out
     assert (out / "Häuser am See.ply").is_file()
-    assert len(list(out.glob("scene/test/ours_120/renders/*.png"))) == 3
+    assert len(list(out.glob("scene/test/ours_120/renders/*.png"))) == 2
     assert not list(out.rglob("*.tmp"))
 
 

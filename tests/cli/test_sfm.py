@@ -4,8 +4,6 @@ import errno
 import json
 import os
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -13,12 +11,11 @@ import pycolmap
 import pytest
 from PIL import Image
 
-import snowsplat
+from snowsplat.cli.main import main
 from snowsplat.data import load_dataset
 
 from ..sfm.colmap import scenes
 
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
 STAGES = ("photos", "poses", "images", "report")
 QUICK = ("--quality", "draft", "--threads", "1")
 
@@ -27,17 +24,15 @@ pytestmark = pytest.mark.sfm
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
-    """10 photos, 320×240; read-only for the tests."""
-    return scenes.write_photos(tmp_path_factory.mktemp("capture") / "photos", 10)
+    """6 photos, 320×240; read-only for the tests."""
+    return scenes.write_photos(tmp_path_factory.mktemp("capture") / "photos", 6)
 
 
 @pytest.fixture(scope="module")
 def captured(photos, tmp_path_factory) -> Path:
     """Their dataset, with smaller copies; read-only for the tests."""
     out = tmp_path_factory.mktemp("captured") / "garden"
-    command = [sys.executable, "-m", "snowsplat", "sfm", photos, "-o", out, *QUICK, "--resize"]
-    done = subprocess.run(list(map(str, command)), env=ENVIRONMENT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    assert main(["sfm", str(photos), "-o", str(out), *QUICK, "--resize"]) == 0
     return out
 
 
@@ -61,7 +56,7 @@ def test_layout_is_that_of_convert_py(captured, photos):
     assert (captured / "distorted" / "database.db").is_file()
     distorted = pycolmap.Reconstruction(captured / "distorted" / "sparse" / "0")
     model = pycolmap.Reconstruction(captured / "sparse" / "0")
-    assert model.num_reg_images() == distorted.num_reg_images() == 10
+    assert model.num_reg_images() == distorted.num_reg_images() == 6
     assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
     record = json.loads((captured / "capture.json").read_text())
     assert list(record["stages"]) == list(STAGES)
@@ -175,23 +170,21 @@ def test_a_full_disk_keeps_finished_stages(captured, photos, run, tmp_path, monk
 
 
 @pytest.mark.parametrize("stage", ["photos", "poses", "images"])
-def test_after_a_kill_in_any_stage_the_same_command_resumes(stage, photos, run, tmp_path):
+def test_after_a_kill_in_any_stage_the_same_command_resumes(stage, photos, run, start, tmp_path):
     out = tmp_path / "garden"
-    command = [sys.executable, "-m", "snowsplat", "sfm", photos, "-o", out, *QUICK]
+    command = ("sfm", photos, "-o", out, *QUICK)
     begun = {
         "photos": lambda: out.exists(),
         "poses": lambda: (out / "distorted" / "database.db").exists(),
         "images": lambda: (out / "images").exists(),
     }[stage]
-    with subprocess.Popen(
-        list(map(str, command)), env=ENVIRONMENT, stdout=subprocess.DEVNULL
-    ) as process:
+    with start(*command) as process:
         while not begun():
             assert process.poll() is None
             time.sleep(0.005)
         process.kill()
-    result = run(*command[3:])
+    result = run(*command)
     assert result.code == 0, result.err
     dataset = load_dataset(out)
-    assert len(dataset.train) + len(dataset.test) == 10
+    assert len(dataset.train) + len(dataset.test) == 6
     assert not (out / ".new").exists()

@@ -4,11 +4,8 @@ import contextlib
 import os
 import resource
 import signal
-import subprocess
-import sys
 import time
 import warnings
-from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -16,6 +13,8 @@ import torch
 
 from snowsplat.training import checkpoint, checkpoint_file
 from snowsplat.util.errors import UserError
+
+from ..fork_server import popen
 
 
 def some_tensors() -> dict[str, torch.Tensor]:
@@ -186,11 +185,7 @@ def test_kill_9_during_a_save(tmp_path):
     cut = 0
     for attempt in range(2):
         folder = tmp_path / str(attempt)
-        process = subprocess.Popen(
-            [sys.executable, "-c", SAVER, str(folder)],
-            stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": str(Path(checkpoint.__file__).parents[2])},
-        )
+        process = popen("-c", SAVER, folder)
         assert process.stdout is not None
         process.stdout.readline()
         deadline = time.monotonic() + 20

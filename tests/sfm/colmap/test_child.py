@@ -4,7 +4,6 @@ import json
 import os
 import resource
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import asdict
@@ -16,12 +15,11 @@ from snowsplat.sfm.colmap import SfmOptions, estimate_poses
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
+from ...fork_server import popen
 from . import scenes
 
 DRAFT = SfmOptions(effort="draft", threads=2)
 CHILDREN = Path("/proc/self/task") / str(os.getpid()) / "children"
-# The child imports the same `snowsplat` as this process.
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 PARENT = """
 import json, sys
@@ -56,7 +54,10 @@ def photos(tmp_path, pictures):
 
 
 def children_of(pid):
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    """The child processes in which COLMAP runs."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    commands = {int(child): Path(f"/proc/{child}/cmdline").read_bytes() for child in children}
+    return [child for child, command in commands.items() if b"colmap.worker" in command]
 
 
 def is_alive(pid):
@@ -132,13 +133,7 @@ def test_interrupt_ends_the_child(tmp_path, photos):
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_child_ends_with_a_killed_parent(tmp_path, photos, what, number):
     photos_json = json.dumps([asdict(photo) for photo in photos])
-    parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT, str(tmp_path), photos_json],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=ENVIRONMENT,
-    )
-    with parent:
+    with popen("-c", PARENT, tmp_path, photos_json) as parent:
         while parent.stdout.readline().strip() != what:
             pass
         children = children_of(parent.pid)

@@ -1,0 +1,261 @@
+"""Starts Python programs in forks of a process that has loaded all modules: no time for imports.
+
+    python fork_server.py 3      the server; 3 is its end of a socket
+
+A program has its own streams, environment, handling of Ctrl-C and exit code. Tests of imports, and
+of variables that are read by Python or while libraries are loaded, need a process that is really
+new.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import gc
+import json
+import os
+import runpy
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+_LARGEST_REQUEST = 1 << 17
+
+
+def popen(
+    *arguments: object,
+    env: Mapping[str, str] = ENVIRONMENT,
+    stderr: int = subprocess.PIPE,
+) -> Process | subprocess.Popen:
+    """``python arguments``: ``-m module …``, ``-c code …`` or ``script …``; stdout is a pipe.
+
+    Where forks are not possible, it is a new process.
+    """
+    texts = [str(argument) for argument in arguments]
+    if hasattr(os, "pidfd_open"):
+        return Process(texts, dict(env), stderr)
+    command = [sys.executable, *texts]
+    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=stderr, text=True)
+
+
+def run(
+    *arguments: object, env: Mapping[str, str] = ENVIRONMENT, timeout: float = 300
+) -> subprocess.CompletedProcess[str]:
+    """Like `popen`, but waits for the end."""
+    process = popen(*arguments, env=env)
+    out, err = process.communicate(timeout)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+class Process:
+    """A process that the server started. Its methods are those of `subprocess.Popen`."""
+
+    def __init__(self, arguments: list[str], env: dict[str, str], stderr: int) -> None:
+        self.args = arguments
+        self.returncode: int | None = None
+        self.stdout, out = _pipe()
+        self.stderr, err = _pipe() if stderr == subprocess.PIPE else (None, os.dup(out))
+        request = {"argv": arguments, "env": env, "cwd": os.getcwd()}
+        self.pid = _server().ask(request, [out, err])
+        os.close(out)
+        os.close(err)
+        # Until the server is asked for its exit code, the number belongs to this process.
+        self._handle = os.pidfd_open(self.pid)
+
+    def poll(self) -> int | None:
+        return self._ended_within(0)
+
+    def wait(self, timeout: float | None = None) -> int:
+        code = self._ended_within(timeout)
+        if code is None:
+            raise subprocess.TimeoutExpired(self.args, timeout or 0)
+        return code
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        texts = {}
+
+        def read(stream) -> None:
+            with stream:
+                texts[stream] = stream.read()
+
+        streams = [stream for stream in (self.stdout, self.stderr) if stream]
+        threads = [threading.Thread(target=read, args=(s,), daemon=True) for s in streams]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(timeout)
+            if thread.is_alive():
+                raise subprocess.TimeoutExpired(self.args, timeout or 0)
+        self.wait(timeout)
+        return texts[self.stdout], texts.get(self.stderr, "")
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            signal.pidfd_send_signal(self._handle, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for stream in (self.stdout, self.stderr):
+            if stream:
+                stream.close()
+        self.wait()
+
+    def _ended_within(self, timeout: float | None) -> int | None:
+        if self.returncode is None and select.select([self._handle], [], [], timeout)[0]:
+            self.returncode = _server().ask({"ended": self.pid})
+            os.close(self._handle)
+        return self.returncode
+
+
+def _pipe():
+    read, write = os.pipe()
+    return open(read, encoding="utf-8"), write
+
+
+class _Server:
+    """The process that forks, and the socket to it."""
+
+    def __init__(self) -> None:
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._lock = threading.Lock()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, __file__, str(theirs.fileno())],
+                env=ENVIRONMENT,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,  # so that the streams of programs are not a terminal's
+                pass_fds=[theirs.fileno()],
+            )
+        atexit.register(self._end)
+
+    def ask(self, request: dict, streams: list[int] | None = None) -> int:
+        with self._lock:
+            socket.send_fds(self._socket, [json.dumps(request).encode()], streams or [])
+            return int(self._socket.recv(_LARGEST_REQUEST))
+
+    def _end(self) -> None:
+        self._socket.close()
+        self._process.wait()
+
+
+@functools.cache
+def _server() -> _Server:
+    return _Server()
+
+
+def _import_all() -> None:
+    import snowsplat.cli.main
+    import snowsplat.evaluation.metrics
+    import snowsplat.formats
+    import snowsplat.pipeline.make
+    import snowsplat.pipeline.memory_use
+    import snowsplat.pipeline.videos
+    import snowsplat.scene.edit
+    import snowsplat.sfm.dataset_folder
+    import snowsplat.sfm.orient
+    import snowsplat.sfm.report
+    import snowsplat.sfm.undistort
+    import snowsplat.training.checkpoint
+    import snowsplat.training.recipes
+    import snowsplat.training.report
+    import snowsplat.training.time_budget.plan
+    import snowsplat.training.trainer
+    import snowsplat.viewer.web.scene
+    import snowsplat.viewer.web.server
+
+    for name in snowsplat.cli.main.SUBCOMMANDS:
+        snowsplat.cli.main.parse([name])
+
+
+def _serve(ours: socket.socket) -> dict:
+    """Answer requests; returns only in a fork, with its request."""
+    while True:
+        data, streams, _, _ = socket.recv_fds(ours, _LARGEST_REQUEST, 2)
+        if not data:  # the tests have ended
+            os._exit(0)
+        request = json.loads(data)
+        if "ended" in request:
+            _, status = os.waitpid(request["ended"], 0)
+            ours.send(b"%d" % os.waitstatus_to_exitcode(status))
+            continue
+        pid = os.fork()
+        if pid == 0:
+            ours.close()
+            for number, stream in enumerate(streams, 1):
+                os.dup2(stream, number)
+                os.close(stream)
+            return request
+        for stream in streams:
+            os.close(stream)
+        ours.send(b"%d" % pid)
+
+
+def _execute(request: dict) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ.clear()
+    os.environ.update(request["env"])
+    os.chdir(request["cwd"])
+    first, *rest = request["argv"]
+    if first == "-m":
+        sys.path[0], sys.argv = os.getcwd(), rest
+        runpy.run_module(rest[0], run_name="__main__", alter_sys=True)
+    elif first == "-c":
+        sys.path[0], sys.argv = "", ["-c", *rest[1:]]
+        exec(compile(rest[0], "<string>", "exec"), {"__name__": "__main__"})
+    else:
+        sys.path[0], sys.argv = str(Path(first).parent), request["argv"]
+        runpy.run_path(first, run_name="__main__")
+
+
+def _exit_code(request: dict) -> int:
+    try:
+        _execute(request)
+    except SystemExit as ended:
+        if ended.code is None or isinstance(ended.code, int):
+            return ended.code or 0
+        print(ended.code, file=sys.stderr)
+        return 1
+    except BaseException as error:
+        sys.excepthook(type(error), error, error.__traceback__)
+        return -signal.SIGINT if isinstance(error, KeyboardInterrupt) else 1
+    return 0
+
+
+def _run_and_exit(request: dict) -> None:
+    """The end of an interpreter, but it frees no modules: that would take a second."""
+    code = 120  # Python's own if the output cannot be written
+    try:
+        code_of_program = _exit_code(request)
+        threading._shutdown()  # waits for threads
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        code = code_of_program
+        if code < 0:
+            signal.signal(-code, signal.SIG_DFL)
+            os.kill(os.getpid(), -code)
+    finally:
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    # Ctrl-C ends the tests, and then the server.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _import_all()
+    gc.freeze()  # forks do not look for garbage among the modules
+    _run_and_exit(_serve(socket.socket(fileno=int(sys.argv[1]))))
