@@ -4,6 +4,7 @@
 describes them.
 """
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -42,6 +43,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(_OF_FOLDERS[folder])
         for fixture in _OF_FIXTURES.keys() & getattr(item, "fixturenames", ()):
             item.add_marker(_OF_FIXTURES[fixture])
+
+
+def pytest_collection_finish() -> None:
+    # Each training run calls gc.collect(), which need not examine the loaded modules and all tests.
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
