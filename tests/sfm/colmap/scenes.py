@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,12 +110,16 @@ def _sample(texture: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
 
 
 def write_photos(folder: Path, count: int) -> Path:
-    """``count`` photos of the boards, 000.jpg …, as files that a user has; returns the folder."""
+    """``count`` photos of the boards, 000.jpg …, in colour, with EXIF data; returns the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     scene = boards()
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "snowsplat", "boards"  # Make, Model
+    exif.get_ifd(0x8769)[0xA405] = round(FOCAL * math.hypot(36, 24) / math.hypot(WIDTH, HEIGHT))
     for i, pose in enumerate(arc(count)):
-        photo = Image.fromarray(photograph(scene, pose, i))
-        photo.save(folder / f"{i:03}.jpg", quality=95)
+        grey = photograph(scene, pose, i)
+        colour = np.stack([grey, 0.9 * grey, 255 - 0.7 * grey], -1).astype(np.uint8)
+        Image.fromarray(colour).save(folder / f"{i:03}.jpg", quality=95, exif=exif)
     return folder
 
 

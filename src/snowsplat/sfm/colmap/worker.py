@@ -10,6 +10,7 @@ parent handles. The output of COLMAP goes to stderr, which the parent writes to 
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import os
 import signal
@@ -31,6 +32,9 @@ from snowsplat.util.errors import UserError
 def main() -> None:
     """Run the job that is read from stdin."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The handlers of COLMAP's logger allocate memory, so a crash within malloc would hang in them.
+    faulthandler.enable()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     answers = _redirected_stdout()
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
