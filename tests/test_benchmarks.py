@@ -18,6 +18,8 @@ from snowsplat.ops.cuda.launches import KERNELS, launch_by
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
+from . import fork_server
+
 ROOT = Path(__file__).resolve().parents[1]
 BENCHMARKS = ROOT / "benchmarks"
 #: A sleep duration that no other process uses, which identifies the children of these tests.
@@ -29,14 +31,8 @@ pytestmark = pytest.mark.slow
 
 def benchmark(script: str, *arguments: object) -> str:
     """The output of a script. It never uses the garden, so it is the same everywhere."""
-    environment = os.environ | {"SNOWSPLAT_GARDEN": "none", "PYTHONPATH": str(ROOT / "src")}
-    run = subprocess.run(
-        [sys.executable, str(BENCHMARKS / script), *map(str, arguments)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    environment = fork_server.ENVIRONMENT | {"SNOWSPLAT_GARDEN": "none"}
+    run = fork_server.run(BENCHMARKS / script, *arguments, env=environment)
     assert run.returncode == 0, run.stderr
     return run.stdout
 
@@ -145,12 +141,7 @@ def test_psnr_against_time(tmp_path):
 
 
 def test_a_wrong_dataset_is_a_one_line_error(tmp_path):
-    run = subprocess.run(
-        [sys.executable, str(BENCHMARKS / "train.py"), str(tmp_path / "none")],
-        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
-        capture_output=True,
-        text=True,
-    )
+    run = fork_server.run(BENCHMARKS / "train.py", tmp_path / "none")
     assert run.returncode == 1
     assert run.stderr.startswith("train: ")
     assert len(run.stderr.splitlines()) == 1
@@ -208,12 +199,8 @@ def job(name, code, limit=30.0, **more):
 
 
 def test_without_a_gpu_it_prints_one_line(tmp_path):
-    run = subprocess.run(
-        [sys.executable, str(BENCHMARKS / "gpu.py"), "--out", str(tmp_path / "out")],
-        env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},
-        capture_output=True,
-        text=True,
-    )
+    environment = fork_server.ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": ""}
+    run = fork_server.run(BENCHMARKS / "gpu.py", "--out", tmp_path / "out", env=environment)
     assert run.returncode == 2
     assert len(run.stdout.splitlines()) == 1
     assert run.stdout.startswith("gpu: nothing was measured: ")
@@ -762,6 +749,7 @@ def test_comparison_with_a_peer(fake_gpu, capsys, monkeypatch):
 
 FAKE_RUN = """
 import sys
+sys.path.insert(0, BENCHMARKS)
 import gpu, gpu_jobs
 report = "print('@@ {}', flush=True); "
 def job(name, code, **more):
@@ -780,12 +768,8 @@ sys.exit(gpu.main())
 
 @pytest.mark.parametrize("long", [0, LONG], ids=["to its end", "killed"])
 def test_a_complete_run_writes_its_page(tmp_path, long):
-    run = subprocess.Popen(
-        [sys.executable, "-c", FAKE_RUN.replace("LONG", str(long)), "--out", str(tmp_path)],
-        env=os.environ | {"PYTHONPATH": f"{BENCHMARKS}{os.pathsep}{ROOT / 'src'}"},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    code = FAKE_RUN.replace("BENCHMARKS", repr(str(BENCHMARKS))).replace("LONG", str(long))
+    run = fork_server.popen("-c", code, "--out", tmp_path)
     if long:
         page, until = tmp_path / "gpu.md", time.monotonic() + 60
 
