@@ -65,6 +65,7 @@ def _sum_in_a_fixed_order() -> None:
 
     # Required by cuBLAS, which reads it at its first use.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    torch.use_deterministic_algorithms(True, warn_only=True)
+    # As torch.use_deterministic_algorithms, which would also import PyTorch's compiler, in 2 s.
+    torch.set_deterministic_debug_mode("warn")
     # Otherwise PyTorch fills all new memory, to make reads of uninitialized memory repeatable.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
