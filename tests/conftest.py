@@ -5,6 +5,7 @@ describes them.
 """
 
 import gc
+import logging
 import os
 import signal
 from pathlib import Path
@@ -49,6 +50,11 @@ def pytest_collection_finish() -> None:
     # Each training run calls gc.collect(), which need not examine the loaded modules and all tests.
     gc.collect()
     gc.freeze()
+    # For each phase of a test, pytest adds its handlers to each logger that does not propagate to
+    # the root logger. Torch has more than 40 of them.
+    for name, logger in logging.root.manager.loggerDict.items():
+        if name.split(".")[0] == "torch" and isinstance(logger, logging.Logger):
+            logger.propagate = True
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -95,7 +95,8 @@ def double(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> V
 @pytest.fixture
 def sums_in_order() -> Iterator[None]:
     """Gradients are summed in a fixed order, on a GPU too."""
-    before = torch.are_deterministic_algorithms_enabled()
-    torch.use_deterministic_algorithms(True)
+    before = torch.get_deterministic_debug_mode()
+    # The same as torch.use_deterministic_algorithms(True), which imports torch's compiler first.
+    torch.set_deterministic_debug_mode("error")
     yield
-    torch.use_deterministic_algorithms(before)
+    torch.set_deterministic_debug_mode(before)

@@ -7,12 +7,14 @@ and its float64 reference is then only the rounding error of the op.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from snowsplat import ops
 from snowsplat.ops import reference
@@ -49,6 +51,10 @@ EMULATED_FLOAT32 = replace(NATIVE_FLOAT32, engine="emulated")
 EMULATED_FLOAT64 = replace(NATIVE_FLOAT64, engine="emulated")
 CUDA_FLOAT32 = replace(NATIVE_FLOAT32, engine="cuda")
 CUDA_FLOAT64 = replace(NATIVE_FLOAT64, engine="cuda")
+
+
+#: Length of the longest images of the emulated kernels, in pixels; that of the others is 16384.
+EMULATED_LENGTH = 10_000
 
 
 @dataclass(frozen=True)
@@ -230,6 +236,35 @@ def differentiable_columns(splats: Splats2D) -> Tensor:
     s = splats
     scalars = torch.stack([s.opacities, s.depths], dim=1)
     return torch.cat([s.means2d, s.conics, scalars, s.colors], dim=1)
+
+
+class Adam:
+    """Torch's Adam. Its class torch.optim.Adam imports torch's compiler, which takes seconds."""
+
+    def __init__(self, leaves: list[Tensor], rates: list[float], eps: float = 1e-8) -> None:
+        self.leaves, self.rates, self.eps = leaves, rates, eps
+        self.m, self.v = ([torch.zeros_like(leaf) for leaf in leaves] for _ in range(2))
+        self.steps = [torch.zeros(()) for _ in leaves]
+
+    @torch.no_grad()
+    def step(self, grads: Sequence[Tensor]) -> None:
+        rows = zip(self.leaves, grads, self.m, self.v, self.steps, self.rates, strict=True)
+        for leaf, grad, m, v, step, rate in rows:
+            adam(
+                [leaf],
+                [grad],
+                [m],
+                [v],
+                [],
+                [step],
+                amsgrad=False,
+                beta1=0.9,
+                beta2=0.999,
+                lr=rate,
+                weight_decay=0,
+                eps=self.eps,
+                maximize=False,
+            )
 
 
 def relative_error(actual: Tensor, expected: Tensor) -> float:

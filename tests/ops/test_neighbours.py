@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import pytest
@@ -85,15 +86,23 @@ CLOUDS = {
 }
 
 
+@functools.cache
+def cloud_and_distances(name: str) -> tuple[Tensor, Tensor]:
+    """A cloud and the distances to at most 20 neighbours, computed once for all variants."""
+    points = as_float32(CLOUDS[name](generator(0)).double())
+    return points, reference.neighbours(points, min(20, len(points) - 1))
+
+
 @pytest.mark.parametrize("k", [1, 3, 20])
-@pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS.keys())
-def test_native_agrees_with_the_reference(native: Variant, cloud, k: int) -> None:
-    points = as_float32(cloud(generator(0)).double())
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_native_agrees_with_the_reference(native: Variant, cloud: str, k: int) -> None:
+    points, distances = cloud_and_distances(cloud)
     k = min(k, len(points) - 1)
-    expected = reference.neighbours(points, k)
     actual = native.ops.neighbours(points.to(native.dtype), k)
     # Each distance separately: in the L2 norm over all, the outlier would hide the others.
-    torch.testing.assert_close(actual.double(), expected, rtol=native.forward * 1e-1, atol=1e-12)
+    torch.testing.assert_close(
+        actual.double(), distances[:, :k], rtol=native.forward * 1e-1, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("k", [2, 4, 8, 9, 64])
