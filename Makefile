@@ -88,7 +88,10 @@ layers: $(ENVIRONMENT)
 
 # Number of processes for tests.
 JOBS ?= $(shell $(PYTHON) -c 'import os; print(os.cpu_count())')
-PYTEST = $(PYTHON) -m pytest -n $(JOBS) --dist worksteal
+PYTEST = $(PROCESS) $(PYTHON) -m pytest $(PROCESSES)
+# A single process does not need xdist.
+PROCESS = $(if $(filter 1,$(JOBS)),OMP_NUM_THREADS=1)
+PROCESSES = $(if $(filter 1,$(JOBS)),,-n $(JOBS) --dist worksteal)
 # Slow tests have a mark, and `quick` excludes these marks (listed in pyproject.toml).
 QUICK := not (sfm or browser or build or emulated or gpu or kill or slow)
 ISA := isa and not (emulated or gpu)

@@ -32,7 +32,9 @@ extern EmulatedIndex thread_index, block_index, block_size, grid_size;
 struct Place {
   const char* file;
   int line;
-  bool operator==(const Place& o) const { return line == o.line && !std::strcmp(file, o.file); }
+  bool operator==(const Place& o) const {
+    return line == o.line && (file == o.file || !std::strcmp(file, o.file));
+  }
 };
 inline Place here(const char* file = __builtin_FILE(), int line = __builtin_LINE()) {
   return {file, line};
