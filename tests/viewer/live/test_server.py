@@ -64,6 +64,19 @@ def test_unavailable_ports(taken):
             free_port("127.0.0.1", port)
 
 
+def test_another_process_takes_the_free_port_first(taken, monkeypatch):
+    monkeypatch.setattr("snowsplat.viewer.live.server.free_port", lambda host, port: taken)
+    running = start_server("127.0.0.1", None, "")
+    try:
+        port = running.server.get_port()
+        assert port != taken
+        assert running.url == f"http://127.0.0.1:{port}"
+    finally:
+        stop_server(running.server)
+    with pytest.raises(UserError, match=f"port: {taken} is in use"):
+        start_server("127.0.0.1", taken, "")
+
+
 @pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid", "a b"])
 def test_hosts_that_are_not_local(host):
     with pytest.raises(UserError, match=f"host: .*{host}"):

@@ -67,11 +67,12 @@ def start_server(host: str, port: int | None, label: str) -> RunningServer:
     if not guard.serves:
         stop_server(server)
         raise RuntimeError(f"viser {viser.__version__} is not supported: it starts differently")
-    if server.get_port() != free:  # it is in use now; viser takes the next port without a message
+    listens = server.get_port()  # viser takes the next port if another process was faster
+    if port is not None and listens != port:
         stop_server(server)
-        raise SettingError("port", f"{free} is in use; choose another, e.g. {free + 1}")
-    others = address(socket.gethostname(), free, token) if host in ANY_HOST else None
-    return RunningServer(server, address(host, free, token), others, guard)
+        raise SettingError("port", f"{port} is in use; choose another, e.g. {port + 1}")
+    others = address(socket.gethostname(), listens, token) if host in ANY_HOST else None
+    return RunningServer(server, address(host, listens, token), others, guard)
 
 
 @contextlib.contextmanager
