@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import atexit
 import functools
-import gc
 import json
 import os
 import runpy
@@ -158,30 +157,6 @@ def _server() -> _Server:
     return _Server()
 
 
-def _import_all() -> None:
-    import snowsplat.cli.main
-    import snowsplat.evaluation.metrics
-    import snowsplat.formats
-    import snowsplat.pipeline.make
-    import snowsplat.pipeline.memory_use
-    import snowsplat.pipeline.videos
-    import snowsplat.scene.edit
-    import snowsplat.sfm.dataset_folder
-    import snowsplat.sfm.orient
-    import snowsplat.sfm.report
-    import snowsplat.sfm.undistort
-    import snowsplat.training.checkpoint
-    import snowsplat.training.recipes
-    import snowsplat.training.report
-    import snowsplat.training.time_budget.plan
-    import snowsplat.training.trainer
-    import snowsplat.viewer.web.scene
-    import snowsplat.viewer.web.server
-
-    for name in snowsplat.cli.main.SUBCOMMANDS:
-        snowsplat.cli.main.parse([name])
-
-
 def _serve(ours: socket.socket) -> dict:
     """Answer requests; returns only in a fork, with its request."""
     while True:
@@ -256,6 +231,7 @@ def _run_and_exit(request: dict) -> None:
 if __name__ == "__main__":
     # Ctrl-C ends the tests, and then the server.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _import_all()
-    gc.freeze()  # forks do not look for garbage among the modules
+    from imports import import_all
+
+    import_all()
     _run_and_exit(_serve(socket.socket(fileno=int(sys.argv[1]))))

@@ -9,7 +9,6 @@ itself, the number of changes is written to LOG.changes. The responses are {"pid
 """
 
 import fcntl
-import gc
 import importlib
 import json
 import os
@@ -23,41 +22,10 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 _CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate")
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
-
-
-def _import_all() -> None:
-    from PIL import Image
-
-    import snowsplat.cli.main
-    import snowsplat.evaluation.metrics
-    import snowsplat.formats
-    import snowsplat.pipeline.make
-    import snowsplat.pipeline.memory_use
-    import snowsplat.pipeline.videos
-    import snowsplat.scene.edit
-    import snowsplat.sfm.dataset_folder
-    import snowsplat.sfm.orient
-    import snowsplat.sfm.report
-    import snowsplat.sfm.undistort
-    import snowsplat.training.checkpoint
-    import snowsplat.training.recipes
-    import snowsplat.training.report
-    import snowsplat.training.time_budget.plan
-    import snowsplat.training.trainer
-    import snowsplat.viewer.web.scene
-    import snowsplat.viewer.web.server
-
-    # Imported after Python's zlib, because pycolmap would replace zlib by its own.
-    importlib.import_module("pycolmap")
-    for name in snowsplat.cli.main.SUBCOMMANDS:
-        snowsplat.cli.main.parse([name])
-    Image.init()  # imports the readers of all formats
-    # Runs need not examine, and thereby copy, the objects that exist now.
-    gc.collect()
-    gc.freeze()
 
 
 def _kill_at(at: int | None, delay: float, watched: list[str], changes: list[int]) -> None:
@@ -144,7 +112,12 @@ def _child(run: dict) -> None:
 
 def serve() -> None:
     """Execute runs until stdin is closed."""
-    _import_all()
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from imports import import_all
+
+    import_all()
+    # Imported after Python's zlib, because pycolmap would replace zlib by its own.
+    importlib.import_module("pycolmap")
     for line in sys.stdin:
         run = json.loads(line)
         pid = os.fork()

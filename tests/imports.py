@@ -1,0 +1,34 @@
+"""Loads all modules of the command line, for a process whose forks run it."""
+
+import gc
+
+
+def import_all() -> None:
+    """Import what the subcommands import, and keep it out of garbage collections."""
+    from PIL import Image
+
+    import snowsplat.cli.main
+    import snowsplat.evaluation.metrics
+    import snowsplat.formats
+    import snowsplat.pipeline.make
+    import snowsplat.pipeline.memory_use
+    import snowsplat.pipeline.videos
+    import snowsplat.scene.edit
+    import snowsplat.sfm.dataset_folder
+    import snowsplat.sfm.orient
+    import snowsplat.sfm.report
+    import snowsplat.sfm.undistort
+    import snowsplat.training.checkpoint
+    import snowsplat.training.recipes
+    import snowsplat.training.report
+    import snowsplat.training.time_budget.plan
+    import snowsplat.training.trainer
+    import snowsplat.viewer.web.scene
+    import snowsplat.viewer.web.server
+
+    for name in snowsplat.cli.main.SUBCOMMANDS:
+        snowsplat.cli.main.parse([name])
+    Image.init()  # imports the readers of all formats
+    # Forks need not examine, and thereby copy, the objects that exist now.
+    gc.collect()
+    gc.freeze()
