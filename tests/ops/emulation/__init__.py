@@ -12,6 +12,7 @@ import fcntl
 import functools
 import os
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 from snowsplat.ops.cuda import nvrtc
@@ -22,9 +23,9 @@ _HERE = Path(__file__).parent
 _ROOT = _HERE.parents[2]
 _NATIVE = _ROOT / "src" / "snowsplat" / "native"
 _FLAGS = {
-    "": ["-O2", "-g1"],
+    "": [],
     "sanitized": [
-        *("-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"),
+        *("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"),
         # AddressSanitizer reports an access through a null pointer, too.
         "-fno-sanitize=null,object-size,vptr",
     ],
@@ -33,27 +34,36 @@ _FLAGS = {
 _ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
 
 
-@functools.cache
-def library(file: str) -> ctypes.CDLL:
-    """`native/cuda/<file>.cu`, or a file in this folder, compiled for the CPU if it has changed."""
-    kind = os.environ.get("SNOWSPLAT_EMULATION", "")
-    folder = _ROOT / "build" / "emulation" / (kind or "plain")
-    folder.mkdir(parents=True, exist_ok=True)
-    target, source = folder / f"{file}.so", nvrtc.path_of(file)
-    if not source.exists():
-        source = _HERE / f"{file}.cu"
-    made_of = [*nvrtc.sources(source), *_HERE.glob("*.h"), *_HERE.glob("*.cpp")]
-    with (folder / f"{file}.lock").open("w") as lock:
+def _compile(target: Path, made_of: Sequence[Path], arguments: Sequence[str | Path]) -> None:
+    """Compiles as C++, if one of the files has changed."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with target.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         newest = max(path.stat().st_mtime for path in made_of)
         if not target.exists() or target.stat().st_mtime < newest:
-            command = [os.environ.get("CXX", "c++"), "-std=c++17", *_FLAGS[kind]]
-            command += ["-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas"]  # for unrolling
-            command += ["-fPIC", "-shared", "-ffp-contract=fast"]
-            command += ["-DSNOWSPLAT_EMULATION", f"-I{_HERE}", f"-I{_NATIVE}"]
-            command += [str(_HERE / "block.cpp"), "-x", "c++", str(source), "-o", str(target)]
+            command = [os.environ.get("CXX", "c++"), "-std=c++17", "-fPIC", "-Wall", "-Wextra"]
+            command += ["-Werror", "-DSNOWSPLAT_EMULATION", f"-I{_HERE}", f"-I{_NATIVE}"]
+            command += [*map(str, arguments), "-o", str(target)]
             made = subprocess.run(command, env=_ENVIRONMENT, capture_output=True, text=True)
-            assert made.returncode == 0, f"{source.name} does not compile as C++:\n{made.stderr}"
+            assert made.returncode == 0, f"{target.name} cannot be compiled:\n{made.stderr}"
+
+
+@functools.cache
+def library(file: str, float64: bool) -> ctypes.CDLL:
+    """The float64 kernels, or the others, of `native/cuda/<file>.cu` or a file in this folder."""
+    kind = os.environ.get("SNOWSPLAT_EMULATION", "")
+    folder = _ROOT / "build" / "emulation" / (kind or "plain")
+    target, source = folder / f"{file}{'_f64' * float64}.so", nvrtc.path_of(file)
+    if not source.exists():
+        source = _HERE / f"{file}.cu"
+    header, block = _HERE / "cuda_emulation.h", folder / "block.o"
+    options = ["-O2", "-g1", f"-DSNOWSPLAT_EMULATE_FLOAT64={int(float64)}"]
+    if kind:
+        options.append(f"-DSNOWSPLAT_{kind.upper()}")
+    _compile(block, [_HERE / "block.cpp", header], [*options, "-c", _HERE / "block.cpp"])
+    options += ["-shared", "-ffp-contract=fast", "-Wno-unknown-pragmas"]  # for unrolling
+    arguments = [*options, *_FLAGS[kind], block, "-x", "c++", source]
+    _compile(target, [*nvrtc.sources(source), header, block], arguments)
     loaded = ctypes.CDLL(str(target))
     loaded.emulate.restype = ctypes.c_char_p
     return loaded
@@ -66,7 +76,7 @@ def execute(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
         RuntimeError: a divergent barrier, or another fault that the emulation detects.
         AssertionError: threads or parameters do not match the kernel.
     """
-    loaded = library(kernel.file)
+    loaded = library(kernel.file, name.endswith("_f64"))
     built = getattr(loaded, f"{name}_threads")()
     assert built == kernel.threads, f"{name} has {built} threads, its Kernel says {kernel.threads}"
     layout = layout_of(kernel.params)

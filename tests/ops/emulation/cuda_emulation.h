@@ -5,8 +5,9 @@
 //   (forward, backward or a seed of shuffles) sets the order, so that missing barriers have effects.
 // - A barrier that only some threads reach, a lane of a mask that never arrives, and threads that wait
 //   at different places are errors with their names and lines.
-// - A shared array is a separate allocation, filled with NaN when a block begins, so that
-//   AddressSanitizer detects accesses out of bounds, and tests detect reads of unwritten memory.
+// - A shared array is a separate allocation, filled with NaN when a block begins and not accessible
+//   after it, so that AddressSanitizer detects accesses out of bounds, and tests detect reads of
+//   unwritten memory.
 #pragma once
 
 #include <cmath>
@@ -26,7 +27,10 @@ struct EmulatedIndex {
 
 namespace emulation {
 
+constexpr int kWarpSize = 32;
+
 extern EmulatedIndex thread_index, block_index, block_size, grid_size;
+extern int64_t running_block;  // its number among those of all kernels, from 1 on
 
 // A line of a kernel at which threads wait for each other.
 struct Place {
@@ -40,20 +44,32 @@ inline Place here(const char* file = __builtin_FILE(), int line = __builtin_LINE
   return {file, line};
 }
 
-// Memory that the threads of the running block share, the same for the same `site`.
-void* shared(const void* site, int64_t bytes);
+// An array that the threads of a block share.
+struct SharedArray {
+  void* memory;
+  int64_t bytes, block;  // `block`: the last that has used it
+};
+// Called by the first thread that uses the array in a block.
+void* begin_shared(SharedArray&, int64_t bytes);
 // Waits until all running threads of the block have arrived.
 void block_barrier(Place);
 // The same; returns the sum of the values.
 int block_sum(int value, Place);
-// Waits until all lanes of `mask` have arrived; returns the value of each lane (≤ 8 bytes).
-const uint64_t* warp_exchange(unsigned mask, uint64_t value, Place);
+struct Exchange {
+  uint64_t values[kWarpSize];  // of each lane, ≤ 8 bytes
+  unsigned votes;              // the lanes with a value other than 0
+};
+// Waits until all lanes of `mask` have arrived.
+const Exchange& warp_exchange(unsigned mask, uint64_t value, Place);
+// The lanes of `mask` with this value.
+unsigned lanes_with(const Exchange&, unsigned mask, uint64_t value);
 
 template <class T, int64_t kCount, class Site>
 T* shared_array(Site) {
   static_assert(std::is_trivially_destructible<T>::value, "it is never destroyed");
-  static const char site = 0;
-  return static_cast<T*>(shared(&site, int64_t(sizeof(T)) * kCount));
+  static SharedArray array;
+  const bool begun = array.block == running_block;
+  return static_cast<T*>(begun ? array.memory : begin_shared(array, int64_t(sizeof(T)) * kCount));
 }
 
 template <class T>
@@ -70,7 +86,18 @@ T from_bits(uint64_t bits) {
   return value;
 }
 
-inline int lane() { return int(thread_index.x % 32); }
+inline int lane() { return int(thread_index.x % kWarpSize); }
+
+// Whether this library has a kernel: one has those of float64, another has the others. The compiler
+// skips functions that nothing calls, which takes most of its time.
+template <size_t kLength>
+constexpr bool is_built(const char (&name)[kLength]) {
+  const char suffix[] = "_f64";
+  bool is_float64 = kLength > sizeof(suffix);
+  for (size_t i = 0; is_float64 && i < sizeof(suffix); i++)
+    is_float64 = name[kLength - sizeof(suffix) + i] == suffix[i];
+  return is_float64 == bool(SNOWSPLAT_EMULATE_FLOAT64);
+}
 
 }  // namespace emulation
 
@@ -84,7 +111,10 @@ inline int lane() { return int(thread_index.x % 32); }
 #define SNOW_KERNEL(NAME, THREADS, ...)                                                     \
   static void NAME(const __VA_ARGS__& p);                                                   \
   SNOW_EMULATION_EXPORT void NAME##_call(void** parameters) {                               \
-    NAME(*static_cast<const __VA_ARGS__*>(parameters[0]));                                  \
+    if constexpr (emulation::is_built(#NAME))                                               \
+      NAME(*static_cast<const __VA_ARGS__*>(parameters[0]));                                \
+    else                                                                                    \
+      __builtin_trap();                                                                     \
   }                                                                                         \
   SNOW_EMULATION_EXPORT int NAME##_threads() { return THREADS; }                            \
   SNOW_EMULATION_EXPORT uint64_t NAME##_layout() { return snow::layout_of<__VA_ARGS__>(); } \
@@ -112,58 +142,44 @@ template <class T>
 T __shfl_sync(unsigned mask, T value, int source, int width = 32,
               emulation::Place at = emulation::here()) {
   const int lane = emulation::lane(), first = lane & ~(width - 1);
-  const uint64_t* all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
-  return emulation::from_bits<T>(all[first + (source & (width - 1))]);
+  const emulation::Exchange& all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
+  return emulation::from_bits<T>(all.values[first + (source & (width - 1))]);
 }
 template <class T>
 T __shfl_up_sync(unsigned mask, T value, unsigned delta, int width = 32,
                  emulation::Place at = emulation::here()) {
   const int lane = emulation::lane(), first = lane & ~(width - 1), from = lane - int(delta);
-  const uint64_t* all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
-  return from < first ? value : emulation::from_bits<T>(all[from]);
+  const emulation::Exchange& all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
+  return from < first ? value : emulation::from_bits<T>(all.values[from]);
 }
 template <class T>
 T __shfl_down_sync(unsigned mask, T value, unsigned delta, int width = 32,
                    emulation::Place at = emulation::here()) {
   const int lane = emulation::lane(), last = lane | (width - 1), from = lane + int(delta);
-  const uint64_t* all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
-  return from > last ? value : emulation::from_bits<T>(all[from]);
+  const emulation::Exchange& all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
+  return from > last ? value : emulation::from_bits<T>(all.values[from]);
 }
 template <class T>
 T __shfl_xor_sync(unsigned mask, T value, int bits, int width = 32,
                   emulation::Place at = emulation::here()) {
   const int lane = emulation::lane(), last = lane | (width - 1), from = lane ^ bits;
-  const uint64_t* all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
-  return from > last ? value : emulation::from_bits<T>(all[from]);
+  const emulation::Exchange& all = emulation::warp_exchange(mask, emulation::to_bits(value), at);
+  return from > last ? value : emulation::from_bits<T>(all.values[from]);
 }
 inline unsigned __ballot_sync(unsigned mask, int predicate,
                               emulation::Place at = emulation::here()) {
-  const uint64_t* all = emulation::warp_exchange(mask, predicate != 0, at);
-  unsigned votes = 0;
-  for (int l = 0; l < 32; l++)
-    if (mask >> l & 1 && all[l]) votes |= 1u << l;
-  return votes;
+  return emulation::warp_exchange(mask, predicate != 0, at).votes;
 }
 inline int __any_sync(unsigned mask, int predicate, emulation::Place at = emulation::here()) {
-  const uint64_t* all = emulation::warp_exchange(mask, predicate != 0, at);
-  for (int l = 0; l < 32; l++)
-    if (mask >> l & 1 && all[l]) return 1;
-  return 0;
+  return emulation::warp_exchange(mask, predicate != 0, at).votes != 0;
 }
 inline int __all_sync(unsigned mask, int predicate, emulation::Place at = emulation::here()) {
-  const uint64_t* all = emulation::warp_exchange(mask, predicate != 0, at);
-  for (int l = 0; l < 32; l++)
-    if (mask >> l & 1 && !all[l]) return 0;
-  return 1;
+  return emulation::warp_exchange(mask, predicate == 0, at).votes == 0;
 }
 template <class T>
 unsigned __match_any_sync(unsigned mask, T value, emulation::Place at = emulation::here()) {
   const uint64_t own = emulation::to_bits(value);
-  const uint64_t* all = emulation::warp_exchange(mask, own, at);
-  unsigned same = 0;
-  for (int l = 0; l < 32; l++)
-    if (mask >> l & 1 && all[l] == own) same |= 1u << l;
-  return same;
+  return emulation::lanes_with(emulation::warp_exchange(mask, own, at), mask, own);
 }
 
 inline void __threadfence() {}
