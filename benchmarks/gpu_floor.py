@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from snowsplat.ops.layout import TILE
+from snowsplat.util.native_layout import TILE
 
 GEOMETRY = 3 + 3 + 4 + 1  # numbers per Gaussian: mean, scales, rotation, opacity
 NUMBERS = GEOMETRY + 3 + 45  # and colours of SH degree 3

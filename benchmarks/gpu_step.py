@@ -24,7 +24,6 @@ from snowsplat.data import Dataset, Points, View
 from snowsplat.data.decode import ImageSource, LoadedImage
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import Execute, launch_by
-from snowsplat.ops.layout import Params
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.scene.render import project, render
 from snowsplat.training.config import TrainConfig
@@ -33,6 +32,7 @@ from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.optim import Adam
 from snowsplat.training.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
 from snowsplat.training.trainer import Trainer
+from snowsplat.util.native_layout import Params
 
 GPU = torch.device("cuda")
 EXTENT = 4.0

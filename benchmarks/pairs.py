@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.ops import Splats2D
-from snowsplat.ops.layout import TILE
+from snowsplat.util.native_layout import TILE
 
 ALPHA_MIN, ALPHA_MAX, LEAST_LIGHT = 1 / 255, 0.99, 1e-4
 #: Pixels per vector, in float32.

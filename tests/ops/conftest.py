@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from snowsplat.ops.layout import Params
 from snowsplat.ops.native import LAUNCHERS
+from snowsplat.util.native_layout import Params
 
 from .engines import launcher
 from .scenes import (

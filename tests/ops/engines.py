@@ -12,7 +12,7 @@ import torch
 from snowsplat.ops.cuda import driver
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import launch_by
-from snowsplat.ops.layout import Params
+from snowsplat.util.native_layout import Params
 
 from . import emulation
 

@@ -17,8 +17,8 @@ import pytest
 import snowsplat
 from snowsplat.ops.cuda import nvrtc
 from snowsplat.ops.cuda.launches import KERNELS, SEQUENCES
-from snowsplat.ops.layout import layout_of
 from snowsplat.ops.params import ENTRIES
+from snowsplat.util.native_layout import layout_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGE = Path(snowsplat.__file__).parent

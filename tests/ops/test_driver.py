@@ -18,9 +18,9 @@ import snowsplat
 from snowsplat.ops import native
 from snowsplat.ops.cuda import cubins, driver, nvrtc
 from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.ops.layout import Params, layout_of
 from snowsplat.ops.params import BackgroundBackwardParams
 from snowsplat.util.errors import UserError
+from snowsplat.util.native_layout import Params, layout_of
 
 
 @dataclass(slots=True, kw_only=True)
@@ -399,7 +399,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from snowsplat.ops.cuda import cubins, driver
 from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.ops.layout import Params, layout_of
+from snowsplat.util.native_layout import Params, layout_of
 from snowsplat.ops.params import BackgroundBackwardParams
 
 stub = ctypes.CDLL("libcuda.so.1")

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.ops.layout import Params
 from snowsplat.ops.params import SizeQueryParams
+from snowsplat.util.native_layout import Params
 
 from . import emulation
 

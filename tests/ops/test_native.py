@@ -10,10 +10,12 @@ import pytest
 import torch
 
 import snowsplat
-from snowsplat.ops import layout, native
-from snowsplat.ops.layout import Params
+from snowsplat.ops import native
 from snowsplat.ops.params import SizeQueryParams, SplatsReduceParams
+from snowsplat.util import native_layout as layout
+from snowsplat.util import native_library
 from snowsplat.util.errors import UserError
+from snowsplat.util.native_layout import Params
 
 SOURCES = Path(snowsplat.__file__).parents[1]
 
@@ -29,8 +31,12 @@ def fresh(monkeypatch):
     """Resets the loader to the state before the first launch, also after the test."""
     monkeypatch.delenv("SNOWSPLAT_ISA", raising=False)
     monkeypatch.delenv("SNOWSPLAT_THREADS", raising=False)
-    for name in ("available_isas", "_library"):
-        monkeypatch.setattr(native, name, functools.cache(getattr(native, name).__wrapped__))
+    for module, name in (
+        (native_library, "available_isas"),
+        (native_library, "library"),
+        (native, "_library"),
+    ):
+        monkeypatch.setattr(module, name, functools.cache(getattr(module, name).__wrapped__))
     monkeypatch.setattr(native, "_functions", {})
 
 
@@ -66,8 +72,8 @@ def recorder(tmp_path_factory):
 
 @pytest.fixture
 def recording(fresh, recorder, monkeypatch):
-    monkeypatch.setattr(native, "_LIBRARIES", recorder.parent)
-    monkeypatch.setattr(native, "_choose", lambda: "recorder")
+    monkeypatch.setattr(native_library, "_LIBRARIES", recorder.parent)
+    monkeypatch.setattr(native_library, "_choose", lambda: "recorder")
     monkeypatch.setattr(native, "ENTRIES", {"record": RecordParams})
 
 
@@ -225,14 +231,14 @@ def test_unknown_function_names_the_remedy(fresh):
 
 
 def test_missing_library_names_the_remedy(fresh, tmp_path, monkeypatch):
-    monkeypatch.setattr(native, "_LIBRARIES", tmp_path)
+    monkeypatch.setattr(native_library, "_LIBRARIES", tmp_path)
     with pytest.raises(UserError, match="libsnowsplat_baseline.so is missing; .*make native"):
         native.isa()
 
 
 def test_broken_library_is_named(fresh, tmp_path, monkeypatch):
     (tmp_path / "libsnowsplat_baseline.so").write_bytes(b"\x7fELF, but not for long")
-    monkeypatch.setattr(native, "_LIBRARIES", tmp_path)
+    monkeypatch.setattr(native_library, "_LIBRARIES", tmp_path)
     with pytest.raises(UserError, match="libsnowsplat_baseline.so cannot be loaded"):
         native.isa()
 
@@ -242,6 +248,7 @@ def test_the_best_isa_is_selected_and_every_available_one_can_be_forced(fresh, m
     assert native.isa() == best
     for name in native.available_isas():
         monkeypatch.setenv("SNOWSPLAT_ISA", name)
+        native_library.library.cache_clear()
         native._library.cache_clear()
         assert native.isa() == name
         library = native._library()[1]
@@ -258,7 +265,7 @@ def test_unknown_isa_names_the_valid_ones(fresh, monkeypatch):
 
 def test_an_unsupported_isa_names_the_supported_ones(fresh, monkeypatch):
     monkeypatch.setenv("SNOWSPLAT_ISA", "avx512")
-    monkeypatch.setattr(native, "available_isas", lambda: ("baseline",))
+    monkeypatch.setattr(native_library, "available_isas", lambda: ("baseline",))
     with pytest.raises(UserError, match="avx512 is not supported here; .* have baseline"):
         native.isa()
 
@@ -292,14 +299,14 @@ def test_threads_come_from_the_environment_or_the_affinity(monkeypatch):
     monkeypatch.delenv("SNOWSPLAT_THREADS", raising=False)
     try:
         os.sched_setaffinity(0, {min(affinity)})
-        assert native._default_threads() == 1
+        assert native_library.default_threads() == 1
     finally:
         os.sched_setaffinity(0, affinity)
-    assert native._default_threads() == len(affinity)
+    assert native_library.default_threads() == len(affinity)
     for wrong in ("0", "-2", "many"):
         monkeypatch.setenv("SNOWSPLAT_THREADS", wrong)
         with pytest.raises(UserError, match=f"'{wrong}' is not a number of threads"):
-            native._default_threads()
+            native_library.default_threads()
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from snowsplat.ops import native as natives
 from snowsplat.ops.cuda import sorting
 from snowsplat.ops.cuda.kernels import Run
 from snowsplat.ops.cuda.launches import KERNELS
-from snowsplat.ops.layout import TILE, Params
 from snowsplat.ops.params import (
     SizeQueryParams,
     SplatsPrepareParams,
@@ -24,6 +23,7 @@ from snowsplat.ops.params import (
     TilesCountParams,
     TilesFillParams,
 )
+from snowsplat.util.native_layout import TILE, Params
 
 from . import emulation
 from .conftest import variants

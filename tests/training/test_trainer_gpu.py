@@ -15,11 +15,11 @@ from snowsplat.data import Dataset
 from snowsplat.data.decode import LoadedImage
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import launch_by
-from snowsplat.ops.layout import Params, layout_of
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.finite import Diverged
 from snowsplat.training.trainer import Trainer
+from snowsplat.util.native_layout import Params, layout_of
 
 from ..ops.engines import launcher
 from .test_trainer import BUSY, BUSY_MCMC, dataset, every_density_control

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_tensor, variant
-from snowsplat.ops.layout import MAX_NEIGHBOURS
 from snowsplat.ops.native import launch
 from snowsplat.ops.params import NeighboursParams
+from snowsplat.util.native_layout import MAX_NEIGHBOURS
 
 
 def neighbours(points: Tensor, k: int = 3) -> Tensor:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from snowsplat.ops.layout import Params
+from snowsplat.util.native_layout import Params
 
 # ------------------------------------------------------------------- parts of the structs below
 

@@ -12,7 +12,6 @@ from torch.autograd.function import once_differentiable
 
 from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
-from snowsplat.ops.layout import POSE_SUMS
 from snowsplat.ops.native import launch
 from snowsplat.ops.params import (
     CameraParams,
@@ -25,6 +24,7 @@ from snowsplat.ops.params import (
 )
 from snowsplat.ops.splats import Splats2D, packed_width
 from snowsplat.ops.sums import sum_of_rows
+from snowsplat.util.native_layout import POSE_SUMS
 
 
 def project(

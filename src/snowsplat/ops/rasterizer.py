@@ -13,7 +13,6 @@ from torch.autograd.function import once_differentiable
 from snowsplat.ops import scratch
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
-from snowsplat.ops.layout import GROUP_CHANNELS, SLOT_WIDTH, TILE
 from snowsplat.ops.native import launch
 from snowsplat.ops.params import (
     BackgroundBackwardParams,
@@ -32,6 +31,7 @@ from snowsplat.ops.params import (
 )
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
 from snowsplat.ops.sums import sum_of_rows
+from snowsplat.util.native_layout import GROUP_CHANNELS, SLOT_WIDTH, TILE
 
 
 def rasterize(

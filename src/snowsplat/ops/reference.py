@@ -29,8 +29,8 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from snowsplat.ops.capacity import Capacity
-from snowsplat.ops.layout import TILE
 from snowsplat.ops.splats import Splats2D
+from snowsplat.util.native_layout import TILE
 
 LOW_PASS = 0.3  # pixels²: blurs every splat, so that it covers at least one pixel centre
 ALPHA_MIN = 1 / 255  # smaller contributions do not change an 8-bit image and are skipped

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from snowsplat.ops.layout import PACKED_HEADER, PACKED_STRIDE
+from snowsplat.util.native_layout import PACKED_HEADER, PACKED_STRIDE
 
 # Columns of a packed row. The C colours begin at COLORS. Zeros pad the row to a multiple of
 # PACKED_STRIDE.

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from snowsplat.ops.cuda import nvrtc
 from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.ops.layout import Params, layout_of
+from snowsplat.util.native_layout import Params, layout_of
 
 _HERE = Path(__file__).parent
 _ROOT = _HERE.parents[2]

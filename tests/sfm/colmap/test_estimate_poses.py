@@ -80,6 +80,7 @@ def test_progress_has_all_steps_in_order(done):
     calls = done[3]
     assert list(dict.fromkeys(what for _, _, what in calls)) == [
         "features",
+        "compared pairs",
         "pairs",
         "registered photos",
     ]

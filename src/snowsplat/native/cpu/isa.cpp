@@ -1,7 +1,7 @@
 // The instruction set for which this library was built, and the best one that this machine
 // supports.
 //
-// The loader (ops/native.py) calls best_isa() of the baseline library, which runs on every machine.
+// The loader (util/native_library.py) calls best_isa() of the baseline library, which runs on every machine.
 // It must do so before it loads another library, because loading a library runs its static
 // constructors.
 #include <cstdint>
@@ -14,7 +14,7 @@
 
 namespace {
 
-// In the order of ISAS in ops/native.py.
+// In the order of ISAS in util/native_library.py.
 enum Isa : int64_t { kBaseline = 0, kAvx2 = 1, kAvx512 = 2 };
 
 #if defined(__x86_64__)

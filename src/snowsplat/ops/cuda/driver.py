@@ -19,8 +19,8 @@ import torch
 from snowsplat.ops.cuda import cubins
 from snowsplat.ops.cuda.availability import why_unusable
 from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.ops.layout import LARGEST_PARAMS, Params, layout_of
 from snowsplat.util.errors import UserError
+from snowsplat.util.native_layout import LARGEST_PARAMS, Params, layout_of
 
 # Errors of the driver. If the code is for another GPU, the next candidate is tried.
 _OUT_OF_MEMORY = 2

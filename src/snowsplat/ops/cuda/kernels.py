@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from snowsplat.ops.layout import Params
+from snowsplat.util.native_layout import Params
 
 
 @dataclass(frozen=True)

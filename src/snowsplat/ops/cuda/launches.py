@@ -24,7 +24,7 @@ from snowsplat.ops.cuda import (
     tiling,
 )
 from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.ops.layout import Params
+from snowsplat.util.native_layout import Params
 
 _PARTS = (projection, adam, sorting, tiling, rasterizer, photometric, nearest_neighbours)
 KERNELS: dict[str, Kernel] = {n: k for part in _PARTS for n, k in part.KERNELS.items()}

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
 from snowsplat.ops.cuda.sorting import sort_pairs
-from snowsplat.ops.layout import MAX_NEIGHBOURS, Params
 from snowsplat.ops.params import NeighboursParams
+from snowsplat.util.native_layout import MAX_NEIGHBOURS, Params
 
 _CHUNK = 32  # points of a chunk; also chunks of a group
 _CODE_BITS = 63

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
-from snowsplat.ops.layout import Params
 from snowsplat.ops.params import PhotometricParams
+from snowsplat.util.native_layout import Params
 
 
 @dataclass(slots=True, kw_only=True)

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
-from snowsplat.ops.layout import POSE_SUMS, Params
 from snowsplat.ops.params import (
     ProjectBackwardParams,
     ProjectCullParams,
@@ -17,6 +16,7 @@ from snowsplat.ops.params import (
     ScreenStatisticsParams,
     SizeQueryParams,
 )
+from snowsplat.util.native_layout import POSE_SUMS, Params
 
 
 @dataclass(slots=True, kw_only=True)

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from snowsplat.ops.cuda.kernels import Kernel, Run
 from snowsplat.ops.cuda.sorting import exclusive_scan, sort_pairs, sort_passes
-from snowsplat.ops.layout import SLOT_WIDTH, Params
 from snowsplat.ops.params import (
     SizeQueryParams,
     SplatsPrepareParams,
@@ -25,6 +24,7 @@ from snowsplat.ops.params import (
     TilesCountParams,
     TilesFillParams,
 )
+from snowsplat.util.native_layout import SLOT_WIDTH, Params
 
 
 @dataclass(slots=True, kw_only=True)

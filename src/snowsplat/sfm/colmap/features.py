@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap.database import count_rows, set_names, trim_features
+from snowsplat.sfm.colmap.database import closing_database, count_rows, set_names, trim_features
+from snowsplat.sfm.colmap.matching import LENGTH, match_descriptors
 from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import Report
+from snowsplat.util import native_library
 
-# Number of pairs that are matched before the results are written to the database. A kill loses at
+# Number of pairs that are processed before the results are written to the database. A kill loses at
 # most this many pairs. The progress increases in steps of this number.
 _PAIRS_PER_BLOCK = 64
+
+# Number of photos whose descriptors are kept in memory while pairs are matched.
+_CACHED_PHOTOS = 100
 
 # A photo has at most this many times the requested number of features.
 _MAX_FEATURE_FACTOR = 2
@@ -113,8 +121,9 @@ def match_pairs(
     """Match the features of those ``pairs`` that are not in the database yet.
 
     A pair consists of two indices of photos. ``max_error`` in pixels is the largest distance of a
-    match from its epipolar line.
+    match from its epipolar line. COLMAP verifies the matches that it finds in the database.
     """
+    _write_matches(database, pairs, threads, progress.report)
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -140,6 +149,27 @@ def match_pairs(
     finally:
         os.remove(pairing.match_list_path)
         set_names(database, [photo.name for photo in photos])
+
+
+def _write_matches(path: Path, pairs: list[tuple[int, int]], threads: int, report: Report) -> None:
+    """Write the matches of those ``pairs`` that have none in the database ``path``."""
+    native_library.set_num_threads(threads)
+    with closing_database(path) as database:
+
+        @functools.lru_cache(_CACHED_PHOTOS)
+        def descriptors(index: int) -> NDArray[np.uint8]:
+            if not database.exists_descriptors(index + 1):
+                return np.zeros((0, LENGTH), np.uint8)
+            return np.asarray(database.read_descriptors(index + 1).data).reshape(-1, LENGTH)
+
+        left = [(i, j) for i, j in pairs if not database.exists_matches(i + 1, j + 1)]
+        for start in range(0, len(left), _PAIRS_PER_BLOCK):
+            report(len(pairs) - len(left) + start, len(pairs), "compared pairs")
+            transaction = pycolmap.DatabaseTransaction(database)
+            for i, j in left[start : start + _PAIRS_PER_BLOCK]:
+                matches = match_descriptors(descriptors(i), descriptors(j))
+                database.write_matches(i + 1, j + 1, matches)
+            del transaction  # ends it
 
 
 @contextmanager

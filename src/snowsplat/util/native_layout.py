@@ -1,9 +1,10 @@
 """The layout of structs of parameters: packs them for a kernel, and checks that libraries match.
 
 A struct is a dataclass that inherits from `Params`; `native/params.h` has the same struct in C++.
-Every field has 8 bytes: a tensor is passed as a data pointer, None as a null pointer, int and bool
-as int64, float as double, and a nested struct as its fields. `Layout.hash` is a hash of the names,
-kinds and offsets of the fields; `layout_of` in `native/layout.h` computes the same hash.
+Every field has 8 bytes: a tensor, or another object with a method `data_ptr`, is passed as a data
+pointer, None as a null pointer, int and bool as int64, float as double, and a nested struct as its
+fields. `Layout.hash` is a hash of the names, kinds and offsets of the fields; `layout_of` in
+`native/layout.h` computes the same hash.
 """
 
 from __future__ import annotations
@@ -14,8 +15,6 @@ from dataclasses import fields
 from operator import attrgetter
 from types import UnionType
 from typing import Any, get_args, get_type_hints
-
-import torch
 
 # Constants that Python and C++ share; they are part of the hash.
 TILE = 16
@@ -88,13 +87,13 @@ class Layout:
             raise self._wrong_kind(params) from None
 
     def _wrong_kind(self, params: Params) -> TypeError:
-        kinds: dict[str, tuple[type, ...]] = {
-            "p": (torch.Tensor, type(None)),
-            "i": (int,),
-            "d": (float, int),
-        }
+        kinds: dict[str, tuple[type, ...]] = {"i": (int,), "d": (float, int)}
         for name, kind, value in zip(self.names, self.kinds, self.values(params), strict=True):
-            if not isinstance(value, kinds[kind]):
+            if kind == "p":
+                fits = value is None or hasattr(value, "data_ptr")
+            else:
+                fits = isinstance(value, kinds[kind])
+            if not fits:
                 wanted = {"p": "a tensor or None", "i": "an int", "d": "a float"}[kind]
                 return TypeError(
                     f"{self.name}: {name} must be {wanted}, got {type(value).__name__}"
@@ -154,7 +153,7 @@ def _kind(hint: Any) -> str | type[Params]:
         (hint,) = (one for one in get_args(hint) if one is not type(None))
     if issubclass(hint, Params):
         return hint
-    return {torch.Tensor: "p", int: "i", bool: "i", float: "d"}[hint]
+    return {int: "i", bool: "i", float: "d"}.get(hint, "p")
 
 
 def _fnv1a(text: str) -> int:

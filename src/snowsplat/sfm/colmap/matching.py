@@ -1,0 +1,135 @@
+"""Matches of SIFT descriptors: exact nearest neighbours, the ratio test and the cross check.
+
+The criteria are those of COLMAP's exact matching on the CPU. This module is imported by the child
+process of COLMAP, so it does not import torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snowsplat.util import native_library
+from snowsplat.util.native_layout import Params, layout_of
+from snowsplat.util.native_library import ArrayPointer
+
+#: Values of a descriptor.
+LENGTH = 128
+
+_MAX_ANGLE = np.float32(0.7)  # radians between the descriptors of a match
+_MAX_RATIO = np.float32(0.8)  # of the angles to the nearest and the second nearest descriptor
+_NORM = 512  # Euclidean norm of a descriptor, apart from rounding
+
+
+class Nearest(NamedTuple):
+    """For each of N descriptors, the two nearest ones of another photo, each (N,) int32."""
+
+    index: NDArray[np.int32]  # the nearest; the smallest index if several are equally near
+    best: NDArray[np.int32]  # its dot product with the descriptor
+    second: NDArray[np.int32]  # the dot product of the second nearest; 0 if there is none
+
+
+@dataclass(slots=True, kw_only=True)
+class MatchDescriptorsParams(Params):
+    """The struct of the same name in `native/params.h`."""
+
+    n: int
+    m: int
+    first: ArrayPointer
+    second: ArrayPointer
+    row_index: ArrayPointer
+    row_best: ArrayPointer
+    row_second: ArrayPointer
+    column_index: ArrayPointer
+    column_best: ArrayPointer
+    column_second: ArrayPointer
+
+
+#: The native functions that are called from here. They exist for the CPU only.
+ENTRIES: dict[str, type[Params]] = {"match_descriptors": MatchDescriptorsParams}
+
+
+def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Matches (K, 2) between descriptors ``first`` (N, 128) and ``second`` (M, 128).
+
+    A row of the result has an index into ``first`` and one into ``second``, ascending in the first.
+    Two descriptors match if each is the nearest one of the other, the angle between them is at most
+    0.7, and this angle is less than 0.8 times that to the second nearest descriptor, in both
+    directions (Lowe 2004, section 7.1).
+
+    Raises:
+        ValueError: a wrong shape or dtype.
+        UserError: the native library is missing or outdated.
+    """
+    rows, columns = two_nearest(first, second)
+    forth, back = _accepted(rows), _accepted(columns)
+    if len(forth) == 0 or len(back) == 0:
+        return np.zeros((0, 2), np.uint32)
+    (found,) = np.nonzero(forth >= 0)
+    found = found[back[forth[found]] == found]
+    return np.stack([found, forth[found]], 1).astype(np.uint32)
+
+
+def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Nearest, Nearest]:
+    """The nearest of ``second`` (M, 128) for each of ``first`` (N, 128), and the other direction.
+
+    The nearest descriptor is the one with the largest dot product. If there are no descriptors in
+    which to search, indices and dot products are -1. The results are exact.
+
+    Raises:
+        ValueError: a wrong shape or dtype.
+        UserError: the native library is missing or outdated.
+    """
+    for name, descriptors in (("first", first), ("second", second)):
+        if descriptors.ndim != 2 or descriptors.shape[1] != LENGTH:
+            raise ValueError(
+                f"two_nearest: {name} must be (any, {LENGTH}), got {descriptors.shape}"
+            )
+        if descriptors.dtype != np.uint8:
+            raise ValueError(f"two_nearest: {name} must be uint8, got {descriptors.dtype}")
+    n, m = len(first), len(second)
+    rows, columns = (Nearest(*(np.empty(k, np.int32) for _ in range(3))) for k in (n, m))
+    params = MatchDescriptorsParams(
+        n=n,
+        m=m,
+        first=ArrayPointer(np.ascontiguousarray(first)),
+        second=ArrayPointer(np.ascontiguousarray(second)),
+        row_index=ArrayPointer(rows.index),
+        row_best=ArrayPointer(rows.best),
+        row_second=ArrayPointer(rows.second),
+        column_index=ArrayPointer(columns.index),
+        column_best=ArrayPointer(columns.best),
+        column_second=ArrayPointer(columns.second),
+    )
+    layout = layout_of(MatchDescriptorsParams)
+    buffer = ctypes.create_string_buffer(layout.size)
+    layout.pack_into(buffer, params)
+    _function()(ctypes.addressof(buffer))
+    return rows, columns
+
+
+@functools.cache
+def _function() -> Callable[[int], Any]:
+    native_library.check_layouts(ENTRIES)
+    function = native_library.library()[1].match_descriptors
+    function.restype, function.argtypes = ctypes.c_int64, (ctypes.c_void_p,)
+    return function  # type: ignore[no-any-return]
+
+
+def _accepted(nearest: Nearest) -> NDArray[np.int32]:
+    """The index of the nearest descriptor, or -1 where it is too far or not distinctive."""
+    angle, second = (_angle(product) for product in (nearest.best, nearest.second))
+    return np.where(
+        (angle <= _MAX_ANGLE) & (angle < _MAX_RATIO * second), nearest.index, np.int32(-1)
+    )
+
+
+def _angle(product: NDArray[np.int32]) -> NDArray[np.float32]:
+    cosine = product.astype(np.float32) * np.float32(1 / _NORM**2)
+    return np.arccos(np.clip(cosine, np.float32(0), np.float32(1)))

@@ -1,0 +1,142 @@
+"""Loads the library of CPU kernels for the best instruction set of this machine.
+
+`snowsplat/_lib` has one shared library per instruction set. All have the same entries: C functions
+that take a pointer to a struct of parameters and return an int64. The environment variable
+SNOWSPLAT_ISA (avx512, avx2 or baseline) selects another library than the best.
+
+This module does not import torch, so that programs that only process NumPy arrays start fast.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from snowsplat.util.errors import UserError
+from snowsplat.util.native_layout import Params, layout_of
+
+# Worst to best. The index of a name is its number in native/cpu/isa.cpp.
+ISAS = ("baseline", "avx2", "avx512")
+
+_LIBRARIES = Path(__file__).resolve().parent.parent / "_lib"
+_lock = threading.RLock()
+
+
+class ArrayPointer:
+    """A NumPy array as a pointer in a struct of parameters, which otherwise are tensors."""
+
+    __slots__ = ("array",)
+
+    def __init__(self, array: NDArray[Any]) -> None:
+        if not array.flags.c_contiguous:
+            raise ValueError(f"an array of shape {array.shape} is not contiguous")
+        self.array = array
+
+    def data_ptr(self) -> int:
+        return int(self.array.ctypes.data)
+
+
+def _open(isa: str) -> ctypes.CDLL:
+    """The library of one instruction set. Its calls release the interpreter lock."""
+    path = _LIBRARIES / f"libsnowsplat_{isa}.so"
+    if not path.exists():
+        raise UserError(
+            f"the native library {path.name} is missing; in a checkout `make native` builds it, "
+            "elsewhere `pip install .` does"
+        )
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError as error:
+        raise UserError(
+            f"the native library {path} cannot be loaded ({error}); rebuild it"
+        ) from error
+
+
+@functools.cache
+def available_isas() -> tuple[str, ...]:
+    """The instruction sets that are built and that this machine supports, worst first."""
+    best = _open("baseline").best_isa()
+    built = (isa for isa in ISAS if (_LIBRARIES / f"libsnowsplat_{isa}.so").exists())
+    return tuple(isa for isa in built if ISAS.index(isa) <= best)
+
+
+def _choose() -> str:
+    forced = os.environ.get("SNOWSPLAT_ISA", "")
+    if not forced:
+        return available_isas()[-1]
+    if forced not in ISAS:
+        raise UserError(
+            f"SNOWSPLAT_ISA={forced!r} is not an instruction set; use one of {', '.join(ISAS)}"
+        )
+    if forced not in available_isas():
+        raise UserError(
+            f"SNOWSPLAT_ISA={forced} is not supported here; this machine and this build have "
+            f"{', '.join(available_isas())}"
+        )
+    return forced
+
+
+@functools.cache
+def library() -> tuple[str, ctypes.CDLL]:
+    """The instruction set in use, and its library. The structs must be checked before a call.
+
+    Raises UserError if the library is missing, or SNOWSPLAT_ISA or SNOWSPLAT_THREADS is invalid.
+    """
+    with _lock:
+        isa = _choose()
+        found = _open(isa)
+        found.set_num_threads(ctypes.c_int64(default_threads()))
+        return isa, found
+
+
+def check_layouts(entries: Mapping[str, type[Params]]) -> None:
+    """Raises UserError unless the library has these entries, with the structs of Python."""
+    isa, found = library()
+    for entry, params in entries.items():
+        for name in (entry, entry + "_f64"):
+            try:
+                layout = getattr(found, name + "_layout")
+            except AttributeError:
+                if name != entry:
+                    continue  # has no variant for float64
+                raise outdated(isa, name) from None
+            layout.restype = ctypes.c_uint64
+            if layout() != layout_of(params).hash:
+                raise outdated(isa, name)
+
+
+def outdated(isa: str, name: str) -> UserError:
+    """The error for a library that does not match the Python files."""
+    return UserError(
+        f"the native library for {isa} does not match the Python files ({name}); "
+        "rebuild it: `make native` in a checkout, `pip install .` elsewhere"
+    )
+
+
+def set_num_threads(threads: int) -> None:
+    """Sets the number of threads that the kernels use. Results are bit-identical for any number.
+
+    Raises UserError if the number is less than 1, and as `library`.
+    """
+    if threads < 1:
+        raise UserError(f"the number of threads must be 1 or more, not {threads}")
+    library()[1].set_num_threads(ctypes.c_int64(threads))
+
+
+def default_threads() -> int:
+    """SNOWSPLAT_THREADS, or else the number of processors that this process may use."""
+    asked = os.environ.get("SNOWSPLAT_THREADS", "")
+    if not asked:
+        if hasattr(os, "sched_getaffinity"):
+            return len(os.sched_getaffinity(0))
+        return os.cpu_count() or 1
+    if not asked.isdecimal() or int(asked) < 1:
+        raise UserError(f"SNOWSPLAT_THREADS={asked!r} is not a number of threads; use 1 or more")
+    return int(asked)
