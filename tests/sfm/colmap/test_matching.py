@@ -63,7 +63,7 @@ def test_descriptors_of_zeros_are_found():
 def test_nothing_to_search_in():
     descriptors = random_descriptors(np.random.default_rng(0), 3)
     rows, columns = two_nearest(descriptors, descriptors[:0])
-    assert (list(rows.index), list(rows.best)) == ([-1] * 3, [-1] * 3)
+    assert (list(rows.which), list(rows.best)) == ([-1] * 3, [-1] * 3)
     assert [len(column) for column in columns] == [0, 0, 0]
     for first, second in ((3, 0), (0, 3), (0, 0)):
         assert match_descriptors(descriptors[:first], descriptors[:second]).shape == (0, 2)

@@ -30,7 +30,7 @@ _NORM = 512  # Euclidean norm of a descriptor, apart from rounding
 class Nearest(NamedTuple):
     """For each of N descriptors, the two nearest ones of another photo, each (N,) int32."""
 
-    index: NDArray[np.int32]  # the nearest; the smallest index if several are equally near
+    which: NDArray[np.int32]  # index of the nearest; of equally near ones, the smallest
     best: NDArray[np.int32]  # its dot product with the descriptor
     second: NDArray[np.int32]  # the dot product of the second nearest; 0 if there is none
 
@@ -100,10 +100,10 @@ def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Ne
         m=m,
         first=ArrayPointer(np.ascontiguousarray(first)),
         second=ArrayPointer(np.ascontiguousarray(second)),
-        row_index=ArrayPointer(rows.index),
+        row_index=ArrayPointer(rows.which),
         row_best=ArrayPointer(rows.best),
         row_second=ArrayPointer(rows.second),
-        column_index=ArrayPointer(columns.index),
+        column_index=ArrayPointer(columns.which),
         column_best=ArrayPointer(columns.best),
         column_second=ArrayPointer(columns.second),
     )
@@ -119,14 +119,14 @@ def _function() -> Callable[[int], Any]:
     native_library.check_layouts(ENTRIES)
     function = native_library.library()[1].match_descriptors
     function.restype, function.argtypes = ctypes.c_int64, (ctypes.c_void_p,)
-    return function  # type: ignore[no-any-return]
+    return function
 
 
 def _accepted(nearest: Nearest) -> NDArray[np.int32]:
     """The index of the nearest descriptor, or -1 where it is too far or not distinctive."""
     angle, second = (_angle(product) for product in (nearest.best, nearest.second))
     return np.where(
-        (angle <= _MAX_ANGLE) & (angle < _MAX_RATIO * second), nearest.index, np.int32(-1)
+        (angle <= _MAX_ANGLE) & (angle < _MAX_RATIO * second), nearest.which, np.int32(-1)
     )
 
 
