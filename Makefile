@@ -120,8 +120,8 @@ pytest-repeated:
 pytest-isas:
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
 	    for isa in $$isas; do \
-	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training"; \
-	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training || exit 1; \
+	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training tests/sfm/colmap/test_matching.py"; \
+	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training tests/sfm/colmap/test_matching.py || exit 1; \
 	    done
 
 # The GPU kernels on the CPU under AddressSanitizer and UndefinedBehaviorSanitizer, with the threads of a

@@ -165,7 +165,8 @@ class Matcher {
     Lanes words[kWords][kColumns];
   };
 
-  // Columns beyond the last are 0 and their sums start at -1, so that they are never found.
+  // Columns beyond the last are 0. They are never found: a column with the same product precedes
+  // them.
   void pack_columns(int64_t block) {
     Columns& packed = columns_[size_t(block)];
     for (int column = 0; column < kWidth; column++) {
@@ -183,7 +184,7 @@ class Matcher {
         std::memcpy(&bits, values, sizeof bits);
         packed.words[word][vector][lane] = bits;
       }
-      packed.start[vector][lane] = at < p_.m ? Words::offset * sum : -1;
+      packed.start[vector][lane] = Words::offset * sum;
     }
   }
 
