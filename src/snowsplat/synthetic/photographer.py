@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,20 +70,48 @@ def write_synthetic_photos(
         distortion: k1, k2, p1, p2 of COLMAP's model OPENCV.
         report: progress callback.
     """
+    lens = phone_lens(width, height, distortion)
+    return take_photos(folder, lambda: still_life(seed), lens, walk(n_views, seed), seed, report)
+
+
+def phone_lens(
+    width: int,
+    height: int,
+    distortion: tuple[float, float, float, float] = _DISTORTION,
+) -> Lens:
+    """A wide-angle lens like a phone's. Its focal length differs slightly from that in EXIF."""
+    focal = _FOCAL_TRUE * _FOCAL_35MM * math.hypot(width, height) / math.hypot(36, 24)
+    return Lens(width, height, focal, distortion)
+
+
+def take_photos(
+    folder: Path | str,
+    build: Callable[[], Scene],
+    lens: Lens,
+    poses: Sequence[Tensor],
+    seed: int = 0,
+    report: Report = silent,
+) -> Truth:
+    """Render photos ``IMG_0001.jpg`` … of a scene into ``folder``; existing photos are kept.
+
+    Args:
+        build: makes the scene; called only if a photo is missing.
+        poses: ``cam_from_world`` (3, 4) float64 of each photo, metres.
+        seed: seed of the noise of the image sensor.
+        report: progress callback.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    focal = _FOCAL_TRUE * _FOCAL_35MM * math.hypot(width, height) / math.hypot(36, 24)
-    lens = Lens(width, height, focal, distortion)
-    names = [f"IMG_{number:04d}.jpg" for number in range(1, n_views + 1)]
-    truth = Truth(lens, dict(zip(names, walk(n_views, seed), strict=True)))
+    names = [f"IMG_{number:04d}.jpg" for number in range(1, len(poses) + 1)]
+    truth = Truth(lens, dict(zip(names, poses, strict=True)))
     missing = [i for i, name in enumerate(names) if not (folder / name).exists()]
     if not missing:
         return truth
     report(0, len(missing), "building the scene")
-    scene = still_life(seed)
+    scene = build()
 
     def take(i: int) -> None:
-        pixels = photograph(scene, lens, truth.poses[names[i]], np.random.default_rng([seed, i]))
+        pixels = photograph(scene, lens, poses[i], np.random.default_rng([seed, i]))
         with atomic_path(folder / names[i]) as temporary:
             _save(temporary, pixels)
 
@@ -111,11 +140,11 @@ def walk(count: int, seed: int) -> list[Tensor]:
             torch.from_numpy(target),
             torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64),
         )
-        poses.append(_rolled(pose, random.normal(0, 0.06)))
+        poses.append(rolled(pose, random.normal(0, 0.06)))
     return poses
 
 
-def _rolled(cam_from_world: Tensor, angle: float) -> Tensor:
+def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
     """The camera rotated about its optical axis by ``angle`` in radians."""
     cos, sin = math.cos(angle), math.sin(angle)
     roll = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64)

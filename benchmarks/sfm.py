@@ -1,0 +1,263 @@
+"""Structure from motion: time of each stage, photos placed rightly, memory.
+
+    python benchmarks/sfm.py                                  the captures and scenes of 60 photos
+    python benchmarks/sfm.py room twins --photos 60 150       scenes of 60 and of 150 photos
+    python benchmarks/sfm.py fern rooms-300 --json sfm.json
+    python benchmarks/sfm.py room --versus ../before/src      another build / this one, alternating
+
+A workload is a capture (a photo folder or video; skipped if absent) or a scene of `sfm_scenes.py`
+with its number of photos. The photos of a scene are rendered once, into the folder that
+SNOWSPLAT_SFM_SCENES or --cache names. A photo is placed rightly if its rotation is wrong by less
+than 3° and its centre by less than 3% of the largest distance between two true centres, after the
+model was aligned by the similarity transform that agrees with the most photos (`sfm_placed.py`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from sfm_placed import placed
+from sfm_scenes import CACHE_VARIABLE, KINDS, SIZE, cache_folder, photos_of
+from torch import Tensor
+
+from snowsplat.data.colmap import read_model
+from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.util.errors import UserError
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Name -> the photos or the video, and a COLMAP model of the same photos, relative to the captures.
+CAPTURES: dict[str, tuple[str, str | None]] = {
+    "fern": ("fern/images", "fern/sparse/0"),
+    "kitchen25": ("kitchen25/images", "kitchen25/sparse/0"),
+    "tree_photos": ("tree_photos", None),
+    "fox_photos": ("fox_photos", "fox/sparse/0"),
+    "walkaround.mp4": ("walkaround.mp4", None),
+    "bonsai_photos": ("bonsai_photos", None),
+}
+_LONG = ("bonsai_photos",)  # not measured by default
+_STAGES = ("start", "decode", "features", "choose pairs", "match", "map", "undistort", "report")
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Photos or a video, and the true poses if they are known."""
+
+    name: str
+    source: Path
+    true: Mapping[str, Tensor] | None  # photo name -> cam_from_world (3, 4)
+
+
+def poses_in(model: Path) -> dict[str, Tensor]:
+    """``cam_from_world`` (3, 4) float64 of each photo in a COLMAP model."""
+    poses = {}
+    for image in read_model(model).images:
+        pose = torch.tensor(image.pose, dtype=torch.float64)
+        poses[image.name] = torch.cat([rotation_from_quat(pose[:4]), pose[4:, None]], 1)
+    return poses
+
+
+def workload(name: str, captures: Path, cache: Path, size: tuple[int, int]) -> Workload | None:
+    """The workload of a name; None if it is a capture that is absent."""
+    if name in CAPTURES:
+        photos, model = CAPTURES[name]
+        if not (captures / photos).exists():
+            return None
+        known = model is not None and (captures / model).is_dir()
+        return Workload(name, captures / photos, poses_in(captures / str(model)) if known else None)
+    kind, _, count = name.partition("-")
+
+    def report(done: int, total: int, what: str = "") -> None:
+        print(f"\r{name}: {what} {done}/{total}  ", end="", file=sys.stderr, flush=True)
+        if done == total:
+            print(file=sys.stderr)
+
+    folder, truth = photos_of(kind, int(count), cache, size, report=report)
+    return Workload(name, folder, truth.poses)
+
+
+def measure(work: Workload, folder: Path, options: Mapping[str, Any], source: Path) -> dict:
+    """Make a dataset in ``folder`` with the package in ``source``; returns a row of the table."""
+    job = {"inputs": [str(work.source)], "folder": str(folder), "options": dict(options)}
+    run = subprocess.run(
+        [sys.executable, str(Path(__file__).with_name("sfm_worker.py"))],
+        input=json.dumps(job) + "\n",
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(source)},
+        text=True,
+    )
+    if run.returncode:
+        raise UserError(f"{work.name}: the worker ended with status {run.returncode}; see above")
+    answer = json.loads(run.stdout.splitlines()[-1])
+    result = answer.get("result")
+    row: dict[str, Any] = {
+        "workload": work.name,
+        "source": str(source),
+        "error": answer.get("error"),
+        "stages": answer["stages"],
+        "wall": sum(times["wall"] for times in answer["stages"].values()),
+        "cpu": sum(times["cpu"] for times in answer["stages"].values()),
+        "peak_mb": answer["peak_mb"],
+        "own_peak_mb": answer["own_peak_mb"],
+    }
+    found: dict[str, Tensor] = {}
+    if result is not None:
+        found = poses_in(folder / "distorted" / "sparse" / "0")
+        row |= {
+            "photos": len(result["registered"]) + len(result["unregistered"]),
+            "placed": len(found),
+            "models": result["sub_models"],
+            "points": result["points"],
+            "reprojection_error": result["reprojection_error"],
+            "attempts": result["attempts"],
+        }
+    if work.true is not None:
+        compared = placed(found, work.true)
+        row |= {"photos": len(work.true), "placed": len(found)}
+        row |= {"right": len(compared.right), "wrong": compared.wrong, "missing": compared.missing}
+        if compared.right:
+            row |= {
+                "rotation_error": float(compared.rotations.median()),
+                "centre_error": 100 * float(compared.centres.median()),
+                "rotation_errors": compared.rotations.tolist(),
+                "centre_errors": (100 * compared.centres).tolist(),
+            }
+    return row
+
+
+# Tables
+
+
+def _cell(value: float | int | None, digits: int = 0) -> str:
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def print_quality(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
+    heads = ("photos", "right", "wrong", "none", "points", "error px", "rot °", "centre %", "MB")
+    print(f"{'':22}" + "".join(f"{head:>10}" for head in heads))
+    for name, row in zip(names, rows, strict=True):
+        photos, found = row.get("photos"), row.get("placed")
+        none = None if photos is None else photos - (found or 0)
+        cells = [_cell(photos), _cell(row.get("right"))]
+        cells.append(_cell(len(row["wrong"]) if "wrong" in row else None))
+        cells += [_cell(none), _cell(row.get("points")), _cell(row.get("reprojection_error"), 2)]
+        cells += [_cell(row.get("rotation_error"), 3), _cell(row.get("centre_error"), 3)]
+        cells.append(_cell(row["peak_mb"] or None))
+        print(f"{name:22}" + "".join(f"{cell:>10}" for cell in cells))
+        if row["error"]:
+            print(f"  {row['error']}")
+
+
+def print_times(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
+    found = [stage for row in rows for stage in row["stages"]]
+    stages = [stage for stage in _STAGES if stage in found]
+    stages += sorted(set(found) - set(stages))
+    print(f"\n{'seconds: wall, cpu':22}" + "".join(f"{stage:>15}" for stage in [*stages, "total"]))
+    for name, row in zip(names, rows, strict=True):
+        times = [row["stages"].get(stage) for stage in stages] + [row]
+        cells = [f"{t['wall']:.1f}, {t['cpu']:.1f}" if t else "-" for t in times]
+        print(f"{name:22}" + "".join(f"{cell:>15}" for cell in cells))
+
+
+def print_ratios(rows: Sequence[Mapping[str, Any]]) -> None:
+    """The least processor time of each stage with this build / with the other one."""
+    a, b = dict.fromkeys(row["source"] for row in rows)
+    print(f"\n{'cpu: this build / ' + a:40}")
+    for name in dict.fromkeys(row["workload"] for row in rows):
+        own = [row for row in rows if row["workload"] == name]
+        print(f"  {name}")
+        for stage in [*_STAGES, "total"]:
+            least = []
+            for source in (a, b):
+                times = [
+                    row["cpu"] if stage == "total" else row["stages"].get(stage, {}).get("cpu", 0)
+                    for row in own
+                    if row["source"] == source
+                ]
+                least.append(min(times))
+            if least[0] > 0:
+                print(f"    {stage:16}{least[1] / least[0]:8.3f}")
+
+
+def _names(arguments: argparse.Namespace) -> list[str]:
+    """The workloads with their numbers of photos."""
+    chosen = arguments.workloads or [*(n for n in CAPTURES if n not in _LONG), *KINDS]
+    names = []
+    for name in chosen:
+        kind, dash, count = name.partition("-")
+        if name in CAPTURES or (kind in KINDS and count.isdecimal() and int(count) >= 3):
+            names.append(name)
+        elif kind in KINDS and not dash:
+            names += [f"{kind}-{photos}" for photos in arguments.photos]
+        else:
+            known = ", ".join([*CAPTURES, *KINDS])
+            raise UserError(f"workload: unknown name {name!r}; use one of {known}")
+    return names
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, height = text.split("x")
+    return int(width), int(height)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("workloads", nargs="*", help="a capture, a scene, or SCENE-PHOTOS")
+    parser.add_argument("--photos", type=int, nargs="+", default=[60], help="of a scene")
+    parser.add_argument("--size", type=_size, default=SIZE, help="of these photos (800x600)")
+    parser.add_argument("--captures", type=Path, default=ROOT.parent / "shared" / "captures")
+    parser.add_argument("--cache", type=Path, default=None, help=f"default: ${CACHE_VARIABLE}")
+    parser.add_argument("--render-only", action="store_true", help="only render the photos")
+    parser.add_argument("--effort", default="normal", choices=["draft", "normal", "best"])
+    parser.add_argument("--mapper", default="incremental", choices=["incremental", "global"])
+    parser.add_argument("--threads", type=int, default=None)
+    parser.add_argument("--versus", type=Path, metavar="SRC", help="the src folder of a checkout")
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the datasets in DIR")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    cache = arguments.cache or cache_folder()
+    options = {key: getattr(arguments, key) for key in ("effort", "mapper", "threads")}
+    sources = [*([arguments.versus.resolve()] if arguments.versus else []), ROOT / "src"]
+    rows: list[dict[str, Any]] = []
+    labels: list[str] = []
+    with ExitStack() as stack:
+        out = arguments.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        for name in _names(arguments):
+            work = workload(name, arguments.captures, cache, arguments.size)
+            if work is None:
+                print(f"{name}: skipped, not in {arguments.captures}")
+                continue
+            if arguments.render_only:
+                continue
+            for _ in range(arguments.repeats):
+                for i, source in enumerate(sources):
+                    folder = out / f"{name}-{len(rows)}"
+                    rows.append(measure(work, folder, options, source))
+                    other = arguments.versus is not None and i == 0
+                    labels.append(f"{name} other" if other else name)
+                    print(f"{labels[-1]}: {rows[-1]['wall']:.0f} s", file=sys.stderr, flush=True)
+                    if arguments.json:
+                        arguments.json.write_text(json.dumps(rows, indent=1))
+    if rows:
+        print_quality(rows, labels)
+        print_times(rows, labels)
+        if arguments.versus:
+            print_ratios(rows)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except UserError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,127 @@
+"""Paths of a hand-held camera through the scenes of `sfm_scenes.py`.
+
+Each function returns ``cam_from_world`` (3, 4) float64 of ``count`` photos: metres, z up, the floor
+at z = 0. Equal arguments return equal paths.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from snowsplat.scene.geometry import look_at
+from snowsplat.synthetic.photographer import rolled
+
+_UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+_PHOTOS_OF_A_LOOP = 20
+_HEIGHTS = (1.45, 1.75, 1.1)  # metres, of the first loop, the second …
+
+
+def loops(
+    count: int, seed: int, half: tuple[float, float] = (1.65, 1.2), down: float = 0.0
+) -> list[Tensor]:
+    """Elliptical loops with the half axes ``half``. In turn, the camera looks across and outwards.
+
+    ``down`` is the distance in metres by which the point that the camera looks at is lowered.
+    """
+    random = np.random.default_rng([seed, count])
+    rounds = max(1, min(6, count // _PHOTOS_OF_A_LOOP))
+    positions, targets = [], []
+    for i in range(count):
+        number, angle = divmod(i * rounds / count, 1.0)
+        number, angle = int(number), 2 * math.pi * angle + 0.4 * number
+        size = 1 - 0.12 * (number // 2)
+        at = np.array([half[0] * math.cos(angle), half[1] * math.sin(angle), 0]) * size
+        at[2] = _HEIGHTS[number % 3]
+        if number % 2:  # outwards, and a little ahead
+            ahead = angle + 0.5
+            to = at + 1.5 * np.array([math.cos(ahead), math.sin(ahead), 0])
+        else:
+            to = -0.9 * at
+        to[2] = at[2] - 0.25 - down
+        positions.append(at)
+        targets.append(to)
+    return _hand_held(positions, targets, random)
+
+
+def looking_down(count: int, seed: int) -> list[Tensor]:
+    """Loops on which the camera sees mostly the floor."""
+    return loops(count, seed, (1.9, 1.4), down=1.5)
+
+
+def around_two(count: int, seed: int, distance: float = 4.4, radius: float = 1.55) -> list[Tensor]:
+    """A figure of eight around two things at x = ± half of ``distance``."""
+    random = np.random.default_rng([seed, count])
+    positions, targets = [], []
+    for i in range(count):
+        second, share = divmod(2 * i / count, 1.0)
+        side = 1 if second else -1
+        rounds = 1 if count < 150 else 2
+        angle = 2 * math.pi * share * rounds + (math.pi if second else 0)
+        # The two rounds, if any, differ in height.
+        height = 1.2 + (0.4 if share * rounds >= 1 else 0)
+        middle = np.array([side * distance / 2, 0.0, 0.0])
+        around = np.array([math.cos(angle), math.sin(angle) * (-side), 0.0])
+        positions.append(middle + radius * around + np.array([0, 0, height]))
+        targets.append(middle + np.array([0, 0, 0.62]))
+    return _hand_held(positions, targets, random)
+
+
+def through_two_rooms(
+    count: int, seed: int, middles: tuple[float, float], door: float, corridor: float
+) -> list[Tensor]:
+    """A loop in a room, the way through the passage, a loop in the other room.
+
+    The middles of the rooms are at (x, 0) for the two x of ``middles``. A room has its door at
+    (x + ``door``, −…); the passage runs along y = ``corridor``.
+    """
+    random = np.random.default_rng([seed, count])
+    between = max(1, round(0.3 * count))
+    first = (count - between) // 2
+    positions, targets = [], []
+
+    def loop(middle: float, photos: int) -> None:
+        rounds = max(1, min(4, photos // _PHOTOS_OF_A_LOOP))
+        for i in range(photos):
+            number, share = divmod(i * rounds / photos, 1.0)
+            angle = 2 * math.pi * share - math.pi / 2
+            at = np.array([1.0 * math.cos(angle), 0.85 * math.sin(angle), 0])
+            to = -1.1 * at if int(number) % 2 == 0 else 2.5 * at
+            lift = _HEIGHTS[int(number) % 3]
+            positions.append(at + np.array([middle, 0, lift]))
+            targets.append(to + np.array([middle, 0, lift - 0.25]))
+
+    loop(middles[0], first)
+    a, b = middles
+    corners = [(a, -0.6), (a + door, -1.3), (a + door, corridor), (b + door, corridor)]
+    corners += [(b + door, -1.3), (b, -0.4), (b, 1.0)]
+    for i in range(between):
+        at = _along(corners, (i + 0.5) / between * 0.9)
+        to = _along(corners, min(1.0, (i + 0.5) / between * 0.9 + 0.1))
+        positions.append(np.array([*at, 1.45]))
+        targets.append(np.array([*to, 1.3]))
+    loop(middles[1], count - between - first)
+    return _hand_held(positions, targets, random)
+
+
+def _along(corners: list[tuple[float, float]], share: float) -> np.ndarray:
+    """The point (2,) at ``share`` (0 to 1) of the length of the line through ``corners``."""
+    points = np.array(corners)
+    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    at = share * lengths[-1]
+    return np.array([np.interp(at, lengths, points[:, axis]) for axis in (0, 1)])
+
+
+def _hand_held(
+    positions: list[np.ndarray], targets: list[np.ndarray], random: np.random.Generator
+) -> list[Tensor]:
+    """Poses with small random errors of the position, direction and roll."""
+    poses = []
+    for position, target in zip(positions, targets, strict=True):
+        at = torch.from_numpy(position + random.normal(0, 0.025, 3))
+        to = torch.from_numpy(target + random.normal(0, 0.05, 3))
+        poses.append(rolled(look_at(at, to, _UP), random.normal(0, 0.05)))
+    return poses

@@ -1,0 +1,329 @@
+"""Procedural scenes with known camera poses for `sfm.py`; ray traced once, and then kept.
+
+    room     a furnished room, several loops
+    around   the still life of the demo, rounds around a table
+    plain    the room with walls of one colour and less furniture
+    carpet   a room whose carpet repeats exactly; the camera looks down
+    twins    two identical things in a hall with plain walls, a figure of eight around them
+    rooms    two identical rooms, and the passage from one to the other
+
+Metres, z up; except in "around", the floor is at z = 0. Textures depend on the seed.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from sfm_paths import around_two, looking_down, loops, through_two_rooms
+from torch import Tensor
+
+from snowsplat.sfm.progress import Report, silent
+from snowsplat.synthetic import Truth
+from snowsplat.synthetic import textures as paint
+from snowsplat.synthetic.light import Lamp
+from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
+from snowsplat.synthetic.scene import Scene, SceneObject
+from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
+from snowsplat.synthetic.still_life import still_life
+
+#: Part of the folder names. Increase it with every change that changes the photos.
+VERSION = 1
+CACHE_VARIABLE = "SNOWSPLAT_SFM_SCENES"
+SIZE = (800, 600)
+
+_HEIGHT = 2.6  # metres, of all rooms
+_TEXEL = 0.005  # metres
+_OAK, _PINE, _DARK = (0.62, 0.45, 0.29), (0.78, 0.62, 0.42), (0.42, 0.28, 0.19)
+_PLASTER = (0.72, 0.70, 0.64)
+# The two rooms: width and depth, x of their middles, the passage.
+_OWN = (4.2, 3.8)
+MIDDLES = (-2.16, 2.16)
+_DOOR, _DOOR_WIDTH, _DOOR_HEIGHT = 0.9, 0.95, 2.1  # x relative to the middle of the room
+_WALL, _PASSAGE = 0.12, 1.5  # thickness of the walls, width of the passage
+_TWINS = 4.4  # distance of the two things
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A scene and a path through it, for a seed."""
+
+    build: Callable[[int], Scene]
+    path: Callable[[int, int], list[Tensor]]  # number of photos, seed
+
+
+def cache_folder() -> Path:
+    """The folder for the photos: that of the environment variable, or one in the user's cache."""
+    named = os.environ.get(CACHE_VARIABLE, "")
+    if named:
+        return Path(named)
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "snowsplat-sfm-scenes"
+
+
+def photos_of(
+    kind: str,
+    count: int,
+    cache: Path,
+    size: tuple[int, int] = SIZE,
+    seed: int = 0,
+    report: Report = silent,
+) -> tuple[Path, Truth]:
+    """The folder with ``count`` photos of a scene of `KINDS`, and their true poses.
+
+    Photos that are not in ``cache`` are rendered: 1 to 2 seconds of processor time each at 800×600.
+    """
+    chosen = KINDS[kind]
+    folder = cache / f"{kind}-{count}-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
+    lens = phone_lens(*size)
+    poses = chosen.path(count, seed)
+    return folder, take_photos(folder, lambda: chosen.build(seed), lens, poses, seed, report)
+
+
+# The scenes
+
+
+def _room(seed: int) -> Scene:
+    random = np.random.default_rng(seed)
+    x, y = 6.0, 5.0
+    long, short = _pixels(x, _HEIGHT), _pixels(y, _HEIGHT)
+    walls = [
+        paint.bricks(short, 24, 18, random),
+        paint.wood(short, 10, _OAK, random),
+        paint.plain(long, _PLASTER, random),
+        paint.marble(long, (0.42, 0.50, 0.52), (0.62, 0.66, 0.60), random),
+    ]
+    walls = [_with_pictures(wall, 4, random) for wall in walls]
+    floor = paint.wood(_pixels(x, y), 26, _PINE, random)
+    objects = [_shell((x, y), [*walls, floor, _plain((0.86, 0.86, 0.84))])]
+    objects += [
+        _bookcase(random, (-1.4, 2.33), (1.8, 0.3, 1.7)),
+        _bookcase(random, (1.6, -2.33), (1.4, 0.3, 1.2)),
+        *_crates(random, (2.6, 1.9), 0.6),
+        *_crates(random, (-2.6, -1.9), 0.5),
+        *_crates(random, (2.6, -1.0), 0.45),
+        *_table(random, (0.0, 0.0)),
+    ]
+    return Scene(objects, _lamp((1.6, 1.2)))
+
+
+def _plain_room(seed: int) -> Scene:
+    random = np.random.default_rng([seed, 1])
+    x, y = 6.0, 5.0
+    floor = paint.wood(_pixels(x, y), 26, _PINE, random)
+    colours = [_plain((0.78, 0.77, 0.72)), _plain((0.70, 0.74, 0.74))] * 2
+    objects = [
+        _shell((x, y), [*colours, floor, _plain((0.86, 0.86, 0.84))]),
+        _bookcase(random, (-1.4, 2.33), (1.2, 0.3, 0.9)),
+        *_crates(random, (2.6, -1.0), 0.5),
+        *_table(random, (0.0, 0.0)),
+    ]
+    return Scene(objects, _lamp((1.6, 1.2)))
+
+
+def _carpeted_room(seed: int) -> Scene:
+    random = np.random.default_rng([seed, 2])
+    across, down, tile = 10, 8, 0.6  # metres of a tile
+    colours = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
+    one = paint.woven(_pixels(tile, tile), 5, colours, random)
+    carpet = np.tile(one, (down, across, 1))
+    walls = [_plain((0.78, 0.77, 0.72)), _plain((0.70, 0.74, 0.74))] * 2
+    objects = [
+        _shell((across * tile, down * tile), [*walls, carpet, _plain((0.86, 0.86, 0.84))]),
+        *_crates(random, (2.6, 1.9), 0.5),
+        *_crates(random, (-2.6, -1.8), 0.5),
+    ]
+    return Scene(objects, _lamp((1.6, 1.2)))
+
+
+def _twins(seed: int) -> Scene:
+    random = np.random.default_rng([seed, 3])
+    x, y = 9.4, 5.4
+    floor = paint.plain(_pixels(x, y), (0.50, 0.46, 0.40), random, stains=0.1)
+    walls = [_plain((0.78, 0.77, 0.72)), _plain((0.70, 0.74, 0.74))] * 2
+    objects = [_shell((x, y), [*walls, floor, _plain((0.86, 0.86, 0.84))])]
+    for side in (-1, 1):
+        objects += _monument(np.random.default_rng([seed, 4]), (side * _TWINS / 2, 0.0))
+    return Scene(objects, _lamp((6.0, 2.0)))
+
+
+def _two_rooms(seed: int) -> Scene:
+    random = np.random.default_rng([seed, 5])
+    width, depth = _OWN
+    x, y = 2 * width + 3 * _WALL, depth + _PASSAGE + 2 * _WALL
+    middle = (0.0, -(_PASSAGE + _WALL) / 2)
+    walls = [
+        _with_pictures(paint.plain(_pixels(side, _HEIGHT), colour, random), 5, random)
+        for side, colour in ((y, _PLASTER), (y, _OAK), (x, (0.55, 0.62, 0.66)), (x, _PLASTER))
+    ]
+    floor = paint.wood(_pixels(x, y), 26, _DARK, random)
+    objects = [_shell((x, y), [*walls, floor, _plain((0.86, 0.86, 0.84))], middle)]
+    for at in MIDDLES:
+        objects += own_room(np.random.default_rng([seed, 6]), at)
+    return Scene(objects, _lamp((7.0, 3.0)))
+
+
+def own_room(random: np.random.Generator, middle: float) -> list[SceneObject]:
+    """One of the two rooms: walls, floor and furniture. Equal generators make equal rooms."""
+    width, depth = _OWN
+    size = {"side": _pixels(depth, _HEIGHT), "back": _pixels(width, _HEIGHT)}
+    left = _with_pictures(paint.bricks(size["side"], 24, 14, random), 2, random)
+    right = _with_pictures(paint.wood(size["side"], 10, _OAK, random), 3, random)
+    back = _with_pictures(paint.plain(size["back"], _PLASTER, random), 3, random)
+    front = paint.marble(size["back"], (0.42, 0.50, 0.52), (0.62, 0.66, 0.60), random)
+    floor = paint.wood(_pixels(width, depth), 18, _PINE, random)
+    thick, z = _WALL / 2, _HEIGHT / 2
+    # Half of each wall belongs to the room. Its outer faces are hidden by those of its neighbour.
+    objects = [
+        _board((middle - width / 2 - thick / 2, 0, z), (thick, depth, _HEIGHT), left),
+        _board((middle + width / 2 + thick / 2, 0, z), (thick, depth, _HEIGHT), right),
+        _board((middle, depth / 2 + thick / 2, z), (width, thick, _HEIGHT), back),
+        _board((middle, 0, 0.005), (width, depth, 0.01), floor),
+    ]
+    # The front wall has a door: a piece on its left, one on its right and one above it.
+    edges = (-width / 2, _DOOR - _DOOR_WIDTH / 2, _DOOR + _DOOR_WIDTH / 2, width / 2)
+    for i, bottom in enumerate((0.0, _DOOR_HEIGHT, 0.0)):
+        low, high = edges[i], edges[i + 1]
+        columns = [round((edge / width + 0.5) * front.shape[1]) for edge in (low, high)]
+        rows = front.shape[0] - round(bottom / _HEIGHT * front.shape[0])
+        piece = np.ascontiguousarray(front[:rows, columns[0] : columns[1]])
+        centre = (middle + (low + high) / 2, -depth / 2 - _WALL / 2, (bottom + _HEIGHT) / 2)
+        objects.append(_board(centre, (high - low, _WALL, _HEIGHT - bottom), piece))
+    objects += [
+        _bookcase(random, (middle - 0.8, depth / 2 - 0.16), (1.4, 0.3, 1.5)),
+        *_crates(random, (middle + 1.7, 1.4), 0.5),
+        *_crates(random, (middle - 1.75, -1.4), 0.45),
+    ]
+    return objects
+
+
+# Parts of scenes
+
+
+def _pixels(*metres: float) -> tuple[int, int]:
+    """Size of a texture in pixels; multiples of 16, which can be halved exactly."""
+    width, height = (max(16, 16 * round(side / _TEXEL / 16)) for side in metres)
+    return width, height
+
+
+def _plain(colour: Sequence[float]) -> np.ndarray:
+    """A surface without any detail."""
+    return np.full((32, 32, 3), colour, np.float32)
+
+
+def _lamp(size: tuple[float, float]) -> Lamp:
+    # A larger lamp is on average farther away from a surface.
+    power = 3.0 * math.sqrt(size[0] * size[1])
+    return Lamp((0.0, 0.0, _HEIGHT - 0.02), size, power=power, ambient=0.55)
+
+
+def _shell(
+    size: tuple[float, float],
+    faces: Sequence[np.ndarray],
+    middle: tuple[float, float] = (0.0, 0.0),
+) -> SceneObject:
+    """The inside of a building: walls −x, +x, −y, +y, floor, ceiling."""
+    centre = (*middle, _HEIGHT / 2)
+    return SceneObject(Box(centre, (*size, _HEIGHT), inside=True), faces)
+
+
+def _board(
+    centre: tuple[float, float, float], size: tuple[float, float, float], face: np.ndarray
+) -> SceneObject:
+    """A thin box with one texture on its large faces, and plain edges."""
+    thin = int(np.argmin(size))
+    edge = _plain((0.6, 0.58, 0.52))
+    return SceneObject(Box(centre, size), [face if i // 2 == thin else edge for i in range(6)])
+
+
+def _with_pictures(wall: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
+    """The wall with framed prints side by side."""
+    width = wall.shape[1]
+    for i in range(count):
+        portrait = random.random() < 0.5
+        size = (180, 240) if portrait else (240, 180)
+        frame = np.full((size[1] + 24, size[0] + 24, 3), random.uniform(0.1, 0.3, 3), np.float32)
+        frame[12:-12, 12:-12] = paint.printed(size, random)
+        at = ((i + random.uniform(0.35, 0.65)) / count, 0.45 + random.normal(0, 0.03))
+        metres = random.uniform(0.45, 0.75)
+        wall = paint.paste(wall, frame, at, metres / _TEXEL / width, random.normal(0, 1.5))
+    return wall
+
+
+def _bookcase(
+    random: np.random.Generator, at: tuple[float, float], size: tuple[float, float, float]
+) -> SceneObject:
+    width, depth, height = size
+    front = paint.spines(_pixels(width, height), max(2, round(height / 0.38)), random)
+    side = paint.wood(_pixels(depth, height), 2, _DARK, random)
+    top = paint.wood(_pixels(width, depth), 2, _DARK, random)
+    return SceneObject(Box((*at, height / 2), size), [side, side, front, front, top, top])
+
+
+def _crate(
+    random: np.random.Generator, centre: tuple[float, float, float], side: float, angle: float
+) -> SceneObject:
+    faces = []
+    for _ in range(6):
+        wall = paint.wood(_pixels(side, side), 4, _PINE, random)
+        label = paint.printed((160, 120), random, lines=7)
+        middle = (random.uniform(0.4, 0.6), random.uniform(0.4, 0.6))
+        faces.append(paint.paste(wall, label, middle, 0.6, random.normal(0, 4)))
+    return SceneObject(Box(centre, (side,) * 3, angle), faces)
+
+
+def _crates(random: np.random.Generator, at: tuple[float, float], side: float) -> list[SceneObject]:
+    """Two crates on top of each other."""
+    x, y = at
+    upper = 0.7 * side
+    return [
+        _crate(random, (x, y, side / 2), side, random.uniform(-0.3, 0.3)),
+        _crate(random, (x, y, side + upper / 2), upper, random.uniform(0, 1.5)),
+    ]
+
+
+def _table(random: np.random.Generator, at: tuple[float, float]) -> list[SceneObject]:
+    """A low round table with a globe and a box on it."""
+    x, y = at
+    top = paint.wood((320, 320), 5, _OAK, random)
+    rim = paint.wood((640, 16), 1, _DARK, random)
+    leg = paint.wood((128, 128), 1, _DARK, random)
+    return [
+        SceneObject(Frustum((x, y, 0.5), 0.04, 0.55, 0.55), [rim, top, top]),
+        SceneObject(Frustum((x, y, 0), 0.5, 0.2, 0.08), [leg]),
+        SceneObject(
+            Ellipsoid((x + 0.12, y + 0.1, 0.74), (0.2, 0.2, 0.2)), [paint.globe((512, 256), random)]
+        ),
+        _crate(random, (x - 0.22, y - 0.18, 0.66), 0.24, 0.5),
+    ]
+
+
+def _monument(random: np.random.Generator, at: tuple[float, float]) -> list[SceneObject]:
+    """A crate, a drum and a globe on top of each other, 1.4 m high."""
+    x, y = at
+    drum = paint.printed(_pixels(1.5, 0.4), random, lines=9)
+    lid = paint.wood((96, 96), 2, _DARK, random)
+    return [
+        _crate(random, (x, y, 0.3), 0.6, 0.3),
+        SceneObject(Frustum((x, y, 0.6), 0.35, 0.25, 0.22), [drum, lid, lid]),
+        SceneObject(Ellipsoid((x, y, 1.17), (0.22, 0.22, 0.22)), [paint.globe((512, 256), random)]),
+    ]
+
+
+def _through_two_rooms(count: int, seed: int) -> list[Tensor]:
+    corridor = -_OWN[1] / 2 - _WALL - _PASSAGE / 2
+    return through_two_rooms(count, seed, MIDDLES, _DOOR, corridor)
+
+
+KINDS = {
+    "room": Kind(_room, loops),
+    "around": Kind(still_life, walk),
+    "plain": Kind(_plain_room, loops),
+    "carpet": Kind(_carpeted_room, looking_down),
+    "twins": Kind(_twins, around_two),
+    "rooms": Kind(_two_rooms, _through_two_rooms),
+}

@@ -1,0 +1,159 @@
+"""The process in which `sfm.py` makes a dataset: times of the stages, peak memory.
+
+The job is a line of JSON on standard input, the response is a line on standard output:
+{"inputs", "folder", "options"} → {"stages", "result", "peak_mb", "own_peak_mb"} or {"stages",
+"error"}. ``options`` are fields of `SfmOptions`. ``stages`` has wall and processor time in seconds
+of each stage; processor time includes all threads and child processes.
+
+Only `make_dataset` and its progress are used, so the process can run any build of the package.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from snowsplat.sfm.colmap import SfmOptions
+from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
+from snowsplat.sfm.progress import Report
+from snowsplat.util.errors import UserError
+
+_TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
+_SAMPLE_SECONDS = 0.05
+_STAGES = {"photos": "decode", "images": "undistort", "report": "report"}
+# The stage "poses" consists of what its progress counts.
+_COUNTED = {"features": "features", "pairs": "match", "registered photos": "map"}
+_BEFORE = "start"  # until the first progress: the start of COLMAP's process
+# Work between two stages that has no progress of its own.
+_BETWEEN = {("features", "match"): "choose pairs"}
+
+
+class Stopwatch:
+    """Receives the progress of `make_dataset` (`Watcher`) and adds up the times of its parts."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, dict[str, float]] = {}
+        self.memory = PeakMemory()  # of the processes of the stage "poses"
+        self._now = _BEFORE
+        self._last = (time.perf_counter(), processor_time())
+
+    def begin(self, stage: str) -> Report:
+        self._switch(_STAGES.get(stage, _BEFORE))
+        if stage == "poses":
+            self.memory.start()
+
+        def report(done: int, total: int, what: str = "") -> None:
+            if stage == "poses":
+                self._switch(_COUNTED.get(what, what))
+
+        return report
+
+    def end(self, stage: str, outcome: object) -> None:
+        self._switch(_BEFORE)
+        if stage == "poses":
+            self.memory.stop()
+
+    def note(self, line: str) -> None:
+        pass
+
+    def _switch(self, to: str) -> None:
+        """Add the time since the last call to the stage that was running."""
+        now = (time.perf_counter(), processor_time())
+        times = self.stages.setdefault(
+            _BETWEEN.get((self._now, to), self._now), {"wall": 0.0, "cpu": 0.0}
+        )
+        times["wall"] += now[0] - self._last[0]
+        # The time of a child that ends right now may be counted late.
+        times["cpu"] += max(0.0, now[1] - self._last[1])
+        self._now, self._last = to, now
+
+
+def _descendants(pid: str = "self") -> list[str]:
+    """The ids of the running child processes, and of theirs; none where there is no /proc."""
+    found = []
+    for file in Path(f"/proc/{pid}/task").glob("*/children"):
+        try:
+            children = file.read_text().split()
+        except OSError:  # the thread has ended
+            continue
+        for child in children:
+            found += [child, *_descendants(child)]
+    return found
+
+
+def processor_time() -> float:
+    """Seconds of processor time of this process and of all its descendants so far."""
+    times = os.times()
+    total = times.user + times.system + times.children_user + times.children_system
+    for pid in _descendants():
+        try:
+            # The name of the program, in brackets, may contain blanks.
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        total += sum(int(field) for field in fields[11:15]) / _TICKS
+    return total
+
+
+def _peak_mb(pid: str) -> float:
+    """The peak memory of a process so far; 0 if it is unknown."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
+
+
+def _command(pid: str) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+class PeakMemory:
+    """Observes the largest peak memory of a descendant, in MB, between `start` and `stop`."""
+
+    def __init__(self) -> None:
+        self.peak = 0.0
+        self._own = _command("self")
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._observe, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _observe(self) -> None:
+        while not self._end.wait(_SAMPLE_SECONDS):
+            # Until a new process starts its own program, its memory is that of this process.
+            started = [pid for pid in _descendants() if _command(pid) not in (b"", self._own)]
+            self.peak = max([self.peak, *map(_peak_mb, started)])
+
+
+def main() -> None:
+    job: dict[str, Any] = json.loads(sys.stdin.readline())
+    options = DatasetOptions(sfm=SfmOptions(**job["options"]))
+    watch, answer = Stopwatch(), dict[str, Any]()
+    try:
+        inputs = [Path(path) for path in job["inputs"]]
+        outcomes = make_dataset(inputs, Path(job["folder"]), options, watch)
+        answer["result"] = outcomes["poses"].result
+    except UserError as error:
+        answer["error"] = str(error)
+        watch.end("", None)
+    answer |= {"stages": watch.stages, "peak_mb": watch.memory.peak}
+    answer["own_peak_mb"] = _peak_mb("self")
+    print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    main()
