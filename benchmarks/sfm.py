@@ -186,7 +186,7 @@ def print_ratios(rows: Sequence[Mapping[str, Any]]) -> None:
                     if row["source"] == source
                 ]
                 least.append(min(times))
-            if least[0] > 0:
+            if min(least) > 0:
                 print(f"    {stage:16}{least[1] / least[0]:8.3f}")
 
 
