@@ -27,7 +27,12 @@ _TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 _SAMPLE_SECONDS = 0.05
 _STAGES = {"photos": "decode", "images": "undistort", "report": "report"}
 # The stage "poses" consists of what its progress counts.
-_COUNTED = {"features": "features", "pairs": "match", "registered photos": "map"}
+_COUNTED = {
+    "features": "features",
+    "compared pairs": "match",
+    "pairs": "match",
+    "registered photos": "map",
+}
 _BEFORE = "start"  # until the first progress: the start of COLMAP's process
 # Work between two stages that has no progress of its own.
 _BETWEEN = {("features", "match"): "choose pairs"}
