@@ -21,17 +21,19 @@ def all_pairs(count, inliers=200, flat=False):
 
 
 def test_each_photo_without_a_pose_has_its_own_reason():
-    features = [2000, 2000, 2000, 12, 2000, 2000, 2000, 2000, 2000]
+    features = [2000, 2000, 2000, 12, 2000, 2000, 2000, 2000, 2000, 2000]
     pairs = [Pair(0, 1, 300, False), Pair(0, 5, 22, False), Pair(2, 5, 18, False)]
     pairs += [Pair(1, 6, 400, False), Pair(7, 8, 90, False)]
     evidence = Evidence(features, pairs, 0.2, 36)
-    reasons = explain(photos(9), evidence, [{"0.jpg", "1.jpg", "2.jpg"}, {"7.jpg", "8.jpg"}])
-    assert list(reasons) == [f"{i}.jpg" for i in (3, 4, 5, 6, 7, 8)]
+    models = [{"0.jpg", "1.jpg", "2.jpg"}, {"7.jpg", "8.jpg"}]
+    reasons = explain(photos(10), evidence, models, {"9.jpg": "its place is wrong"})
+    assert list(reasons) == [f"{i}.jpg" for i in (3, 4, 5, 6, 7, 8, 9)]
     assert "hardly any detail (12 features)" in reasons["3.jpg"]
     assert reasons["4.jpg"] == "it matches no other photo"
     assert reasons["5.jpg"] == "it has too few matches with 2 other photos (at most 22)"
     assert reasons["6.jpg"] == "its matches with 1 other photo are not consistent with the model"
     assert "a separate group of 2 photos" in reasons["7.jpg"]
+    assert reasons["9.jpg"] == "its place is wrong"
 
 
 @pytest.mark.parametrize(

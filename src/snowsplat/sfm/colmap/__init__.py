@@ -4,6 +4,7 @@ child        starts the child process and handles its end
 worker       the child process, in which COLMAP runs
 reconstruct  repeated attempts, until enough photos have a pose
 features, pairs, retrieval, mapping   the steps of an attempt, on the COLMAP `database`
+consistency, repair   find photos in a wrong place after mapping, and place them again
 diagnosis    explains why photos have no pose
 """
 

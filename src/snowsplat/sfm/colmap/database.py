@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +75,29 @@ def replace_database(path: Path, by: Path) -> None:
     remove_database(path)
     by.rename(path)
     remove_database(by)
+
+
+def copy_for_mapping(path: Path, target: Path, without: Iterable[tuple[int, int]]) -> None:
+    """Copy what the mapper reads to ``target``: not the descriptors and the unverified matches.
+
+    The verified matches of the pairs ``without`` (two image ids each) are not copied either.
+    """
+    remove_database(target)
+    ids = [(pycolmap.image_pair_to_pair_id(*pair),) for pair in sorted(without)]
+    with closing(sqlite3.connect(target)) as connection:
+        connection.execute("ATTACH DATABASE ? AS source", (str(path),))
+        (version,) = connection.execute("PRAGMA source.user_version").fetchone()
+        connection.execute(f"PRAGMA main.user_version = {int(version)}")
+        objects = connection.execute(
+            "SELECT type, name, sql FROM source.sqlite_master WHERE sql IS NOT NULL "
+            "AND name NOT LIKE 'sqlite_%' ORDER BY type DESC"
+        ).fetchall()
+        with connection:
+            for kind, name, sql in objects:
+                connection.execute(sql)
+                if kind == "table" and name not in ("descriptors", "matches"):
+                    connection.execute(f'INSERT INTO main."{name}" SELECT * FROM source."{name}"')
+            connection.executemany("DELETE FROM main.two_view_geometries WHERE pair_id = ?", ids)
 
 
 @contextmanager

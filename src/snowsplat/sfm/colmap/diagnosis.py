@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,11 +90,15 @@ def gather_evidence(database: Path, photos: Sequence[Photo], compared: int) -> E
 
 
 def explain(
-    photos: Sequence[Photo], evidence: Evidence, models: Sequence[set[str]]
+    photos: Sequence[Photo],
+    evidence: Evidence,
+    models: Sequence[set[str]],
+    left_out: Mapping[str, str],
 ) -> dict[str, str]:
     """Why photos have no pose: name -> reason, for each photo that is not in the first model.
 
-    ``models`` has the names of the photos in each model, the largest model first.
+    ``models`` has the names of the photos in each model, the largest model first. ``left_out`` has
+    the reasons of photos that had a pose and lost it (`repair`).
     """
     partners: list[list[int]] = [[] for _ in photos]
     for pair in evidence.pairs:
@@ -105,7 +109,9 @@ def explain(
         if photo.name in models[0]:
             continue
         part = next((model for model in models[1:] if photo.name in model), None)
-        if part is not None:
+        if photo.name in left_out:
+            reason = left_out[photo.name]
+        elif part is not None:
             reason = f"it is in a separate group of {len(part)} photos"
         elif features < _FEW_FEATURES:
             reason = f"it shows hardly any detail ({features} features): too dark, blurred or plain"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,20 +55,31 @@ class Mapping:
             models = self._map_globally()
         else:
             models = self._map_incrementally(self._options(relaxed), start=None)
-        return _usable([self._refine(model) for model in models])
+        return usable([self._refine(model) for model in models])
 
-    def extend(self, models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-        """Try to add photos to the first of ``models``, accepting weaker matches.
+    def extend(
+        self, models: list[pycolmap.Reconstruction], relaxed: bool = True
+    ) -> list[pycolmap.Reconstruction]:
+        """Try to add photos to the first of ``models``; ``relaxed``: accept weaker matches.
 
         Photos of the other models are tried, too, so that separate groups may be joined.
         """
-        grown = self._map_incrementally(self._options(relaxed=True), start=models[0])
+        grown = self._map_incrementally(self._options(relaxed), start=models[0])
         if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():
             return models
         refined = self._refine(grown[0])
         if refined.num_reg_images() <= models[0].num_reg_images():
             return models
-        return _usable([refined, *models[1:]])
+        return usable([refined, *models[1:]])
+
+    def without(
+        self, model: pycolmap.Reconstruction, photos: Iterable[int]
+    ) -> pycolmap.Reconstruction:
+        """``model`` with no poses for ``photos`` (image ids), adjusted; changes ``model``."""
+        observations = pycolmap.ObservationManager(model)
+        for image_id in sorted(photos):
+            observations.deregister_frame(model.image(image_id).frame_id)
+        return self._refine(model)
 
     def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()
@@ -173,8 +184,8 @@ class Mapping:
         return model
 
 
-def _usable(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    # Sort the models, the largest first. Drop a model if larger models contain all of its photos.
+def usable(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """``models``, the largest first, without those whose photos are all in larger models."""
     kept: list[pycolmap.Reconstruction] = []
     placed: set[int] = set()
     for model in sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D())):

@@ -31,9 +31,10 @@ from snowsplat.sfm.colmap.database import (
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features, match_pairs
-from snowsplat.sfm.colmap.mapping import Mapping, write_models
+from snowsplat.sfm.colmap.mapping import Mapping, usable, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
+from snowsplat.sfm.colmap.repair import repair
 from snowsplat.sfm.colmap.result import names_in, result_of
 from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
@@ -58,6 +59,7 @@ class Attempt:
 
     matched: Matched
     models: list[pycolmap.Reconstruction]
+    left_out: dict[str, str]  # name -> reason, for photos whose place would be wrong
 
     @property
     def registered(self) -> int:
@@ -98,7 +100,10 @@ class Reconstruction:
             raise failure(evidence)
         write_models(best.models, self.folders.sparse)
         reasons = explain(
-            self.photos, self._evidence(best.matched), [names_in(model) for model in best.models]
+            self.photos,
+            self._evidence(best.matched),
+            [names_in(model) for model in best.models],
+            best.left_out,
         )
         result = result_of(
             best.models, self.photos, reasons, best.matched.choice.description, self.log
@@ -161,13 +166,19 @@ class Reconstruction:
             models = mapping.extend(models)
             added = models[0].num_reg_images() - before
             weak = f", {added} of them with weak matches" if added else ""
-        attempt = Attempt(matched, models)
+        check, left_out = "", dict[str, str]()
+        if models:
+            repaired = repair(models[0], mapping, _MAX_ERROR * matched.scale)
+            models = usable([repaired.model, *models[1:]])
+            left_out = repaired.left_out
+            check = f"; {repaired.description}" if repaired.description else ""
+        attempt = Attempt(matched, models, left_out)
         self.attempts.append(attempt)
         effort = matched.effort
         self.log.append(
             f"{how}: {effort.features} features per photo at {effort.image_size} pixels, "
             f"{matched.choice.description}, {mapper} mapping: "
-            f"{attempt.registered} of {len(self.photos)} photos registered{weak}"
+            f"{attempt.registered} of {len(self.photos)} photos registered{weak}{check}"
         )
 
     def _enough(self, evidence: Evidence) -> bool:

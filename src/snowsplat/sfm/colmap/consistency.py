@@ -1,0 +1,337 @@
+"""Finds photos that a model has in a wrong place, from matches that did not become points.
+
+The mapper registers a photo if some of its matches agree with the points of the model. If two
+places look alike, it may register a photo, and then all following ones, at the wrong place. The
+reprojection error remains small, because the mapper drops the matches that disagree: photos that
+follow each other then have thousands of verified matches and share no points. Such a pair is a
+*tear*.
+
+A right model has tears, too: its look-alike places have verified matches that are wrong. So a
+photo is judged by all of its matches. The photos are the nodes of a graph. The demand of an edge is
+the squared number of verified matches: photos taken side by side have many matches, and a few such
+pairs outweigh many weak ones, which may be false. The support of an edge is the part of its demand
+that the model confirms. If the photos of a model can be divided into two parts such that the model
+confirms little of the demand between them, the parts contradict each other (`find_parts`). This is
+the sparsest cut of the support relative to the demand. Its relaxation is a generalised eigenvalue
+problem (Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable constrained clustering: a
+generalized spectral method", AISTATS 2016).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snowsplat.sfm.colmap.database import closing_database, verified_pairs
+from snowsplat.sfm.colmap.features import SEED
+
+Floats = NDArray[np.floating[Any]]
+Ints = NDArray[np.integer[Any]]
+
+# Pairs with fewer verified matches are not evidence: random matches reach this number.
+_MIN_MATCHES = 50
+# The model confirms a pair if at least this share of its matches became points of both photos, and
+# contradicts it if the share is less than `_TORN`.
+_CONFIRMED = 0.3
+_TORN = 0.1
+# The model also confirms a pair if at least this share of its matches agrees with the poses: far
+# points and small steps give no points.
+_AGREEING = 0.5
+_MIN_ANGLE = 2.0  # degrees between two rays that may be parallel
+_MAX_ROTATION = 10.0  # degrees between the rotation of the model and that of the matches
+# Two parts are cut apart if at most this share of the demand between them is confirmed …
+_MAX_SUPPORT = 0.25
+# … and at least this many pairs between them are tears. As many confirmed pairs with more matches
+# are stronger evidence: photos taken side by side have more matches than look-alikes.
+_MIN_TEARS = 3
+_VECTORS = 6  # eigenvectors that are tried for a cut
+_THRESHOLDS = 10  # thresholds that are tried for each of them
+
+
+@dataclass(frozen=True)
+class CheckedPair:
+    """Two photos with a pose and verified matches, and what became of these matches.
+
+    ``first`` and ``second`` are image ids of the database, ``first`` < ``second``.
+    """
+
+    first: int
+    second: int
+    matches: int  # verified matches
+    shared: int  # matches whose two features observe the same point of the model
+    agreeing: float = 0.0  # share of the matches that agree with the poses, if computed
+    rotation: float = 0.0  # degrees between the model and the matches, if computed
+
+    @property
+    def share(self) -> float:
+        """The share of the verified matches that became points."""
+        return self.shared / self.matches
+
+    @property
+    def support(self) -> float:
+        """How far the model confirms the matches: 0 (it contradicts them) … 1."""
+        if self.agreeing >= _AGREEING:
+            return 1.0
+        if self.rotation > _MAX_ROTATION and self.share < _CONFIRMED:
+            return 0.0
+        return float(np.clip((self.share - _TORN) / (_CONFIRMED - _TORN), 0, 1))
+
+    @property
+    def torn(self) -> bool:
+        """Whether the model contradicts the matches."""
+        return self.matches >= _MIN_MATCHES and self.support == 0
+
+
+def check_pairs(
+    model: pycolmap.Reconstruction, database: Path, max_error: float
+) -> list[CheckedPair]:
+    """Compare each verified pair of photos in ``model`` with the poses and points of the model.
+
+    ``max_error`` in pixels is the largest distance of a verified match from its epipolar line.
+    """
+    placed = set(model.reg_image_ids())
+    points = {image_id: _point_ids(model.image(image_id)) for image_id in placed}
+    rays: dict[int, Floats] = {}
+    checked = []
+    with closing_database(database) as source:
+
+        def rays_of(image_id: int, features: Ints) -> Floats:
+            if image_id not in rays:
+                camera = model.camera(model.image(image_id).camera_id)
+                pixels = source.read_keypoints(image_id)[:, :2].astype(np.float64)
+                rays[image_id] = np.asarray(camera.cam_from_img(pixels))
+            return rays[image_id][features]
+
+        for found in sorted(verified_pairs(database), key=lambda p: (p.first, p.second)):
+            first, second = found.first + 1, found.second + 1
+            if first not in placed or second not in placed:
+                continue
+            rows = source.read_two_view_geometry(first, second).inlier_matches
+            of_first, of_second = points[first][rows[:, 0]], points[second][rows[:, 1]]
+            is_shared = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
+            pair = CheckedPair(first, second, len(rows), int(is_shared.sum()))
+            if len(rows) >= _MIN_MATCHES and pair.support < 1:
+                images = model.image(first), model.image(second)
+                focal = np.mean([model.camera(i.camera_id).mean_focal_length() for i in images])
+                pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
+                both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
+                error = max_error / float(focal)
+                pair = replace(pair, agreeing=agreement(pose, *both, error))
+                if pair.agreeing < _AGREEING and not found.flat:
+                    pair = replace(pair, rotation=rotation_error(pose, *both, error))
+            checked.append(pair)
+    return checked
+
+
+def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
+    """(features,) the id of the point that each feature observes, or the invalid id."""
+    points = image.points2D
+    ids = np.full(len(points), pycolmap.INVALID_POINT3D_ID, np.uint64)
+    for row in image.get_observation_point2D_idxs():
+        ids[row] = points[row].point3D_id
+    return ids
+
+
+def agreement(
+    cam2_from_cam1: pycolmap.Rigid3d, rays1: Floats, rays2: Floats, max_error: float
+) -> float:
+    """Share of the matches that agree with a relative pose, whether or not they became points.
+
+    Such a match is on its epipolar line, and its rays meet in front of both cameras or are nearly
+    parallel. ``rays1`` and ``rays2``: (M, 2) the matched features in the normalised image planes of
+    the two cameras. ``max_error``: the largest Sampson distance, in the same unit.
+    """
+    rotation, translation = cam2_from_cam1.rotation.matrix(), cam2_from_cam1.translation
+    x, y, z = translation
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    one, two = (np.concatenate([rays, np.ones((len(rays), 1))], 1) for rays in (rays1, rays2))
+    lines1, lines2 = two @ essential, one @ essential.T
+    length = (lines1[:, :2] ** 2).sum(1) + (lines2[:, :2] ** 2).sum(1)
+    distance = np.abs((two * lines2).sum(1)) / np.sqrt(np.maximum(length, 1e-300))
+    # depth1 · one + translation ≈ depth2 · two, with both rays in the frame of the second camera.
+    one = one @ rotation.T
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    two /= np.linalg.norm(two, axis=1, keepdims=True)
+    cosine = (one * two).sum(1)
+    along1, along2 = one @ translation, two @ translation
+    is_in_front = (cosine * along2 > along1) & (along2 > cosine * along1)
+    is_parallel = cosine > np.cos(np.radians(_MIN_ANGLE))
+    return float(np.mean((distance <= max_error) & (is_in_front | is_parallel)))
+
+
+def rotation_error(
+    cam2_from_cam1: pycolmap.Rigid3d, rays1: Floats, rays2: Floats, max_error: float
+) -> float:
+    """Degrees between a relative rotation and that of the essential matrix of the matches.
+
+    The arguments are those of `agreement`. The result is 0 if the matches do not determine a
+    rotation.
+    """
+    # Pixels outside of the domain of the distortion have no ray.
+    finite = np.isfinite(rays1).all(1) & np.isfinite(rays2).all(1)
+    options = pycolmap.RANSACOptions()
+    options.max_error = max_error
+    options.random_seed = SEED
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1.0, 1, 1)
+    camera.params = [1.0, 0.0, 0.0]
+    found = pycolmap.estimate_essential_matrix(
+        rays1[finite], rays2[finite], camera, camera, options
+    )
+    if found is None:
+        return 0.0
+    return float(np.degrees(found["cam2_from_cam1"].rotation.angle_to(cam2_from_cam1.rotation)))
+
+
+def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
+    """The parts of a model that contradict each other: sets of image ids.
+
+    The first part is the largest one, with all photos that do not contradict it; so a model without
+    contradictions is one part. Photos without evidence are in no part.
+    """
+    pairs = [pair for pair in pairs if pair.matches >= _MIN_MATCHES]
+    ids = sorted({i for pair in pairs for i in (pair.first, pair.second)})
+    if not ids:
+        return []
+    index = {image_id: row for row, image_id in enumerate(ids)}
+    demand = np.zeros((len(ids), len(ids)))
+    support, torn, confirmed = demand.copy(), demand.copy(), demand.copy()
+    for pair in pairs:
+        i, j = index[pair.first], index[pair.second]
+        weight = float(pair.matches) ** 2
+        demand[i, j] = demand[j, i] = weight
+        support[i, j] = support[j, i] = weight * pair.support
+        torn[i, j] = torn[j, i] = pair.matches * pair.torn
+        confirmed[i, j] = confirmed[j, i] = pair.matches * (pair.support > 0)
+    graph = _Graph(demand, support, torn, confirmed)
+    parts = [part for component in _components(demand > 0) for part in _split(graph, component)]
+    parts = sorted(_merged(graph, parts), key=lambda part: (-len(part), part[0]))
+    kept: list[int] = []
+    cut = []
+    for part in parts:
+        if kept and graph.contradicts(part, kept):
+            cut.append(part)
+        else:
+            kept += part
+    return [{ids[row] for row in part} for part in [kept, *cut]]
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """Symmetric (N, N) matrices without diagonal."""
+
+    demand: Floats  # the squared number of matches
+    support: Floats  # the confirmed part of it
+    torn: Floats  # the number of matches of tears
+    confirmed: Floats  # the number of matches of (partly) confirmed pairs
+
+    def contradicts(self, one: Sequence[int], other: Sequence[int]) -> bool:
+        """Whether the model contradicts the matches between two sets of photos."""
+        across = np.ix_(one, other)
+        torn = _strongest(self.torn[across])
+        return bool(
+            torn > 0
+            and torn > _strongest(self.confirmed[across])
+            and self.support[across].sum() <= _MAX_SUPPORT * self.demand[across].sum()
+        )
+
+
+def _strongest(matches: Floats) -> float:
+    """The number of matches that `_MIN_TEARS` pairs have at least."""
+    ordered = np.sort(matches, axis=None)
+    return float(ordered[-_MIN_TEARS]) if len(ordered) >= _MIN_TEARS else 0.0
+
+
+def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
+    """The connected components of a symmetric (N, N) matrix of links: sorted rows."""
+    left = set(range(len(linked)))
+    components = []
+    while left:
+        found, new = set(), {min(left)}
+        while new:
+            found |= new
+            new = set(np.flatnonzero(linked[sorted(new)].any(0)).tolist()) - found
+        components.append(sorted(found))
+        left -= found
+    return components
+
+
+def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
+    """Cut the photos until no part contradicts itself."""
+    best = None
+    for one in _cuts(graph, photos):
+        inside = set(one)
+        other = [i for i in photos if i not in inside]
+        if graph.contradicts(one, other):
+            across = np.ix_(one, other)
+            ratio = graph.support[across].sum() / graph.demand[across].sum()
+            if best is None or ratio < best[0]:
+                best = ratio, one, other
+    if best is None:
+        yield photos
+        return
+    for part in best[1:]:
+        for component in _components(graph.demand[np.ix_(part, part)] > 0):
+            yield from _split(graph, [part[i] for i in component])
+
+
+def _cuts(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
+    """Candidates for one side of the sparsest cut of ``photos``: sweeps over eigenvectors."""
+    count = len(photos)
+    if count < 2:
+        return
+    rows = np.ix_(photos, photos)
+    demand, support = graph.demand[rows], graph.support[rows]
+    scale = demand.sum() / count
+    ones = np.ones((count, count)) / count
+    # The constant vector solves the problem with the value 0; the second term makes its value 2,
+    # greater than all others, which are between 0 and 1.
+    above = _laplacian(support) / scale + 2 * ones
+    below = _laplacian(demand) / scale + ones
+    inverse = np.linalg.inv(np.linalg.cholesky(below))
+    vectors = inverse.T @ np.linalg.eigh(inverse @ above @ inverse.T)[1][:, :_VECTORS]
+    for vector in vectors.T:
+        order = np.argsort(vector, kind="stable")
+        across_demand = _cut_weights(demand, order)
+        across_support = _cut_weights(support, order)
+        ratio = across_support / np.maximum(across_demand, 1e-300)
+        torn = _cut_weights((graph.torn[rows] > 0).astype(float), order)
+        ratio[torn < _MIN_TEARS] = np.inf
+        for size in np.argsort(ratio, kind="stable")[:_THRESHOLDS] + 1:
+            if ratio[size - 1] <= _MAX_SUPPORT:
+                yield sorted(photos[i] for i in order[:size])
+
+
+def _laplacian(weights: Floats) -> Floats:
+    return np.diag(weights.sum(1)) - weights
+
+
+def _cut_weights(weights: Floats, order: Ints) -> Floats:
+    """(N − 1,) weight between the first k and the other photos of ``order``, for each k."""
+    sorted_weights = weights[np.ix_(order, order)]
+    # Photo k leaves the other side: its links to the first ones are no longer cut, the others are.
+    before = np.tril(sorted_weights).sum(1)
+    return np.cumsum(sorted_weights.sum(1) - 2 * before)[:-1]
+
+
+def _merged(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
+    """Join parts that the model confirms to belong together, the most strongly linked first."""
+    parts = [sorted(part) for part in parts]
+    while True:
+        best = None
+        for i, one in enumerate(parts):
+            for j, other in enumerate(parts[:i]):
+                across = np.ix_(one, other)
+                support = graph.support[across].sum()
+                linked = support > 0 and not graph.contradicts(one, other)
+                if linked and (best is None or support > best[0]):
+                    best = support, i, j
+        if best is None:
+            return parts
+        _, i, j = best
+        parts[j] = sorted(parts[j] + parts.pop(i))

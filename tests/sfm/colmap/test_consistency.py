@@ -1,0 +1,133 @@
+"""Which photos contradict the others, from verified matches and shared points."""
+
+import itertools
+
+import numpy as np
+import pycolmap
+import pytest
+
+from snowsplat.sfm.colmap.consistency import (
+    CheckedPair,
+    agreement,
+    find_parts,
+    rotation_error,
+)
+
+
+def chain(photos, share=0.7, matches=400, neighbours=3):
+    """Each photo and the following ones, of which the model confirms a share."""
+    return [
+        CheckedPair(i, j, matches, round(share * matches))
+        for i, j in itertools.combinations(photos, 2)
+        if photos.index(j) - photos.index(i) <= neighbours
+    ]
+
+
+def folded():
+    """Photos 1 … 20 and 21 … 30: torn apart, linked by weak matches of look-alikes."""
+    pairs = chain(range(1, 21)) + chain(range(21, 31))
+    pairs += [CheckedPair(i, j, 900, 20) for i in (18, 19, 20) for j in (21, 22, 23)]
+    return pairs + [CheckedPair(i, i + 20, 90, 60) for i in range(1, 11)]
+
+
+def test_a_model_without_contradictions_is_one_part():
+    assert find_parts(chain(range(1, 31))) == [set(range(1, 31))]
+    assert find_parts([]) == []
+
+
+def test_a_folded_part_is_cut_off():
+    assert find_parts(folded()) == [set(range(1, 21)), set(range(21, 31))]
+
+
+def test_the_order_of_the_pairs_does_not_matter():
+    pairs = folded()
+    np.random.default_rng(0).shuffle(pairs)
+    assert find_parts(pairs) == find_parts(folded())
+
+
+def test_several_parts_are_cut_off():
+    pairs = chain(range(1, 21)) + chain(range(21, 31)) + chain(range(31, 39))
+    for one, other in ((20, 21), (30, 31), (12, 36)):
+        pairs += [CheckedPair(one - a, other + b, 900, 0) for a in range(3) for b in range(3)]
+    pairs += [CheckedPair(i, i + 20, 90, 60) for i in range(1, 11)]
+    pairs += [CheckedPair(i, i + 30, 90, 60) for i in range(1, 9)]
+    assert find_parts(pairs) == [set(range(1, 21)), set(range(21, 31)), set(range(31, 39))]
+
+
+def test_a_single_photo_is_cut_off():
+    pairs = chain([i for i in range(1, 31) if i != 15])
+    pairs += [CheckedPair(*sorted((15, i)), 400, 8) for i in (12, 13, 14, 16, 17, 18)]
+    assert find_parts(pairs) == [set(range(1, 31)) - {15}, {15}]
+
+
+def test_look_alikes_in_a_right_model_cut_nothing():
+    """Two places with many false matches between them; the model confirms the way between them."""
+    pairs = chain(range(1, 31))
+    pairs += [CheckedPair(i, j, 300, 0) for i in range(1, 6) for j in range(26, 31)]
+    assert find_parts(pairs) == [set(range(1, 31))]
+
+
+def test_little_evidence_cuts_nothing():
+    """Two tears, or pairs with few matches, are not enough."""
+    two = [CheckedPair(10, 11, 900, 0), CheckedPair(9, 12, 900, 0)]
+    assert len(find_parts(chain(range(1, 11)) + chain(range(11, 16)) + two)) == 1
+    weak = [CheckedPair(i, j, 49, 0) for i in range(1, 11) for j in range(11, 16)]
+    assert len(find_parts(chain(range(1, 11)) + chain(range(11, 16)) + weak)) == 1
+
+
+def test_matches_that_agree_with_the_poses_are_no_tears():
+    """Points too far away to be triangulated: the pairs have no points."""
+    pairs = [
+        CheckedPair(p.first, p.second, p.matches, p.shared, 0.9 if p.share < 0.1 else 0.0)
+        for p in folded()
+    ]
+    assert len(find_parts(pairs)) == 1
+
+
+@pytest.mark.parametrize(
+    ("share", "rotation", "support"),
+    [(0.0, 0, 0), (0.1, 0, 0), (0.2, 0, 0.5), (0.3, 0, 1), (0.9, 0, 1), (0.2, 11, 0), (0.5, 11, 1)],
+)
+def test_support_follows_the_share_of_matches_that_became_points(share, rotation, support):
+    pair = CheckedPair(1, 2, 1000, round(1000 * share), 0.0, rotation)
+    assert pair.support == pytest.approx(support)
+    assert pair.torn == (support == 0)
+
+
+@pytest.fixture
+def two_views():
+    """cam2_from_cam1, and the rays of 200 points in both cameras."""
+    random = np.random.default_rng(3)
+    axis = np.array([0.1, 0.25, -0.05])
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(axis), np.array([1.0, 0.2, 0.1]))
+    points = random.uniform([-3, -3, 4], [3, 3, 9], (200, 3))
+    both = points, points @ pose.rotation.matrix().T + pose.translation
+    return (pose, *(xyz[:, :2] / xyz[:, 2:] for xyz in both))
+
+
+def test_matches_agree_with_their_pose(two_views):
+    pose, rays1, rays2 = two_views
+    assert agreement(pose, rays1, rays2, 1e-9) == 1
+    assert rotation_error(pose, rays1, rays2, 1e-3) < 0.01
+
+
+def test_matches_behind_the_cameras_do_not_agree(two_views):
+    pose, rays1, rays2 = two_views
+    back = pycolmap.Rigid3d(pose.rotation, -pose.translation)
+    assert agreement(back, rays1, rays2, 1e-3) < 0.1
+
+
+def test_matches_of_a_turning_camera_agree(two_views):
+    """The rays are parallel, so there are no points."""
+    pose, rays1, _ = two_views
+    turned = np.concatenate([rays1, np.ones((200, 1))], 1) @ pose.rotation.matrix().T
+    moved = pycolmap.Rigid3d(pose.rotation, np.array([0.01, 0, 0]))
+    assert agreement(moved, rays1, turned[:, :2] / turned[:, 2:], 1e-3) == 1
+
+
+def test_matches_do_not_agree_with_another_pose(two_views):
+    pose, rays1, rays2 = two_views
+    turn = pycolmap.Rotation3d(np.array([0, np.radians(20), 0]))
+    wrong = pycolmap.Rigid3d(turn * pose.rotation, pose.translation)
+    assert agreement(wrong, rays1, rays2, 1e-3) < 0.1
+    assert rotation_error(wrong, rays1, rays2, 1e-3) == pytest.approx(20, abs=0.1)

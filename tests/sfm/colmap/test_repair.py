@@ -1,0 +1,141 @@
+"""Photos in a wrong place are found, placed anew, or left out with a reason."""
+
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.scene.geometry import similarity_from_points
+from snowsplat.sfm.colmap.consistency import check_pairs
+from snowsplat.sfm.colmap.database import closing_database, copy_for_mapping, verified_pairs
+from snowsplat.sfm.colmap.features import Folders, WorkerProgress
+from snowsplat.sfm.colmap.mapping import Mapping
+from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
+from snowsplat.sfm.colmap.pairs import PairChoice
+from snowsplat.sfm.colmap.reconstruct import Matched, Reconstruction
+from snowsplat.sfm.colmap.repair import repair
+from snowsplat.sfm.progress import silent
+
+from . import look_alikes
+
+pytestmark = pytest.mark.sfm
+
+FAR = {i + 1 for i in look_alikes.FAR}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return look_alikes.walk()
+
+
+@pytest.fixture
+def mapping(tmp_path, scene):
+    database = look_alikes.write_database(tmp_path / "database.db", scene)
+    return Mapping(database, tmp_path, 1.0, 1, silent)
+
+
+def state_of(model):
+    poses = {i: model.image(i).cam_from_world().matrix().tolist() for i in model.reg_image_ids()}
+    points = {i: (p.xyz.tolist(), str(p.track)) for i, p in model.points3D.items()}
+    return poses, points
+
+
+def largest_centre_error(model, scene):
+    ids = sorted(model.reg_image_ids())
+    found = torch.tensor(np.stack([model.image(i).projection_center() for i in ids]))
+    truth = torch.tensor(scene.centres[[i - 1 for i in ids]])
+    return float((similarity_from_points(found, truth).apply(found) - truth).norm(dim=1).max())
+
+
+def test_a_right_model_is_not_changed(mapping, scene):
+    """The look-alikes are tears of the right model, but the other matches confirm the places."""
+    model = look_alikes.model(scene, folded=False)
+    before = state_of(model)
+    pairs = check_pairs(model, mapping.database, 4.0)
+    assert sum(pair.torn for pair in pairs) > 5
+    repaired = repair(model, mapping, 4.0)
+    assert repaired.model is model
+    assert state_of(model) == before
+    assert (repaired.contradicting, repaired.left_out, repaired.description) == (0, {}, "")
+
+
+def test_a_folded_part_is_placed_anew(mapping, scene):
+    model = look_alikes.model(scene, folded=True)
+    assert largest_centre_error(model, scene) > 5
+    repaired = repair(model, mapping, 4.0)
+    assert repaired.contradicting == len(FAR)
+    assert repaired.left_out == {}
+    assert repaired.description == "7 contradicted their matches: 7 placed again, 0 left out"
+    assert set(repaired.model.reg_image_ids()) == set(range(1, look_alikes.COUNT + 1))
+    assert largest_centre_error(repaired.model, scene) < 0.05
+
+
+def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):
+    first, second = (
+        repair(look_alikes.model(scene, folded=True), mapping, 4.0).model for _ in range(2)
+    )
+    assert state_of(first)[0] == state_of(second)[0]
+
+
+def test_a_part_that_cannot_be_placed_is_left_out_with_a_reason(mapping, scene, monkeypatch):
+    monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
+    repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
+    assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
+    assert set(repaired.model.reg_image_ids()).isdisjoint(FAR)
+    reason = repaired.left_out["09.png"]
+    assert reason.startswith("it was, with 6 other photos, in a place that its matches contradict")
+    assert "09.png" in reason
+    assert "but only 0 points in common" in reason
+    assert repaired.description == "7 contradicted their matches: 0 placed again, 7 left out"
+
+
+def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypatch):
+    def fold_again(self, models, relaxed=True):
+        return [look_alikes.model(scene, folded=True)]
+
+    monkeypatch.setattr(Mapping, "extend", fold_again)
+    repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
+    assert set(repaired.model.reg_image_ids()).isdisjoint(FAR)
+    assert len(repaired.left_out) == len(FAR)
+
+
+def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_path):
+    folded = look_alikes.model(scene, folded=True)
+    monkeypatch.setattr(Mapping, "run", lambda self, mapper, relaxed: [folded])
+    monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
+    progress = WorkerProgress(silent, lambda *table: None)
+    photos = look_alikes.photos()
+    job = Reconstruction(Folders(tmp_path), photos, SfmOptions(), 1, progress)
+    choice = PairChoice(sorted(scene.matches), "neighbours")
+    job._try("as configured", Matched(mapping.database, EFFORTS["draft"], choice, 1.0), "global")
+    assert job.attempts[0].registered == len(photos) - len(FAR)
+    assert len(job.attempts[0].left_out) == len(FAR)
+    assert job.log[0].endswith(
+        "9 of 16 photos registered; 7 contradicted their matches: 0 placed again, 7 left out"
+    )
+
+
+def test_the_copy_for_the_mapper_is_a_database_without_some_pairs(mapping, scene, tmp_path):
+    copy = tmp_path / "copy.db"
+    copy_for_mapping(mapping.database, copy, without=[(1, 2), (3, 4)])
+    left = {(pair.first + 1, pair.second + 1) for pair in verified_pairs(copy)}
+    assert left == {(i + 1, j + 1) for i, j in scene.matches} - {(1, 2), (3, 4)}
+    with closing_database(copy) as database:
+        assert database.num_images() == look_alikes.COUNT
+        assert np.array_equal(
+            database.read_two_view_geometry(2, 3).inlier_matches, scene.matches[1, 2]
+        )
+        assert database.num_keypoints() == sum(map(len, scene.pixels))
+
+
+def test_the_database_is_not_changed(mapping, scene):
+    def rows():
+        with closing(sqlite3.connect(mapping.database)) as connection:
+            return list(connection.iterdump())
+
+    before = rows()
+    repair(look_alikes.model(scene, folded=True), mapping, 4.0)
+    assert rows() == before
+    assert [path.name for path in mapping.database.parent.iterdir()] == ["database.db"]
