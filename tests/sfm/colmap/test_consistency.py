@@ -45,6 +45,24 @@ def test_the_order_of_the_pairs_does_not_matter():
     assert find_parts(pairs) == find_parts(folded())
 
 
+def test_a_long_part_with_many_weak_links_is_cut_off():
+    """Two walks of 300 and 200 photos, torn at one place; 199 weak false pairs link them."""
+
+    def near(photos):
+        return [
+            CheckedPair(i, j, 2400 // (j - i), 1700 // (j - i))
+            for i, j in itertools.combinations(photos, 2)
+            if j - i <= 12
+        ]
+
+    pairs = near(range(1, 301)) + near(range(301, 501))
+    pairs += [
+        CheckedPair(300 - a, 301 + b, 2400 // (a + b + 1), 5) for a in range(6) for b in range(6)
+    ]
+    pairs += [CheckedPair(i, i + 300, 150, 100) for i in range(1, 200)]
+    assert find_parts(pairs) == [set(range(1, 301)), set(range(301, 501))]
+
+
 def test_several_parts_are_cut_off():
     pairs = chain(range(1, 21)) + chain(range(21, 31)) + chain(range(31, 39))
     for one, other in ((20, 21), (30, 31), (12, 36)):

@@ -19,6 +19,7 @@ generalized spectral method", AISTATS 2016).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -264,7 +265,7 @@ def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
 def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
     """Cut the photos until no part contradicts itself."""
     best = None
-    for one in _cuts(graph, photos):
+    for one in itertools.chain(_grown(graph, photos), _cuts(graph, photos)):
         inside = set(one)
         other = [i for i in photos if i not in inside]
         if graph.contradicts(one, other):
@@ -278,6 +279,32 @@ def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
     for part in best[1:]:
         for component in _components(graph.demand[np.ix_(part, part)] > 0):
             yield from _split(graph, [part[i] for i in component])
+
+
+def _grown(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
+    """Candidates for one side of a cut: groups grown along the confirmed pairs, strongest first.
+
+    Groups that contradict each other are not joined. The eigenvectors miss a part that many weak
+    pairs link to the rest.
+    """
+    group = {photo: [photo] for photo in photos}
+    apart: set[tuple[int, int, int, int]] = set()
+    rows, columns = np.nonzero(np.triu(graph.support[np.ix_(photos, photos)]))
+    strength = graph.confirmed[np.take(photos, rows), np.take(photos, columns)]
+    for edge in np.argsort(-strength, kind="stable"):
+        one, other = group[photos[rows[edge]]], group[photos[columns[edge]]]
+        key = (one[0], len(one), other[0], len(other))
+        if one is other or key in apart:
+            continue
+        if graph.contradicts(one, other):
+            apart.add(key)
+            continue
+        one += other
+        for photo in other:
+            group[photo] = one
+    groups = {id(members): members for members in group.values()}
+    if len(groups) > 1:
+        yield from (sorted(members) for members in groups.values())
 
 
 def _cuts(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
