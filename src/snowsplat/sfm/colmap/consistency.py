@@ -34,6 +34,8 @@ from snowsplat.sfm.colmap.features import SEED
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
+# A photo of a pair, the point that each of its matched features observes, and their rays.
+_Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 
 # Pairs with fewer verified matches are not evidence: random matches reach this number.
 _MIN_MATCHES = 50
@@ -44,6 +46,11 @@ _TORN = 0.1
 # The model also confirms a pair if at least this share of its matches agrees with the poses: far
 # points and small steps give no points.
 _AGREEING = 0.5
+# Poses whose distance is wrong agree with the matches, too, because two photos do not determine their
+# distance. Therefore, the model does not confirm a pair if at least this share of its matches has a
+# point of one of the photos that is elsewhere in the other photo.
+_MISSING = 0.3
+_ELSEWHERE = 4.0  # times the largest distance of a match from its epipolar line
 _MIN_ANGLE = 2.0  # degrees between two rays that may be parallel
 _MAX_ROTATION = 10.0  # degrees between the rotation of the model and that of the matches
 # Two parts are cut apart if at most this share of the demand between them is confirmed …
@@ -67,6 +74,7 @@ class CheckedPair:
     matches: int  # verified matches
     shared: int  # matches whose two features observe the same point of the model
     agreeing: float = 0.0  # share of the matches that agree with the poses, if computed
+    missing: float = 0.0  # share of the matches whose points are elsewhere, if computed
     rotation: float = 0.0  # degrees between the model and the matches, if computed
 
     @property
@@ -77,7 +85,7 @@ class CheckedPair:
     @property
     def support(self) -> float:
         """How far the model confirms the matches: 0 (it contradicts them) … 1."""
-        if self.agreeing >= _AGREEING:
+        if self.agreeing >= _AGREEING and self.missing < _MISSING:
             return 1.0
         if self.rotation > _MAX_ROTATION and self.share < _CONFIRMED:
             return 0.0
@@ -123,7 +131,14 @@ def check_pairs(
                 pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
                 both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
                 error = max_error / float(focal)
-                pair = replace(pair, agreeing=agreement(pose, *both, error))
+                sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
+                missed = _misses(model, sides[0], sides[1], _ELSEWHERE * error)
+                missed |= _misses(model, sides[1], sides[0], _ELSEWHERE * error)
+                pair = replace(
+                    pair,
+                    agreeing=agreement(pose, *both, error),
+                    missing=float(np.mean(missed & ~is_shared)),
+                )
                 if pair.agreeing < _AGREEING and not found.flat:
                     pair = replace(pair, rotation=rotation_error(pose, *both, error))
             checked.append(pair)
@@ -137,6 +152,27 @@ def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
     for row in image.get_observation_point2D_idxs():
         ids[row] = points[row].point3D_id
     return ids
+
+
+def _misses(
+    model: pycolmap.Reconstruction, one: _Side, other: _Side, max_error: float
+) -> NDArray[np.bool_]:
+    """(M,) whether the feature of ``one`` has a point that is elsewhere in the photo of ``other``.
+
+    ``max_error``: the largest distance from the matched feature in the normalised image plane.
+    """
+    _, ids, _ = one
+    image, _, rays = other
+    missed = np.zeros(len(ids), bool)
+    rows = np.flatnonzero(ids != pycolmap.INVALID_POINT3D_ID)
+    if len(rows):
+        points = np.array([model.point3D(int(i)).xyz for i in ids[rows]])
+        camera = image.cam_from_world().matrix()
+        seen = points @ camera[:, :3].T + camera[:, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.linalg.norm(seen[:, :2] / seen[:, 2:] - rays[rows], axis=1)
+        missed[rows] = (seen[:, 2] <= 0) | (distance > max_error)
+    return missed
 
 
 def agreement(
