@@ -30,7 +30,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
-from snowsplat.sfm.colmap.features import SEED
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
@@ -39,22 +38,20 @@ _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 
 # Pairs with fewer verified matches are not evidence: random matches reach this number.
 _MIN_MATCHES = 50
-# The model confirms a pair if at least this share of its matches became points of both photos, and
-# contradicts it if the share is less than `_TORN`.
-_CONFIRMED = 0.3
-_TORN = 0.1
-# The model also confirms a pair if at least this share of its matches agrees with the poses: far
-# points and small steps give no points.
+# A match is a hit if it became a point of both photos, and a miss if one of its features has a point
+# that is elsewhere in the other photo. The support of a pair is the share of hits among both; in a
+# right model, it is nearly 1. Matches that have no points are no evidence: far points and small
+# steps give no points. If fewer matches than this share are hits or misses, the support is 1 if at
+# least `_AGREEING` of the matches agree with the poses, otherwise 0.
+_EVIDENCE = 0.05
 _AGREEING = 0.5
-# Poses whose distance is wrong agree with the matches, too, because two photos do not determine their
-# distance. Therefore, the model does not confirm a pair if at least this share of its matches has a
-# point of one of the photos that is elsewhere in the other photo.
-_MISSING = 0.3
-_ELSEWHERE = 4.0  # times the largest distance of a match from its epipolar line
+# The model confirms a pair with at least this support, and contradicts it with at most `_TORN`.
+_CONFIRMED = 0.8
+_TORN = 0.3
+_ELSEWHERE = 4.0  # distance of a miss, in units of the largest distance from an epipolar line
 _MIN_ANGLE = 2.0  # degrees between two rays that may be parallel
-_MAX_ROTATION = 10.0  # degrees between the rotation of the model and that of the matches
 # Two parts are cut apart if at most this share of the demand between them is confirmed …
-_MAX_SUPPORT = 0.25
+_MAX_SUPPORT = 0.5
 # … and at least this many pairs between them are tears. As many confirmed pairs with more matches
 # are stronger evidence: photos taken side by side have more matches than look-alikes.
 _MIN_TEARS = 3
@@ -74,8 +71,7 @@ class CheckedPair:
     matches: int  # verified matches
     shared: int  # matches whose two features observe the same point of the model
     agreeing: float = 0.0  # share of the matches that agree with the poses, if computed
-    missing: float = 0.0  # share of the matches whose points are elsewhere, if computed
-    rotation: float = 0.0  # degrees between the model and the matches, if computed
+    missing: float = 0.0  # share of misses, if computed
 
     @property
     def share(self) -> float:
@@ -85,16 +81,15 @@ class CheckedPair:
     @property
     def support(self) -> float:
         """How far the model confirms the matches: 0 (it contradicts them) … 1."""
-        if self.agreeing >= _AGREEING and self.missing < _MISSING:
-            return 1.0
-        if self.rotation > _MAX_ROTATION and self.share < _CONFIRMED:
-            return 0.0
-        return float(np.clip((self.share - _TORN) / (_CONFIRMED - _TORN), 0, 1))
+        hits, misses = self.share, self.missing
+        if hits + misses >= _EVIDENCE:
+            return hits / (hits + misses)
+        return float(self.agreeing >= _AGREEING)
 
     @property
     def torn(self) -> bool:
         """Whether the model contradicts the matches."""
-        return self.matches >= _MIN_MATCHES and self.support == 0
+        return self.matches >= _MIN_MATCHES and self.support <= _TORN
 
 
 def check_pairs(
@@ -106,6 +101,7 @@ def check_pairs(
     """
     placed = set(model.reg_image_ids())
     points = {image_id: _point_ids(model.image(image_id)) for image_id in placed}
+    positions = _Positions.of(model)
     rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
@@ -125,22 +121,20 @@ def check_pairs(
             of_first, of_second = points[first][rows[:, 0]], points[second][rows[:, 1]]
             is_shared = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
             pair = CheckedPair(first, second, len(rows), int(is_shared.sum()))
-            if len(rows) >= _MIN_MATCHES and pair.support < 1:
+            if len(rows) >= _MIN_MATCHES:
                 images = model.image(first), model.image(second)
                 focal = np.mean([model.camera(i.camera_id).mean_focal_length() for i in images])
                 pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
                 both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
                 error = max_error / float(focal)
                 sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
-                missed = _misses(model, sides[0], sides[1], _ELSEWHERE * error)
-                missed |= _misses(model, sides[1], sides[0], _ELSEWHERE * error)
+                missed = _misses(positions, sides[0], sides[1], _ELSEWHERE * error)
+                missed |= _misses(positions, sides[1], sides[0], _ELSEWHERE * error)
                 pair = replace(
                     pair,
                     agreeing=agreement(pose, *both, error),
                     missing=float(np.mean(missed & ~is_shared)),
                 )
-                if pair.agreeing < _AGREEING and not found.flat:
-                    pair = replace(pair, rotation=rotation_error(pose, *both, error))
             checked.append(pair)
     return checked
 
@@ -154,9 +148,24 @@ def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
     return ids
 
 
-def _misses(
-    model: pycolmap.Reconstruction, one: _Side, other: _Side, max_error: float
-) -> NDArray[np.bool_]:
+@dataclass(frozen=True)
+class _Positions:
+    """The positions of all points of a model."""
+
+    ids: NDArray[np.uint64]  # (P,) ascending
+    xyz: Floats  # (P, 3)
+
+    @staticmethod
+    def of(model: pycolmap.Reconstruction) -> _Positions:
+        ids = np.array(sorted(model.points3D), np.uint64)
+        xyz = np.array([model.point3D(int(i)).xyz for i in ids]).reshape(-1, 3)
+        return _Positions(ids, xyz)
+
+    def __getitem__(self, ids: NDArray[np.uint64]) -> Floats:
+        return self.xyz[np.searchsorted(self.ids, ids)]
+
+
+def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -> NDArray[np.bool_]:
     """(M,) whether the feature of ``one`` has a point that is elsewhere in the photo of ``other``.
 
     ``max_error``: the largest distance from the matched feature in the normalised image plane.
@@ -166,7 +175,7 @@ def _misses(
     missed = np.zeros(len(ids), bool)
     rows = np.flatnonzero(ids != pycolmap.INVALID_POINT3D_ID)
     if len(rows):
-        points = np.array([model.point3D(int(i)).xyz for i in ids[rows]])
+        points = positions[ids[rows]]
         camera = image.cam_from_world().matrix()
         seen = points @ camera[:, :3].T + camera[:, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -202,29 +211,6 @@ def agreement(
     return float(np.mean((distance <= max_error) & (is_in_front | is_parallel)))
 
 
-def rotation_error(
-    cam2_from_cam1: pycolmap.Rigid3d, rays1: Floats, rays2: Floats, max_error: float
-) -> float:
-    """Degrees between a relative rotation and that of the essential matrix of the matches.
-
-    The arguments are those of `agreement`. The result is 0 if the matches do not determine a
-    rotation.
-    """
-    # Pixels outside of the domain of the distortion have no ray.
-    finite = np.isfinite(rays1).all(1) & np.isfinite(rays2).all(1)
-    options = pycolmap.RANSACOptions()
-    options.max_error = max_error
-    options.random_seed = SEED
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1.0, 1, 1)
-    camera.params = [1.0, 0.0, 0.0]
-    found = pycolmap.estimate_essential_matrix(
-        rays1[finite], rays2[finite], camera, camera, options
-    )
-    if found is None:
-        return 0.0
-    return float(np.degrees(found["cam2_from_cam1"].rotation.angle_to(cam2_from_cam1.rotation)))
-
-
 def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
     """The parts of a model that contradict each other: sets of image ids.
 
@@ -244,7 +230,7 @@ def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
         demand[i, j] = demand[j, i] = weight
         support[i, j] = support[j, i] = weight * pair.support
         torn[i, j] = torn[j, i] = pair.matches * pair.torn
-        confirmed[i, j] = confirmed[j, i] = pair.matches * (pair.support > 0)
+        confirmed[i, j] = confirmed[j, i] = pair.matches * (pair.support >= _CONFIRMED)
     graph = _Graph(demand, support, torn, confirmed)
     parts = [part for component in _components(demand > 0) for part in _split(graph, component)]
     parts = sorted(_merged(graph, parts), key=lambda part: (-len(part), part[0]))
