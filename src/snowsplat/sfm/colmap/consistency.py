@@ -38,7 +38,7 @@ _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 
 # Pairs with fewer verified matches are not evidence: random matches reach this number.
 _MIN_MATCHES = 50
-# A match is a hit if it became a point of both photos, and a miss if one of its features has a point
+# A match is a hit if it became a point of both photos. It is a miss if a feature of it has a point
 # that is elsewhere in the other photo. The support of a pair is the share of hits among both; in a
 # right model, it is nearly 1. Matches that have no points are no evidence: far points and small
 # steps give no points. If fewer matches than this share are hits or misses, the support is 1 if at
