@@ -151,7 +151,8 @@ def _communicate(
 
     def listen() -> None:
         assert child.stdout is not None
-        with child.stdout:
+        # After an interrupt, the stream may be closed while it is read.
+        with contextlib.suppress(ValueError), child.stdout:
             for line in child.stdout:
                 lines.put(line)
         lines.put(None)
