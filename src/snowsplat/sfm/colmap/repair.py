@@ -78,25 +78,12 @@ def _part_of(parts: Sequence[set[int]]) -> dict[int, int]:
 
 
 def _false_links(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set[tuple[int, int]]:
-    """The pairs of photos in different parts whose matches the model does not contradict.
-
-    Pairs with more matches than the strongest tear between the same parts are kept: photos taken
-    side by side have more matches than look-alikes.
-    """
+    """The pairs of photos in different parts whose matches the model does not contradict."""
     part = _part_of(parts)
-    across = [p for p in pairs if part.get(p.first, 0) != part.get(p.second, 0)]
-
-    def border(pair: CheckedPair) -> tuple[int, ...]:
-        return tuple(sorted((part.get(pair.first, 0), part.get(pair.second, 0))))
-
-    strongest: dict[tuple[int, ...], int] = {}
-    for pair in across:
-        if pair.torn:
-            strongest[border(pair)] = max(strongest.get(border(pair), 0), pair.matches)
     return {
         (pair.first, pair.second)
-        for pair in across
-        if not pair.torn and pair.matches <= strongest.get(border(pair), pair.matches)
+        for pair in pairs
+        if part.get(pair.first, 0) != part.get(pair.second, 0) and not pair.torn
     }
 
 
