@@ -18,7 +18,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.viewer.live.display import DisplaySettings, Pose, fit
 
 STILL = 0.2  # seconds without motion after which a camera counts as still
-_MOVE_SECONDS = 2.0  # maximum time until a browser is at the pose of a photo
+MOVE_SECONDS = 2.0  # maximum time until a browser is at the pose of a photo
 # While the camera moves, images are made so small that rendering takes at most this many seconds.
 _MOVING_SECONDS = 0.05
 _SMALLEST = 160  # pixels: minimum of the longer side of such an image
@@ -83,6 +83,11 @@ class Visitor:
     shown_full: bool = False
     shown_scene: int = -1
     seconds_per_pixel: float = 0.0
+
+    @property
+    def going(self) -> bool:
+        """Whether the browser was moved to a photo and has not sent a pose from there yet."""
+        return self.photo_view is not None and not self.arrived
 
     def request(self, scene: int, now: float) -> RenderRequest | None:
         """The image that is needed at the time ``now``, if any."""
@@ -160,13 +165,18 @@ class Session:
             self._notify()
 
     def move(self, visitor: Visitor, pose: Pose) -> None:
-        """Set the pose of a browser. If it moves away from the photo, the photo view ends."""
+        """Set the pose of a browser. If it moves away from the photo, the photo view ends.
+
+        While the browser is `Visitor.going`, another pose may be one from before. Set the last pose
+        again after `MOVE_SECONDS`: a user who moved the camera at once may not have sent a pose
+        near the photo.
+        """
         photo_view, arrived = visitor.photo_view, visitor.arrived
         if photo_view is not None:
             if pose.is_near(photo_view.pose):
                 arrived = True
             # Otherwise, the browser may have sent this pose before it was moved to the photo.
-            elif arrived or self._clock() - visitor.photo_view_since > _MOVE_SECONDS:
+            elif arrived or self._clock() - visitor.photo_view_since > MOVE_SECONDS:
                 photo_view = None
         self.change(visitor, pose=pose, photo_view=photo_view, arrived=arrived)
 

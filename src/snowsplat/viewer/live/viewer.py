@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ from snowsplat.viewer.live.page import Controls, ScenePanel
 from snowsplat.viewer.live.photos import Photos, placed_photo
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.server import start_server, stop_server
-from snowsplat.viewer.live.session import RenderRequest, Session, Visitor
+from snowsplat.viewer.live.session import MOVE_SECONDS, RenderRequest, Session, Visitor
 
 _QUALITY = {"moving": 60, "still": 90, "idle": 90}  # of JPEG images
 _TICK = 0.02  # seconds between two checks for requested images
@@ -114,11 +115,20 @@ class NetworkViewer:
         self._browsers[client.client_id] = client, visitor, controls
         self._photos.begin()
 
+        def move(pose: Pose) -> None:
+            self.session.move(visitor, pose)
+            controls.follow()
+            if visitor.going:
+                asyncio.get_running_loop().call_later(MOVE_SECONDS, move_again, pose)
+
+        def move_again(pose: Pose) -> None:
+            if visitor.going and visitor.pose is pose:
+                move(pose)
+
         async def moved(camera: viser.CameraHandle) -> None:
             pose = _pose(camera)
             if pose is not None:
-                self.session.move(visitor, pose)
-                controls.follow()
+                move(pose)
 
         await moved(client.camera)
         client.camera.on_update(moved)
