@@ -77,6 +77,22 @@ def test_a_single_photo_is_cut_off():
     assert find_parts(pairs) == [set(range(1, 31)) - {15}, {15}]
 
 
+def test_photos_that_follow_each_other_outweigh_look_alikes():
+    """Two walks, linked only where the second one begins; look-alikes have nearly as many matches.
+
+    So it is in bonsai_photos: true matches of 5763 and 5764, false ones of 5750 and 5845.
+    """
+
+    def pairs(follows):
+        border = [(20, 21, 500), (19, 21, 200), (20, 22, 200)]
+        true = [CheckedPair(i, j, matches, 150, follows=follows) for i, j, matches in border]
+        false = [CheckedPair(i, j, 350, 0) for i in (8, 9, 10) for j in (28, 29, 30)]
+        return chain(range(1, 21)) + chain(range(21, 41)) + true + false
+
+    assert find_parts(pairs(follows=False)) == [set(range(1, 21)), set(range(21, 41))]
+    assert find_parts(pairs(follows=True)) == [set(range(1, 41))]
+
+
 def test_look_alikes_in_a_right_model_cut_nothing():
     """Two places with many false matches between them; the model confirms the way between them."""
     pairs = chain(range(1, 31))

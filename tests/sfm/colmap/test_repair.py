@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from snowsplat.scene.geometry import similarity_from_points
-from snowsplat.sfm.colmap.consistency import check_pairs
+from snowsplat.sfm.colmap.consistency import CheckedPair, check_pairs
 from snowsplat.sfm.colmap.database import closing_database, copy_for_mapping, verified_pairs
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress
 from snowsplat.sfm.colmap.mapping import Mapping
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
 from snowsplat.sfm.colmap.pairs import PairChoice
 from snowsplat.sfm.colmap.reconstruct import Matched, Reconstruction
-from snowsplat.sfm.colmap.repair import repair
+from snowsplat.sfm.colmap.repair import _false_links, repair
 from snowsplat.sfm.progress import silent
 
 from . import look_alikes
@@ -70,6 +70,20 @@ def test_a_folded_part_is_placed_anew(mapping, scene):
     assert repaired.description == "7 contradicted their matches: 7 placed again, 0 left out"
     assert set(repaired.model.reg_image_ids()) == set(range(1, look_alikes.COUNT + 1))
     assert largest_centre_error(repaired.model, scene) < 0.05
+
+
+def test_photos_that_follow_each_other_by_name(mapping, scene):
+    pairs = check_pairs(look_alikes.model(scene, folded=True), mapping.database, 4.0)
+    follow = {(pair.first, pair.second) for pair in pairs if pair.follows}
+    assert follow == {(i + 1, j + 1) for i, j in scene.matches if j - i <= 2}
+
+
+def test_which_links_between_parts_are_false():
+    """Tears show the true place, and photos that follow each other may be the only true link."""
+    torn, confirmed = CheckedPair(1, 4, 300, 0), CheckedPair(1, 5, 300, 200)
+    following = CheckedPair(3, 4, 300, 200, follows=True)
+    inside = CheckedPair(1, 2, 300, 200)
+    assert _false_links([torn, confirmed, following, inside], [{1, 2, 3}, {4, 5}]) == {(1, 5)}
 
 
 def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):

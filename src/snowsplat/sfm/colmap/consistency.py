@@ -30,6 +30,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
+from snowsplat.sfm.colmap.pairs import following, numbered_series
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
@@ -48,6 +49,10 @@ _AGREEING = 0.5
 # The model confirms a pair with at least this support, and contradicts it with at most `_TORN`.
 _CONFIRMED = 0.8
 _TORN = 0.3
+# Matches of photos whose places in the series of names differ by at most `_NEXT` count `_FOLLOWING`
+# times: such photos were usually taken side by side, so their matches are rarely false.
+_NEXT = 2
+_FOLLOWING = 4.0
 _ELSEWHERE = 4.0  # distance of a miss, in units of the largest distance from an epipolar line
 _MIN_ANGLE = 2.0  # degrees between two rays that may be parallel
 # Two parts are cut apart if at most this share of the demand between them is confirmed …
@@ -72,6 +77,12 @@ class CheckedPair:
     shared: int  # matches whose two features observe the same point of the model
     agreeing: float = 0.0  # share of the matches that agree with the poses, if computed
     missing: float = 0.0  # share of misses, if computed
+    follows: bool = False  # the photos follow each other by name, at most `_NEXT` apart
+
+    @property
+    def weight(self) -> float:
+        """The number of matches, as evidence: those of photos that follow each other count more."""
+        return self.matches * (_FOLLOWING if self.follows else 1.0)
 
     @property
     def share(self) -> float:
@@ -105,6 +116,7 @@ def check_pairs(
     rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
+        in_order = _pairs_in_order(source)
 
         def rays_of(image_id: int, features: Ints) -> Floats:
             if image_id not in rays:
@@ -120,7 +132,8 @@ def check_pairs(
             rows = source.read_two_view_geometry(first, second).inlier_matches
             of_first, of_second = points[first][rows[:, 0]], points[second][rows[:, 1]]
             is_shared = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
-            pair = CheckedPair(first, second, len(rows), int(is_shared.sum()))
+            follows = (first, second) in in_order
+            pair = CheckedPair(first, second, len(rows), int(is_shared.sum()), follows=follows)
             if len(rows) >= _MIN_MATCHES:
                 images = model.image(first), model.image(second)
                 focal = np.mean([model.camera(i.camera_id).mean_focal_length() for i in images])
@@ -137,6 +150,13 @@ def check_pairs(
                 )
             checked.append(pair)
     return checked
+
+
+def _pairs_in_order(database: pycolmap.Database) -> set[tuple[int, int]]:
+    """The image ids (first < second) of the pairs of photos that follow each other by name."""
+    names = {image.image_id: image.name for image in database.read_all_images()}
+    steps = range(1, _NEXT + 1)
+    return set().union(*(following(series, steps) for series in numbered_series(names)))
 
 
 def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
@@ -226,11 +246,10 @@ def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
     support, torn, confirmed = demand.copy(), demand.copy(), demand.copy()
     for pair in pairs:
         i, j = index[pair.first], index[pair.second]
-        weight = float(pair.matches) ** 2
-        demand[i, j] = demand[j, i] = weight
-        support[i, j] = support[j, i] = weight * pair.support
-        torn[i, j] = torn[j, i] = pair.matches * pair.torn
-        confirmed[i, j] = confirmed[j, i] = pair.matches * (pair.support >= _CONFIRMED)
+        demand[i, j] = demand[j, i] = pair.weight**2
+        support[i, j] = support[j, i] = pair.weight**2 * pair.support
+        torn[i, j] = torn[j, i] = pair.weight * pair.torn
+        confirmed[i, j] = confirmed[j, i] = pair.weight * (pair.support >= _CONFIRMED)
     graph = _Graph(demand, support, torn, confirmed)
     parts = [part for component in _components(demand > 0) for part in _split(graph, component)]
     parts = sorted(_merged(graph, parts), key=lambda part: (-len(part), part[0]))

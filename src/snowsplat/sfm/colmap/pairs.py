@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,7 +64,8 @@ def choose_pairs(
             pairs |= _pairs_along(sequence, effort.overlap)
         rules.append("frames of a video with the following ones")
     overlap = round(_NUMBERED_SHARE * effort.overlap)
-    numbered = [_following(series, range(1, overlap + 1)) for series in _numbered_series(photos)]
+    names = {i: photo.name for i, photo in enumerate(photos) if photo.sequence is None}
+    numbered = [following(series, range(1, overlap + 1)) for series in numbered_series(names)]
     if numbered:
         pairs |= set().union(*numbered)
         rules.append("photos with the next ones by name")
@@ -82,6 +83,30 @@ def choose_pairs(
     return PairChoice(sorted(pairs), f"{', '.join(rules)} ({len(pairs)} pairs)")
 
 
+def numbered_series(names: Mapping[int, str]) -> list[list[int]]:
+    """The photos whose names differ only in the last number, such as IMG_0017.jpg, in its order.
+
+    ``names``: number of a photo -> file name. Series of a single photo are left out.
+    """
+    by_prefix: dict[str, list[tuple[int, int]]] = {}
+    for i, name in names.items():
+        parts = _NUMBERED_NAME.fullmatch(name)
+        if parts is not None:
+            by_prefix.setdefault(parts[1], []).append((int(parts[2]), i))
+    return [[i for _, i in sorted(series)] for series in by_prefix.values() if len(series) > 1]
+
+
+def following(series: Sequence[int], steps: Sequence[int]) -> Pairs:
+    """Pairs (i < j) of the entries of ``series`` that are one of ``steps`` places apart."""
+    pairs = set()
+    for position, i in enumerate(series):
+        for step in steps:
+            if position + step < len(series):
+                j = series[position + step]
+                pairs.add((min(i, j), max(i, j)))
+    return pairs
+
+
 def _sequences(photos: Sequence[Photo]) -> list[list[int]]:
     by_name: dict[str, list[int]] = {}
     for i, photo in enumerate(photos):
@@ -90,33 +115,13 @@ def _sequences(photos: Sequence[Photo]) -> list[list[int]]:
     return [sorted(frames, key=lambda i: photos[i].name) for frames in by_name.values()]
 
 
-def _numbered_series(photos: Sequence[Photo]) -> list[list[int]]:
-    # Photos whose names differ only in the last number, such as IMG_0017.jpg, in its order.
-    by_prefix: dict[str, list[tuple[int, int]]] = {}
-    for i, photo in enumerate(photos):
-        parts = _NUMBERED_NAME.fullmatch(photo.name)
-        if photo.sequence is None and parts is not None:
-            by_prefix.setdefault(parts[1], []).append((int(parts[2]), i))
-    return [[i for _, i in sorted(series)] for series in by_prefix.values() if len(series) > 1]
-
-
 def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
     # Pair every frame with the next `overlap` frames, and with frames at distances of 2, 4, 8 …
     # times `overlap`.
     steps = list(range(1, overlap + 1))
     while steps[-1] * 2 < len(sequence):
         steps.append(steps[-1] * 2)
-    return _following(sequence, steps)
-
-
-def _following(sequence: Sequence[int], steps: Sequence[int]) -> Pairs:
-    pairs = set()
-    for position, i in enumerate(sequence):
-        for step in steps:
-            if position + step < len(sequence):
-                j = sequence[position + step]
-                pairs.add((min(i, j), max(i, j)))
-    return pairs
+    return following(sequence, steps)
 
 
 def _similar_pairs(

@@ -45,8 +45,7 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     false: set[tuple[int, int]] = set()
     wrong: dict[int, str] = {}
     for number in range(_ROUNDS + 1):
-        checked = check_pairs(model, mapping.database, max_error)
-        pairs = [pair for pair in checked if (pair.first, pair.second) not in false]
+        pairs = check_pairs(model, mapping.database, max_error)
         parts = find_parts(pairs)
         if len(parts) < 2:
             break
@@ -78,12 +77,16 @@ def _part_of(parts: Sequence[set[int]]) -> dict[int, int]:
 
 
 def _false_links(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set[tuple[int, int]]:
-    """The pairs of photos in different parts whose matches the model does not contradict."""
+    """The pairs of photos in different parts whose matches the model does not contradict.
+
+    Those of photos that follow each other are kept: they may be the true link of two parts that
+    false matches elsewhere have moved together to a wrong place.
+    """
     part = _part_of(parts)
     return {
         (pair.first, pair.second)
         for pair in pairs
-        if part.get(pair.first, 0) != part.get(pair.second, 0) and not pair.torn
+        if part.get(pair.first, 0) != part.get(pair.second, 0) and not (pair.torn or pair.follows)
     }
 
 
