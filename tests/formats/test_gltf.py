@@ -310,6 +310,16 @@ def test_invalid_json_is_reported(tmp_path, seed, one_line, name):
     one_line(assemble(tmp_path / "a.glb", document, binary))
 
 
+def test_the_method_of_compressed_splats_is_named_if_it_is_known(tmp_path, seed, one_line):
+    document, binary, _ = seed
+    primitive(document)["attributes"] = {"POSITION": 0}
+    path = assemble(tmp_path / "a.glb", document, binary)
+    assert "compressed by an unknown method" in one_line(path)
+    extension(document)["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {}}
+    path = assemble(tmp_path / "a.glb", document, binary)
+    assert "compressed by KHR_gaussian_splatting_compression_spz_2" in one_line(path)
+
+
 def test_invalid_chunks_are_reported(tmp_path, seed, one_line):
     document, binary, _ = seed
     data = assemble(tmp_path / "a.glb", document, binary).read_bytes()

@@ -246,6 +246,15 @@ def test_invalid_headers_are_reported(tmp_path, change, expected):
     assert expected in one_line(path)
 
 
+def test_an_error_names_at_most_four_missing_properties(tmp_path):
+    path = tmp_path / "scene.ply"
+    data = dialect(random_gaussians(3, 1)).replace(b"float rot_", b"float turn_")
+    path.write_bytes(data)
+    assert one_line(path).endswith("missing properties: rot_0, rot_1, rot_2, rot_3")
+    path.write_bytes(data.replace(b"float opacity", b"float alpha"))
+    assert one_line(path).endswith("missing properties: opacity, rot_0, rot_1, rot_2, …")
+
+
 @pytest.mark.parametrize("row", [b"0.0 nonsense", b"0.0", b"", b"\xff\xfe"])
 def test_ascii_rows_that_are_not_numbers(tmp_path, row):
     lines = dialect(random_gaussians(4, 0), format="ascii").split(b"\n")

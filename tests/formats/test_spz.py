@@ -73,6 +73,14 @@ def test_version_2_has_three_bytes_of_rotation_and_may_be_uncompressed(tmp_path)
         check_the_one(read)
 
 
+def test_three_bytes_of_rotation_determine_w(tmp_path):
+    q = bytes([204, 128, 127])  # x is 0.6, so w is 0.8; y and z are nearly 0
+    body = head(2, 1, 1) + b"".join([*COLUMNS[:4], q, COLUMNS[5]])
+    (tmp_path / "a.spz").write_bytes(body)
+    rotation = read_gaussians(tmp_path / "a.spz").rotations[0]
+    torch.testing.assert_close(rotation, torch.tensor([0.8, 0.6, 0, 0]), rtol=0, atol=0.005)
+
+
 def test_version_1_has_positions_as_halves(tmp_path):
     q = bytes([128 + 90, 127 - 90, 128])
     halves = struct.pack("<3e", 1, -2, 0.5)

@@ -103,6 +103,16 @@ def test_axes_that_intersect_behind_the_cameras():
     torch.testing.assert_close(focus_of(cameras, 10.0), expected)
 
 
+@pytest.mark.parametrize(("length", "depth"), [(0.097, 0.0), (0.103, 10.0)])
+def test_focus_of_cameras_that_look_away_from_each_other(length, depth):
+    """It is their mean centre unless the mean of their directions is at least 0.1 long."""
+    across = math.sqrt(1 - length**2)
+    targets = [torch.tensor([x * (1 + 5 * across), 0.0, 5 * length]).double() for x in (-1, 1)]
+    cameras = [camera_at((x, 0.0, 0.0), target) for x, target in zip((-1, 1), targets, strict=True)]
+    expected = torch.tensor([0.0, 0.0, depth]).double()
+    torch.testing.assert_close(focus_of(cameras, 10.0), expected)
+
+
 def test_up_is_the_default_if_cameras_are_level_and_upright():
     x, y, z = FOCUS.tolist()
     for height in (-1.0, 0.5):  # the cameras look down, or up

@@ -251,6 +251,12 @@ def test_spiral_reaches_the_outer_cameras():
     assert float(places[:, 2].abs().max()) == pytest.approx(0.05, rel=0.01)
 
 
+def test_radius_of_a_spiral_is_the_80_percent_quantile():
+    """Of the distances from the middle, here 0, 0.15, … 3.0 on both sides."""
+    path = spiral_path(wall(1, 41), 200, 5.0)
+    assert float(path[100].position[1]) == pytest.approx(3.0 - 2.4, rel=0.01)
+
+
 @pytest.mark.parametrize(("spread", "one"), [(38.0, True), (44.0, False)])
 def test_one_direction_is_within_forty_degrees_of_the_mean(spread, one):
     """Two groups at ± spread: the mean of their directions is cos(spread) long, at least 0.75."""

