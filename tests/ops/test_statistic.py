@@ -35,6 +35,15 @@ def test_one_gaussian(variant: Variant) -> None:
     assert radii.tolist() == [1.0, 6.0, 9.0]
 
 
+def test_only_a_valid_view_is_added(variant: Variant) -> None:
+    ones = torch.ones(1, 16, dtype=variant.dtype)
+    splats = splats_of(torch.tensor([0]), ones, ones)
+    sums = torch.zeros(3, 1, dtype=variant.dtype)
+    for valid, views in ((False, 0.0), (True, 1.0)):
+        variant.ops.accumulate_screen_statistics(splats, 2, 2, *sums, valid=torch.tensor([valid]))
+        assert sums[1:].tolist() == [[views], [views]]
+
+
 @pytest.mark.parametrize("with_radii", [True, False])
 def test_native_agrees_with_the_reference(native: Variant, with_radii: bool) -> None:
     generator = torch.Generator().manual_seed(1)

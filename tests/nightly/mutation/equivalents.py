@@ -228,4 +228,14 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "return files.image(layout.files[name], n, 4 * n + (1 << 16)).reshape(-1, 4)[:n]",
         "return files.image(layout.files[name], n, 4 * n + (1 << 16)).reshape(-2, 4)[:n]",
     ): "NumPy computes any negative length, not only -1",
+    (
+        "ops/reference.py",
+        "low, high = means2d - half_extent - 1e-3, means2d + half_extent + 1e-3",
+        "low, high = means2d - half_extent - 1.001, means2d + half_extent + 1e-3",
+    ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
+    (
+        "ops/reference.py",
+        "last = torch.tensor([left + w - 0.5, top + h - 0.5]).to(means2d)",
+        "last = torch.tensor([left + w + 0.5, top + h - 0.5]).to(means2d)",
+    ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
 }
