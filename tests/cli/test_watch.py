@@ -82,7 +82,7 @@ def test_the_page_of_a_training_run_stays_until_ctrl_c(start, run, dataset, tmp_
     port = unused_port()
     process = start("train", dataset, "-o", viewed, "--iterations", 30, "--view", "--port", port)
     url = url_of(process)
-    while not (line := process.stdout.readline()).startswith("the scene stays at"):
+    while not (line := process.stdout.readline()).startswith("the scene is shown at"):
         assert line
     assert b"<html" in page_at(url)
     process.send_signal(signal.SIGINT)

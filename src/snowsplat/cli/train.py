@@ -1,4 +1,4 @@
-"""`snowsplat train`: a posed dataset becomes a scene."""
+"""`snowsplat train`: trains a scene from photos with known camera poses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Train(TrainFlags):
     """Train a scene from photos with known camera poses (COLMAP or transforms.json).
 
     Examples:
-      snowsplat train garden -o out                  3000 steps, in some minutes
+      snowsplat train garden -o out                  3000 steps; takes a few minutes
       snowsplat train garden -o out --eval           hold out every 8th photo
       snowsplat train garden -o out -r 4             faster: 1/4 of the width
       snowsplat train garden -o out --minutes 5      finish within 5 minutes
@@ -64,7 +64,7 @@ class Train(TrainFlags):
                 print(f"resume with: snowsplat train -o {self.output} --resume")
                 return 130
             if page is not None:
-                with suppress(KeyboardInterrupt):  # also right after this line is printed
-                    print(f"the scene stays at {page.url} until Ctrl-C", flush=True)
+                with suppress(KeyboardInterrupt):  # Ctrl-C may arrive during the print
+                    print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)
                     page.show_result()
         return 0

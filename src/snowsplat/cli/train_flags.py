@@ -18,7 +18,7 @@ from snowsplat.util.errors import UserError
 
 @dataclass
 class JobFlags:
-    """What to train on, for how long, and where the result goes."""
+    """The dataset, the output folder, the limits of time and memory, the page, and the device."""
 
     dataset: Annotated[Path | None, tyro.conf.Positional, flag("DATASET")] = None
     """Folder with photos and their cameras: images/ and a COLMAP model in sparse/0/, or
@@ -29,9 +29,9 @@ class JobFlags:
     recipe: Annotated[
         Recipe | None, flag(f"{{{','.join(get_args(Recipe))}}}", default="default")
     ] = None
-    """Named configuration, which determines the defaults of the other settings. default: 3000 fast
-    steps; paper: the 30,000 steps of the paper; mcmc: 30,000 steps with a fixed maximum number of
-    Gaussians."""
+    """Named configuration, which determines the defaults of the other settings. default: 3000
+    steps, designed for CPUs; paper: the 30,000 steps of the paper; mcmc: 30,000 steps with a fixed
+    maximum number of Gaussians."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
     """Finish within this time, including evaluation and saving. The number of steps, the size of
     the photos and the maximum number of Gaussians are chosen for this time, unless flags set them.

@@ -41,7 +41,7 @@ class Points:
 def usable_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> Points | None:
     """The points whose coordinates are finite and below 1e18; None if there are none.
 
-    Logs a warning with the number of other points.
+    Logs a warning with the number of points that are left out.
 
     Args:
         path: the file that the points were read from, for the warning.

@@ -1,5 +1,5 @@
-// The opacity of one splat at one pixel, the pixels where it is visible, and how splats are
-// composited.
+// The opacity α of one splat at one pixel, the pixels in which a splat is visible, and the
+// compositing of splats.
 //
 // α(d) = o exp(−½ dᵀ K d), where d = pixel − mean, o is the opacity and K the conic (Kerbl et al.
 // 2023, eq. 3 and appendix). The kernels use the base-2 logarithm. Then the opacity is a summand,
@@ -8,8 +8,9 @@
 //   log₂ α = A dx² + B dx dy + C dy² + log₂ o,
 //   A = −½ log₂e · a,  B = −log₂e · b,  C = −½ log₂e · c
 //
-// Along a row of pixels, dy is constant and dx = X + x₀. Therefore log₂ α is a quadratic function of
-// X, whose coefficients depend only on the row.
+// Along a row of pixels of a tile, dy is constant and dx = X − x₀, where X is the column of the
+// pixel and x₀ that of the mean. Therefore log₂ α is a quadratic function of X, whose coefficients
+// depend only on the row.
 #pragma once
 
 #include "layout.h"
@@ -125,9 +126,9 @@ SNOW_INLINE Real log_alpha_gradient(Real weighted_dot, Real alpha, Real behind) 
   return weighted_dot - alpha * behind * reciprocal_estimate(Real(1.f) - alpha);
 }
 
-// The geometric gradients are computed from sums of q = ∂L/∂(log α) over pixels, weighted by powers
-// of d:
-//   ∂ log α/∂mean = K d,  ∂/∂a = −½ dx²,  ∂/∂b = −dx dy,  ∂/∂c = −½ dy²,  ∂/∂o = 1/o
+// The gradients of the mean, the conic and the opacity are computed from sums of q = ∂L/∂(log α)
+// over pixels, weighted by powers of d. The derivatives of log α are:
+//   ∂/∂mean = K d,  ∂/∂a = −½ dx²,  ∂/∂b = −dx dy,  ∂/∂c = −½ dy²,  ∂/∂o = 1/o
 template <class Real>
 struct BlendMoments {
   Real q, qx, qy, qxx, qxy, qyy;

@@ -1,7 +1,7 @@
 """3D Gaussian Splatting in plain PyTorch: the reference of every operation.
 
 Names, arguments and results are those of `snowsplat.ops`. The functions work in any floating dtype
-and are differentiable by autograd, but are hundreds of times slower. Tests compare the native
+and are differentiable by autograd, but are much slower than the native kernels. Tests compare the
 kernels with these functions in float64. From top to bottom, this file describes the method:
 
     project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
@@ -10,6 +10,7 @@ kernels with these functions in float64. From top to bottom, this file describes
     photometric_loss, ssim                       L1, D-SSIM          Kerbl et al. 2023, eq. 7;
                                                                      Wang et al. 2004
     neighbours      the initial size             Kerbl et al. 2023, §5.1
+    accumulate_screen_statistics                 for density control Kerbl et al. 2023, §5.2
     adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
 
 [Kerbl et al. 2023]    3D Gaussian Splatting for Real-Time Radiance Field Rendering. ACM TOG 42(4).
@@ -35,7 +36,7 @@ from snowsplat.util.native_layout import TILE
 LOW_PASS = 0.3  # pixels²: blurs every splat, so that it covers at least one pixel centre
 ALPHA_MIN = 1 / 255  # smaller contributions do not change an 8-bit image and are skipped
 ALPHA_MAX = 0.99  # so that 1 − α, and with it the transmittance, is never 0
-TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance becomes lower
+TRANSMITTANCE_MIN = 1e-4  # a splat that would make T lower, and those behind it, are not blended
 JACOBIAN_MARGIN = 0.15  # fraction of the image size; J is clamped beyond this margin
 QUAT_EPS = 1e-12
 
@@ -167,7 +168,7 @@ def _project_rows(
 
 
 def _rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotations (M, 3, 3) of quaternions (M, 4) wxyz, which are normalised. Zero: the identity."""
+    """Rotations (M, 3, 3) of quaternions (M, 4) wxyz of any length. Zero: the identity."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp(min=QUAT_EPS)).unbind(dim=1)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -304,7 +305,8 @@ def _blend_weights(
     a, b, c = conics.unbind(dim=1)
     alpha = opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
     alpha = torch.where(alpha < ALPHA_MIN, 0, alpha.clamp(max=ALPHA_MAX))
-    # T decreases: a pixel is finished before the first splat that would make T too small.
+    # T decreases. The first splat that would make T too small, and all splats behind it, are not
+    # blended.
     unfinished = torch.cumprod(1 - alpha, dim=1) >= TRANSMITTANCE_MIN
     alpha = torch.where(unfinished, alpha, 0)
     ones = alpha.new_ones(len(pixels), 1)

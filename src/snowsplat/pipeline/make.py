@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.train import TrainOptions
     from snowsplat.util.stages import Outcome
 
-STAGES = ("scene", "pictures")  # the dataset has a record of its own
+STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
 RECORD = "make.json"
 HOLD_OUT = 8
 # The fields of a preset that affect the training.
 _TRAINING_FIELDS = ("side", "iterations", "max_gaussians", "densify_interval")
-# Time between checkpoints in seconds: a kill loses at most this much work.
+# Time between checkpoints in seconds. If the process is killed, at most this much work is lost.
 _CHECKPOINT_SECONDS = 15.0
 # Minimum time of a training run: in seconds, and as a share of the given time.
 _MIN_SECONDS = 15.0
@@ -45,11 +45,11 @@ class MakeOptions:
     """Options of `make`.
 
     Attributes:
-        quality: default: "normal" or, with ``minutes``, chosen for that time. With ``minutes`` it
-            determines only the effort to estimate the camera poses; the training uses the rest of
-            the time.
+        quality: default: "normal" or, with ``minutes``, chosen for that time. With ``minutes``, the
+            quality determines only the effort to estimate the camera poses; the training uses the
+            rest of the time.
         minutes: finish within this time. Stages that an earlier run has finished are not counted.
-            An interrupted training run resumes with the time that remained.
+            A resumed training run has the time that was left at its interruption.
         memory: memory limit of the training; see `TrainOptions`.
         compute: device and threads.
 
@@ -78,7 +78,7 @@ class MakeResult:
         renders, photos: folders with the rendered test views and the held-out photos.
         psnr, ssim: means over the held-out photos; PSNR in dB.
         views: number of held-out photos.
-        seconds: duration of this run.
+        seconds: duration of this call.
     """
 
     scene: Path
@@ -139,7 +139,7 @@ def make(
     paths = [Path(each) for each in ([inputs] if isinstance(inputs, Path | str) else inputs)]
     name = scene_name(paths)
     out = Path(output) if output is not None else Path(f"{name}_scene")
-    if options.compute.device is not None:  # an unusable device is reported before hours of work
+    if options.compute.device is not None:  # report an unusable device before the long stages
         options.compute.apply()
     _check_free(out)
     return _Job(paths, name, out, options, overwrite, observer, page, started).run()

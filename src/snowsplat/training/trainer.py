@@ -26,7 +26,7 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import interrupts_between_steps, single_threaded
 
-#: Other threads decode the photos of this many following steps.
+#: Other threads decode the photos for this number of steps in advance.
 LOOKAHEAD = 16
 
 #: There is one random generator for each kind of random choice, so that additional choices of one
@@ -43,7 +43,7 @@ class Progress:
     """The report of `Trainer.run` after each step.
 
     ``downscale`` is the factor by which the photos of the step were reduced. ``metrics`` is the
-    evaluation of the test views, in the steps ``test_iterations``.
+    evaluation of the test views, after the steps of ``test_iterations``; None after other steps.
     """
 
     step: int
@@ -62,12 +62,12 @@ class Trainer:
         trainer.gaussians
 
     Between two steps, `state_tensors` is the complete state. A trainer that loads it produces
-    bit-identical results. ``schedule`` may be stretched between two steps.
+    bit-identical results. Between two steps, `Schedule.stretch` may change the number of steps.
 
     Attributes:
         gaussians: the scene after ``step`` steps, on ``device``.
-        within_step: True after an error or a second Ctrl-C in the middle of a step: the state is
-            inconsistent and must not be saved.
+        within_step: True during a step. It stays True if an error or a second Ctrl-C interrupts a
+            step: the state is then inconsistent and must not be saved.
     """
 
     def __init__(
@@ -83,7 +83,8 @@ class Trainer:
             device: the device for training; default: the CPU.
 
         Raises:
-            UserError: the dataset has no training views, or has points that cannot be represented.
+            UserError: the dataset has no training views, or some points are so far apart that
+                float32 cannot represent their Gaussians.
         """
         if not dataset.train:
             raise UserError("the dataset has no training views; check its folder and its split")
@@ -160,8 +161,9 @@ class Trainer:
         """
         self.within_step = True
         with single_threaded():
-            # In the paper, a step ends with density control. Here it runs at the beginning of the
-            # next step, so that a scene is never evaluated or saved directly after it.
+            # In the paper, a step ends with density control. Here, density control runs at the
+            # beginning of the next step, so that a scene is never evaluated or saved directly after
+            # a change by density control.
             if self.step > 0:
                 self.gaussians = self._density.after_step(
                     self.step, self.gaussians, self._optimizer
@@ -258,7 +260,7 @@ class Trainer:
         for name, random in self._generators.items():
             try:
                 random.set_state(tensors[f"random.{name}"])
-            except RuntimeError:  # torch has checked the state
+            except RuntimeError:  # torch rejects an invalid state
                 raise UserError(
                     f"the checkpoint: random state {name!r} is damaged; resume from an earlier one"
                 ) from None

@@ -1,11 +1,13 @@
 """Chooses the pairs of photos to match. Matching all pairs takes quadratic time.
 
     few photos           all pairs
-    frames of a video    the following frames, in growing steps, and frames that look similar:
-                         these close a loop when the camera returns to a place
-    photos with GPS      the nearest photos, and some that look similar
-    many photos          those that look similar, and those with the next numbers in their names,
-                         which were usually taken next
+    frames of a video    each frame with the next frames, with later frames at growing distances,
+                         and with frames that look similar. The latter close loops: the camera
+                         was at the same place at two different times
+    photos with GPS      each photo with the nearest photos, and with some that look similar
+    many photos          each photo with those that look similar. A photo with a number in its name
+                         is also paired with the photos that have the next numbers, which were
+                         usually taken directly after it
 
 If several rules apply, all of them are used, so that all groups of photos are connected.
 """
@@ -29,8 +31,8 @@ _METRES_PER_DEGREE = 111_320.0
 # Share of `Effort.neighbours` that is used if the order in time or GPS already determines most
 # pairs.
 _LOOP_SHARE = 0.4
-# Share of `Effort.overlap` that is used for numbered photos. They are farther apart than the frames
-# of a video, and the similar photos usually include the next ones.
+# Share of `Effort.overlap` that is used for photos with numbered names. Such photos are farther
+# apart than the frames of a video, and the photos that look similar usually include the next ones.
 _NUMBERED_SHARE = 0.5
 _NUMBERED_NAME = re.compile(r"(.*?)([0-9]+)\.[^./]*")
 
@@ -84,9 +86,9 @@ def choose_pairs(
 
 
 def numbered_series(names: Mapping[int, str]) -> list[list[int]]:
-    """The photos whose names differ only in the last number, such as IMG_0017.jpg, in its order.
+    """Series of photos whose names differ only in the last number, in the order of this number.
 
-    ``names``: number of a photo -> file name. Series of a single photo are left out.
+    ``names``: number of a photo -> file name (IMG_0017.jpg). Series of a single photo are left out.
     """
     by_prefix: dict[str, list[tuple[int, int]]] = {}
     for i, name in names.items():
@@ -97,7 +99,7 @@ def numbered_series(names: Mapping[int, str]) -> list[list[int]]:
 
 
 def following(series: Sequence[int], steps: Sequence[int]) -> Pairs:
-    """Pairs (i < j) of the entries of ``series`` that are one of ``steps`` places apart."""
+    """Pairs (i < j) of entries of ``series`` whose distance in ``series`` is one of ``steps``."""
     pairs = set()
     for position, i in enumerate(series):
         for step in steps:
@@ -127,8 +129,8 @@ def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
 def _similar_pairs(
     photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], count: int, overlap: int
 ) -> Pairs:
-    # A frame is most similar to its neighbours in time, which are already paired with it. They are
-    # excluded; otherwise no loop would be found.
+    # A frame is most similar to its neighbours in time, which are already paired with it. These
+    # neighbours are excluded; otherwise no pair would close a loop.
     similarity = similarity.copy()
     for sequence in _sequences(photos):
         for position, i in enumerate(sequence):

@@ -1,9 +1,9 @@
 """Density control: adds and removes Gaussians during training.
 
-A method is a module with two dataclasses: its settings, and its state. The settings are frozen and
-part of `TrainConfig`; their method ``control`` creates the state, which has the `DensityControl`
-protocol. The trainer uses only these two. `AdaptiveDensity` is the method of the paper,
-`McmcDensity` that of Kheradmand et al. 2024.
+Each density control is a module with two dataclasses: its settings, and its state. The settings
+are frozen and part of `TrainConfig`. `DensityConfig.control` creates the state, which follows the
+protocol `DensityControl`. The trainer uses only these two dataclasses. `AdaptiveDensity` is the
+density control of the paper, and `McmcDensity` is that of Kheradmand et al. 2024.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ class DensityControl(Protocol):
         """Called before the optimiser: accumulates statistics, or adds gradients of regularisers.
 
         Statistics are accumulated by `ViewGradient.add_statistics`, which changes nothing if the
-        step is invalid. The gradient of a regulariser is assigned to ``.grad`` of the parameters;
-        the optimiser adds and clears it. This function must not wait for a GPU.
+        step is invalid. The gradient of a regulariser is assigned to ``.grad`` of the parameters.
+        The optimiser adds it to the gradient of the loss, and then clears it. This function must
+        not wait for a GPU.
         """
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
@@ -66,12 +67,12 @@ class DensityConfig(Protocol):
 
     @property
     def densify_from(self) -> When:
-        """The first moment at which Gaussians may be added."""
+        """The first step at which Gaussians may be added (float: fraction of all steps)."""
         ...
 
     @property
     def densify_until(self) -> When:
-        """The last moment at which Gaussians may be added."""
+        """The last step at which Gaussians may be added (float: fraction of all steps)."""
         ...
 
     @property
@@ -101,7 +102,7 @@ class DensityConfig(Protocol):
         ...
 
 
-#: The settings of every method, by the name of the class; stored configurations contain this name.
+#: The settings class of every density control, by its name. Checkpoints contain this name.
 DENSITY_CONTROLS: dict[str, type[DensityConfig]] = {
     settings.__name__: settings for settings in (AdaptiveDensity, McmcDensity)
 }

@@ -37,7 +37,7 @@ class AdaptiveDensity:
             steps).
         densify_interval: number of steps between two densifications.
         grad_threshold: τ_pos of the paper: a Gaussian is densified if the norm of its view-space
-            position gradient, averaged over the views, is larger.
+            position gradient, averaged over the views, is larger than this value.
         percent_dense: Gaussians up to this scale, in units of the scene extent, are cloned; larger
             ones are split.
         prune_opacity: Gaussians with a lower opacity are removed.

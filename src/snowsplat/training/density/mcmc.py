@@ -3,10 +3,10 @@ Splatting as Markov Chain Monte Carlo".
 
 The Gaussians are regarded as samples of a distribution whose density is high where they reproduce
 the photos. Noise is added to their positions, so that they explore the space (stochastic gradient
-Langevin dynamics, section 3.2). Dead Gaussians are moved to the positions of live ones such that
-the rendered image does not change (section 3.3). A regulariser of opacity and scale makes Gaussians
-that are not needed disappear (section 3.4). The number of Gaussians grows by a fixed fraction up to
-a limit, so the memory is known before training.
+Langevin dynamics, section 3.2). Dead Gaussians, which are nearly transparent, are moved to the
+positions of other Gaussians such that the rendered image does not change (section 3.3). A
+regulariser of opacity and scale makes Gaussians that are not needed disappear (section 3.4). The
+number of Gaussians grows by a fixed fraction up to a limit, so the memory is known before training.
 """
 
 from __future__ import annotations

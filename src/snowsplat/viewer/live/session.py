@@ -30,7 +30,7 @@ _IDLE_SECONDS = 1.0  # minimum time between two idle images
 
 @dataclass(frozen=True, eq=False)
 class PhotoView:
-    """The photo at whose pose a browser is, so that its rendering can be compared with the photo.
+    """A photo to whose pose a browser was moved, to compare the photo with its rendering.
 
     Attributes:
         index: index of the photo in the viewer's list.
@@ -140,7 +140,7 @@ class Session:
         self._next_allowed = {"requested": 0.0, "idle": 0.0}
         self.busy = False  # whether a browser is connected or the training is paused
 
-    # From the browsers
+    # Called when browsers send messages
 
     def enter(self, number: int) -> Visitor:
         """Add a browser."""
@@ -165,11 +165,12 @@ class Session:
             self._notify()
 
     def move(self, visitor: Visitor, pose: Pose) -> None:
-        """Set the pose of a browser. If it moves away from the photo, the photo view ends.
+        """Set the pose of a browser. If the browser moves away from the photo, the photo view ends.
 
-        While the browser is `Visitor.going`, another pose may be one from before. Set the last pose
-        again after `MOVE_SECONDS`: a user who moved the camera at once may not have sent a pose
-        near the photo.
+        While `Visitor.going` is true, a pose that is not near the photo does not end the photo view
+        immediately, because the browser may have sent this pose before it was moved to the photo.
+        Call this method again with the last pose after `MOVE_SECONDS`: if the user moved the camera
+        at once, the browser may never have sent a pose near the photo. The photo view then ends.
         """
         photo_view, arrived = visitor.photo_view, visitor.arrived
         if photo_view is not None:
@@ -207,7 +208,7 @@ class Session:
         self.busy = bool(self._visitors) or self._paused
         self._changed.notify_all()
 
-    # From the training
+    # Called by the training
 
     @property
     def paused(self) -> bool:
@@ -219,7 +220,7 @@ class Session:
         return len(self._visitors)
 
     def may_step(self) -> bool:
-        """Whether the training may run a step; if paused, this consumes one of the single steps."""
+        """Whether the training may run a step. While paused, True uses up one single step."""
         with self._changed:
             if self._paused and self._steps:
                 self._steps -= 1
@@ -243,7 +244,7 @@ class Session:
             found = [request for v in self._visitors.values() if (request := v.request(scene, now))]
         if training:
             found = [request for request in found if now >= self._next_allowed[_budget_of(request)]]
-        # Moving cameras first, then the visitor that has waited longest.
+        # Moving cameras are first; within one kind, the visitor that has waited longest is first.
         order = ("moving", "still", "idle")
         return min(
             found,
@@ -258,7 +259,7 @@ class Session:
         self.charge(_budget_of(request), seconds)
 
     def begin_sending(self, visitor: Visitor) -> None:
-        """Record that an image is being sent; the browser gets no other until `end_sending`."""
+        """Record that an image is being sent. The browser gets no other one until `end_sending`."""
         with self._changed:
             visitor.sending = True
 
