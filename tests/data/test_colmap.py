@@ -11,8 +11,11 @@ from snowsplat.data import load_dataset
 from snowsplat.data.colmap import (
     ColmapCamera,
     ColmapImage,
+    ColmapModel,
+    posed_camera,
     read_model,
     read_points,
+    types,
     write_model,
 )
 from snowsplat.scene.geometry import rotation_from_quat
@@ -149,6 +152,11 @@ def test_the_model_with_most_images_is_used(dataset_copy, caplog, kind):
     assert "sparse/3" in dataset.description
 
 
+@pytest.mark.parametrize(("kind", "name"), [("colmap-bin", "binary"), ("colmap-txt", "text")])
+def test_the_description_names_the_model_and_its_kind(pristine, kind, name):
+    assert load_dataset(pristine[kind]).description == f"COLMAP model sparse/0 ({name})"
+
+
 def test_a_model_directly_in_sparse(dataset_copy):
     folder = dataset_copy("colmap-bin")
     (folder / "sparse/0").rename(folder / "elsewhere")
@@ -220,9 +228,28 @@ def test_a_text_file_with_fewer_records_than_its_comment_declares(dataset_copy, 
     path = folder / "sparse/0/points3D.txt"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:21]))
+    for kind, declared in (("cameras", 1), ("images", 9)):
+        path = folder / "sparse/0" / f"{kind}.txt"
+        path.write_text(path.read_text().replace(f"{kind}: {declared}", f"{kind}: 12"))
     with caplog.at_level(logging.WARNING):
         assert len(load_dataset(folder).points) == 20
+    assert "1 cameras, but its comment declares 12" in caplog.text
+    assert "9 images, but its comment declares 12" in caplog.text
     assert "20 points, but its comment declares 60" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("colour", "valid"),
+    [("0 0 0", True), ("255 255 255", True), ("0 -1 0", False), ("0 0 256", False)],
+)
+def test_colours_of_points_in_text_files(dataset_copy, colour, valid):
+    folder = dataset_copy("colmap-txt")
+    (folder / "sparse/0/points3D.txt").write_text(f"1 0.5 1.5 2.5 {colour} 0\n")
+    if valid:
+        assert read_points(folder / "sparse/0").rgb.tolist() == [[int(colour.split()[0])] * 3]
+    else:
+        with pytest.raises(UserError, match=r"a colour is outside 0\.\.255"):
+            read_points(folder / "sparse/0")
 
 
 @pytest.mark.parametrize(
@@ -266,6 +293,27 @@ def test_words_of_observations_are_counted_in_blocks(tmp_path, monkeypatch, bloc
                 read_model(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("norm", "distance", "valid"),
+    [
+        (0.51, 0.0, True),
+        (1.99, 0.99e15, True),
+        (0.49, 0.0, False),
+        (2.01, 0.0, False),
+        (1.0, 1.01e15, False),
+    ],
+)
+def test_limits_of_poses(tmp_path, norm, distance, valid):
+    camera = ColmapCamera("SIMPLE_PINHOLE", 32, 24, (30.0, 16.0, 12.0))
+    image = ColmapImage("a.png", 1, (0.6 * norm, 0.8 * norm, 0.0, 0.0, 0.0, 0.0, -distance))
+    model = ColmapModel(tmp_path, False, {1: camera}, [image])
+    if valid:
+        assert float(posed_camera(model, image).cam_from_world[2, 3]) == -distance
+    else:
+        with pytest.raises(UserError, match=r"the pose of image a\.png is damaged"):
+            posed_camera(model, image)
+
+
 def test_an_image_with_an_unknown_camera(dataset_copy):
     folder = dataset_copy("colmap-bin")
     model = read_model(folder / "sparse/0")
@@ -299,6 +347,20 @@ def test_numbers_of_the_camera_models_in_binary_files(tmp_path):
         expected = struct.pack(f"<QIiQQ{count}d", 1, 3, number, 640, 480, *params)
         assert content == expected
         assert read_model(tmp_path).cameras == {3: camera}
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_the_number_of_records_is_limited(tmp_path, monkeypatch, suffix):
+    cameras = {i: ColmapCamera("SIMPLE_PINHOLE", 32, 24, (30.0, 16.0, 12.0)) for i in range(2)}
+    images = [ColmapImage(f"{i}.png", 0, POSE) for i in range(3)]
+    nothing = np.empty((0, 3))
+    write_model(tmp_path, cameras, images, nothing, nothing, text=suffix == "txt")
+    monkeypatch.setattr(types, "_MAX_RECORDS", 3)
+    assert len(read_model(tmp_path).images) == 3
+    for limit, kind in ((2, "images"), (1, "cameras")):
+        monkeypatch.setattr(types, "_MAX_RECORDS", limit)
+        with pytest.raises(UserError, match=f"/{kind}.{suffix}: more than {limit} {kind}"):
+            read_model(tmp_path)
 
 
 def test_two_images_of_the_same_name_are_rejected(dataset_copy):

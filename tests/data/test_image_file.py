@@ -64,6 +64,16 @@ def test_the_longest_side(tmp_path, width, height):
         read_header(path)
 
 
+def test_the_largest_number_of_pixels(tmp_path, monkeypatch):
+    path = tmp_path / "a.ppm"
+    path.write_bytes(b"P5 40 30 255\n")
+    monkeypatch.setattr(image_file, "MOST_PIXELS", 40 * 30)
+    assert read_header(path).width == 40
+    monkeypatch.setattr(image_file, "MOST_PIXELS", 40 * 30 - 1)
+    with pytest.raises(UserError, match="cannot be decoded"):
+        read_header(path)
+
+
 def test_scans_of_a_jpeg(tmp_path, monkeypatch):
     """A progressive file of libjpeg has 10 scans. Markers inside of a comment are not scans."""
     path = tmp_path / "a.jpg"

@@ -36,6 +36,15 @@ def stored(view: View) -> torch.Tensor:
     return torch.from_numpy(np.array(Image.open(view.image.path)))
 
 
+def wait_until_idle(loader: ImageLoader) -> None:
+    """Wait until no thread decodes an image."""
+    for _ in range(1000):
+        with loader._lock:
+            if not loader._running:
+                return
+        threading.Event().wait(0.01)
+
+
 def test_images_are_planar_in_memory(views):
     with ImageLoader(views) as loader:
         image = loader.get(views[3])
@@ -183,6 +192,46 @@ def test_prefetching_stays_within_half_of_the_budget(views):
             assert torch.equal(loader.get(view).rgb, stored(view))
 
 
+def test_an_image_decoded_ahead_makes_room_for_the_next_when_it_is_requested(views, monkeypatch):
+    """The request for a view outside of the order changes nothing."""
+    decoded = []
+
+    def counting(source, background=None):
+        decoded.append(source.path.name)
+        return load_image(source, background)
+
+    monkeypatch.setattr("snowsplat.data.image_loader.load_image", counting)
+    one = 4 * 16 * 20
+    with ImageLoader(views, budget_bytes=2 * one) as loader:
+        loader.prefetch(views[:3])
+        wait_until_idle(loader)
+        loader.get(views[9])
+        loader.get(views[0])
+        wait_until_idle(loader)
+    assert decoded == ["0.png", "9.png", "1.png"]
+
+
+def test_images_that_are_cached_or_being_decoded_are_not_submitted_again(views, monkeypatch):
+    release = threading.Event()
+
+    def slow(source, background=None):
+        release.wait(10)
+        return load_image(source, background)
+
+    monkeypatch.setattr("snowsplat.data.image_loader.load_image", slow)
+    with ImageLoader(views) as loader:
+        submit, submitted = loader._pool.submit, []
+        monkeypatch.setattr(
+            loader._pool, "submit", lambda *args: submitted.append(args) or submit(*args)
+        )
+        loader.prefetch(views[:2])
+        loader.prefetch(views[:2])
+        release.set()
+        wait_until_idle(loader)
+        loader.prefetch(views[:2])
+    assert len(submitted) == 2
+
+
 def test_requests_in_another_order_than_prefetched(views):
     with ImageLoader(views, threads=2, budget_bytes=3000) as loader:
         loader.prefetch(views)
@@ -255,11 +304,7 @@ def test_images_decoded_ahead_are_removed_if_nothing_else_is_cached(tmp_path):
     views = [make_view(tmp_path / f"{i}.png", pixels) for i in range(3)]
     with ImageLoader(views, budget_bytes=0, threads=3) as loader:
         loader.prefetch(views, 4)
-        for _ in range(1000):
-            with loader._lock:
-                if not loader._running:
-                    break
-            threading.Event().wait(0.01)
+        wait_until_idle(loader)
         assert loader.cached_bytes == 3
 
 

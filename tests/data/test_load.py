@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from snowsplat import data
 from snowsplat.data import ImageLoader, Points, load_dataset, read_files
 from snowsplat.data.bounds import scene_bounds
 from snowsplat.data.dataset import scene_extent
@@ -21,6 +22,11 @@ def resize_folder(source, target, size):
     for path in source.iterdir():
         with Image.open(path) as image:
             image.resize(size).save(target / path.name)
+
+
+def test_public_names_can_be_imported():
+    for name in data.__all__:
+        assert getattr(data, name).__name__ == name
 
 
 def test_every_eighth_image_by_name_is_held_out(pristine):

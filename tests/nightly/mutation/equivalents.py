@@ -238,4 +238,15 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "last = torch.tensor([left + w - 0.5, top + h - 0.5]).to(means2d)",
         "last = torch.tensor([left + w + 0.5, top + h - 0.5]).to(means2d)",
     ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
+    (
+        "data/transforms_json.py",
+        "u, _, vt = np.linalg.svd(axes / scale if scale > 1e-9 else np.zeros((3, 3)))",
+        "u, _, vt = np.linalg.svd(axes / scale if scale > 9.375000000000001e-10 "
+        "else np.zeros((3, 3)))",
+    ): "a matrix with a scale of at most 1e-9 is rejected either way",
+    (
+        "data/bounds.py",
+        "across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]",
+        "across = torch.eye(3, dtype=None) - axes[:, :, None] * axes[:, None, :]",
+    ): "0 and 1 are exact in float32, and the difference is float64",
 }
