@@ -33,6 +33,10 @@ _LARGE_MODEL = 40
 _GROWTH = 1.4
 _ADJUSTMENTS = 2
 _ITERATIONS = 20
+# Bundle adjustment ends when an iteration reduces the cost by less than this share. By default,
+# COLMAP goes on until the gradient is small, which takes 2.6 times as long and changes no camera of
+# fox_photos by more than 3e-6 of the extent of the scene.
+_COST_TOLERANCE = 1e-6
 _MIN_ANGLE = 1.5  # degrees between the rays of a point
 
 
@@ -89,6 +93,8 @@ class Mapping:
             options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
             options.ba_global_max_refinements = _ADJUSTMENTS
             options.ba_global_max_num_iterations = _ITERATIONS
+        options.ba_global_function_tolerance = _COST_TOLERANCE
+        options.ba_local_function_tolerance = _COST_TOLERANCE
         options.random_seed = SEED
         options.min_model_size = MIN_PHOTOS
         mapper, triangulation = options.mapper, options.triangulation
@@ -170,6 +176,7 @@ class Mapping:
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.ceres.solver_options.num_threads = self.threads
+        options.ceres.solver_options.function_tolerance = _COST_TOLERANCE
         observations = pycolmap.ObservationManager(model)
         for _ in range(2):
             observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
