@@ -266,6 +266,38 @@ def test_a_deleted_image(views):
         loader.get(views[0])
 
 
+def test_a_closed_loader_has_no_threads_and_no_images(views):
+    before = set(threading.enumerate())
+    loader = ImageLoader(views)
+    loader.prefetch(views)
+    assert set(threading.enumerate()) - before
+    loader.close()
+    assert set(threading.enumerate()) <= before
+    assert loader.cached_bytes == 0
+
+
+def test_closing_cancels_images_that_no_thread_decodes_yet(views, monkeypatch):
+    started, decoded = threading.Event(), []
+
+    def until_cancelled(source, background=None):
+        decoded.append(source.path.name)
+        started.set()
+        for _ in range(1000):
+            with loader._lock:
+                if len(loader._running) == 1:
+                    break
+            threading.Event().wait(0.01)
+        return load_image(source, background)
+
+    monkeypatch.setattr("snowsplat.data.image_loader.load_image", until_cancelled)
+    loader = ImageLoader(views, threads=1)
+    loader.prefetch(views)
+    assert len(loader._running) == 2
+    assert started.wait(10)
+    loader.close()
+    assert decoded == ["0.png"]
+
+
 def test_other_downscale_factors_are_rejected(views):
     with ImageLoader(views) as loader, pytest.raises(ValueError, match="1, 2 or 4"):
         loader.get(views[0], 3)

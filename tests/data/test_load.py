@@ -130,6 +130,8 @@ def test_intrinsics_are_scaled_to_the_rounded_size(large):
     assert view.camera.fx == pytest.approx(full.camera.fx * 38 / 75)
     assert view.camera.fy == pytest.approx(full.camera.fy / 2)
     assert "images" in view.image.path.parts
+    quarter = load_dataset(large, resolution=4).train[0].camera
+    assert (quarter.width, quarter.height) == (19, 16)
 
 
 def test_folders_of_smaller_copies_are_used(large):

@@ -61,6 +61,9 @@ FIELD = 2 * math.atan(0.4)  # 40 pixels at a focal length of 50
         ({"camera_angle_x": FIELD}, (50, 50, 20, 15)),
         ({"camera_angle_x": FIELD, "camera_angle_y": 2 * math.atan(0.3)}, (50, 50, 20, 15)),
         ({"x_fov": math.degrees(FIELD)}, (50, 50, 20, 15)),
+        # A width without a height has no effect.
+        ({"fl_x": 50.0, "w": 80}, (50, 50, 20, 15)),
+        ({"fl_x": 50.0, "h": 60}, (50, 50, 20, 15)),
         ({"fl_x": 50.0, "fl_y": 60.0, "cx": 19.0, "cy": 14.5}, (50, 60, 19, 14.5)),
         ({"fl_x": 50, "fl_y": 60, "cx": 19, "cy": 14.5, "w": 40, "h": 30.0}, (50, 60, 19, 14.5)),
         ({"fl_y": 60.0, "k1": 0.0, "camera_model": "OPENCV"}, (60, 60, 20, 15)),
@@ -97,6 +100,14 @@ def test_a_frame_overrides_the_file(scene):
 def test_cameras_that_cannot_be_used(scene, common, message):
     with pytest.raises(UserError, match=message):
         camera_of(common, {}, scene)
+
+
+def test_each_distortion_is_rejected_and_named(scene):
+    for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"):
+        with pytest.raises(UserError, match=rf"lens distortion \({name} = 0\.5\)"):
+            camera_of({"fl_x": 50, name: 0.5}, {}, scene)
+    with pytest.raises(UserError, match=r"lens distortion \(k1 = 0\.1, p2 = -0\.2\)"):
+        camera_of({"fl_x": 50, "k1": 0.1, "k2": 0, "p2": -0.2}, {}, scene)
 
 
 @pytest.mark.parametrize(
@@ -201,6 +212,13 @@ def test_a_missing_ply_file_is_reported(scene, caplog):
         dataset = load_dataset(scene({"fl_x": 50, "ply_file_path": "cloud.ply"}, [{}, {}]))
     assert dataset.points is None
     assert "cloud.ply: the point cloud (ply_file_path) is missing" in caplog.text
+
+
+def test_a_ply_file_outside_of_the_folder_is_refused(scene):
+    folder = scene({"fl_x": 50, "ply_file_path": "../cloud.ply"}, [{}, {}])
+    with pytest.raises(UserError) as error:
+        load_dataset(folder)
+    assert str(error.value).startswith(f"{folder}: ply_file_path: '../cloud.ply' is not in")
 
 
 def test_points_of_the_colmap_model_of_nerfstudio(scene, dataset_copy, tmp_path):

