@@ -1,11 +1,16 @@
 """Fixtures for the tests of all formats: scenes, comparisons, and checks of error messages."""
 
+from __future__ import annotations
+
+import json
 import math
 import os
 import shutil
 import subprocess
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -122,24 +127,50 @@ def rotation_error() -> Callable[[Gaussians, Gaussians], float]:
     return largest
 
 
+class NodeProgram:
+    """A program in tests/node that answers each line of JSON with a line of JSON."""
+
+    def __init__(self, script: str, package: str) -> None:
+        folder = Path(__file__).parents[1] / "node"
+        if not (folder / "node_modules" / package).is_dir() or shutil.which("node") is None:
+            pytest.skip(f"{package} or node is missing; `npm ci --ignore-scripts` in {folder}")
+        self._process = subprocess.Popen(
+            ["node", folder / script],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "NO_COLOR": "1"},
+        )
+
+    def ask(self, request: object) -> Any:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(request) + "\n")
+        self._process.stdin.flush()
+        timer = threading.Timer(100, self._process.kill)
+        timer.start()
+        answer = self._process.stdout.readline()
+        timer.cancel()
+        assert answer, "the program ended, or it took more than 100 s"
+        return json.loads(answer)
+
+    def __enter__(self) -> NodeProgram:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.communicate()
+
+
 @pytest.fixture(scope="session")
-def splat_transform() -> Callable[..., None]:
+def splat_transform() -> Iterator[Callable[..., None]]:
     """``splat_transform(source, target, *flags)``: the converter of PlayCanvas, an independent
     implementation. It needs Node; `npm ci --ignore-scripts` in tests/node installs it.
     """
-    program = Path(__file__).parents[1] / "node/node_modules/.bin/splat-transform"
-    if not program.exists() or shutil.which("node") is None:
-        pytest.skip(f"{program} or node is missing; `npm ci --ignore-scripts` in tests/node")
+    with NodeProgram("splat_transform.mjs", "@playcanvas/splat-transform") as program:
 
-    def convert(source: Path, target: Path, *flags: str) -> None:
-        command = ["node", program, "--quiet", "--overwrite", source, *flags, target]
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=100,
-            env={**os.environ, "NO_COLOR": "1"},
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
+        def convert(source: Path, target: Path, *flags: str) -> None:
+            arguments = ["--quiet", "--overwrite", source, *flags, target]
+            done = program.ask([str(argument) for argument in arguments])
+            assert done["code"] == 0, done["output"]
 
-    return convert
+        yield convert

@@ -1,10 +1,7 @@
 """Exchange of `.spz` files with Niantic's implementation, in both directions."""
 
-import json
-import shutil
-import subprocess
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -14,28 +11,17 @@ from snowsplat.formats.gaussian_arrays import GaussianArrays
 from snowsplat.formats.spz import write_spz
 from snowsplat.scene.gaussians import Gaussians
 
-NODE = Path(__file__).parents[1] / "node"
+from .conftest import NodeProgram
 
 
 @pytest.fixture(scope="module")
-def reference() -> Callable[..., str]:
-    """``reference("read", file)`` returns JSON;
-    ``reference("write", version, file, input=json)``.
-    """
-    if not (NODE / "node_modules/@adobe/spz").is_dir() or shutil.which("node") is None:
-        pytest.skip(f"{NODE}/node_modules or node is missing; `npm ci --ignore-scripts` in {NODE}")
-
-    def run(*arguments: object, input: str = "") -> str:
-        command = ["node", str(NODE / "spz.mjs"), *map(str, arguments)]
-        done = subprocess.run(command, input=input, capture_output=True, text=True, timeout=60)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    return run
+def reference() -> Iterator[NodeProgram]:
+    """The answers are scenes as `from_json` expects them."""
+    with NodeProgram("spz.mjs", "@adobe/spz") as program:
+        yield program
 
 
-def from_json(text: str) -> Gaussians:
-    scene = json.loads(text)
+def from_json(scene: dict[str, Any]) -> Gaussians:
     n = scene["numPoints"]
     columns = {
         name: torch.tensor(scene[name], dtype=torch.float32)
@@ -51,19 +37,17 @@ def from_json(text: str) -> Gaussians:
     )
 
 
-def to_json(scene: Gaussians) -> str:
-    return json.dumps(
-        {
-            "numPoints": len(scene),
-            "shDegree": scene.sh_degree,
-            "positions": scene.means.flatten().tolist(),
-            "scales": scene.log_scales.flatten().tolist(),
-            "rotations": scene.rotations.roll(-1, 1).flatten().tolist(),
-            "alphas": scene.opacity_logits.tolist(),
-            "colors": scene.sh_dc.flatten().tolist(),
-            "sh": scene.sh_rest.flatten().tolist(),
-        }
-    )
+def to_json(scene: Gaussians) -> dict[str, Any]:
+    return {
+        "numPoints": len(scene),
+        "shDegree": scene.sh_degree,
+        "positions": scene.means.flatten().tolist(),
+        "scales": scene.log_scales.flatten().tolist(),
+        "rotations": scene.rotations.roll(-1, 1).flatten().tolist(),
+        "alphas": scene.opacity_logits.tolist(),
+        "colors": scene.sh_dc.flatten().tolist(),
+        "sh": scene.sh_rest.flatten().tolist(),
+    }
 
 
 def assert_same(a: Gaussians, b: Gaussians) -> None:
@@ -82,7 +66,7 @@ def test_niantics_reader_agrees_with_ours_on_our_files(
 ):
     write_spz(tmp_path / "a.spz", GaussianArrays.from_gaussians(make_scene(300, degree)), version)
     ours = read_gaussians(tmp_path / "a.spz")
-    assert_same(from_json(reference("read", tmp_path / "a.spz")), ours)
+    assert_same(from_json(reference.ask({"path": str(tmp_path / "a.spz")})), ours)
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -91,7 +75,8 @@ def test_our_reader_agrees_with_niantics_on_its_files(
     tmp_path, make_scene, reference, version, degree
 ):
     scene = make_scene(300, degree)
-    reference("write", version, tmp_path / "a.spz", input=to_json(scene))
-    ours = read_gaussians(tmp_path / "a.spz")
-    assert_same(from_json(reference("read", tmp_path / "a.spz")), ours)
+    path = tmp_path / "a.spz"
+    theirs = reference.ask({"path": str(path), "version": version, "scene": to_json(scene)})
+    ours = read_gaussians(path)
+    assert_same(from_json(theirs), ours)
     torch.testing.assert_close(ours.means, scene.means, rtol=0, atol=0.51 / 4096)
