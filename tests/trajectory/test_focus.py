@@ -95,6 +95,32 @@ def test_axes_within_eight_degrees_of_their_mean_are_parallel(degrees, depth):
     torch.testing.assert_close(focus, torch.tensor([0.0, 0.0, depth]).double())
 
 
+def test_a_camera_that_looks_elsewhere_hardly_moves_the_focus():
+    """It moves by less than 1% of the distance, at any scale of the scene."""
+    focus = torch.tensor([10.0, 20.0, 30.0]).double()
+    around = [(4.0, 0, 0), (0.0, 0, 4), (-4.0, 0, 0), (3.0, -2, 0), (0.0, -2, 3), (0.0, 1, -4)]
+    targets = focus.repeat(6, 1)
+    targets[5] += torch.tensor([3.0, 1.0, 0.0])
+    places = torch.tensor(around).double() + focus
+
+    def moved(scale: float) -> torch.Tensor:
+        pairs = zip(scale * places, scale * targets, strict=True)
+        cameras = [camera_at(place.tolist(), target) for place, target in pairs]
+        return focus_of(cameras, 4.0 * scale) / scale - focus
+
+    assert float(moved(1.0).norm()) < 0.01 * 4.0
+    torch.testing.assert_close(moved(10.0), moved(1.0))
+
+
+@pytest.mark.parametrize(("share", "ahead"), [(0.103, True), (0.097, False)])
+def test_a_focus_is_at_least_a_tenth_of_the_distance_ahead(share, ahead):
+    target = torch.tensor([0.0, 0.0, 1.0]).double()
+    distance = math.sqrt(2) / share
+    focus = focus_of([camera_at((x, 0.0, 0.0), target) for x in (-1.0, 1.0)], distance)
+    expected = target if ahead else distance * target
+    torch.testing.assert_close(focus, expected)
+
+
 def test_axes_that_intersect_behind_the_cameras():
     cameras = [
         camera_at((x, 0.0, 0.0), torch.tensor([2.0 * x, 0.0, 2.0]).double()) for x in (-1.0, 1.0)

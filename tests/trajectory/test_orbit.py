@@ -217,6 +217,16 @@ def test_cameras_surround_the_focus_if_no_gap_is_wider_than_110_degrees(gap, sur
     assert (float(heights.max() - heights.min()) < 1e-9) == surrounds
 
 
+def test_an_oval_does_not_enter_a_wide_gap():
+    """The cameras cover 240°. The oval swings by 80% of that."""
+    cameras = ring(30, 3.0, 3.0, math.radians(240) * 30 / 29)
+    path = ellipse_path(cameras, 400, math.hypot(3.0, 1.0))
+    middle = math.radians(120)
+    swings = torch.remainder(azimuths(path) - middle + math.pi, 2 * math.pi) - math.pi
+    assert float(swings.max()) == pytest.approx(0.8 * middle, abs=5e-3)
+    assert float(swings.min()) == pytest.approx(-0.8 * middle, abs=5e-3)
+
+
 def test_axes_of_an_ellipse_are_those_of_the_cameras():
     """Turned by 30°: the mean square of a coordinate on an ellipse is half its squared axis."""
     turn = math.radians(30)

@@ -31,6 +31,10 @@ def test_tours_of_few_places():
         assert sorted(short_tour(torch.rand(count, count))) == list(range(count))
 
 
+def test_a_tour_of_places_that_coincide_ends():
+    assert sorted(short_tour(torch.zeros(4, 4))) == [0, 1, 2, 3]
+
+
 def test_cameras_of_a_walk_are_ordered_by_name():
     """frame_10 comes after frame_9. The order of the list does not matter."""
     cameras = ring(30, turn=5.0)

@@ -1,11 +1,13 @@
 """Videos: decoding returns the written frames, and no partial file is left."""
 
 import itertools
+import math
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+from av.codec.codec import UnknownCodecError
 
 from snowsplat.trajectory import video as video_module
 from snowsplat.trajectory.video import video_writer
@@ -112,7 +114,8 @@ def test_a_full_disk_raises_and_leaves_no_file(tmp_path):
 
 
 def test_invalid_arguments_are_rejected(tmp_path, monkeypatch):
-    for size, fps in (((63, 48), 24), ((64, 47), 24), ((0, 0), 24), ((64, 48), 0)):
+    sizes = ((63, 48), 24), ((64, 47), 24), ((0, 0), 24)
+    for size, fps in (*sizes, ((64, 48), 0), ((64, 48), math.inf), ((64, 48), math.nan)):
         with (
             pytest.raises(ValueError, match="a video needs"),
             video_writer(tmp_path / "a.mp4", *size, fps),
@@ -127,6 +130,23 @@ def test_invalid_arguments_are_rejected(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="cannot encode videos"):
         write(tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("available", "used"),
+    [
+        ({"mpeg4", "libopenh264", "libx264"}, "libx264"),
+        ({"mpeg4", "libopenh264"}, "libopenh264"),
+        ({"mpeg4"}, "mpeg4"),
+    ],
+)
+def test_the_first_available_encoder_is_used(monkeypatch, available, used):
+    def codec(name: str, mode: str) -> None:
+        if name not in available:
+            raise UnknownCodecError(name)
+
+    monkeypatch.setattr("av.codec.Codec", codec)
+    assert video_module._encoder() == used
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):

