@@ -7,7 +7,7 @@ from PIL import Image
 
 from snowsplat.data.colmap import read_model
 from snowsplat.scene.geometry import rotation_from_quat, transform_points
-from snowsplat.synthetic import write_synthetic_photos
+from snowsplat.synthetic import light, write_synthetic_photos
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.photographer import photograph, walk
@@ -24,7 +24,19 @@ DISTORTIONS = [
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory):
+def coarse_light():
+    """The light of the still life is computed at fewer points: the photos of these tests are small.
+
+    This is most of the time in which the scene is built.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(light, "_SPACING", 0.1)
+        patch.setattr(light, "_MOST_POINTS", 12)
+        yield
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory, coarse_light):
     folder = tmp_path_factory.mktemp("photos")
     return folder, write_synthetic_photos(folder, n_views=3, width=96, height=64, seed=1)
 

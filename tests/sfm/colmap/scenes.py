@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +25,9 @@ class Board:
     texture: np.ndarray
 
 
+@functools.cache
 def texture(seed: int, size: int = 256) -> np.ndarray:
-    """Blobs of many sizes, (size, size) 0–1: unique features everywhere."""
+    """Blobs of many sizes, (size, size) 0–1: unique features everywhere. Read-only."""
     random = np.random.default_rng(seed)
     sum_ = np.zeros((size, size))
     for cells in (8, 16, 32, 64):
@@ -81,21 +83,23 @@ def photograph(scene: list[Board], cam_from_world: np.ndarray, seed: int = 0) ->
     """(HEIGHT, WIDTH) uint8: a pinhole camera with four rays per pixel and a little noise."""
     rotation, translation = cam_from_world[:, :3], cam_from_world[:, 3]
     centre = -rotation.T @ translation
-    y, x = (np.indices((2 * HEIGHT, 2 * WIDTH)) + 0.5) / 2
-    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1)
-    rays = rays @ rotation
-    nearest, grey = np.full(x.shape, np.inf), np.full(x.shape, 0.5)
+    x = ((np.arange(2 * WIDTH) + 0.5) / 2 - WIDTH / 2) / FOCAL
+    y = ((np.arange(2 * HEIGHT) + 0.5) / 2 - HEIGHT / 2) / FOCAL
+    nearest, grey = np.full((len(y), len(x)), np.inf), np.full((len(y), len(x)), 0.5)
     for board in scene:
-        # centre + t ray = corner + u right + v down
-        normal = np.cross(board.right, board.down)
-        t = (board.corner - centre) @ normal / (rays @ normal)
-        offset = centre + t[..., None] * rays - board.corner
-        edges = np.linalg.pinv(np.stack([board.right, board.down], 1))
-        u, v = np.moveaxis(offset @ edges.T, -1, 0)
-        hit = (t > 0) & (t < nearest) & (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
-        nearest[hit] = t[hit]
+        # centre + t ray = corner + u right + v down, so u/t, v/t and 1/t are linear in x and y.
+        edges = np.stack([board.right, board.down, board.corner - centre], 1)
+        u, v, inverse = (
+            row[0] * x + (row[1] * y + row[2])[:, None]
+            for row in np.linalg.solve(edges, rotation.T)
+        )
+        with np.errstate(divide="ignore"):
+            t = 1 / inverse
+        ahead = (inverse > 0) & (t < nearest)
+        hit = ahead & (u >= 0) & (u < inverse) & (v >= 0) & (v < inverse)
+        t = nearest[hit] = t[hit]
         size = len(board.texture)
-        grey[hit] = _sample(board.texture, v[hit] * (size - 1), u[hit] * (size - 1))
+        grey[hit] = _sample(board.texture, v[hit] * t * (size - 1), u[hit] * t * (size - 1))
     grey = grey.reshape(HEIGHT, 2, WIDTH, 2).mean((1, 3))
     noise = np.random.default_rng(seed).normal(0, 1.5, grey.shape)
     return np.clip(20 + 215 * grey + noise, 0, 255).astype(np.uint8)

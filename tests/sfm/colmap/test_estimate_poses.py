@@ -148,10 +148,10 @@ def test_camera_models_are_known_to_colmap(camera_model):
 
 
 def test_global_mapper(tmp_path, pictures):
-    photos = scenes.write(tmp_path, pictures[:6])
+    photos = scenes.write(tmp_path, pictures[2:6])
     options = dataclasses.replace(DRAFT, mapper="global")
     result = estimate_poses(tmp_path, photos, options, silent)
-    assert len(result.registered) == 6
+    assert len(result.registered) == 4
     assert "global" in result.attempts[0]
 
 
@@ -175,22 +175,22 @@ def test_masked_areas_have_no_features(tmp_path, pictures):
 
 def test_photos_of_another_scene_are_named(tmp_path, pictures):
     stranger = scenes.photograph(scenes.boards(7), scenes.arc(3)[1])
-    photos = scenes.write(tmp_path, [*pictures, BLACK, stranger])
+    photos = scenes.write(tmp_path, [*pictures[2:7], BLACK, stranger])
     result = estimate_poses(tmp_path, photos, DRAFT, silent)
-    assert len(result.registered) == 10
-    assert "hardly any detail" in result.unregistered["010.png"]
-    assert result.unregistered["011.png"] == "it matches no other photo"
+    assert len(result.registered) == 5
+    assert "hardly any detail" in result.unregistered["005.png"]
+    assert result.unregistered["006.png"] == "it matches no other photo"
     # More effort cannot add these two photos, so there is no second attempt.
     assert len(result.attempts) == 1
 
 
 def test_two_scenes_yield_the_larger_one_after_a_second_attempt(tmp_path, pictures):
-    other = [scenes.photograph(scenes.boards(9), pose, i) for i, pose in enumerate(scenes.arc(4))]
-    photos = scenes.write(tmp_path, [*other, *pictures[:6]])
+    other = [scenes.photograph(scenes.boards(9), pose, i) for i, pose in enumerate(scenes.arc(3))]
+    photos = scenes.write(tmp_path, [*other, *pictures[2:6]])
     result = estimate_poses(tmp_path, photos, DRAFT, silent)
-    assert result.registered == [f"{i:03}.png" for i in range(4, 10)]
-    assert result.sub_models == [6, 4]
-    assert "a separate group of 4 photos" in result.unregistered["000.png"]
+    assert result.registered == [f"{i:03}.png" for i in range(3, 7)]
+    assert result.sub_models == [4, 3]
+    assert "a separate group of 3 photos" in result.unregistered["000.png"]
     assert len(result.attempts) > 1
     assert "4096 features" in result.attempts[1]
     sparse = tmp_path / "distorted" / "sparse"
@@ -214,16 +214,16 @@ def rotating(count):
     ],
     ids=["static", "rotating"],
 )
-@pytest.mark.parametrize("mapper", ["incremental", "global"])
-def test_camera_that_did_not_move(tmp_path, poses, message, mapper):
+def test_camera_that_did_not_move(tmp_path, poses, message):
     boards = scenes.boards()
     photos = scenes.write(
         tmp_path, [scenes.photograph(boards, pose, i) for i, pose in enumerate(poses)]
     )
-    options = dataclasses.replace(DRAFT, mapper=mapper)
-    with pytest.raises(UserError, match=message):
-        estimate_poses(tmp_path, photos, options, silent)
-    assert not (tmp_path / "distorted" / "sparse").exists()
+    for mapper in ("incremental", "global"):  # with the same features and matches
+        options = dataclasses.replace(DRAFT, mapper=mapper)
+        with pytest.raises(UserError, match=message):
+            estimate_poses(tmp_path, photos, options, silent)
+        assert not (tmp_path / "distorted" / "sparse").exists()
 
 
 def test_photos_of_different_scenes(tmp_path):
@@ -243,22 +243,22 @@ def test_two_photos(tmp_path, pictures):
 
 
 def test_a_flat_wall_is_reconstructed(tmp_path):
-    flat = [scenes.photograph(scenes.wall(), pose, i) for i, pose in enumerate(scenes.arc(6))]
+    flat = [scenes.photograph(scenes.wall(), pose, i) for i, pose in enumerate(scenes.arc(5))]
     result = estimate_poses(tmp_path, scenes.write(tmp_path, flat), DRAFT, silent)
-    assert len(result.registered) == 6
+    assert len(result.registered) == 5
 
 
 def test_features_and_matches_are_reused(tmp_path, pictures):
-    photos = scenes.write(tmp_path, pictures[:4])
+    photos = scenes.write(tmp_path, pictures[:3])
     estimate_poses(tmp_path, photos, DRAFT, silent)
     calls = []
     estimate_poses(tmp_path, photos, DRAFT, lambda *call: calls.append(call))
-    assert calls[0] == (4, 4, "features")
-    assert next(call for call in calls if call[2] == "pairs") == (6, 6, "pairs")
+    assert calls[0] == (3, 3, "features")
+    assert next(call for call in calls if call[2] == "pairs") == (3, 3, "pairs")
     # A changed photo is noticed.
     scenes.save(tmp_path, photos[0].name, pictures[5])
     calls.clear()
     estimate_poses(tmp_path, photos, DRAFT, lambda *call: calls.append(call))
-    assert calls[0] == (0, 4, "features")
+    assert calls[0] == (0, 3, "features")
     with closing(connect(tmp_path / "distorted" / "database.db")) as connection:
-        assert connection.execute("SELECT COUNT(*) FROM images").fetchone() == (4,)
+        assert connection.execute("SELECT COUNT(*) FROM images").fetchone() == (3,)
