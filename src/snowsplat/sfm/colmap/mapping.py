@@ -27,16 +27,18 @@ _MAX_REPROJECTION_ERROR = 3.0
 # same in every run.
 _MANY_PHOTOS = 150
 # With at least this number of photos, the whole model is adjusted less often: after it has grown by
-# 40% (default of COLMAP: 10%), and then at most twice (5 times) with at most 20 iterations. Between
+# 40% (default of COLMAP: 10%), and then once (at most 5 times) with at most 20 iterations. Between
 # these adjustments, each new photo and its neighbours are adjusted, as with fewer photos.
 _LARGE_MODEL = 40
 _GROWTH = 1.4
-_ADJUSTMENTS = 2
 _ITERATIONS = 20
-# Bundle adjustment ends when an iteration reduces the cost by less than this share. By default,
-# COLMAP goes on until the gradient is small, which takes 2.6 times as long and changes no camera of
+# Bundle adjustment ends when an iteration reduces the cost by less than this share: of the new
+# photo and its neighbours, of the growing model, and of the result. By default, COLMAP goes on
+# until the gradient is small. For the result, this takes 2.6 times as long and changes no camera of
 # fox_photos by more than 3e-6 of the extent of the scene.
-_COST_TOLERANCE = 1e-6
+_LOCAL_TOLERANCE = 1e-4
+_GLOBAL_TOLERANCE = 1e-5
+_FINAL_TOLERANCE = 1e-6
 _MIN_ANGLE = 1.5  # degrees between the rays of a point
 
 
@@ -91,10 +93,11 @@ class Mapping:
         options.num_threads = self.threads if photos > _MANY_PHOTOS else 1
         if photos >= _LARGE_MODEL:
             options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
-            options.ba_global_max_refinements = _ADJUSTMENTS
+            options.ba_global_max_refinements = 1
             options.ba_global_max_num_iterations = _ITERATIONS
-        options.ba_global_function_tolerance = _COST_TOLERANCE
-        options.ba_local_function_tolerance = _COST_TOLERANCE
+        options.ba_global_function_tolerance = _GLOBAL_TOLERANCE
+        options.ba_local_function_tolerance = _LOCAL_TOLERANCE
+        options.ba_local_max_refinements = 1
         options.random_seed = SEED
         options.min_model_size = MIN_PHOTOS
         mapper, triangulation = options.mapper, options.triangulation
@@ -176,7 +179,7 @@ class Mapping:
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.ceres.solver_options.num_threads = self.threads
-        options.ceres.solver_options.function_tolerance = _COST_TOLERANCE
+        options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
         observations = pycolmap.ObservationManager(model)
         for _ in range(2):
             observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
