@@ -165,6 +165,14 @@ def test_a_model_directly_in_sparse(dataset_copy):
     assert len(load_dataset(folder).train) == 7
 
 
+def test_a_model_in_colmap_sparse(dataset_copy):
+    """There nerfstudio keeps the model; a dataset without transforms.json uses it."""
+    folder = dataset_copy("colmap-bin")
+    (folder / "colmap").mkdir()
+    (folder / "sparse").rename(folder / "colmap/sparse")
+    assert load_dataset(folder).description == "COLMAP model colmap/sparse/0 (binary)"
+
+
 def test_missing_images_are_skipped_and_counted(dataset_copy, caplog):
     folder = dataset_copy("colmap-bin")
     (folder / "images/view_03.png").unlink()
@@ -361,6 +369,14 @@ def test_the_number_of_records_is_limited(tmp_path, monkeypatch, suffix):
         monkeypatch.setattr(types, "_MAX_RECORDS", limit)
         with pytest.raises(UserError, match=f"/{kind}.{suffix}: more than {limit} {kind}"):
             read_model(tmp_path)
+
+
+def test_bytes_of_a_point(tmp_path):
+    """Number, position, colour, reprojection error, and the track."""
+    xyz, rgb = np.array([[0.5, -1.5, 2.5]]), np.array([[1, 2, 3]], np.uint8)
+    write_model(tmp_path, {}, [], xyz, rgb, [[(7, 8), (9, 10)]])
+    expected = struct.pack("<QQ3d3BdQ4I", 1, 1, 0.5, -1.5, 2.5, 1, 2, 3, 0.0, 2, 7, 8, 9, 10)
+    assert (tmp_path / "points3D.bin").read_bytes() == expected
 
 
 def test_two_images_of_the_same_name_are_rejected(dataset_copy):

@@ -2,6 +2,7 @@
 
 import os
 import threading
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, ImageSource, View
-from snowsplat.data.decode import load_image, resize_area
+from snowsplat.data.decode import load_image, load_mask, resize_area
 from snowsplat.data.image_loader import available_memory
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
@@ -142,6 +143,12 @@ def test_a_downscaled_mask_keeps_only_pixels_that_are_fully_inside(views, tmp_pa
         assert loader.get(view, 2).mask.sum() == 3 * 8
 
 
+def test_a_mask_is_white_from_128_on(tmp_path):
+    Image.fromarray(np.array([[0, 127, 128, 255]], np.uint8)).save(tmp_path / "mask.png")
+    mask = load_mask(ImageSource(tmp_path / "mask.png", 4, 1))
+    assert mask.tolist() == [[False, False, True, True]]
+
+
 def test_a_budget_for_two_images_returns_the_same_pixels(views):
     one = 3 * 16 * 20
     order = [views[i] for i in torch.randperm(10).tolist() * 3]
@@ -230,6 +237,23 @@ def test_images_that_are_cached_or_being_decoded_are_not_submitted_again(views, 
         wait_until_idle(loader)
         loader.prefetch(views[:2])
     assert len(submitted) == 2
+
+
+def test_images_that_are_ready_at_once_are_decoded_once(views, monkeypatch):
+    """The callback of a decoded image then runs inside of the loop that submits the images."""
+    submitted = []
+
+    def decode_now(decode, key):
+        submitted.append(key[0].path.name)
+        future: Future = Future()
+        future.set_result(decode(key))
+        return future
+
+    with ImageLoader(views) as loader:
+        monkeypatch.setattr(loader._pool, "submit", decode_now)
+        loader.prefetch(views)
+        assert loader.cached_bytes == 10 * 3 * 16 * 20
+    assert submitted == [f"{i}.png" for i in range(10)]
 
 
 def test_requests_in_another_order_than_prefetched(views):

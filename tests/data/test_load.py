@@ -12,7 +12,7 @@ from PIL import Image
 from snowsplat import data
 from snowsplat.data import ImageLoader, Points, load_dataset, read_files
 from snowsplat.data.bounds import scene_bounds
-from snowsplat.data.dataset import scene_extent
+from snowsplat.data.dataset import safe_name, scene_extent
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
@@ -27,6 +27,11 @@ def resize_folder(source, target, size):
 def test_public_names_can_be_imported():
     for name in data.__all__:
         assert getattr(data, name).__name__ == name
+
+
+def test_names_of_views_are_relative_paths():
+    assert safe_name("a\\b/./../c.png") == "a/b/c.png"
+    assert safe_name("C:\\photos//1.png") == safe_name("/photos/1.png") == "photos/1.png"
 
 
 def test_every_eighth_image_by_name_is_held_out(pristine):

@@ -61,6 +61,7 @@ FIELD = 2 * math.atan(0.4)  # 40 pixels at a focal length of 50
         ({"camera_angle_x": FIELD}, (50, 50, 20, 15)),
         ({"camera_angle_x": FIELD, "camera_angle_y": 2 * math.atan(0.3)}, (50, 50, 20, 15)),
         ({"x_fov": math.degrees(FIELD)}, (50, 50, 20, 15)),
+        ({"fl_x": 0.5, "fl_y": 0.75}, (0.5, 0.75, 20, 15)),
         # A width without a height has no effect.
         ({"fl_x": 50.0, "w": 80}, (50, 50, 20, 15)),
         ({"fl_x": 50.0, "h": 60}, (50, 50, 20, 15)),
@@ -193,8 +194,9 @@ def test_alpha_is_used(dataset_copy):
 
 
 def test_splits_of_nerfstudio(scene):
+    """An image in several lists is used for training."""
     names = [f"images/{i}.png" for i in range(4)]
-    lists = {"train_filenames": names[:3], "test_filenames": names[3:]}
+    lists = {"train_filenames": names[:3], "test_filenames": names[2:], "val_filenames": names[:1]}
     folder = scene({"fl_x": 50, **lists}, [{} for _ in names])
     assert [view.name for view in load_dataset(folder).test] == names[3:]
 
@@ -305,6 +307,10 @@ def test_a_folder_of_smaller_copies_takes_the_place_of_images(scene):
         {"fl_x": "wide"},
         {"fl_x": 0},
         {"h": 0, "w": 4},
+        {"w": "wide"},
+        {"h": "high"},
+        {"cx": "middle"},
+        {"cy": "middle"},
         {"camera_angle_x": 4, "fl_x": None},
         {"k1": 0.1},
         {"camera_model": "FISHEYE"},

@@ -274,4 +274,9 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "while count > 2:",
         "while count > 3:",
     ): "of three places, the first tour is already the shortest: it omits the longest step",
+    (
+        "data/load.py",
+        "usual[folder] = Counter(sorted(factors)).most_common(1)[0][0]",
+        "usual[folder] = Counter(sorted(factors)).most_common(2)[0][0]",
+    ): "the first entry is the same",
 }
