@@ -32,6 +32,7 @@ class StageProgress:
         self._task = TaskID(0)
         self._stage = self._what = ""
         self._start = self._last_line = time.monotonic()
+        self._first = self._done = 0  # items: finished at the start, and now
 
     def begin(self, stage: str) -> Report:
         """A stage begins; returns its progress callback."""
@@ -75,13 +76,15 @@ class StageProgress:
 
     def _report(self, done: int, total: int, what: str = "") -> None:
         now = time.monotonic()
-        if what != self._what or done == 0:
-            self._what, self._start = what, now
+        if what != self._what or done == 0 or done < self._done:
+            # Other items, or a second attempt. Some items may be finished before it begins.
+            self._what, self._start, self._first = what, now, done
+        self._done = done
         elapsed = now - self._start
         counted = f"{done}/{total} {what}" if total else f"{done or ''} {what}"
         left = ""
-        if 0 < done < total and elapsed > 1.0:
-            left = f"  {duration(elapsed / done * (total - done))} left"
+        if self._first < done < total and elapsed > 1.0:
+            left = f"  {duration(elapsed / (done - self._first) * (total - done))} left"
         if self._bar is not None:
             self._bar.update(
                 self._task, completed=done, total=total or None, text=f"{counted.strip()}{left}"
