@@ -1,5 +1,6 @@
 """Runs the CPU kernels under sanitizers: AddressSanitizer and UndefinedBehaviorSanitizer with the
-tests of the ops, on each instruction set of this machine, and ThreadSanitizer for the threads.
+tests of the ops and of matching, on each instruction set of this machine, and ThreadSanitizer for
+the threads.
 
     python tests/nightly/sanitize_native.py              some minutes
     python tests/nightly/sanitize_native.py --isa avx2 --skip threads
@@ -83,7 +84,8 @@ def _isas(package: Path) -> list[str]:
 
 def _tests(package: Path, isa: str) -> bool:
     started = time.monotonic()
-    command = [sys.executable, "-m", "pytest", "tests/ops", "-m", "not emulated and not gpu"]
+    command = [sys.executable, "-m", "pytest", "-m", "not emulated and not gpu"]
+    command += ["tests/ops", "tests/sfm/colmap/test_matching.py"]
     # Without tests that measure times, load their own libraries, or compile with NVRTC, which does
     # not find its own libraries under a sanitizer.
     for other in ("native", "emulation", "driver", "cuda_build"):
