@@ -7,6 +7,7 @@ plus the change of the reference for such changes of its input.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -153,10 +154,14 @@ def _scales(kinds: Sequence[str], pixels: Tensor, g: torch.Generator) -> Tensor:
 
 @dataclass(frozen=True)
 class Compared:
-    """The reference's results, and how far each number moves if its input changes by roundings."""
+    """The reference's results, and how far each number moves if its input changes by roundings.
+
+    Most results agree without this spread, which takes six calls of the reference: it is computed
+    when a comparison needs it.
+    """
 
     value: Tensor
-    spread: Tensor
+    spread: Callable[[], Tensor]
 
     @staticmethod
     def of(
@@ -165,25 +170,32 @@ class Compared:
         """``function``: maps float64 inputs to several results."""
         rounding = 1e-5 if variant.dtype == torch.float32 else 1e-10
         values = function(*inputs)
-        spreads = [torch.zeros_like(value) for value in values]
-        g = generator(seed)
-        for _ in range(3):
-            changes = [
-                rounding * (2 * torch.rand(t.shape, generator=g).double() - 1) for t in inputs
-            ]
-            for sign in (1.0, -1.0):  # both signs, so that values at a threshold fall on both sides
-                moved = [t * (1 + sign * c) for t, c in zip(inputs, changes, strict=True)]
-                for spread, value, other in zip(spreads, values, function(*moved), strict=True):
-                    # NaN: not compared.
-                    torch.maximum(spread, (other - value).abs(), out=spread)
-        return [Compared(v, s) for v, s in zip(values, spreads, strict=True)]
+
+        @functools.cache
+        def spreads() -> list[Tensor]:
+            found = [torch.zeros_like(value) for value in values]
+            g = generator(seed)
+            for _ in range(3):
+                changes = [
+                    rounding * (2 * torch.rand(t.shape, generator=g).double() - 1) for t in inputs
+                ]
+                for sign in (1.0, -1.0):  # so that values at a threshold fall on both sides
+                    moved = [t * (1 + sign * c) for t, c in zip(inputs, changes, strict=True)]
+                    for spread, value, other in zip(found, values, function(*moved), strict=True):
+                        # NaN: not compared.
+                        torch.maximum(spread, (other - value).abs(), out=spread)
+            return found
+
+        return [
+            Compared(v, functools.partial(lambda k: spreads()[k], i)) for i, v in enumerate(values)
+        ]
 
     def at(self, rows: Tensor) -> Compared:
-        return Compared(self.value[rows], self.spread[rows])
+        return Compared(self.value[rows], lambda: self.spread()[rows])
 
     def in_rows(self) -> Compared:
         """Use the spread of a row for each of its numbers: few input changes affect all."""
-        return Compared(self.value, _of_rows(self.spread))
+        return Compared(self.value, lambda: _of_rows(self.spread()))
 
     def check(
         self, actual: Tensor, relative: float, name: str, scale: Tensor | None = None
@@ -191,13 +203,19 @@ class Compared:
         """``scale``: magnitude of the summands of a number if they may cancel."""
         assert actual.shape == self.value.shape, f"{name}: {actual.shape}, not {self.value.shape}"
         scale = self.value.abs() if scale is None else scale
-        tolerance = relative * scale + 10.0 * self.spread
+        fault = self._fault(actual, relative, scale, relative * scale)
+        if fault:
+            fault = self._fault(actual, relative, scale, relative * scale + 10.0 * self.spread())
+        assert not fault, f"{name}: {fault}"
+
+    def _fault(self, actual: Tensor, relative: float, scale: Tensor, tolerance: Tensor) -> str:
         decided = tolerance.isfinite() & (scale < 1e30) & (self.value.abs() < 1e30)
         found = actual.detach().double()[decided]
-        assert found.isfinite().all(), f"{name}: not finite where the reference is"
+        if not found.isfinite().all():
+            return "not finite where the reference is"
         excess = (found - self.value[decided]).abs() - tolerance[decided] - 1e-4 * relative
         worst = float(excess.max()) if len(excess) else 0.0
-        assert worst <= 0, f"{name}: off by {worst:.3g} more than {tolerance[decided].max():.3g}"
+        return f"off by {worst:.3g} more than {tolerance[decided].max():.3g}" if worst > 0 else ""
 
 
 def _every_row(scene: Scene, params: Sequence[Tensor], pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -250,9 +268,11 @@ def check_project(variant: Variant, extreme: Extreme) -> None:
     # In single precision, the determinant of the largest overflows, so they are invisible.
     huge = (rows.value[:, 7] > 3 * LARGE) & (variant.dtype == torch.float32)
     edge = (255 * scene.params["opacity_logits"].sigmoid() - 1).abs() < 1e-5
-    clear = (seen.spread == 0) & ~huge & ~edge
+    clear = ~huge & ~edge
     found = torch.zeros(count, dtype=torch.bool)
     found[ids] = True
+    if not torch.equal(found[clear], seen.value.bool()[clear]):
+        clear &= seen.spread() == 0
     assert torch.equal(found[clear], seen.value.bool()[clear]), "who is seen"
 
     both = clear & found
@@ -427,7 +447,7 @@ def check_harm(variant: Variant, extreme: Extreme, value: float, picks: Sequence
         assert torch.equal(results[1][name], wanted), name
 
 
-LONG = ((16384, 3), (3, 16384))
+LONG = ((16384, 2), (2, 16384))
 
 
 def photos(

@@ -83,6 +83,10 @@ class Scene:
             return splats
         return Splats2D(splats.packed[seen], splats.ids[seen], splats.channels)
 
+    def rows(self, rows: Sequence[int]) -> Scene:
+        """Only these Gaussians."""
+        return replace(self, params={name: p[list(rows)] for name, p in self.params.items()})
+
     def leaves(self) -> dict[str, Tensor]:
         return {**self.params, "cam_from_world": self.cam_from_world}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 
 import pytest
@@ -47,6 +48,7 @@ def bits(tensor: Tensor) -> Tensor:
     return tensor.detach().contiguous().flatten().view(torch.uint8)
 
 
+@functools.cache
 def the_scene() -> Scene:
     return random_scene(0, COUNT, WIDTH, HEIGHT)
 
@@ -66,20 +68,19 @@ def test_project(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize(("channels", "count"), [(3, 3000), (5, 3000), (3, 60_000)])
+@pytest.mark.parametrize(("channels", "count"), [(3, 3000), (5, 3000), (3, 12_000)])
 def test_rasterize(dtype: torch.dtype, channels: int, count: int) -> None:
+    made = random_splats(2, count, WIDTH, HEIGHT, channels, pixels=1.0)
+    cotangents = [normal(generator(4), HEIGHT, WIDTH, n).to(dtype) for n in (channels, 1, 1)]
     results = []
     for threads in THREADS:
         ops.set_num_threads(threads)
-        made = random_splats(2, count, WIDTH, HEIGHT, channels, pixels=1.0)
         splats = leaf_splats(made, dtype)
         background = uniform(generator(3), 0, 1, channels).to(dtype).requires_grad_()
         image, alpha, depth = ops.rasterize(splats, WIDTH, HEIGHT, background, with_depth=True)
         outputs = {"image": image, "alpha": alpha, "depth": depth}
-        torch.autograd.backward(
-            list(outputs.values()),
-            [normal(generator(4), *o.shape).to(dtype) for o in outputs.values()],
-        )
+        pairs = zip(outputs.values(), cotangents, strict=True)
+        torch.autograd.backward(list(outputs.values()), [c.view_as(o) for o, c in pairs])
         grads = {"packed": splats.packed.grad, "background": background.grad}
         results.append({**outputs, **grads})
     assert_same_bits(results)
@@ -130,7 +131,7 @@ def test_neighbours(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("visible_only", [False, True])
 def test_training_steps(dtype: torch.dtype, visible_only: bool) -> None:
-    """Three complete steps: project, rasterize, loss, Adam."""
+    """Two complete steps: project, rasterize, loss, Adam."""
     rates = dict.fromkeys(the_scene().params, 0.01)
     results = []
     target = uniform(generator(1), 0, 1, HEIGHT, WIDTH, 3).to(dtype)
@@ -139,7 +140,7 @@ def test_training_steps(dtype: torch.dtype, visible_only: bool) -> None:
         scene = the_scene().to(dtype, requires_grad=False)
         m = {name: torch.zeros_like(p) for name, p in scene.params.items()}
         v = {name: torch.zeros_like(p) for name, p in scene.params.items()}
-        for step in (1, 2, 3):
+        for step in (1, 2):
             splats = scene.project(ops)
             splats.packed.requires_grad_()
             image, _, _ = ops.rasterize(splats, WIDTH, HEIGHT)

@@ -17,7 +17,6 @@ from snowsplat.ops.splats import Splats2D
 
 from .extremes import CHECKS, LONG, check_photometric
 from .scenes import (
-    EMULATED_LENGTH,
     PARAMETERS,
     Scene,
     Variant,
@@ -261,9 +260,9 @@ def test_random_extremes(native: Variant, name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", LONG)
 def test_long_images(native: Variant, size: tuple[int, int]) -> None:
-    """The loss, and the image at both ends, are correct for 16384×3 and 3×16384 pixels."""
-    if native.engine == "emulated":  # which is slow
-        size = min(size[0], EMULATED_LENGTH), min(size[1], EMULATED_LENGTH)
+    """The loss, and the image at both ends, are correct for 16384×2 and 2×16384 pixels."""
+    if native.engine == "emulated":  # which is slow; these are more than 256 tiles
+        size = min(size[0], 4200), min(size[1], 4200)
     if native.dtype == torch.float32:
         check_photometric(native, (1, size, "noise", True), 0.2)
     width, height = size
