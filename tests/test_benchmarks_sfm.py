@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from snowsplat.scene.geometry import Similarity, invert_rigid, rotation_from_quat
+from snowsplat.synthetic import light
 
 from . import fork_server
 
@@ -88,10 +89,13 @@ def test_the_limits_of_a_right_place(sfm_modules):
     assert sfm_placed.placed({}, true).missing == sorted(true)
 
 
-def test_scenes_for_structure_from_motion(sfm_modules, tmp_path):
+def test_scenes_for_structure_from_motion(sfm_modules, tmp_path, monkeypatch):
     """Paths stay inside of the scenes, and photos are rendered only once."""
     from sfm_scenes import KINDS, photos_of
 
+    # Light at fewer points: building the scenes takes most of the time.
+    monkeypatch.setattr(light, "_SPACING", 0.1)
+    monkeypatch.setattr(light, "_MOST_POINTS", 12)
     folder, truth = photos_of("twins", 4, tmp_path, (48, 36))
     files = sorted(folder.iterdir())
     assert [file.name for file in files] == list(truth.poses)

@@ -53,20 +53,19 @@ def state(out: Path) -> dict[str, int]:
 
 
 @pytest.mark.sfm
-def test_from_photos_to_files_and_repeated_stages(
-    run, refused, quick, photos, tmp_path, monkeypatch
-):
+def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path, monkeypatch):
+    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=60))
     monkeypatch.chdir(tmp_path)
     command = ("make", photos, "--quality", "draft", "--threads", 1)
     result = run(*command)
     assert result.code == 0, result.err
     out = tmp_path / "Häuser am See_scene"
     scene = out / "Häuser am See.ply"
-    original = out / "scene/point_cloud/iteration_120/point_cloud.ply"
+    original = out / "scene/point_cloud/iteration_60/point_cloud.ply"
     assert scene.read_bytes() == original.read_bytes()
     metrics = json.loads((out / "scene/metrics.json").read_text())
     assert metrics["psnr"] > 12
-    made = files(out / "scene/test/ours_120")
+    made = files(out / "scene/test/ours_60")
     assert made == {f"{kind}/{i:05d}.png" for kind in ("renders", "gt") for i in range(2)}
     assert (out / "capture/capture_report.html").is_file()
     assert not (out / "scene/checkpoints").exists()
@@ -76,7 +75,7 @@ def test_from_photos_to_files_and_repeated_stages(
 
     facts = json.loads(run("info", out, "--json").out)
     assert facts["kind"] == "output folder"
-    assert facts["scenes"] == [120]
+    assert facts["scenes"] == [60]
 
     # The same command again: all stages are skipped.
     before = state(out)
@@ -91,16 +90,16 @@ def test_from_photos_to_files_and_repeated_stages(
     again = run(*command)
     assert "pictures: repeated (its files are missing)" in again.out
     assert state(out).keys() == before.keys()
-    assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_120/point_cloud.ply"]
+    assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_60/point_cloud.ply"]
 
     # Another training setting: the cameras are kept.
-    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=60))
+    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=20))
     again = run(*command)
     assert again.code == 0, again.err
     assert "scene: repeated (changed: iterations)" in again.out
     assert again.out.count("done before") == 4
-    assert (out / "scene/test/ours_60").is_dir()
-    assert not (out / "scene/test/ours_120").exists()
+    assert (out / "scene/test/ours_20").is_dir()
+    assert not (out / "scene/test/ours_60").exists()
 
     # Other photos: the existing output is not replaced.
     fewer = tmp_path / "fewer"
