@@ -111,27 +111,29 @@ def assert_identical(a: Gaussians, b: Gaussians) -> None:
 
 @pytest.mark.slow
 def test_training_learns_and_has_the_same_losses_in_float64(dataset, monkeypatch):
-    """300 steps with the native ops and with the reference in double precision: the same losses."""
+    """200 of the 300 steps, up to the highest SH degree, have the losses of the reference ops."""
 
-    def losses(trainer: Trainer) -> torch.Tensor:
-        return torch.tensor([trainer.step_once() for _ in range(300)], dtype=torch.float64)
+    def losses(trainer: Trainer, steps: int) -> torch.Tensor:
+        return torch.tensor([trainer.step_once() for _ in range(steps)], dtype=torch.float64)
 
-    trainer = Trainer(dataset, CALM)
+    config = replace(CALM, sh_interval=50)
+    trainer = Trainer(dataset, config)
     before = trainer.evaluate()
-    native = losses(trainer)
+    native = losses(trainer, 300)
     after = trainer.evaluate()
     assert native[-50:].mean() < 0.35 * native[:50].mean()
     assert after.psnr > before.psnr + 3
 
-    exact = Trainer(dataset, CALM)
+    exact = Trainer(dataset, config)
     exact.gaussians = exact.gaussians.to(dtype=torch.float64)
     for moments in (exact._optimizer.exp_avg, exact._optimizer.exp_avg_sq):
         moments.update({name: moment.double() for name, moment in moments.items()})
     for name in ("project", "rasterize", "photometric_loss", "adam_step"):
         monkeypatch.setattr(ops, name, getattr(reference, name))
-    expected = losses(exact)
+    expected = losses(exact, 200)
+    native = native[:200]
     torch.testing.assert_close(native[:30], expected[:30], rtol=1e-3, atol=0)
-    # Rounding errors grow during training, so only the trend is the same at the end.
+    # Rounding errors grow during training, so only the trend is the same later.
     torch.testing.assert_close(native, expected, rtol=0.1, atol=0)
     assert float(native[-50:].mean()) == pytest.approx(float(expected[-50:].mean()), rel=0.02)
 
