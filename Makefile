@@ -103,8 +103,9 @@ pytest-quick: native
 	$(PYTEST) -m '$(QUICK)'
 
 # All tests on the best instruction set. Some of them wait for browsers and servers. Therefore, at the same
-# time and with half as many processes: on each other instruction set, the tests that depend on it; and the
-# GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not repeated without them.
+# time, with half as many processes and a lower priority: on each other instruction set, the tests that
+# depend on it; and the GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not
+# repeated without them.
 pytest: native
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
 
@@ -113,7 +114,7 @@ pytest-best:
 
 # Prints everything if a test fails, otherwise only the numbers of tests.
 pytest-repeated:
-	@if $(MAKE) --no-print-directory pytest-isas sanitized JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
+	@if nice -n 5 $(MAKE) --no-print-directory pytest-isas sanitized JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
 	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
