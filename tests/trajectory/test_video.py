@@ -14,6 +14,7 @@ from snowsplat.trajectory.video import video_writer
 from snowsplat.util.errors import UserError
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
+RATE = 30  # PyAV would take 24 by default
 
 
 def image(i: int) -> np.ndarray:
@@ -24,7 +25,7 @@ def image(i: int) -> np.ndarray:
 
 
 def write(path: Path) -> None:
-    with video_writer(path, WIDTH, HEIGHT, 24) as add:
+    with video_writer(path, WIDTH, HEIGHT, RATE) as add:
         for i in range(FRAMES):
             add(image(i))
 
@@ -53,8 +54,9 @@ def test_size_rate_length_and_index(tmp_path):
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.height, stream.pix_fmt) == (WIDTH, HEIGHT, "yuv420p")
-        assert stream.average_rate == 24
-        assert container.duration == pytest.approx(1e6 * FRAMES / 24, abs=1000)
+        assert stream.average_rate == RATE
+        assert stream.codec_context.framerate == RATE
+        assert container.duration == pytest.approx(1e6 * FRAMES / RATE, abs=1000)
         assert stream.codec_context.name == "h264"
     content = path.read_bytes()
     assert 0 < content.find(b"moov") < content.find(b"mdat")

@@ -296,4 +296,20 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "dense = torch.linspace(start, end, _SAMPLES_PER_FRAME * max(frames, 51), "
         "dtype=torch.float64)",
     ): "any density of about this size measures the length well enough",
+    (
+        "trajectory/orbit.py",
+        "share = (wanted - length[i - 1]) / (length[i] - length[i - 1]).clamp_min(1e-300)",
+        "share = (wanted - length[i - 1]) / (length[i] - length[i - 1]).clamp_min(9.375e-301)",
+    ): "any limit of a similar size is suitable",
+    (
+        "trajectory/focus.py",
+        "if float((right @ DEFAULT_UP).abs().median()) < _LEVEL and float(upper @ DEFAULT_UP) > 0:",
+        "if float((right @ DEFAULT_UP).abs().median()) < _LEVEL "
+        "and float(upper @ DEFAULT_UP) >= 0:",
+    ): "the mean of upward directions is never exactly level",
+    (
+        "trajectory/video.py",
+        "_BITS_PER_PIXEL = 0.25",
+        "_BITS_PER_PIXEL = 0.234375",
+    ): "any bit rate of about this size is suitable",
 }
