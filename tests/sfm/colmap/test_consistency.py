@@ -1,6 +1,7 @@
 """Which photos contradict the others, from verified matches and shared points."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -91,6 +92,20 @@ def test_photos_that_follow_each_other_outweigh_look_alikes():
 
     assert find_parts(pairs(follows=False)) == [set(range(1, 21)), set(range(21, 41))]
     assert find_parts(pairs(follows=True)) == [set(range(1, 41))]
+
+
+def test_photos_that_follow_each_other_outweigh_two_equal_rooms():
+    """A walk through two equal rooms: the photos of both are in one room, torn at the door."""
+
+    def pairs(in_order):
+        door = [(20, 21, 400), (19, 21, 200), (20, 22, 200)]
+        true = chain(range(1, 21)) + chain(range(21, 41)) + [CheckedPair(*p, 0) for p in door]
+        true = [replace(p, follows=in_order and p.second - p.first <= 2) for p in true]
+        false = [CheckedPair(i, i + 20, 900, 700) for i in range(1, 21)]
+        return [*true, *false, *(CheckedPair(i, i + 21, 700, 500) for i in range(1, 20))]
+
+    assert find_parts(pairs(in_order=False)) == [set(range(1, 41))]
+    assert find_parts(pairs(in_order=True)) == [set(range(1, 21)), set(range(21, 41))]
 
 
 def test_look_alikes_in_a_right_model_cut_nothing():

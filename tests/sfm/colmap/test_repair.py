@@ -4,6 +4,7 @@ import sqlite3
 from contextlib import closing
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
@@ -103,6 +104,20 @@ def test_a_part_that_cannot_be_placed_is_left_out_with_a_reason(mapping, scene, 
     assert "09.png" in reason
     assert "but only 0 points in common" in reason
     assert repaired.description == "7 contradicted their matches: 0 placed again, 7 left out"
+
+
+def test_photos_that_the_mapper_drops_are_named(mapping, scene, monkeypatch, tmp_path):
+    """A model of COLMAP does not contain photos that have no matches with others any more."""
+
+    def drop(self, models, relaxed=True):
+        (tmp_path / "registered").mkdir()
+        models[0].write(tmp_path / "registered")
+        return [pycolmap.Reconstruction(tmp_path / "registered")]
+
+    monkeypatch.setattr(Mapping, "extend", drop)
+    repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
+    assert set(repaired.model.images).isdisjoint(FAR)
+    assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
 
 
 def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypatch):

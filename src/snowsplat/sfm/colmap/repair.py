@@ -42,6 +42,7 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     until no part contradicts the others. What still does in the last round is left out.
     ``max_error`` is that of `check_pairs`. A model without contradictions is returned unchanged.
     """
+    names = {i: image.name for i, image in model.images.items()}
     false: set[tuple[int, int]] = set()
     wrong: dict[int, str] = {}
     for number in range(_ROUNDS + 1):
@@ -57,7 +58,6 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         model = _placed_again(model, mapping, false)
     placed = set(model.reg_image_ids())
     left_out = {i: reason for i, reason in wrong.items() if i not in placed}
-    names = {i: model.image(i).name for i in left_out}
     return Repaired(model, len(wrong), {names[i]: reason for i, reason in left_out.items()})
 
 
