@@ -49,6 +49,14 @@ _FLAGS = [
 ]
 
 
+# Scripts get the next frame that begins this many milliseconds later.
+_SLOW_FRAMES = """(() => {
+    const request = window.requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = draw => window.setTimeout(() => request(draw), %g);
+    window.cancelAnimationFrame = window.clearTimeout.bind(window);
+})()"""
+
+
 def chromium() -> str | None:
     """The program: SNOWSPLAT_CHROMIUM, else the first of its usual names on the PATH."""
     named = os.environ.get("SNOWSPLAT_CHROMIUM")
@@ -66,11 +74,15 @@ class Browser:
     """A process of Chromium with a temporary profile; both are removed at the end.
 
     Tabs have ``width`` × ``height`` CSS pixels, of ``scale`` pixels of the screen. Without a GPU,
-    the time to draw a page is proportional to the number of pixels of the screen.
+    the time to draw a page is proportional to the number of pixels of the screen. Scripts that
+    draw for each frame of the screen run at most ``frames`` times per second, because pages with
+    WebGL otherwise use the processor all the time.
     """
 
-    def __init__(self, width: int = 640, height: int = 480, scale: float = 1.0) -> None:
-        self.width, self.height, self.scale = width, height, scale
+    def __init__(
+        self, width: int = 640, height: int = 480, scale: float = 1.0, frames: float = 10.0
+    ) -> None:
+        self.width, self.height, self.scale, self.frames = width, height, scale, frames
 
     def __enter__(self) -> Browser:
         program = chromium()
@@ -122,6 +134,9 @@ class Browser:
             height=self.height,
             deviceScaleFactor=self.scale,
             mobile=False,
+        )
+        page.call(
+            "Page.addScriptToEvaluateOnNewDocument", source=_SLOW_FRAMES % (1e3 / self.frames)
         )
         page.navigate(url, timeout)
         return page
