@@ -1,4 +1,4 @@
-"""Sharpness, images without content, and camera motion between frames."""
+"""Sharpness, and images without content."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ from snowsplat.sfm.ingest.sharpness import (
     PICTURE_SIDE,
     WHITE,
     grey_copy,
-    has_moved,
     sharpness,
     why_useless,
 )
@@ -64,34 +63,3 @@ def test_only_strongly_blurred_images_are_useless():
 def test_dark_images_with_little_contrast_are_used():
     dim = (wall(width=640, height=480) / 16).astype(np.uint8)
     assert why_useless(grey(dim)) is None
-
-
-@pytest.mark.parametrize("level", [0, 2, 6])
-def test_noise_is_not_motion(level):
-    still = wall()
-    assert not has_moved(grey(noisy(still, level, 1)), grey(noisy(still, level, 2)))
-
-
-def test_camera_motion_is_detected():
-    frames = [grey(frame) for frame in pan(10, step=4)]
-    assert has_moved(frames[0], frames[1])
-    assert has_moved(frames[0], frames[9])
-    assert not has_moved(frames[3], frames[3])
-
-
-def test_a_moving_object_is_not_camera_motion():
-    before, after = wall().copy(), wall().copy()
-    before[60:200, 40:100] = wall(seed=5)[60:200, 40:100]
-    after[60:200, 140:200] = wall(seed=5)[60:200, 40:100]
-    assert not has_moved(grey(before), grey(after))
-
-
-def test_a_change_of_light_is_not_camera_motion():
-    assert not has_moved(grey(wall()), grey((wall() * 0.8).astype(np.uint8)))
-
-
-def test_images_without_texture_and_tiny_images():
-    flat = np.full((240, 320), 120, np.uint8)
-    assert not has_moved(flat, flat)
-    assert has_moved(flat, flat + 20)
-    assert not has_moved(flat[:20], flat[:20])

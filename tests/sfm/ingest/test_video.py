@@ -1,6 +1,7 @@
-"""Frames of a video: sharp, upright, without repeated views, at most as many as requested."""
+"""Frames of a video: sharp, upright, with even steps between them, at most as many as requested."""
 
 import logging
+import weakref
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.clip import frames_wanted, read_clip
+from snowsplat.sfm.ingest.clip import decoded_frames, frames_wanted, read_clip
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED
 from snowsplat.sfm.ingest.video import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import silent
@@ -32,9 +33,22 @@ def difference(path, picture) -> float:
         return float(np.abs(np.asarray(image, np.float64) - picture).mean())
 
 
-def test_the_sharpest_frame_of_each_window(tmp_path):
+def travel(speeds) -> tuple[list[np.ndarray], np.ndarray]:
+    """Images of a camera that moves sideways by ``speeds`` pixels per image, and its places."""
+    places = np.concatenate([[0], np.cumsum(speeds)])
+    large = wall(width=WIDTH + int(places[-1]))
+    return [np.ascontiguousarray(large[:, place : place + WIDTH]) for place in places], places
+
+
+def uneven_steps(places, frames) -> float:
+    """The longest step between ``frames``, divided by the median step."""
+    steps = np.diff(places[list(frames)])
+    return float(steps.max() / np.median(steps))
+
+
+def test_sharp_frames_with_even_steps(tmp_path):
     pictures = pan(24)
-    sharp = [2, 5, 8, 15, 16, 23]
+    sharp = [2, 6, 9, 13, 17, 21]
     frames = [p if i in sharp else blurred(p, 1.5) for i, p in enumerate(pictures)]
     made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", 6)
     assert [round(10 * frame.seconds) for frame in made.kept] == sharp
@@ -47,15 +61,99 @@ def test_the_sharpest_frame_of_each_window(tmp_path):
         assert difference(tmp_path / "f" / frame.name, wrong) > 20
 
 
-def test_windows_have_equal_duration_if_the_frame_rate_varies(tmp_path):
+def test_steps_are_even_where_the_camera_stands_walks_and_runs(tmp_path):
+    pictures, places = travel([0] * 20 + [2] * 40 + [12] * 20)
+    video = write_video(tmp_path / "a.mp4", pictures, rate=20)
+    made = extract(video, tmp_path / "f", 16)
+    taken = [round(20 * frame.seconds) for frame in made.kept]
+    assert 15 <= len(taken) <= 16
+    assert uneven_steps(places, taken) < 1.8
+    # The middle frames of 16 equal windows of time.
+    assert uneven_steps(places, range(2, 81, 5)) > 5
+
+
+@pytest.mark.parametrize("speeds", [[1] * 30 + [10] * 20, [10] * 20 + [1] * 30])
+def test_the_order_of_slow_and_fast_parts_does_not_matter(speeds, tmp_path):
+    """The result does not depend on what is known of the motion at the beginning."""
+    pictures, places = travel(speeds)
+    made = extract(write_video(tmp_path / "a.mp4", pictures, rate=20), tmp_path / "f", 10)
+    taken = [round(20 * frame.seconds) for frame in made.kept]
+    assert len(taken) == 10
+    assert uneven_steps(places, taken) < 1.8
+    assert np.diff(places[taken]).max() < 1.8 * places[-1] / 10
+
+
+def test_a_short_scene_between_two_cuts_is_kept(tmp_path):
+    first, second = pan(14, step=4), pan(4, step=4, seed=7)
+    frames = [*first, *second, *pan(14, step=4, seed=9)]
+    made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", 12)
+    taken = [round(10 * frame.seconds) for frame in made.kept]
+    assert set(taken) & {14, 15, 16, 17}
+    assert min(taken) < 6
+    assert max(taken) > 26
+    assert len(taken) <= 12
+
+
+def test_the_same_video_gives_the_same_frames(tmp_path):
+    video = write_video(tmp_path / "a.mp4", travel([1] * 20 + [6] * 20)[0])
+    one, two = (extract(video, tmp_path / name, 9) for name in "ab")
+    assert one == two
+    for frame in one.kept:
+        content = (tmp_path / "a" / frame.name).read_bytes()
+        assert content == (tmp_path / "b" / frame.name).read_bytes()
+
+
+def test_few_files_and_few_frames_in_memory(tmp_path, monkeypatch):
+    """Also for a video with much motion and few frames to keep."""
+    files, alive = [], weakref.WeakSet()
+
+    def decoded(container):
+        for frame in decoded_frames(container):
+            holder = Held(frame)
+            alive.add(holder)
+            yield holder
+            files.append((len(list((tmp_path / "f").iterdir())), len(alive)))
+
+    monkeypatch.setattr("snowsplat.sfm.ingest.video.decoded_frames", decoded)
+    monkeypatch.setattr("snowsplat.sfm.ingest.video._FEW", 5)
+    frames = pan(50, step=8)
+    made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", 5)
+    assert len(made.kept) == 5
+    most_files, most_frames = np.max(files, axis=0)
+    assert 5 < most_files <= 20
+    assert most_frames <= 3
+    assert len(list((tmp_path / "f").iterdir())) == 5
+
+
+class Held:
+    """A decoded frame that a weak reference can follow."""
+
+    def __init__(self, frame):
+        self._frame = frame
+
+    def __getattr__(self, name):
+        return getattr(self._frame, name)
+
+
+def test_ctrl_c_is_raised_and_no_candidates_remain(tmp_path):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    video = write_video(tmp_path / "a.mp4", pan(25))
+    with pytest.raises(KeyboardInterrupt):
+        extract(video, tmp_path / "f", 5, report=stop)
+    assert not list((tmp_path / "f").iterdir())
+
+
+def test_a_variable_frame_rate_does_not_matter(tmp_path):
     # 20 frames in the first second, 4 frames in the next three seconds.
     times = [50 * i for i in range(20)] + [1000 + 750 * i for i in range(4)]
     video = write_video(tmp_path / "a.mkv", pan(24), rate=20, times=times)
-    made = extract(video, tmp_path / "f", 4)
-    assert len(made.kept) == 4
-    length = read_clip(video).seconds
-    assert length == pytest.approx(3.4, abs=0.05)
-    assert [int(4 * frame.seconds / length) for frame in made.kept] == [0, 1, 2, 3]
+    assert read_clip(video).seconds == pytest.approx(3.4, abs=0.05)
+    made = extract(video, tmp_path / "f", 6)
+    taken = [times.index(round(1000 * frame.seconds)) for frame in made.kept]
+    assert len(taken) == 6
+    assert np.diff(taken).max() <= 6
 
 
 @pytest.mark.parametrize("rotation", [90, -90, 180])
@@ -143,15 +241,6 @@ def test_progress_reaches_the_end(tmp_path):
     )
     assert calls[0] == (10, 25, "frames of a.mp4")
     assert calls[-1] == (25, 25, "frames of a.mp4")
-
-
-def test_ctrl_c_is_raised(tmp_path):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    video = write_video(tmp_path / "a.mp4", pan(25))
-    with pytest.raises(KeyboardInterrupt):
-        extract(video, tmp_path / "f", 5, report=stop)
 
 
 def test_a_full_disk_is_not_reported_as_a_damaged_video(tmp_path, monkeypatch):

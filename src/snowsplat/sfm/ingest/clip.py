@@ -142,12 +142,12 @@ def read_clip(path: Path) -> Clip:
 
 
 def frames_wanted(clip: Clip, fps: float | None, frames: int | None) -> int:
-    """Number of time windows into which a video is divided; each yields at most one frame.
+    """The maximum number of frames to use of a video.
 
     The default is 2.5 per second. Walking around an object takes 20 to 40 s, so adjacent frames are
-    a few degrees apart; SIFT matches such frames reliably. A short video has at least 60 windows,
-    because it may show as much as a long one. A long video has at most 150 windows, or one per
-    second (up to 300) if that is more, because each frame takes about 2 s later, on two cores.
+    a few degrees apart; SIFT matches such frames reliably. The number for a short video is at least
+    60, because it may show as much as a long one. For a long video it is 150, or one per second (up
+    to 300) if that is more, because each frame takes about 2 s later, on two cores.
     """
     if frames is not None:
         wanted = float(frames)
@@ -155,7 +155,7 @@ def frames_wanted(clip: Clip, fps: float | None, frames: int | None) -> int:
         wanted = clip.seconds * fps
     else:
         wanted = max(min(max(2.5 * clip.seconds, 60), 150), min(clip.seconds, 300))
-        wanted = min(wanted, clip.packets / 2)  # at least two frames per window to choose from
+        wanted = min(wanted, clip.packets / 2)  # at least two frames to choose each one from
     return max(1, min(round(wanted), clip.packets))
 
 

@@ -143,8 +143,8 @@ def _take_frames(
 ) -> list[Photo]:
     below = folder / source.name
     below.mkdir(parents=True, exist_ok=True)
-    windows = frames_wanted(clip, options.fps, options.frames)
-    frames = extract_frames(clip, below, windows, options.size, report)
+    most = frames_wanted(clip, options.fps, options.frames)
+    frames = extract_frames(clip, below, most, options.size, report)
     label = source.path.name if not source.name else source.name
     skipped += [(f"{label} at {seconds:.1f} s", reason) for seconds, reason in frames.skipped]
     return [

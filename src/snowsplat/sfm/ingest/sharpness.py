@@ -1,4 +1,4 @@
-"""Sharpness of an image, tests for images without content, and a test for camera motion.
+"""Sharpness of an image, and tests for images without content.
 
 All functions use small grey copies, (H, W) uint8. They contain the detail that SfM needs, and
 little noise.
@@ -12,7 +12,7 @@ from PIL import Image
 #: Longest side in pixels of the copies that are compared for sharpness. A blur of half a pixel of
 #: the copy is still detected, while noise of the sensor and of compression is mostly averaged out.
 FRAME_SIDE = 640
-#: Longest side in pixels of the copies that are tested for content and motion.
+#: Longest side in pixels of the copies that are tested for content, and for camera motion.
 PICTURE_SIDE = 320
 
 # An image with less fine detail (`_fine_detail`) is unusable. The limits are given for the longest
@@ -26,10 +26,6 @@ PICTURE_SIDE = 320
 # visible at 80.
 _BLURRED = {160: 0.09, 80: 0.16}
 _BLANK = 8.0  # range of grey levels (0.5% to 99.5% quantile); a lens cap has 2 to 5
-# Pixels of the copy, 0.6% of its longest side. A static camera measures 0 or 1, even with noise; a
-# camera that is carried while walking measures 3 to 10 within 0.4 s.
-_MOVED = 2.0
-_BLOCK = 32  # pixels: side of the blocks of the phase correlation
 
 # Reasons why an image is unusable.
 BLACK = "is completely black"
@@ -55,10 +51,13 @@ def sharpness(grey: np.ndarray) -> float:
     In a real video with motion blur in half of its frames, this measure selected an unblurred frame
     more often than the energy of the gradients, the product of both axes, or a mean of these.
     """
-    g = grey.astype(np.float32)
-    return float(
-        (4 * g[1:-1, 1:-1] - g[:-2, 1:-1] - g[2:, 1:-1] - g[1:-1, :-2] - g[1:-1, 2:]).var()
-    )
+    g = grey.astype(np.int16)  # half the memory of float32, and exact
+    detail = 4 * g[1:-1, 1:-1] - g[:-2, 1:-1] - g[2:, 1:-1] - g[1:-1, :-2] - g[1:-1, 2:]
+    if not detail.size:  # a few pixels
+        return 0.0
+    total = int(detail.sum(dtype=np.int64))
+    squares = int(np.multiply(detail, detail, dtype=np.int32).sum(dtype=np.int64))
+    return (squares - total * total / detail.size) / detail.size
 
 
 def why_useless(grey: np.ndarray) -> str | None:
@@ -87,43 +86,3 @@ def _fine_detail(grey: np.ndarray, side: int) -> float:
         after = float((np.diff(blurred, axis=axis) ** 2).mean())
         shares.append(1 - after / before if before > 0 else 0.0)
     return max(shares)  # motion blur keeps the detail perpendicular to its direction
-
-
-def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether the camera moved between two frames, given equally large copies of `PICTURE_SIDE`.
-
-    The shift of each block is estimated by phase correlation. The result is the median over blocks
-    with texture, so neither a person who walks through the scene nor noise nor a change of light
-    counts as motion.
-    """
-    if min(before.shape) < _BLOCK:
-        return bool(np.abs(before.astype(np.float32) - after).mean() >= 1.0)
-    first, second = _blocks(before), _blocks(after)
-    contrast = first.std(axis=(1, 2))
-    textured = contrast >= max(float(np.median(contrast)), 3.0)
-    if not textured.any():
-        return bool(np.abs(first - second).mean() >= 1.0)
-    first, second = _windowed(first[textured]), _windowed(second[textured])
-    cross = np.fft.rfft2(first) * np.conj(np.fft.rfft2(second))
-    size = np.abs(cross)
-    # Normalise the spectrum to phases, but suppress frequencies with hardly any energy.
-    cross /= size + 1e-3 * size.max(axis=(1, 2), keepdims=True) + 1e-9
-    peaks = np.fft.irfft2(cross, s=(_BLOCK, _BLOCK)).reshape(len(cross), -1).argmax(axis=1)
-    shifts = np.stack(np.divmod(peaks, _BLOCK))
-    shifts = (shifts + _BLOCK // 2) % _BLOCK - _BLOCK // 2
-    return bool(np.median(np.hypot(*shifts)) >= _MOVED)
-
-
-def _blocks(grey: np.ndarray) -> np.ndarray:
-    """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image."""
-    rows, columns = grey.shape[0] // _BLOCK, grey.shape[1] // _BLOCK
-    top = (grey.shape[0] - rows * _BLOCK) // 2
-    left = (grey.shape[1] - columns * _BLOCK) // 2
-    part = grey[top : top + rows * _BLOCK, left : left + columns * _BLOCK].astype(np.float32)
-    return part.reshape(rows, _BLOCK, columns, _BLOCK).swapaxes(1, 2).reshape(-1, _BLOCK, _BLOCK)
-
-
-def _windowed(blocks: np.ndarray) -> np.ndarray:
-    """Blocks minus their mean, faded out at the edges; otherwise the edges would correlate."""
-    fade = np.hanning(_BLOCK + 2)[1:-1].astype(np.float32)
-    return (blocks - blocks.mean(axis=(1, 2), keepdims=True)) * fade[:, None] * fade
