@@ -15,8 +15,8 @@ which has these images:
   codebook.
 
 Version 1 has evenly spaced levels between mins and maxs instead of codebooks. A scene of version 1
-is usually a folder; `read_sog` takes the path of its `meta.json`. The frame is that of the PLY
-files. Specification: developer.playcanvas.com, "The SOG Format".
+is usually a folder; `read_sog` takes the path of its `meta.json`. The coordinate frame is that of
+the PLY files. Specification: developer.playcanvas.com, "The SOG Format".
 """
 
 import io

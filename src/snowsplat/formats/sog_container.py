@@ -1,7 +1,7 @@
 """The members of a SOG scene: a zip file, or a folder with a `meta.json`.
 
-Declared sizes are compared with the size of the file before memory is allocated, and names are not
-trusted: members of a zip file are only looked up, and files outside of the folder are refused.
+Declared sizes are compared with the size of the file before memory is allocated. Names are not
+trusted: a name in a zip file is never used as a path, and a file outside of the folder is refused.
 """
 
 from __future__ import annotations

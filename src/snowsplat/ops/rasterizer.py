@@ -53,8 +53,8 @@ def rasterize(
     (Kerbl et al. 2023, section 6). Gradients flow to `background` and to every column of
     `splats.packed` except the radii.
 
-    With `capacity`, the CPU does not wait until a GPU has counted the instances. On a GPU,
-    gradients are summed with atomic operations, in no fixed order, unless
+    With `capacity`, the CPU does not wait until a GPU has counted the instances (see `Capacity`).
+    On a GPU, gradients are summed with atomic operations, in no fixed order, unless
     `torch.use_deterministic_algorithms` is set.
 
     Raises ValueError if shapes, dtypes or devices do not match.
@@ -76,8 +76,8 @@ def rasterize(
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
     """(H, W): the number of splats that `rasterize` composites into each pixel.
 
-    Splats with α < 1/255 in a pixel, and splats behind the one that finished the pixel, are not
-    counted.
+    Splats with α < 1/255 in a pixel are not counted. The splat that would make T < 1e-4 and all
+    splats behind it are not counted either.
 
     Raises ValueError if shapes or dtypes do not match.
     """

@@ -144,12 +144,13 @@ def resume(
     page: LivePage | None = None,
 ) -> TrainResult:
     """Continue a training run from its newest checkpoint. The result is the same as without the
-    interruption.
+    interruption (on a GPU: only with `Compute.deterministic`).
 
     Args:
         output: the folder of the training.
-        options: these may change the settings iterations, test_iterations and checkpoint_every, and
-            options that do not affect the result. All other options must be the same as before.
+        options: these may change ``minutes``, the settings iterations, test_iterations and
+            checkpoint_every, and options that do not affect the result. All other options must be
+            the same as before.
         dataset: where the photos are now, if they were moved. If there is no checkpoint yet, the
             training starts from this dataset.
 
@@ -240,7 +241,7 @@ class _Job:
         memory = self._memory(dataset, config, _gaussians_in(start))
         trainer = Trainer(dataset, memory.plan.config, schedule, self.device)
         trainer.load_state(start.tensors)
-        start.tensors.clear()  # the trainer has copied them, and the plan counts only one copy
+        start.tensors.clear()  # the trainer has a copy; the memory plan counts only this one
         self.out.write_config(settings, memory.plan.config)
         self.observer.note(_described(dataset))
         iterations = trainer.schedule.iterations
@@ -333,7 +334,8 @@ def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMe
     same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
     if same != config:
         raise _other_settings(start)
-    # A training run with a time budget may have exceeded its first plan.
+    # This is checked only if `iterations` is given: the checkpoint of a training run with a time
+    # budget has the number of the first plan, and the run may have done more steps.
     if options.iterations is not None and resumed.iterations < start.step:
         raise UserError(
             f"{start.path}: is from step {start.step}, after `iterations` {resumed.iterations}; "

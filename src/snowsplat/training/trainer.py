@@ -26,7 +26,8 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import interrupts_between_steps, single_threaded
 
-#: Other threads decode the photos for this number of steps in advance.
+#: The views of at least this number of future steps are known, so that other threads can decode
+#: their photos in advance.
 LOOKAHEAD = 16
 
 #: There is one random generator for each kind of random choice, so that additional choices of one
@@ -62,7 +63,8 @@ class Trainer:
         trainer.gaussians
 
     Between two steps, `state_tensors` is the complete state. A trainer that loads it produces
-    bit-identical results. Between two steps, `Schedule.stretch` may change the number of steps.
+    bit-identical results (on a GPU: only with `torch.use_deterministic_algorithms`).
+    Between two steps, `Schedule.stretch` may change the number of steps.
 
     Attributes:
         gaussians: the scene after ``step`` steps, on ``device``.

@@ -171,7 +171,7 @@ def write_model(
     images: Sequence[ColmapImage],
     points: PointRecords,
 ) -> None:
-    """Write cameras.bin, images.bin and points3D.bin; the arguments are those of `write_model`."""
+    """Write cameras.bin, images.bin and points3D.bin; see `model.write_model` for the arguments."""
     model_numbers = {name: number for number, (name, _) in enumerate(CAMERA_MODELS)}
     camera_records = [
         _CAMERA_HEAD.pack(key, model_numbers[camera.model], camera.width, camera.height)

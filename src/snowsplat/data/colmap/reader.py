@@ -153,10 +153,9 @@ def _pinhole(folder: Path, camera: ColmapCamera) -> tuple[float, float, float, f
     if focal_lengths is None or any(camera.params[focal_lengths + 2 :]):
         raise UserError(
             f"{folder}: its cameras have lens distortion (model {camera.model[:40]}), but "
-            "Gaussians are rendered without distortion; undistort the images first: put them into "
-            "NEW/input and the model into NEW/distorted/sparse/0, run snowsplat sfm -s NEW "
-            "--skip-matching, "
-            "then use NEW"
+            "Gaussians are rendered without distortion; undistort the images first: create a "
+            "folder NEW, put the images into NEW/input and the model into NEW/distorted/sparse/0, "
+            "run snowsplat sfm -s NEW --skip-matching, then use NEW"
         )
     f, (cx, cy) = camera.params[:focal_lengths], camera.params[focal_lengths : focal_lengths + 2]
     if not all(map(math.isfinite, (*f, cx, cy))) or min(f) <= 0 or max(*f, abs(cx), abs(cy)) > 1e9:

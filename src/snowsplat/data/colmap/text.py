@@ -150,7 +150,7 @@ def write_model(
     images: Sequence[ColmapImage],
     points: PointRecords,
 ) -> None:
-    """Write cameras.txt, images.txt and points3D.txt; the arguments are those of `write_model`."""
+    """Write cameras.txt, images.txt and points3D.txt; see `model.write_model` for the arguments."""
     # repr() of a float is the shortest text that reads back as the same number.
     camera_lines = [
         " ".join(map(str, (key, camera.model, camera.width, camera.height, *camera.params)))

@@ -21,7 +21,7 @@ namespace {
 
 constexpr int kValues = 128;          // of a descriptor
 constexpr int64_t kMostTasks = 64;    // bounds the memory: each task has its own results of columns
-constexpr int64_t kFewestTiles = 16;  // of a task below each other
+constexpr int64_t kFewestTiles = 16;  // rows of tiles of a task, at least
 
 #if defined(SNOWSPLAT_ISA_AVX512)
 typedef int32_t Lanes __attribute__((vector_size(64)));
@@ -36,14 +36,15 @@ SNOW_INLINE Lanes all(int32_t x) { return x - Lanes{}; }
 SNOW_INLINE Lanes larger(Lanes a, Lanes b) { return a > b ? a : b; }
 SNOW_INLINE Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }
 
-// How a 32-bit word of values is multiplied. `multiply_add` adds to each lane the dot product of
-// the values in the lanes of two words.
+// How 32-bit words, each with several values, are multiplied. Each lane holds one word.
+// `multiply_add` adds to each lane of `sum` the dot product of the word in this lane of `column`
+// and the word in this lane of `row`.
 //
 // Two 16-bit values per word. Works everywhere.
 struct Pairs {
   using Value = int16_t;
 #if defined(SNOWSPLAT_ISA_AVX512)
-  static constexpr int rows = 6, columns = 3;  // of a tile; columns in vectors
+  static constexpr int rows = 6, columns = 3;  // of a tile; columns are counted in vectors
 #else
   static constexpr int rows = 4, columns = 2;
 #endif
@@ -165,8 +166,8 @@ class Matcher {
     Lanes words[kWords][kColumns];
   };
 
-  // Columns beyond the last are 0. They are never found: a column with the same product precedes
-  // them.
+  // Columns beyond the last are 0, and so are their products. They are never found, because an
+  // earlier column has at least the same product.
   void pack_columns(int64_t block) {
     Columns& packed = columns_[size_t(block)];
     for (int column = 0; column < kWidth; column++) {

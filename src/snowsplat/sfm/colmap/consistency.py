@@ -3,18 +3,19 @@
 The mapper registers a photo if some of its matches agree with the points of the model. If two
 places look alike, it may register a photo, and then all following ones, at the wrong place. The
 reprojection error remains small, because the mapper drops the matches that disagree: photos that
-follow each other then have thousands of verified matches and share no points. Such a pair is a
-*tear*.
+follow each other then have thousands of verified matches and share no points. A pair whose verified
+matches the model contradicts is a *tear*.
 
 A right model has tears, too: its look-alike places have verified matches that are wrong. So a
 photo is judged by all of its matches. The photos are the nodes of a graph. The demand of an edge is
 the squared number of verified matches: photos taken side by side have many matches, and a few such
-pairs outweigh many weak ones, which may be false. The support of an edge is the part of its demand
-that the model confirms. If the photos of a model can be divided into two parts such that the model
-confirms little of the demand between them, the parts contradict each other (`find_parts`). This is
-the sparsest cut of the support relative to the demand. Its relaxation is a generalised eigenvalue
-problem (Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable constrained clustering: a
-generalized spectral method", AISTATS 2016).
+pairs outweigh many weak ones, which may be false. Matches of photos that follow each other count
+more (`CheckedPair.weight`). The support of an edge is the part of its demand that the model
+confirms. If the photos of a model can be divided into two parts such that the model confirms little
+of the demand between them, the parts contradict each other (`find_parts`). To find this division is
+the problem of the sparsest cut of the support relative to the demand. Its relaxation is a
+generalised eigenvalue problem (Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable
+constrained clustering: a generalized spectral method", AISTATS 2016).
 """
 
 from __future__ import annotations
@@ -34,16 +35,18 @@ from snowsplat.sfm.colmap.pairs import following, numbered_series
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
-# A photo of a pair, the point that each of its matched features observes, and their rays.
+# A photo of a pair, the point that each of its matched features observes, and the rays of these
+# features.
 _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 
 # Pairs with fewer verified matches are not evidence: random matches reach this number.
 _MIN_MATCHES = 50
 # A match is a hit if it became a point of both photos. It is a miss if a feature of it has a point
 # that is elsewhere in the other photo. The support of a pair is the share of hits among both; in a
-# right model, it is nearly 1. Matches that have no points are no evidence: far points and small
-# steps give no points. If fewer matches than this share are hits or misses, the support is 1 if at
-# least `_AGREEING` of the matches agree with the poses, otherwise 0.
+# right model, it is nearly 1. Matches that have no points are no evidence: far places and small
+# steps of the camera give no points. If the share of hits and misses among all matches is less than
+# `_EVIDENCE`, the poses decide: the support is 1 if at least the share `_AGREEING` of the matches
+# agrees with them, otherwise 0.
 _EVIDENCE = 0.05
 _AGREEING = 0.5
 # The model confirms a pair with at least this support, and contradicts it with at most `_TORN`.
@@ -54,14 +57,15 @@ _TORN = 0.3
 # captures with right poses, the model confirms all 678 pairs of this kind.
 _NEXT = 2
 _FOLLOWING = 20.0
-_ELSEWHERE = 4.0  # distance of a miss, in units of the largest distance from an epipolar line
-_MIN_ANGLE = 2.0  # degrees between two rays that may be parallel
+_ELSEWHERE = 4.0  # least distance of a miss, in units of the ``max_error`` of `check_pairs`
+_MIN_ANGLE = 2.0  # degrees: two rays with a smaller angle between them count as parallel
 # Two parts are cut apart if at most this share of the demand between them is confirmed …
 _MAX_SUPPORT = 0.5
-# … and at least this many pairs between them are tears. As many confirmed pairs with more matches
-# are stronger evidence: photos taken side by side have more matches than look-alikes.
+# … and at least this many pairs between them are tears. They are not cut apart if the same number
+# of confirmed pairs between them has at least as many matches: photos taken side by side have more
+# matches than look-alikes.
 _MIN_TEARS = 3
-_MIN_FOLLOWING_TEARS = 2  # the same if both photos of each pair follow each other
+_MIN_FOLLOWING_TEARS = 2  # the same if only pairs of photos that follow each other are counted
 _VECTORS = 6  # eigenvectors that are tried for a cut
 _THRESHOLDS = 10  # thresholds that are tried for each of them
 
@@ -271,10 +275,10 @@ def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
 class _Graph:
     """Symmetric (N, N) matrices without diagonal."""
 
-    demand: Floats  # the squared number of matches
-    support: Floats  # the confirmed part of it
-    torn: Floats  # the number of matches of tears
-    confirmed: Floats  # the number of matches of (partly) confirmed pairs
+    demand: Floats  # the squared `CheckedPair.weight`
+    support: Floats  # the confirmed part of the demand
+    torn: Floats  # the weight of tears, 0 for other pairs
+    confirmed: Floats  # the weight of confirmed pairs (`_CONFIRMED`), 0 for other pairs
     follows: NDArray[np.bool_]  # whether the photos follow each other
 
     def contradicts(self, one: Sequence[int], other: Sequence[int]) -> bool:
@@ -282,10 +286,10 @@ class _Graph:
         return self.contradiction(one, other) is not None
 
     def contradiction(self, one: Sequence[int], other: Sequence[int]) -> float | None:
-        """The confirmed share of the demand between two sets of photos, if it is a contradiction.
+        """The confirmed share of the demand between two sets of photos; None: no contradiction.
 
-        The pairs of photos that follow each other suffice, whatever the others show: if two whole
-        rooms look alike, hundreds of false pairs agree with each other.
+        The pairs of photos that follow each other suffice for a contradiction, whatever the other
+        pairs show: if two whole rooms look alike, hundreds of false pairs agree with each other.
         """
         across = np.ix_(one, other)
         follows = self.follows[across]
@@ -305,7 +309,7 @@ class _Graph:
 
 
 def _strongest(matches: Floats, count: int) -> float:
-    """The number of matches that ``count`` pairs have at least."""
+    """The ``count``-th largest of the entries; 0 if there are fewer."""
     ordered = np.sort(matches, axis=None)
     return float(ordered[-count]) if len(ordered) >= count else 0.0
 
@@ -345,7 +349,8 @@ def _grown(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
     """Candidates for one side of a cut: groups grown along the confirmed pairs, strongest first.
 
     Pairs of photos that follow each other come before all others. Groups that contradict each other
-    are not joined. The eigenvectors miss a part that many pairs link to the rest.
+    are not joined. This finds parts that the eigenvectors (`_cuts`) miss: those that many pairs
+    link to the rest.
     """
     group = {photo: [photo] for photo in photos}
     apart: set[tuple[int, int, int, int]] = set()

@@ -23,10 +23,11 @@ class Candidate:
 def choose(candidates: Sequence[Candidate], most: int) -> list[Candidate]:
     """At most ``most`` candidates, between which the picture moves by about the same amount.
 
-    This amount is the smallest step for which ``most`` candidates are enough. Each one is the
-    sharpest within half a step to a step after the one before, or the next one if there is none.
-    If fewer than ``most`` are needed, the longest steps are divided.
-    No step is longer than twice the longest step of the best possible choice.
+    This amount is the smallest step for which ``most`` candidates are enough. After a chosen
+    candidate, the next one is the sharpest of those that are half a step to a whole step farther;
+    if there are none, it is the first one beyond. If fewer than ``most`` are needed, the longest
+    steps are divided. No step is longer than twice the longest step of the best possible choice,
+    which is the one whose longest step is the shortest.
 
     Args:
         candidates: in the order of time; ``moved`` never decreases.
@@ -49,9 +50,9 @@ def choose(candidates: Sequence[Candidate], most: int) -> list[Candidate]:
 
 
 def _with_step(candidates: Sequence[Candidate], places: Sequence[float], step: float) -> list[int]:
-    """The positions in ``candidates`` that `choose` selects for one step."""
+    """The positions in ``candidates`` that `choose` selects if the step is ``step``."""
     chosen: list[int] = []
-    first, last = 0, places[0] - step / 2  # the next candidate, and the place of the one before
+    first, last = 0, places[0] - step / 2  # the next position, and the place of the last choice
     while first < len(candidates):
         nearest = bisect_right(places, last + step / 2, first)
         end = bisect_right(places, last + step, nearest)

@@ -1,9 +1,10 @@
 """Camera motion in a video: whether a frame shows a new view, and how far the picture has moved.
 
-All functions use small grey copies, (H, W) uint8. The shift of each block of a copy is estimated by
-phase correlation. The median over the blocks with texture is the motion, so neither a person who
-walks through the scene nor noise nor a change of light counts. Rotation and zoom shift most blocks
-too.
+All functions use small grey copies, (H, W) uint8. `PICTURE_SIDE` and `FRAME_SIDE` of
+`snowsplat.sfm.ingest.sharpness` are the longest sides of these copies. The shift of each block of a
+copy is estimated by phase correlation. The median over the blocks with texture is the motion, so
+neither a person who walks through the scene nor noise nor a change of light counts. Rotation and
+zoom shift most blocks too.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
-# Pixels of a copy of `PICTURE_SIDE`, 0.6% of its longest side. A static camera measures 0 or 1,
-# even with noise; a camera that is carried while walking measures 3 to 10 within 0.4 s.
+# Pixels of a copy of `PICTURE_SIDE`, 0.6% of its longest side. Measured: 0 or 1 for a static
+# camera, even with noise; 3 to 10 within 0.4 s for a camera that is carried while walking.
 _MOVED = 2.0
-_BLOCK = 32  # pixels: side of the blocks of the phase correlation; it measures up to half of it
+_BLOCK = 32  # pixels: side of a block; phase correlation measures shifts up to half of this side
 _LEAST_CONTRAST = 3.0  # standard deviation of the grey levels of a block with texture
 
 #: Longest side in pixels of the copies with which `PictureMotion` measures. Blocks of 32 pixels
@@ -60,8 +61,8 @@ class PictureMotion:
         It never decreases.
 
         Args:
-            grey: (H, W) uint8, a copy of `FRAME_SIDE`. All frames have the same size; a frame with
-                another size is a cut.
+            grey: (H, W) uint8, a copy of `FRAME_SIDE`. The frames of a video normally have the same
+                size. A change of the size counts as a cut.
         """
         height, width = grey.shape
         factor = max(1, min(max(grey.shape) // _MOTION_SIDE, min(grey.shape) // _BLOCK))
@@ -116,9 +117,10 @@ def _spectrum(blocks: np.ndarray) -> np.ndarray:
 
 
 def _shift(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """The shift between two frames in pixels, and the agreement; medians over at least one block.
+    """The shift between two frames in pixels, and the agreement; both are medians over the blocks.
 
-    The agreement, 0..1, is the share of the frequencies whose phases agree with the shift.
+    The agreement of a block, 0..1, is the share of the frequencies whose phases agree with the
+    shift. There must be at least one block.
 
     Args:
         first: (N, 32, 17) complex; ``second``: the spectra of the same blocks of another frame.

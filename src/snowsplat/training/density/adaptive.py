@@ -45,7 +45,8 @@ class AdaptiveDensity:
             0 disables this. Use 0 for forward-facing scenes, whose extent is small compared to
             their depth; otherwise most of the Gaussians would be removed.
         prune_screen_size: Gaussians with a larger 3σ radius, in pixels, are removed; 0 disables
-            this. Pruning by either size begins after the first opacity reset.
+            this. Pruning by either size begins after step ``opacity_reset_interval``; if that is 0,
+            Gaussians are never pruned by size.
         opacity_reset_interval: steps between opacity resets; 0 disables them. The last one is at
             least 500 steps before densification ends.
         reset_random_start: whether to reset opacity also at ``densify_from``, if training started

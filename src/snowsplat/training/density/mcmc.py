@@ -70,7 +70,7 @@ class McmcDensity:
         generator: torch.Generator,
         device: torch.device | None = None,
     ) -> McmcDensityControl:
-        """The initial state. It depends only on ``schedule`` and ``generator``.
+        """The initial state. Of the arguments, only ``schedule`` and ``generator`` are used.
 
         Raises:
             SettingError: ``max_gaussians`` is not positive.
