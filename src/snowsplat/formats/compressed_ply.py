@@ -14,8 +14,8 @@ packed_color     8, 8, 8, 8    r, g, b between the bounds of the chunk (0 to 1 i
 ===============  ============  ==================================================================
 
 The element ``sh`` has the properties f_rest_0, … of an uncompressed PLY. Each is one byte, which
-represents the range −4 to 4. The frame is that of the uncompressed PLY. The layout was taken from
-github.com/playcanvas/splat-transform (MIT).
+represents the range −4 to 4. The coordinate frame is that of the uncompressed PLY. The layout was
+taken from github.com/playcanvas/splat-transform (MIT).
 """
 
 from pathlib import Path

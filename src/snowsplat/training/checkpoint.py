@@ -1,4 +1,4 @@
-"""Checkpoints: the complete state of a training run; resuming gives a bit-identical result.
+"""Checkpoints: the complete state of a training run, from which it continues as if uninterrupted.
 
 A checkpoint is a set of named tensors (parameters, optimiser moments, random states, statistics,
 the order of the views) and a JSON value in one safetensors file, a format that contains only
