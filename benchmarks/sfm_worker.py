@@ -26,10 +26,14 @@ from snowsplat.util.errors import UserError
 _TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 _SAMPLE_SECONDS = 0.05
 _STAGES = {"photos": "decode", "images": "undistort", "report": "report"}
-# The stage "poses" consists of what its progress counts.
+# The items that the progress of the stage "poses" counts -> the name of the part in the tables.
+# Includes the names that earlier builds use for these items (`--versus`).
 _COUNTED = {
+    "photos with features": "features",
     "features": "features",
+    "matched pairs": "match",
     "compared pairs": "match",
+    "verified pairs": "match",
     "pairs": "match",
     "registered photos": "map",
 }

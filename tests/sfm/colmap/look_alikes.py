@@ -92,7 +92,7 @@ def write_database(path: Path, scene: Walk) -> Path:
 
 
 def model(scene: Walk, folded: bool) -> pycolmap.Reconstruction:
-    """The right model, or the one in which the far cameras are shifted to the near twins."""
+    """The correct model, or the one in which the far cameras are shifted to the near twins."""
     found = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, HEIGHT)
     found.add_camera_with_trivial_rig(camera)

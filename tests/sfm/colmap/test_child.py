@@ -87,7 +87,7 @@ def test_after_one_crash_it_is_repeated_with_less_effort(tmp_path, photos, numbe
     photos, killed = photos[:4], []
 
     def report(done, total, what):
-        if what == "pairs" and not killed:
+        if what == "verified pairs" and not killed:
             killed.append(True)
             kill_child(number)
 
@@ -98,7 +98,7 @@ def test_after_one_crash_it_is_repeated_with_less_effort(tmp_path, photos, numbe
 
 
 @needs_proc
-@pytest.mark.parametrize("what", ["features", "pairs", "registered photos"])
+@pytest.mark.parametrize("what", ["photos with features", "verified pairs", "registered photos"])
 def test_two_crashes_are_reported_in_one_line(tmp_path, photos, what):
     if what != "registered photos":  # the mapper needs time, so that it is killed before its end
         photos = photos[:3]
@@ -120,7 +120,7 @@ def test_interrupt_ends_the_child(tmp_path, photos):
     photos, seen = photos[:4], []
 
     def report(done, total, what):
-        if what == "pairs":
+        if what == "verified pairs":
             seen.extend(children_of(os.getpid()))
             raise KeyboardInterrupt
 
@@ -132,7 +132,7 @@ def test_interrupt_ends_the_child(tmp_path, photos):
 
 
 @needs_proc
-@pytest.mark.parametrize("what", ["features", "pairs", "registered photos"])
+@pytest.mark.parametrize("what", ["photos with features", "verified pairs", "registered photos"])
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_child_ends_with_a_killed_parent(tmp_path, photos, what, number):
     # The mapper needs time, so that the parent is killed before its end.

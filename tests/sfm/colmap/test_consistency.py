@@ -108,7 +108,7 @@ def test_photos_that_follow_each_other_outweigh_two_equal_rooms():
     assert find_parts(pairs(in_order=True)) == [set(range(1, 21)), set(range(21, 41))]
 
 
-def test_look_alikes_in_a_right_model_cut_nothing():
+def test_look_alikes_in_a_correct_model_cut_nothing():
     """Two places with many false matches between them; the model confirms the way between them."""
     pairs = chain(range(1, 31))
     pairs += [CheckedPair(i, j, 300, 0) for i in range(1, 6) for j in range(26, 31)]
@@ -126,7 +126,7 @@ def test_little_evidence_cuts_nothing():
 def test_matches_that_agree_with_the_poses_are_no_tears():
     """Points too far away to be triangulated: the pairs have no points."""
     pairs = [
-        CheckedPair(p.first, p.second, p.matches, p.shared, 0.9 if p.share < 0.1 else 0.0)
+        CheckedPair(p.first, p.second, p.matches, p.shared, 0.9 if p.hit_share < 0.1 else 0.0)
         for p in folded()
     ]
     assert len(find_parts(pairs)) == 1

@@ -79,14 +79,14 @@ def test_result_fits_json(done):
 def test_progress_has_all_steps_in_order(done):
     calls = done[3]
     assert list(dict.fromkeys(what for _, _, what in calls)) == [
-        "features",
-        "compared pairs",
-        "pairs",
+        "photos with features",
+        "matched pairs",
+        "verified pairs",
         "registered photos",
     ]
     assert all(0 <= done <= total for done, total, _ in calls)
-    assert (10, 10, "features") in calls
-    assert (45, 45, "pairs") in calls
+    assert (10, 10, "photos with features") in calls
+    assert (45, 45, "verified pairs") in calls
     assert calls[-1] == (10, 10, "registered photos")
 
 
@@ -253,12 +253,12 @@ def test_features_and_matches_are_reused(tmp_path, pictures):
     estimate_poses(tmp_path, photos, DRAFT, silent)
     calls = []
     estimate_poses(tmp_path, photos, DRAFT, lambda *call: calls.append(call))
-    assert calls[0] == (3, 3, "features")
-    assert next(call for call in calls if call[2] == "pairs") == (3, 3, "pairs")
+    assert calls[0] == (3, 3, "photos with features")
+    assert next(call for call in calls if call[2] == "verified pairs") == (3, 3, "verified pairs")
     # A changed photo is noticed.
     scenes.save(tmp_path, photos[0].name, pictures[5])
     calls.clear()
     estimate_poses(tmp_path, photos, DRAFT, lambda *call: calls.append(call))
-    assert calls[0] == (0, 3, "features")
+    assert calls[0] == (0, 3, "photos with features")
     with closing(connect(tmp_path / "distorted" / "database.db")) as connection:
         assert connection.execute("SELECT COUNT(*) FROM images").fetchone() == (3,)

@@ -72,7 +72,7 @@ def test_many_photos_are_matched_with_similar_ones():
     assert "similar" in choice.description
 
 
-def test_numbered_photos_are_matched_with_the_next_ones_by_name():
+def test_numbered_photos_are_matched_with_the_next_photos_by_name():
     """The order is that of the numbers, not of the text, and each prefix is a series of its own."""
     names = [f"walk/IMG_{i}.JPG" for i in range(2, 102)] + [f"other{i}.png" for i in range(100)]
     photos = [
@@ -83,7 +83,7 @@ def test_numbered_photos_are_matched_with_the_next_ones_by_name():
     chosen, overlap = set(choice.pairs), EFFORT.overlap // 2
     assert all((i, i + step) in chosen for i in range(90) for step in range(1, overlap + 1))
     assert all((i, i + 1) in chosen for i in range(100, 199))
-    assert "next ones by name" in choice.description
+    assert "next photos by name" in choice.description
     assert len(choice.pairs) <= 200 * (EFFORT.neighbours + overlap)
 
 

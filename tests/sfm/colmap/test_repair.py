@@ -1,4 +1,4 @@
-"""Photos in a wrong place are found, placed anew, or left out with a reason."""
+"""Photos in a wrong place are found, registered again, or left out with a reason."""
 
 import sqlite3
 from contextlib import closing
@@ -15,7 +15,7 @@ from snowsplat.sfm.colmap.features import Folders, WorkerProgress
 from snowsplat.sfm.colmap.mapping import Mapping
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
 from snowsplat.sfm.colmap.pairs import PairChoice
-from snowsplat.sfm.colmap.reconstruct import Matched, Reconstruction
+from snowsplat.sfm.colmap.reconstruct import Matched, PoseEstimation
 from snowsplat.sfm.colmap.repair import _false_links, repair
 from snowsplat.sfm.progress import silent
 
@@ -50,8 +50,8 @@ def largest_centre_error(model, scene):
     return float((similarity_from_points(found, truth).apply(found) - truth).norm(dim=1).max())
 
 
-def test_a_right_model_is_not_changed(mapping, scene):
-    """The look-alikes are tears of the right model, but the other matches confirm the places."""
+def test_a_correct_model_is_not_changed(mapping, scene):
+    """The look-alikes are tears of the correct model, but the other matches confirm the places."""
     model = look_alikes.model(scene, folded=False)
     before = state_of(model)
     pairs = check_pairs(model, mapping.database, 4.0)
@@ -62,13 +62,16 @@ def test_a_right_model_is_not_changed(mapping, scene):
     assert (repaired.contradicting, repaired.left_out, repaired.description) == (0, {}, "")
 
 
-def test_a_folded_part_is_placed_anew(mapping, scene):
+def test_a_folded_part_is_registered_again(mapping, scene):
     model = look_alikes.model(scene, folded=True)
     assert largest_centre_error(model, scene) > 5
     repaired = repair(model, mapping, 4.0)
     assert repaired.contradicting == len(FAR)
     assert repaired.left_out == {}
-    assert repaired.description == "7 contradicted their matches: 7 placed again, 0 left out"
+    assert (
+        repaired.description
+        == "the poses of 7 contradicted their matches: 7 registered again, 0 left out"
+    )
     assert set(repaired.model.reg_image_ids()) == set(range(1, look_alikes.COUNT + 1))
     assert largest_centre_error(repaired.model, scene) < 0.05
 
@@ -94,7 +97,7 @@ def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):
     assert state_of(first)[0] == state_of(second)[0]
 
 
-def test_a_part_that_cannot_be_placed_is_left_out_with_a_reason(mapping, scene, monkeypatch):
+def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(mapping, scene, monkeypatch):
     monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
@@ -103,7 +106,10 @@ def test_a_part_that_cannot_be_placed_is_left_out_with_a_reason(mapping, scene, 
     assert reason.startswith("it was, with 6 other photos, in a place that its matches contradict")
     assert "09.png" in reason
     assert "but only 0 points in common" in reason
-    assert repaired.description == "7 contradicted their matches: 0 placed again, 7 left out"
+    assert (
+        repaired.description
+        == "the poses of 7 contradicted their matches: 0 registered again, 7 left out"
+    )
 
 
 def test_photos_that_the_mapper_drops_are_named(mapping, scene, monkeypatch, tmp_path):
@@ -136,13 +142,14 @@ def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_pa
     monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
     progress = WorkerProgress(silent, lambda *table: None)
     photos = look_alikes.photos()
-    job = Reconstruction(Folders(tmp_path), photos, SfmOptions(), 1, progress)
+    job = PoseEstimation(Folders(tmp_path), photos, SfmOptions(), 1, progress)
     choice = PairChoice(sorted(scene.matches), "neighbours")
     job._try("as configured", Matched(mapping.database, EFFORTS["draft"], choice, 1.0), "global")
     assert job.attempts[0].registered == len(photos) - len(FAR)
     assert len(job.attempts[0].left_out) == len(FAR)
     assert job.log[0].endswith(
-        "9 of 16 photos registered; 7 contradicted their matches: 0 placed again, 7 left out"
+        "9 of 16 photos registered; the poses of 7 contradicted their matches: "
+        "0 registered again, 7 left out"
     )
 
 

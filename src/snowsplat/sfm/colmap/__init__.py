@@ -3,9 +3,12 @@
 child        starts the child process and handles its end
 worker       the child process, in which COLMAP runs
 reconstruct  repeated attempts, until enough photos have a pose
-features, pairs, retrieval, mapping   the steps of an attempt, on the COLMAP `database`
-consistency, repair   find photos in a wrong place after mapping, and place them again
+pairs, retrieval   choose the pairs of photos to match
+features, matching   detect features and match them
+mapping      estimates poses and points from the matches in the COLMAP `database`
+consistency, repair   find photos in a wrong place after mapping, and register them again
 diagnosis    explains why photos have no pose
+result, check_model   statistics of models; reading models from unknown sources
 """
 
 from snowsplat.sfm.colmap.child import estimate_poses

@@ -2,9 +2,9 @@
 
     python -m snowsplat.sfm.colmap.check_model FOLDER BYTES
 
-COLMAP does not check the counts in its files. With a damaged count it may allocate all memory or
-run for hours. Therefore the child process has a time limit and a limit of BYTES of additional
-memory, and only the child process fails.
+COLMAP does not check the counts in its files. With a damaged count, it may allocate all memory or
+run for hours. Therefore it reads the model in a child process, which has a time limit and a limit
+of BYTES of additional memory.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ from pathlib import Path
 from snowsplat.sfm.colmap.child import child_environment
 
 _SECONDS = 10.0  # time to start Python and COLMAP
-_BYTES_A_SECOND = 1_000_000  # a low estimate of the reading speed
-_MEMORY = 1 << 30  # bytes of address space, for a model of any size
-_RATIO = 16  # additional bytes of address space per byte of the files
+_BYTES_PER_SECOND = 1_000_000  # a low estimate of the reading speed
+_MEMORY = 1 << 30  # bytes of address space that a model of any size may need
+_MEMORY_PER_BYTE = 16  # bytes of address space that are added for each byte of the files
 
 
 def can_be_read(folder: Path) -> bool:
-    """Whether COLMAP reads the model in ``folder`` within limits that depend on its size."""
+    """Whether COLMAP can read the model in ``folder``, within limits of time and memory.
+
+    The limits depend on the size of the files.
+    """
     size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
-    limit = _MEMORY + _RATIO * size
+    limit = _MEMORY + _MEMORY_PER_BYTE * size
     try:
         done = subprocess.run(
             [sys.executable, "-m", __name__, str(folder), str(limit)],
@@ -32,7 +35,7 @@ def can_be_read(folder: Path) -> bool:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env=child_environment(1),
-            timeout=_SECONDS + size / _BYTES_A_SECOND,
+            timeout=_SECONDS + size / _BYTES_PER_SECOND,
         )
     except subprocess.TimeoutExpired:
         return False

@@ -22,7 +22,7 @@ from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import SettingError, UserError
 
-# Bytes that a growing database may need for its next transaction.
+# Bytes by which the database may grow in one transaction.
 _DATABASE_GROWTH = 8_000_000
 _MODULE = "snowsplat.sfm.colmap.worker"
 _POLL_SECONDS = 0.5
@@ -50,11 +50,12 @@ def estimate_poses(
 ) -> SfmResult:
     """Estimate the pose of each photo in ``input/`` of a dataset, and points of the scene.
 
-    Writes ``distorted/sparse/N`` (0 has the most photos), with distorted cameras, at an arbitrary
-    scale and orientation; ``distorted/database.db``; and ``distorted/colmap.log``, the output of
-    COLMAP. Features and matches of an interrupted run are reused. The same photos and settings
-    lead to the same pairs and matches, and to the same poses except for rounding. With more than
-    150 photos, the coordinate frame may differ, too.
+    Writes three things. ``distorted/sparse/N`` are the models (0 has the most photos); the cameras
+    include the lens distortion, and scale and orientation are arbitrary.
+    ``distorted/database.db`` contains the features and matches. ``distorted/colmap.log`` is the
+    output of COLMAP. Features and matches of an interrupted run are reused. The same photos and
+    settings lead to the same pairs and matches, and to the same poses except for rounding. With
+    more than 150 photos, the coordinate frame may differ, too.
 
     Raises:
         UserError: fewer than 3 photos, an unknown camera model, no poses found (the message
@@ -99,7 +100,10 @@ def estimate_poses(
 
 
 def _check_disk(folder: Path) -> None:
-    """Raises OSError if files in ``folder`` cannot grow, which is the likely cause of a crash."""
+    """Raises OSError if there is no space for a larger file in ``folder``.
+
+    In this case, the full disk is the likely cause of the crash.
+    """
     try:
         largest = max(path.stat().st_size for path in folder.iterdir())
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -170,7 +174,8 @@ def _communicate(
             if "watch" in answer:
                 _report_rows(report, *answer["watch"])
             continue
-        if line is None or not line.endswith("\n"):  # the child has ended, perhaps within a line
+        # If the child has ended, the last line may be incomplete.
+        if line is None or not line.endswith("\n"):
             break
         answer = json.loads(line)
         if "progress" in answer:
@@ -184,7 +189,7 @@ def _communicate(
 def _report_rows(report: Report, database: str, table: str, total: int, what: str) -> None:
     address = f"{Path(database).as_uri()}?mode=ro"
     with (
-        contextlib.suppress(sqlite3.Error),  # the database is locked: rows are counted next time
+        contextlib.suppress(sqlite3.Error),  # if the database is locked, rows are counted later
         contextlib.closing(sqlite3.connect(address, uri=True)) as connection,
     ):
         (rows,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
@@ -196,8 +201,8 @@ def child_environment(threads: int) -> dict[str, str]:
 
     COLMAP uses ``threads`` threads there.
     """
-    # The child imports modules from the same places as this process, from a checkout or a wheel,
-    # but not from the current folder.
+    # The child imports modules from the same places as this process (a checkout or an installed
+    # wheel), but not from the current folder.
     paths: Sequence[str] = [os.path.abspath(path) for path in sys.path if path]
     return {
         **os.environ,

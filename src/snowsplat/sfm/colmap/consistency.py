@@ -1,21 +1,24 @@
-"""Finds photos that a model has in a wrong place, from matches that did not become points.
+"""Finds photos that a model has in a wrong place, from matches that were not triangulated.
+
+docs/cameras.md describes the method with examples.
 
 The mapper registers a photo if some of its matches agree with the points of the model. If two
-places look alike, it may register a photo, and then all following ones, at the wrong place. The
-reprojection error remains small, because the mapper drops the matches that disagree: photos that
-follow each other then have thousands of verified matches and share no points. A pair whose verified
-matches the model contradicts is a *tear*.
+places look alike, it may register a photo, and then all following photos, at the wrong place. The
+reprojection error remains small, because the mapper drops the matches that disagree with the poses.
+Two photos that were taken one after the other may then have thousands of verified matches, but no
+point in common. A pair of photos whose verified matches contradict the model is a *tear*.
 
-A right model has tears, too: its look-alike places have verified matches that are wrong. So a
-photo is judged by all of its matches. The photos are the nodes of a graph. The demand of an edge is
-the squared number of verified matches: photos taken side by side have many matches, and a few such
-pairs outweigh many weak ones, which may be false. Matches of photos that follow each other count
-more (`CheckedPair.weight`). The support of an edge is the part of its demand that the model
-confirms. If the photos of a model can be divided into two parts such that the model confirms little
-of the demand between them, the parts contradict each other (`find_parts`). To find this division is
-the problem of the sparsest cut of the support relative to the demand. Its relaxation is a
-generalised eigenvalue problem (Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable
-constrained clustering: a generalized spectral method", AISTATS 2016).
+Correct models have tears, too: places that look alike have verified matches that are false. So a
+photo is judged by all of its matches. The photos are the nodes of a graph, and each pair with
+verified matches is an edge. The *demand* of an edge is the squared number of its matches: photos
+taken side by side have many matches, and a few such pairs outweigh many weak ones, which may be
+false. Matches of photos that follow each other count more (`CheckedPair.weight`). The *support* of
+an edge is the part of its demand that the model confirms. If the photos of a model can be divided
+into two parts such that the model confirms little of the demand between them, the parts contradict
+each other (`find_parts`). The best division is the sparsest cut of the graph: the cut with the
+least ratio of support to demand. This problem is relaxed to a generalised eigenvalue problem
+(Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable constrained clustering: a
+generalized spectral method", AISTATS 2016).
 """
 
 from __future__ import annotations
@@ -35,84 +38,89 @@ from snowsplat.sfm.colmap.pairs import following, numbered_series
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
-# A photo of a pair, the point that each of its matched features observes, and the rays of these
-# features.
+# One photo of a pair: the image, the id of the point that each matched feature observes, and the
+# positions (M, 2) of these features in the normalised image plane.
 _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 
-# Pairs with fewer verified matches are not evidence: random matches reach this number.
+# Pairs with fewer verified matches are ignored: random matches reach this number.
 _MIN_MATCHES = 50
-# A match is a hit if it became a point of both photos. It is a miss if a feature of it has a point
-# that is elsewhere in the other photo. The support of a pair is the share of hits among both; in a
-# right model, it is nearly 1. Matches that have no points are no evidence: far places and small
-# steps of the camera give no points. If the share of hits and misses among all matches is less than
-# `_EVIDENCE`, the poses decide: the support is 1 if at least the share `_AGREEING` of the matches
-# agrees with them, otherwise 0.
-_EVIDENCE = 0.05
-_AGREEING = 0.5
-# The model confirms a pair with at least this support, and contradicts it with at most `_TORN`.
+# A match is a hit if its two features observe the same point of the model. It is a miss if one of
+# its features observes a point whose projection into the other photo is far from the matched
+# feature. The support of a pair is hits / (hits + misses); in a correct model, it is nearly 1.
+# Matches whose features observe no point count as neither: the mapper creates no points for
+# surfaces that are too far away, or from photos that are too close together. If less than the share
+# `_MIN_COUNTED` of the matches are hits or misses, the poses decide: the support is 1 if at least
+# the share `_MIN_AGREEING` of the matches agrees with the poses (`agreement`), otherwise 0.
+_MIN_COUNTED = 0.05
+_MIN_AGREEING = 0.5
+# The model confirms a pair if its support is at least `_CONFIRMED`, and contradicts it if its
+# support is at most `_TORN`.
 _CONFIRMED = 0.8
 _TORN = 0.3
-# Matches of photos whose places in the series of names differ by at most `_NEXT` count `_FOLLOWING`
-# times: such photos were usually taken side by side, so their matches are rarely false. In five
-# captures with right poses, the model confirms all 678 pairs of this kind.
-_NEXT = 2
-_FOLLOWING = 20.0
-_ELSEWHERE = 4.0  # least distance of a miss, in units of the ``max_error`` of `check_pairs`
+# Two photos follow each other if their positions in a series of names (`numbered_series`) differ by
+# at most `_MAX_STEP`. Such photos were usually taken side by side, so their matches are rarely
+# false, and each match counts as `_FOLLOWING_WEIGHT` matches. In five datasets with correct poses,
+# the model confirms all 678 pairs of this kind.
+_MAX_STEP = 2
+_FOLLOWING_WEIGHT = 20.0
+_MIN_MISS_DISTANCE = 4.0  # in units of the ``max_error`` of `check_pairs`
 _MIN_ANGLE = 2.0  # degrees: two rays with a smaller angle between them count as parallel
-# Two parts are cut apart if at most this share of the demand between them is confirmed …
+# Two parts contradict each other if at most the share `_MAX_SUPPORT` of the demand between them is
+# confirmed, and if the `_MIN_TEARS` strongest tears between them are stronger than the confirmed
+# pairs between them: the tear at this rank has more matches than the confirmed pair at this rank.
+# (Photos taken side by side have more matches than photos of places that look alike.)
 _MAX_SUPPORT = 0.5
-# … and at least this many pairs between them are tears. They are not cut apart if the same number
-# of confirmed pairs between them has at least as many matches: photos taken side by side have more
-# matches than look-alikes.
 _MIN_TEARS = 3
-_MIN_FOLLOWING_TEARS = 2  # the same if only pairs of photos that follow each other are counted
-_VECTORS = 6  # eigenvectors that are tried for a cut
-_THRESHOLDS = 10  # thresholds that are tried for each of them
+_MIN_FOLLOWING_TEARS = 2  # instead, if only pairs of photos that follow each other are counted
+_VECTORS = 6  # number of eigenvectors that are tried
+_THRESHOLDS = 10  # number of thresholds that are tried for each eigenvector
 
 
 @dataclass(frozen=True)
 class CheckedPair:
-    """Two photos with a pose and verified matches, and what became of these matches.
+    """Two registered photos, and how many of their verified matches agree with the model.
 
     ``first`` and ``second`` are image ids of the database, ``first`` < ``second``.
     """
 
     first: int
     second: int
-    matches: int  # verified matches
-    shared: int  # matches whose two features observe the same point of the model
+    matches: int  # number of verified matches
+    shared: int  # number of hits: matches whose two features observe the same point of the model
     agreeing: float = 0.0  # share of the matches that agree with the poses, if computed
-    missing: float = 0.0  # share of misses, if computed
-    follows: bool = False  # the photos follow each other by name, at most `_NEXT` apart
+    miss_share: float = 0.0  # share of the matches that are misses, if computed
+    follows: bool = False  # whether the photos follow each other by name (`_MAX_STEP`)
 
     @property
     def weight(self) -> float:
-        """The number of matches, as evidence: those of photos that follow each other count more."""
-        return self.matches * (_FOLLOWING if self.follows else 1.0)
+        """The number of matches; those of photos that follow each other count several times."""
+        return self.matches * (_FOLLOWING_WEIGHT if self.follows else 1.0)
 
     @property
-    def share(self) -> float:
-        """The share of the verified matches that became points."""
+    def hit_share(self) -> float:
+        """The share of the matches that are hits."""
         return self.shared / self.matches
 
     @property
     def support(self) -> float:
-        """How far the model confirms the matches: 0 (it contradicts them) … 1."""
-        hits, misses = self.share, self.missing
-        if hits + misses >= _EVIDENCE:
+        """How far the model confirms the matches: from 0 (it contradicts them) to 1."""
+        hits, misses = self.hit_share, self.miss_share
+        if hits + misses >= _MIN_COUNTED:
             return hits / (hits + misses)
-        return float(self.agreeing >= _AGREEING)
+        return float(self.agreeing >= _MIN_AGREEING)
 
     @property
     def torn(self) -> bool:
-        """Whether the model contradicts the matches."""
+        """Whether the pair is a tear: the model contradicts its matches."""
         return self.matches >= _MIN_MATCHES and self.support <= _TORN
 
 
 def check_pairs(
     model: pycolmap.Reconstruction, database: Path, max_error: float
 ) -> list[CheckedPair]:
-    """Compare each verified pair of photos in ``model`` with the poses and points of the model.
+    """Compare the verified matches of each pair of photos with the poses and points of ``model``.
+
+    Pairs are sorted by their image ids. Only photos with a pose are considered.
 
     ``max_error`` in pixels is the largest distance of a verified match from its epipolar line.
     """
@@ -147,12 +155,12 @@ def check_pairs(
                 both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
                 error = max_error / float(focal)
                 sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
-                missed = _misses(positions, sides[0], sides[1], _ELSEWHERE * error)
-                missed |= _misses(positions, sides[1], sides[0], _ELSEWHERE * error)
+                missed = _misses(positions, sides[0], sides[1], _MIN_MISS_DISTANCE * error)
+                missed |= _misses(positions, sides[1], sides[0], _MIN_MISS_DISTANCE * error)
                 pair = replace(
                     pair,
                     agreeing=agreement(pose, *both, error),
-                    missing=float(np.mean(missed & ~is_shared)),
+                    miss_share=float(np.mean(missed & ~is_shared)),
                 )
             checked.append(pair)
     return checked
@@ -161,12 +169,12 @@ def check_pairs(
 def _pairs_in_order(database: pycolmap.Database) -> set[tuple[int, int]]:
     """The image ids (first < second) of the pairs of photos that follow each other by name."""
     names = {image.image_id: image.name for image in database.read_all_images()}
-    steps = range(1, _NEXT + 1)
+    steps = range(1, _MAX_STEP + 1)
     return set().union(*(following(series, steps) for series in numbered_series(names)))
 
 
 def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
-    """(features,) the id of the point that each feature observes, or the invalid id."""
+    """(features,) the id of the point that each feature observes, or ``INVALID_POINT3D_ID``."""
     points = image.points2D
     ids = np.full(len(points), pycolmap.INVALID_POINT3D_ID, np.uint64)
     for row in image.get_observation_point2D_idxs():
@@ -192,9 +200,11 @@ class _Positions:
 
 
 def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -> NDArray[np.bool_]:
-    """(M,) whether the feature of ``one`` has a point that is elsewhere in the photo of ``other``.
+    """(M,) whether the feature in ``one`` observes a point that is far from the one in ``other``.
 
-    ``max_error``: the largest distance from the matched feature in the normalised image plane.
+    The point is projected into the photo of ``other``. ``max_error`` is the largest distance of the
+    projection from the matched feature that is not a miss, in the normalised image plane. A point
+    behind the camera of ``other`` is a miss.
     """
     _, ids, _ = one
     image, _, rays = other
@@ -213,11 +223,15 @@ def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -
 def agreement(
     cam2_from_cam1: pycolmap.Rigid3d, rays1: Floats, rays2: Floats, max_error: float
 ) -> float:
-    """Share of the matches that agree with a relative pose, whether or not they became points.
+    """Share of the matches that agree with a relative pose, whether or not they were triangulated.
 
-    Such a match is on its epipolar line, and its rays meet in front of both cameras or are nearly
-    parallel. ``rays1`` and ``rays2``: (M, 2) the matched features in the normalised image planes of
-    the two cameras. ``max_error``: the largest Sampson distance, in the same unit.
+    A match agrees if its Sampson distance is at most ``max_error``, and if its two rays meet in
+    front of both cameras or are nearly parallel.
+
+    Args:
+        rays1, rays2: (M, 2) positions of the matched features in the normalised image planes of the
+            two cameras.
+        max_error: in the unit of the normalised image plane.
     """
     rotation, translation = cam2_from_cam1.rotation.matrix(), cam2_from_cam1.translation
     x, y, z = translation
@@ -240,8 +254,9 @@ def agreement(
 def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
     """The parts of a model that contradict each other: sets of image ids.
 
-    The first part is the largest one, with all photos that do not contradict it; so a model without
-    contradictions is one part. Photos without evidence are in no part.
+    The first part is the largest one, and includes all parts that do not contradict it; so a model
+    without contradictions is one part. Photos that have no pair with at least `_MIN_MATCHES`
+    matches are in no part.
     """
     pairs = [pair for pair in pairs if pair.matches >= _MIN_MATCHES]
     ids = sorted({i for pair in pairs for i in (pair.first, pair.second)})
@@ -273,12 +288,12 @@ def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
 
 @dataclass(frozen=True)
 class _Graph:
-    """Symmetric (N, N) matrices without diagonal."""
+    """The pairs of N photos as symmetric (N, N) matrices; the diagonals are zero."""
 
     demand: Floats  # the squared `CheckedPair.weight`
     support: Floats  # the confirmed part of the demand
-    torn: Floats  # the weight of tears, 0 for other pairs
-    confirmed: Floats  # the weight of confirmed pairs (`_CONFIRMED`), 0 for other pairs
+    torn: Floats  # `CheckedPair.weight` of tears, 0 for other pairs
+    confirmed: Floats  # `CheckedPair.weight` of confirmed pairs (`_CONFIRMED`), 0 for other pairs
     follows: NDArray[np.bool_]  # whether the photos follow each other
 
     def contradicts(self, one: Sequence[int], other: Sequence[int]) -> bool:
@@ -286,9 +301,10 @@ class _Graph:
         return self.contradiction(one, other) is not None
 
     def contradiction(self, one: Sequence[int], other: Sequence[int]) -> float | None:
-        """The confirmed share of the demand between two sets of photos; None: no contradiction.
+        """The confirmed share of the demand between two sets of photos that contradict each other.
 
-        The pairs of photos that follow each other suffice for a contradiction, whatever the other
+        None if they do not. Pairs of photos that follow each other are also examined on their own.
+        If these pairs contradict the model, the sets contradict each other, whatever the other
         pairs show: if two whole rooms look alike, hundreds of false pairs agree with each other.
         """
         across = np.ix_(one, other)
@@ -309,13 +325,16 @@ class _Graph:
 
 
 def _strongest(matches: Floats, count: int) -> float:
-    """The ``count``-th largest of the entries; 0 if there are fewer."""
+    """The ``count``-th largest entry; 0 if there are fewer entries."""
     ordered = np.sort(matches, axis=None)
     return float(ordered[-count]) if len(ordered) >= count else 0.0
 
 
 def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
-    """The connected components of a symmetric (N, N) matrix of links: sorted rows."""
+    """The connected components of a graph with N nodes, as sorted lists of nodes.
+
+    ``linked``: (N, N) symmetric, whether two nodes have an edge.
+    """
     left = set(range(len(linked)))
     components = []
     while left:
@@ -329,9 +348,12 @@ def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
 
 
 def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
-    """Cut the photos until no part contradicts itself."""
+    """Divide photos into parts, until no part can be divided into two that contradict each other.
+
+    Of all candidates, the division with the smallest confirmed share of the demand is used.
+    """
     best = None
-    for one in itertools.chain(_grown(graph, photos), _cuts(graph, photos)):
+    for one in itertools.chain(_grown_groups(graph, photos), _sweep_cuts(graph, photos)):
         inside = set(one)
         other = [i for i in photos if i not in inside]
         share = graph.contradiction(one, other)
@@ -345,12 +367,13 @@ def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
             yield from _split(graph, [part[i] for i in component])
 
 
-def _grown(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
-    """Candidates for one side of a cut: groups grown along the confirmed pairs, strongest first.
+def _grown_groups(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
+    """Candidates for one side of a cut: groups of photos that pairs with support join.
 
-    Pairs of photos that follow each other come before all others. Groups that contradict each other
-    are not joined. This finds parts that the eigenvectors (`_cuts`) miss: those that many pairs
-    link to the rest.
+    Each photo starts as a group. The pairs are processed in the order of their confirmed weight,
+    the largest first; pairs of photos that follow each other come before all others. Each pair
+    joins the groups of its two photos, unless these groups contradict each other. This finds parts
+    that `_sweep_cuts` does not find: those that many pairs link to the rest.
     """
     group = {photo: [photo] for photo in photos}
     apart: set[tuple[int, int, int, int]] = set()
@@ -372,8 +395,12 @@ def _grown(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
         yield from (sorted(members) for members in groups.values())
 
 
-def _cuts(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
-    """Candidates for one side of the sparsest cut of ``photos``: sweeps over eigenvectors."""
+def _sweep_cuts(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
+    """Candidates for one side of the sparsest cut of ``photos``: sweep cuts of eigenvectors.
+
+    The photos are sorted by their entries in an eigenvector. A candidate consists of the first
+    photos in this order; the numbers of photos with the least ratio of support to demand are tried.
+    """
     count = len(photos)
     if count < 2:
         return
@@ -381,8 +408,9 @@ def _cuts(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
     demand, support = graph.demand[rows], graph.support[rows]
     scale = demand.sum() / count
     ones = np.ones((count, count)) / count
-    # The constant vector solves the problem with the value 0; the second term makes its value 2,
-    # greater than all others, which are between 0 and 1.
+    # The eigenvalue problem is L(support) v = λ L(demand) v, where L is the Laplacian. A constant v
+    # is a useless solution. Adding `ones` to L(demand) makes this matrix invertible. Adding twice
+    # `ones` to L(support) gives the constant v the eigenvalue 2; all others are between 0 and 1.
     above = _laplacian(support) / scale + 2 * ones
     below = _laplacian(demand) / scale + ones
     inverse = np.linalg.inv(np.linalg.cholesky(below))
@@ -404,15 +432,19 @@ def _laplacian(weights: Floats) -> Floats:
 
 
 def _cut_weights(weights: Floats, order: Ints) -> Floats:
-    """(N − 1,) weight between the first k and the other photos of ``order``, for each k."""
+    """(N − 1,) sum of the weights between the first k and the other photos of ``order``, each k."""
     sorted_weights = weights[np.ix_(order, order)]
-    # Photo k leaves the other side: its links to the first ones are no longer cut, the others are.
+    # When photo k joins the first photos, its edges to them are not cut any more, and its edges to
+    # the other photos are cut.
     before = np.tril(sorted_weights).sum(1)
     return np.cumsum(sorted_weights.sum(1) - 2 * before)[:-1]
 
 
 def _merged(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
-    """Join parts that the model confirms to belong together, the most strongly linked first."""
+    """Join parts with support between them that do not contradict each other.
+
+    The two parts with the largest support between them are joined first.
+    """
     parts = [sorted(part) for part in parts]
     while True:
         best = None

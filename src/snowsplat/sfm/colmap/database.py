@@ -1,8 +1,9 @@
 """The COLMAP database of a dataset: features and matches, reused after an interrupted run.
 
-Photo number i of the list has image id and frame id i + 1. The ids do not depend on the timing of
-threads, so the same photos always lead to the same database. The database stores a fingerprint of
-photos and settings. Its features and matches are reused only if the fingerprint is unchanged.
+The photo with index i in the list of photos has the image id i + 1 and the frame id i + 1. The ids
+do not depend on the timing of threads, so the same photos always lead to the same database. The
+database stores a fingerprint of the photos and settings. Its features and matches are reused only
+if the fingerprint is unchanged.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.ingest.photo import Photo
 
-# With fewer photos the eight parameters of OPENCV are not well determined.
+# With fewer photos, the eight parameters of the camera model OPENCV are not well determined.
 MIN_PHOTOS_FOR_OPENCV = 8
-# Initial focal length without EXIF, as a multiple of the longest side: a 29 mm lens on 35 mm film.
-# This is between the values of a phone's photos and of its cropped videos. The focal length is then
-# refined together with the poses.
+# Initial focal length of photos without EXIF, divided by the longest side: that of a 29 mm lens on
+# 35 mm film. It is between the values for the photos of a phone and for its videos, which are
+# cropped. The focal length is then refined together with the poses.
 GUESSED_FOCAL = 0.8
 
 _PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
@@ -43,12 +44,13 @@ class Pair:
 
 
 def open_database(path: Path, photos: list[Photo], camera_model: str, fingerprint: str) -> None:
-    """Open or create the database ``path`` of ``photos``; keep features and matches if valid.
+    """Make the database ``path`` ready for ``photos``; keep its features and matches if valid.
 
-    Features and matches are valid if the database is intact and has the same ``fingerprint``. Names
-    and cameras are always rewritten, because features do not depend on the camera model.
+    They are valid if the database is not damaged and has the same ``fingerprint``. Otherwise, a new
+    database is created. Names and cameras are always rewritten, because the features do not depend
+    on the camera model.
     """
-    if not _is_sound(path, fingerprint):
+    if not _is_valid(path, fingerprint):
         remove_database(path)
         with closing_database(path) as database:
             _write_photos(database, photos, camera_model)
@@ -78,9 +80,10 @@ def replace_database(path: Path, by: Path) -> None:
 
 
 def copy_for_mapping(path: Path, target: Path, without: Iterable[tuple[int, int]]) -> None:
-    """Copy what the mapper reads to ``target``: not the descriptors and the unverified matches.
+    """Copy the part of the database that the mapper reads to ``target``.
 
-    The verified matches of the pairs ``without`` (two image ids each) are not copied either.
+    The mapper does not need the descriptors and the matches before verification. The verified
+    matches of the pairs ``without`` (two image ids each) are not copied either.
     """
     remove_database(target)
     ids = [(pycolmap.image_pair_to_pair_id(*pair),) for pair in sorted(without)]
@@ -110,7 +113,7 @@ def closing_database(path: Path) -> Iterator[pycolmap.Database]:
 
 
 def fingerprint_of(images: Path, photos: list[Photo], settings: object) -> str:
-    """A hash of everything that features and matches depend on: photo files and settings."""
+    """A hash of all that features and matches depend on: files, settings, version of pycolmap."""
     files = [(images / photo.name).stat() for photo in photos]
     facts = [
         pycolmap.__version__,
@@ -123,13 +126,13 @@ def fingerprint_of(images: Path, photos: list[Photo], settings: object) -> str:
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
 
-def _is_sound(path: Path, fingerprint: str) -> bool:
+def _is_valid(path: Path, fingerprint: str) -> bool:
     if not path.is_file():
         return False
     try:
         with closing(sqlite3.connect(path)) as connection:
             found = connection.execute("SELECT fingerprint FROM snowsplat").fetchall()
-            # COLMAP does not sync to disk: after a power failure the file may be damaged.
+            # COLMAP does not sync the file to disk, so it may be damaged after a power failure.
             return found == [(fingerprint,)] and connection.execute(
                 "PRAGMA quick_check"
             ).fetchall() == [("ok",)]
@@ -159,7 +162,7 @@ def _write_photos(database: pycolmap.Database, photos: list[Photo], camera_model
 
 
 def _camera_key(photo: Photo) -> tuple[str, int, int]:
-    # All photos of a group should have one size. If not, they need separate cameras.
+    # Photos of a group normally have the same size. If not, they need separate cameras.
     return photo.group, photo.width, photo.height
 
 
@@ -211,7 +214,7 @@ def feature_counts(path: Path, photo_count: int) -> list[int]:
 
 
 def verified_pairs(path: Path) -> list[Pair]:
-    """All pairs with matches consistent with a relative pose, also those with few matches."""
+    """All pairs that have at least one verified match (consistent with a relative pose)."""
     flat = {
         int(config)
         for name, config in pycolmap.TwoViewGeometryConfiguration.__members__.items()
@@ -230,8 +233,9 @@ def verified_pairs(path: Path) -> list[Pair]:
 def trim_features(path: Path, limit: int) -> None:
     """Keep the ``limit`` largest features of each photo.
 
-    The time for matching is quadratic in the number of features. The limit of COLMAP itself is only
-    approximate: it keeps complete octaves, which may be four times as many features.
+    The time for matching is quadratic in the number of features. COLMAP's own limit
+    (``max_num_features``) is only approximate: it keeps complete octaves, which may contain four
+    times as many features.
     """
     with closing(sqlite3.connect(path)) as connection:
         query = "SELECT image_id FROM keypoints WHERE rows > ?"
@@ -256,13 +260,15 @@ def _read_rows(
 
 
 def _largest(keypoints: NDArray[np.float32], count: int) -> NDArray[np.intp]:
-    # The columns after x, y are an affine shape. Its determinant is the squared scale.
+    # The columns after x and y are the matrix of the affine shape. Its determinant is the squared
+    # scale of the feature.
     scale = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     return np.argsort(-scale, kind="stable")[:count]
 
 
 def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
-    """(≤ limit, 128) float32 descriptors of a photo: those of its largest features."""
+    """(K, 128) float32 descriptors of the photo with this index, of its K ≤ ``limit`` largest
+    features."""
     with closing_database(path) as database:
         if not database.exists_descriptors(index + 1):
             return np.zeros((0, 128), np.float32)
@@ -276,8 +282,9 @@ def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
 def displacement_of(path: Path, pairs: Sequence[Pair]) -> float:
     """Typical distance in pixels between the positions of a match in the two photos.
 
-    This is the 90% quantile over the pairs of the median over the matches of a pair. The quantile
-    is high because in a slow video the frames of many pairs are nearly equal.
+    For each pair, this is the median over its matches; of these medians, it is the 90% quantile. A
+    lower quantile would be nearly zero in a slow video, where the frames of many pairs are nearly
+    equal.
     """
     medians = []
     with closing_database(path) as database:

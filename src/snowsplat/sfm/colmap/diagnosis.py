@@ -17,12 +17,12 @@ from snowsplat.util.errors import UserError
 
 # A photo with fewer features is too dark, blurred or plain.
 _FEW_FEATURES = 60
-# A pair of photos with fewer matches is too weak to estimate a pose.
+# A pair of photos with fewer verified matches is too weak to estimate a pose from it.
 _WEAK_PAIR = 50
 # Nearly every sharp photo has more features than this.
 _MANY_FEATURES = 500
-# If the displacement of the matches is smaller, the camera did not move. The unit is the longest
-# side of the photo.
+# If the displacement of the matches, divided by the longest side of the photo, is smaller, the
+# camera did not move.
 _STILL = 0.01
 # If at least this fraction of all matches fits a plane or a pure rotation, depth is undetermined.
 _FLAT_SHARE = 0.8
@@ -33,17 +33,17 @@ class Evidence:
     """The data about the photos that the COLMAP database contains after matching."""
 
     features: list[int]  # number of features of each photo
-    pairs: list[Pair]  # the pairs with consistent matches
+    pairs: list[Pair]  # the pairs with verified matches
     # Typical displacement of a match between two photos, relative to the longest side; None if
     # there are no matches.
     displacement: float | None
-    compared: int  # number of pairs that were matched
+    matched: int  # number of pairs that were matched, with or without success
 
     @property
-    def compared_all(self) -> bool:
+    def matched_all(self) -> bool:
         """Whether every photo was matched with every other photo."""
         count = len(self.features)
-        return self.compared >= count * (count - 1) // 2
+        return self.matched >= count * (count - 1) // 2
 
     @property
     def usable(self) -> int:
@@ -52,9 +52,10 @@ class Evidence:
         Such a photo has enough features, and other photos show the same scene.
         """
         paired = {i for pair in self.pairs for i in (pair.first, pair.second)}
-        # If all pairs were matched, a photo with many features but no match shows another scene.
-        # With fewer features, or if some pairs were not matched, more effort may find matches.
-        no_match_limit = _MANY_FEATURES if self.compared_all else float("inf")
+        # If all pairs were matched, a photo with many features but no verified match shows another
+        # scene. With fewer features, or if some pairs were not matched, another attempt with more
+        # effort may find matches.
+        no_match_limit = _MANY_FEATURES if self.matched_all else float("inf")
         return sum(
             count >= _FEW_FEATURES and (i in paired or count < no_match_limit)
             for i, count in enumerate(self.features)
@@ -79,14 +80,14 @@ class Evidence:
         return self.usable < 3
 
 
-def gather_evidence(database: Path, photos: Sequence[Photo], compared: int) -> Evidence:
-    """Read the database after matching; ``compared`` is the number of matched pairs."""
+def gather_evidence(database: Path, photos: Sequence[Photo], matched: int) -> Evidence:
+    """Read the database after matching; ``matched`` is the number of pairs that were matched."""
     pairs = verified_pairs(database)
     size = max(max(photo.width, photo.height) for photo in photos)
     # About 100 evenly chosen pairs are enough.
     some = pairs[:: max(1, len(pairs) // 100)]
     displacement = displacement_of(database, some) / size if some else None
-    return Evidence(feature_counts(database, len(photos)), pairs, displacement, compared)
+    return Evidence(feature_counts(database, len(photos)), pairs, displacement, matched)
 
 
 def explain(
@@ -97,8 +98,9 @@ def explain(
 ) -> dict[str, str]:
     """Why photos have no pose: name -> reason, for each photo that is not in the first model.
 
-    ``models`` has the names of the photos in each model, the largest model first. ``left_out`` has
-    the reasons of photos that had a pose and lost it (`repair`).
+    Args:
+        models: the names of the photos in each model, the largest model first.
+        left_out: name -> reason, for photos that had a pose in a wrong place (`repair`).
     """
     partners: list[list[int]] = [[] for _ in photos]
     for pair in evidence.pairs:
@@ -108,11 +110,11 @@ def explain(
     for photo, features, matches in zip(photos, evidence.features, partners, strict=True):
         if photo.name in models[0]:
             continue
-        part = next((model for model in models[1:] if photo.name in model), None)
+        other_model = next((model for model in models[1:] if photo.name in model), None)
         if photo.name in left_out:
             reason = left_out[photo.name]
-        elif part is not None:
-            reason = f"it is in a separate group of {len(part)} photos"
+        elif other_model is not None:
+            reason = f"it is in a separate group of {len(other_model)} photos"
         elif features < _FEW_FEATURES:
             reason = f"it shows hardly any detail ({features} features): too dark, blurred or plain"
         elif not matches:
@@ -136,7 +138,7 @@ def failure(evidence: Evidence) -> UserError:
     paired = {i for pair in evidence.pairs for i in (pair.first, pair.second)}
     if usable < 3:
         return UserError(
-            f"photos: only {usable} of {count} show enough detail, the others are too dark, "
+            f"photos: only {usable} of {count} show enough detail, and the others are too dark, "
             "blurred or plain; take sharp, well-lit photos of objects with texture"
         )
     if len(paired) < 3:
@@ -155,8 +157,8 @@ def failure(evidence: Evidence) -> UserError:
             "walk around a scene that has depth"
         )
     return UserError(
-        f"photos: no camera poses were found for the {count} photos, their matches are too "
-        "few or inconsistent; take more photos, with smaller steps between them"
+        f"photos: no camera poses were found for the {count} photos, because their matches are "
+        "too few or inconsistent; take more photos, with smaller steps between them"
     )
 
 

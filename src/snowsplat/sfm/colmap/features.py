@@ -1,4 +1,4 @@
-"""Detects features in the photos and matches them, into the COLMAP database."""
+"""Detects features in the photos, matches them, and writes both into the COLMAP database."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import Report
 from snowsplat.util import native_library
 
-# Number of pairs that are processed before the results are written to the database. A kill loses at
-# most this many pairs. The progress increases in steps of this number.
+# Number of pairs that are matched or verified before the results are written to the database. If
+# the process is killed, at most this many pairs have to be processed again. The progress increases
+# in steps of this number.
 _PAIRS_PER_BLOCK = 64
 
 # Number of photos whose descriptors are kept in memory while pairs are matched.
@@ -65,10 +66,10 @@ class Folders:
 class WorkerProgress:
     """The functions with which the worker sends its progress to the parent process.
 
-    ``report`` sends a number of finished items. ``watch`` names a table of the database: the parent
-    process then counts the rows that COLMAP writes into it. The worker must not count them. COLMAP
-    contains its own copy of SQLite, and two copies of SQLite in one process break each other's
-    locks on a database that both have open.
+    ``report`` sends a number of finished items. ``watch`` sends the name of a table of the
+    database: the parent process then counts the rows that COLMAP writes into this table. The worker
+    must not count them itself: COLMAP contains its own copy of SQLite, and if two copies of SQLite
+    in one process have a database open, each removes the locks of the other.
     """
 
     report: Report
@@ -83,14 +84,14 @@ def extract_features(
     threads: int,
     progress: WorkerProgress,
 ) -> None:
-    """Detect the features of photos that have none in ``database`` yet."""
+    """Detect features in all photos that have none in ``database`` yet, and write them there."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = effort.image_size
     options.num_threads = threads
     options.use_gpu = False
     options.sift.max_num_features = effort.features
     options.sift.first_octave = effort.first_octave
-    with _counted(database, "keypoints", len(photos), "features", progress):
+    with _progress_of_rows(database, "keypoints", len(photos), "photos with features", progress):
         # If a mask folder is set, COLMAP skips photos without a mask. They need a separate call.
         for masked in (False, True):
             names = [photo.name for photo in photos if photo.mask == masked]
@@ -118,10 +119,11 @@ def match_pairs(
     threads: int,
     progress: WorkerProgress,
 ) -> None:
-    """Match the features of those ``pairs`` that are not in the database yet.
+    """Match and verify those ``pairs`` that are not in the database yet.
 
-    A pair consists of two indices of photos. ``max_error`` in pixels is the largest distance of a
-    match from its epipolar line. COLMAP verifies the matches that it finds in the database.
+    A pair consists of two indices of photos. The matches are written to the database first, and
+    COLMAP then only verifies them. ``max_error`` is the largest distance of a verified match from
+    its epipolar line, in pixels of the photos in ``input/``.
     """
     _write_matches(database, pairs, threads, progress.report)
     options = pycolmap.FeatureMatchingOptions()
@@ -133,12 +135,13 @@ def match_pairs(
     pairing = pycolmap.ImportedPairingOptions()
     pairing.block_size = _PAIRS_PER_BLOCK
     pairing.match_list_path = database.with_suffix(".pairs")
-    # The file with the pairs separates names by blanks, and the name of a photo may contain blanks.
-    # Therefore the images are temporarily named by numbers.
+    # COLMAP reads the pairs from a file in which spaces separate the names, and the name of a photo
+    # may contain spaces. Therefore the images temporarily have numbers as names.
     set_names(database, [str(i) for i in range(len(photos))])
     Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
     try:
-        with _counted(database, "two_view_geometries", len(pairs), "pairs", progress):
+        table = "two_view_geometries"
+        with _progress_of_rows(database, table, len(pairs), "verified pairs", progress):
             pycolmap.match_image_pairs(
                 database,
                 matching_options=options,
@@ -162,21 +165,22 @@ def _write_matches(path: Path, pairs: list[tuple[int, int]], threads: int, repor
                 return np.zeros((0, LENGTH), np.uint8)
             return np.asarray(database.read_descriptors(index + 1).data).reshape(-1, LENGTH)
 
-        left = [(i, j) for i, j in pairs if not database.exists_matches(i + 1, j + 1)]
-        for start in range(0, len(left), _PAIRS_PER_BLOCK):
-            report(len(pairs) - len(left) + start, len(pairs), "compared pairs")
+        remaining = [(i, j) for i, j in pairs if not database.exists_matches(i + 1, j + 1)]
+        for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
+            report(len(pairs) - len(remaining) + start, len(pairs), "matched pairs")
             transaction = pycolmap.DatabaseTransaction(database)
-            for i, j in left[start : start + _PAIRS_PER_BLOCK]:
+            for i, j in remaining[start : start + _PAIRS_PER_BLOCK]:
                 matches = match_descriptors(descriptors(i), descriptors(j))
                 database.write_matches(i + 1, j + 1, matches)
-            del transaction  # ends it
+            del transaction  # the destructor ends the transaction
 
 
 @contextmanager
-def _counted(
+def _progress_of_rows(
     database: Path, table: str, total: int, what: str, progress: WorkerProgress
 ) -> Iterator[None]:
-    # COLMAP has the database open inside the with block; see `WorkerProgress`.
+    """Report the number of rows of a table while COLMAP writes them, inside the with block."""
+    # The rows can be counted here only before COLMAP opens the database; see `WorkerProgress`.
     progress.report(min(count_rows(database, table), total), total, what)
     progress.watch(str(database), table, total, what)
     yield

@@ -1,4 +1,4 @@
-"""Estimates camera poses and points from matches, and removes unreliable ones."""
+"""Estimates camera poses and points from matches, and removes unreliable poses and points."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ from snowsplat.sfm.progress import Report
 # A camera that sees fewer points has no reliable pose.
 MIN_POINTS = 15
 MIN_PHOTOS = 3
-# At the end, observations with a larger reprojection error are removed. The unit is a pixel of the
-# scaled photo in which the features were detected.
+# At the end, observations with a larger reprojection error are removed. In pixels of the resized
+# photo in which the features were detected.
 _MAX_REPROJECTION_ERROR = 3.0
 # With several threads, the result of COLMAP's mapper depends on their timing. The initial pair and
 # therefore the coordinate frame may differ, and all poses differ a little. With up to this number
 # of photos, several threads are not faster than one. Then one thread is used, and the poses are the
 # same in every run.
 _MANY_PHOTOS = 150
-# With at least this number of photos, the whole model is adjusted less often: after it has grown by
-# 40% (default of COLMAP: 10%), and then once (at most 5 times) with at most 20 iterations. Between
-# these adjustments, each new photo and its neighbours are adjusted, as with fewer photos.
+# With at least this number of photos, global bundle adjustment runs less often: when the model has
+# grown by 40% (default of COLMAP: 10%). It then runs once (default of COLMAP: up to 5 times), with
+# at most 20 iterations. Local bundle adjustment runs after each new photo, as with fewer photos.
 _LARGE_MODEL = 40
 _GROWTH = 1.4
 _ITERATIONS = 20
-# Bundle adjustment ends when an iteration reduces the cost by less than this share: of the new
-# photo and its neighbours, of the growing model, and of the result. By default, COLMAP goes on
-# until the gradient is small. For the result, this takes 2.6 times as long and changes no camera of
-# fox_photos by more than 3e-6 of the extent of the scene.
+# Bundle adjustment ends when an iteration reduces the cost by less than this share. There is one
+# share for local and one for global bundle adjustment in the mapper, and one for the final bundle
+# adjustment of the result. By default, COLMAP goes on until the gradient is small. In the final
+# bundle adjustment, this takes 2.6 times as long and changes no camera of fox_photos by more than
+# 3e-6 of the extent of the scene.
 _LOCAL_TOLERANCE = 1e-4
 _GLOBAL_TOLERANCE = 1e-5
 _FINAL_TOLERANCE = 1e-6
-_MIN_ANGLE = 1.5  # degrees between the rays of a point
+_MIN_ANGLE = 1.5  # degrees: smallest triangulation angle of a point
 
 
 @dataclass(frozen=True)
@@ -53,22 +54,23 @@ class Mapping:
     report: Report
 
     def run(self, mapper: Mapper, relaxed: bool = False) -> list[pycolmap.Reconstruction]:
-        """Estimate cameras and points; returns the models, the one with the most photos first.
+        """Estimate poses and points; returns the models, the one with the most photos first.
 
-        ``relaxed``: accept weaker matches than COLMAP does by default (incremental only).
+        ``relaxed``: accept weaker matches than COLMAP does by default (incremental mapper only).
         """
         if mapper == "global":
             models = self._map_globally()
         else:
             models = self._map_incrementally(self._options(relaxed), start=None)
-        return usable([self._refine(model) for model in models])
+        return usable_models([self._refine(model) for model in models])
 
     def extend(
         self, models: list[pycolmap.Reconstruction], relaxed: bool = True
     ) -> list[pycolmap.Reconstruction]:
-        """Try to add photos to the first of ``models``; ``relaxed``: accept weaker matches.
+        """Try to add photos to the first of ``models``, and return all models.
 
-        Photos of the other models are tried, too, so that separate groups may be joined.
+        Photos of the other models are tried, too, so that separate models may be joined. If no
+        photo can be added, ``models`` are returned unchanged. ``relaxed`` as in `run`.
         """
         grown = self._map_incrementally(self._options(relaxed), start=models[0])
         if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():
@@ -76,12 +78,15 @@ class Mapping:
         refined = self._refine(grown[0])
         if refined.num_reg_images() <= models[0].num_reg_images():
             return models
-        return usable([refined, *models[1:]])
+        return usable_models([refined, *models[1:]])
 
     def without(
         self, model: pycolmap.Reconstruction, photos: Iterable[int]
     ) -> pycolmap.Reconstruction:
-        """``model`` with no poses for ``photos`` (image ids), adjusted; changes ``model``."""
+        """Remove the poses of ``photos`` (image ids) from ``model``, and run bundle adjustment.
+
+        Changes ``model`` and returns it.
+        """
         observations = pycolmap.ObservationManager(model)
         for image_id in sorted(photos):
             observations.deregister_frame(model.image(image_id).frame_id)
@@ -121,30 +126,30 @@ class Mapping:
         start: pycolmap.Reconstruction | None,
     ) -> list[pycolmap.Reconstruction]:
         total = count_rows(self.database, "images")
-        placed = 0
+        registered = 0
 
         def begin() -> None:
-            nonlocal placed
-            placed = 2 if start is None else start.num_reg_images()
-            self.report(placed, total, "registered photos")
+            nonlocal registered
+            registered = 2 if start is None else start.num_reg_images()
+            self.report(registered, total, "registered photos")
 
         def step() -> None:
-            nonlocal placed
-            placed += 1
-            self.report(min(placed, total), total, "registered photos")
+            nonlocal registered
+            registered += 1
+            self.report(min(registered, total), total, "registered photos")
 
         with self._output() as output:
-            begun = ""
+            start_path = ""
             if start is not None:
-                begun = str(output / "start")
+                start_path = str(output / "start")
                 (output / "start").mkdir()
-                start.write(begun)
+                start.write(start_path)
             models = pycolmap.incremental_mapping(
                 self.database,
                 self.images,
                 output,
                 options,
-                input_path=begun,
+                input_path=start_path,
                 initial_image_pair_callback=begin,
                 next_image_callback=step,
             )
@@ -165,7 +170,7 @@ class Mapping:
 
     @contextmanager
     def _output(self) -> Iterator[Path]:
-        # COLMAP writes each model when it is found. `write_models` writes all of them at once.
+        """A temporary folder, into which COLMAP writes each model as soon as it is complete."""
         output = self.database.with_suffix(".models")
         shutil.rmtree(output, ignore_errors=True)
         output.mkdir()
@@ -175,7 +180,10 @@ class Mapping:
             shutil.rmtree(output, ignore_errors=True)
 
     def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """Remove outliers and cameras with few points, and run bundle adjustment; twice."""
+        """Twice: remove outliers and cameras with few points, then run bundle adjustment.
+
+        Changes ``model`` and returns it.
+        """
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.ceres.solver_options.num_threads = self.threads
@@ -194,20 +202,24 @@ class Mapping:
         return model
 
 
-def usable(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """``models``, the largest first, without those whose photos are all in larger models."""
+def usable_models(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """``models``, the one with the most photos first.
+
+    Models with fewer than `MIN_PHOTOS` photos, and those whose photos are all in larger models, are
+    left out.
+    """
     kept: list[pycolmap.Reconstruction] = []
-    placed: set[int] = set()
+    covered: set[int] = set()
     for model in sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D())):
         photos = set(model.reg_image_ids())
-        if len(photos) >= MIN_PHOTOS and photos - placed:
+        if len(photos) >= MIN_PHOTOS and photos - covered:
             kept.append(model)
-            placed |= photos
+            covered |= photos
     return kept
 
 
 def write_models(models: list[pycolmap.Reconstruction], sparse: Path) -> None:
-    """Write the models as ``sparse/0``, ``sparse/1`` …, replacing the folder at once."""
+    """Write the models as ``sparse/0``, ``sparse/1`` …; replaces the whole folder."""
     temporary = sparse.with_name(f".{sparse.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     for number, model in enumerate(models):

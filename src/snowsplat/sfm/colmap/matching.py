@@ -1,4 +1,4 @@
-"""Matches of SIFT descriptors: exact nearest neighbours, the ratio test and the cross check.
+"""Matches SIFT descriptors by exact nearest neighbours, the ratio test and the cross check.
 
 The criteria are those of COLMAP's exact matching on the CPU. This module is imported by the child
 process of COLMAP, so it does not import torch.
@@ -19,20 +19,20 @@ from snowsplat.util import native_library
 from snowsplat.util.native_layout import Params, layout_of
 from snowsplat.util.native_library import ArrayPointer
 
-#: Values of a descriptor.
+#: Number of values of a descriptor.
 LENGTH = 128
 
-_MAX_ANGLE = np.float32(0.7)  # radians between the descriptors of a match
-_MAX_RATIO = np.float32(0.8)  # of the angles to the nearest and the second nearest descriptor
-_NORM = 512  # Euclidean norm of a descriptor, apart from rounding
+_MAX_ANGLE = np.float32(0.7)  # radians between the two descriptors of a match
+_MAX_RATIO = np.float32(0.8)  # angle to the nearest descriptor / angle to the second nearest
+_NORM = 512  # Euclidean norm of a uint8 descriptor, except for rounding
 
 
 class Nearest(NamedTuple):
-    """For each of N descriptors, the two nearest ones of another photo, each (N,) int32."""
+    """For each of N descriptors, the two nearest descriptors of another photo; all (N,) int32."""
 
-    which: NDArray[np.int32]  # index of the nearest; of equally near ones, the smallest
-    best: NDArray[np.int32]  # its dot product with the descriptor
-    second: NDArray[np.int32]  # the dot product of the second nearest; 0 if there is none
+    which: NDArray[np.int32]  # index of the nearest; the smallest index if several are equally near
+    best: NDArray[np.int32]  # dot product of the descriptor and the nearest
+    second: NDArray[np.int32]  # dot product with the second nearest; 0 if there is none
 
 
 @dataclass(slots=True, kw_only=True)
@@ -60,8 +60,8 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
 
     A row of the result has an index into ``first`` and one into ``second``, ascending in the first.
     Two descriptors match if each is the nearest one of the other, the angle between them is at most
-    0.7, and this angle is less than 0.8 times that to the second nearest descriptor, in both
-    directions (Lowe 2004, section 7.1).
+    0.7 rad, and this angle is less than 0.8 times the angle to the second nearest descriptor, in
+    both directions (Lowe 2004, section 7.1).
 
     Raises:
         ValueError: a wrong shape or dtype.
@@ -77,7 +77,7 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
 
 
 def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Nearest, Nearest]:
-    """The nearest of ``second`` (M, 128) for each of ``first`` (N, 128), and the other direction.
+    """The nearest of ``second`` (M, 128) for each of ``first`` (N, 128), and vice versa.
 
     The nearest descriptor is the one with the largest dot product. If there are no descriptors in
     which to search, indices and dot products are -1. The results are exact.
@@ -123,7 +123,7 @@ def _function() -> Callable[[int], Any]:
 
 
 def _accepted(nearest: Nearest) -> NDArray[np.int32]:
-    """The index of the nearest descriptor, or -1 where it is too far or not distinctive."""
+    """(N,) the index of the nearest descriptor, or -1 where the angle or the ratio is too large."""
     angle, second = (_angle(product) for product in (nearest.best, nearest.second))
     return np.where(
         (angle <= _MAX_ANGLE) & (angle < _MAX_RATIO * second), nearest.which, np.int32(-1)

@@ -48,24 +48,26 @@ class SfmResult:
     observations: int
     reprojection_error: float  # pixels of the photos in input/, mean over points
     sub_models: list[int]  # number of photos of each model, largest first
-    cameras: list[dict[str, Any]]  # model, width, height, params, focal_from, images
-    pairs: str  # how pairs of photos were chosen
-    attempts: list[str]  # a description of each attempt, in order
+    # For each camera: model, width, height, params, focal_from ("exif" or "guessed") and images,
+    # the number of photos.
+    cameras: list[dict[str, Any]]
+    pairs: str  # how the pairs of photos to match were chosen, as text for users
+    attempts: list[str]  # a description of each attempt, as text for users, in order
 
 
 @dataclass(frozen=True)
 class Effort:
     """The parameters of an effort level: features per photo and pairs to match."""
 
-    image_size: int  # pixels of the longest side at which features are detected
+    image_size: int  # longest side in pixels; larger photos are resized before feature detection
     features: int  # approximate number per photo
-    first_octave: int  # -1: also detect small, precise features in the photo enlarged twice
+    first_octave: int  # of SIFT; -1: the photo is enlarged to twice its size, for small features
     exhaustive: int  # up to this number of photos, all pairs are matched
     overlap: int  # number of following frames with which a frame of a video is matched
-    neighbours: int  # number of similar photos with which a photo is matched
+    neighbours: int  # number of similar or near photos with which a photo is matched
 
     def stronger(self) -> Effort:
-        """More features and pairs, for photos without enough matches; about 4 times the work."""
+        """An effort with more features and pairs, for a further attempt; about 4 times the work."""
         return dataclasses.replace(
             self,
             image_size=self.image_size * 3 // 2,
@@ -77,7 +79,7 @@ class Effort:
         )
 
     def reduced(self) -> Effort:
-        """An effort that needs about a third of the memory, for a second run after a crash."""
+        """An effort that needs about a third of the memory, to repeat a run after a crash."""
         return dataclasses.replace(
             self,
             image_size=self.image_size * 2 // 3,

@@ -2,14 +2,14 @@
 
     few photos           all pairs
     frames of a video    each frame with the next frames, with later frames at growing distances,
-                         and with frames that look similar. The latter close loops: the camera
-                         was at the same place at two different times
+                         and with frames that look similar. Similar frames close loops: the camera
+                         comes back to a place where it was before
     photos with GPS      each photo with the nearest photos, and with some that look similar
     many photos          each photo with those that look similar. A photo with a number in its name
                          is also paired with the photos that have the next numbers, which were
                          usually taken directly after it
 
-If several rules apply, all of them are used, so that all groups of photos are connected.
+If several rules apply, all of them are used, so that all photos are connected by pairs.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from snowsplat.sfm.colmap.retrieval import nearest
 from snowsplat.sfm.ingest.photo import Photo
 
 _METRES_PER_DEGREE = 111_320.0
-# Share of `Effort.neighbours` that is used if the order in time or GPS already determines most
-# pairs.
+# Share of `Effort.neighbours` that is used for similar photos if all photos already have pairs from
+# one video or from GPS.
 _LOOP_SHARE = 0.4
 # Share of `Effort.overlap` that is used for photos with numbered names. Such photos are farther
-# apart than the frames of a video, and the photos that look similar usually include the next ones.
+# apart than the frames of a video, and the next photos are usually among the similar ones anyway.
 _NUMBERED_SHARE = 0.5
 _NUMBERED_NAME = re.compile(r"(.*?)([0-9]+)\.[^./]*")
 
@@ -52,7 +52,8 @@ def choose_pairs(
 ) -> PairChoice:
     """Choose the pairs to match.
 
-    ``similarity`` returns the visual similarity of the photos, (N, N). It is called only if needed.
+    ``similarity`` returns the visual similarity of the photos (`retrieval.similarity`), (N, N). It
+    is called only if needed.
     """
     count = len(photos)
     if count <= effort.exhaustive:
@@ -64,31 +65,32 @@ def choose_pairs(
     if sequences:
         for sequence in sequences:
             pairs |= _pairs_along(sequence, effort.overlap)
-        rules.append("frames of a video with the following ones")
+        rules.append("frames of a video with the following frames")
     overlap = round(_NUMBERED_SHARE * effort.overlap)
     names = {i: photo.name for i, photo in enumerate(photos) if photo.sequence is None}
     numbered = [following(series, range(1, overlap + 1)) for series in numbered_series(names)]
     if numbered:
         pairs |= set().union(*numbered)
-        rules.append("photos with the next ones by name")
+        rules.append("photos with the next photos by name")
     located = [i for i, photo in enumerate(photos) if photo.location is not None]
     if len(located) > effort.neighbours:
         places = _positions_in_metres(np.array([photos[i].location for i in located]))
         pairs |= {
             (located[i], located[j]) for i, j in nearest(-_distances(places), effort.neighbours)
         }
-        rules.append("photos with the nearest by GPS")
+        rules.append("photos with the nearest photos by GPS")
     covered = len(located) == count or sum(map(len, sequences)) == count
     share = _LOOP_SHARE if covered else 1.0
     pairs |= _similar_pairs(photos, similarity(), round(share * effort.neighbours), effort.overlap)
-    rules.append("photos with similar ones")
+    rules.append("photos with similar photos")
     return PairChoice(sorted(pairs), f"{', '.join(rules)} ({len(pairs)} pairs)")
 
 
 def numbered_series(names: Mapping[int, str]) -> list[list[int]]:
     """Series of photos whose names differ only in the last number, in the order of this number.
 
-    ``names``: number of a photo -> file name (IMG_0017.jpg). Series of a single photo are left out.
+    ``names``: any number that identifies a photo -> its file name (IMG_0017.jpg). The series
+    contain these identifiers. Series of a single photo are left out.
     """
     by_prefix: dict[str, list[tuple[int, int]]] = {}
     for i, name in names.items():
@@ -99,7 +101,7 @@ def numbered_series(names: Mapping[int, str]) -> list[list[int]]:
 
 
 def following(series: Sequence[int], steps: Sequence[int]) -> Pairs:
-    """Pairs (i < j) of entries of ``series`` whose distance in ``series`` is one of ``steps``."""
+    """Pairs (i < j) of entries of ``series`` whose positions differ by one of ``steps``."""
     pairs = set()
     for position, i in enumerate(series):
         for step in steps:
@@ -129,8 +131,8 @@ def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
 def _similar_pairs(
     photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], count: int, overlap: int
 ) -> Pairs:
-    # A frame is most similar to its neighbours in time, which are already paired with it. These
-    # neighbours are excluded; otherwise no pair would close a loop.
+    # A frame is most similar to the frames directly before and after it, which are already paired
+    # with it. They are excluded here; otherwise no pair would close a loop.
     similarity = similarity.copy()
     for sequence in _sequences(photos):
         for position, i in enumerate(sequence):

@@ -1,14 +1,13 @@
-"""Photos -> poses, in up to four attempts with increasing effort.
-
-The attempts end when one of them finds poses for 90% of the usable photos (those with detail and
-matches), or when the matches show that no further attempt can succeed:
+"""Estimates camera poses from photos, in up to four attempts with increasing effort.
 
     1  features, pairs and mapper as configured
     2  the same features, more pairs; weaker matches are accepted
     3  twice as many features, from larger photos; about 4 times the work of the first attempt
     4  the other mapper, with the existing matches
 
-The result is the model with the most registered photos.
+The attempts end when one of them finds poses for 90% of the usable photos (`Evidence.usable`), or
+when the matches show that no further attempt can succeed. The result is the model with the most
+registered photos.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from snowsplat.sfm.colmap.database import (
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features, match_pairs
-from snowsplat.sfm.colmap.mapping import Mapping, usable, write_models
+from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
 from snowsplat.sfm.colmap.repair import repair
@@ -40,17 +39,19 @@ from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
-_MAX_ERROR = 4.0  # pixels at the size at which features are detected
+# Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
+# which the features were detected.
+_MAX_ERROR = 4.0
 
 
 @dataclass(frozen=True)
 class Matched:
-    """A database with features and matches."""
+    """A database with features and matches, and how they were made."""
 
     database: Path
-    effort: Effort
+    effort: Effort  # of the features
     choice: PairChoice
-    scale: float  # size of a photo over the size at which its features were detected
+    scale: float  # size of a photo / size at which its features were detected (1 or more)
 
 
 @dataclass(frozen=True)
@@ -59,14 +60,14 @@ class Attempt:
 
     matched: Matched
     models: list[pycolmap.Reconstruction]
-    left_out: dict[str, str]  # name -> reason, for photos whose place would be wrong
+    left_out: dict[str, str]  # name -> reason, for photos that had a pose in a wrong place
 
     @property
     def registered(self) -> int:
         return self.models[0].num_reg_images() if self.models else 0
 
 
-class Reconstruction:
+class PoseEstimation:
     """The attempts for one set of photos. `run` makes them and writes the best result."""
 
     def __init__(
@@ -83,7 +84,7 @@ class Reconstruction:
         self.threads = threads
         self.progress = progress
         self.attempts: list[Attempt] = []
-        self.log: list[str] = []  # a line for each attempt
+        self.log: list[str] = []  # a description of each attempt, as text for users
 
     def run(self, effort: Effort) -> SfmResult:
         """Make the attempts, the first with ``effort``; write ``sparse/`` and the database.
@@ -116,7 +117,7 @@ class Reconstruction:
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
         """Make as many attempts as needed; returns the evidence of the last matching.
 
-        ``second`` is the path of the database with more features.
+        ``second`` is the path of the database for the third attempt, which has more features.
         """
         first, mapper = self.folders.database, self.options.mapper
         matched = self._match(first, effort, effort)
@@ -127,7 +128,7 @@ class Reconstruction:
         found = bool(self.attempts[0].models)
         if self._enough(evidence) or (not found and evidence.more_effort_is_useless):
             return evidence
-        if not (found and evidence.compared_all):
+        if not (found and evidence.matched_all):
             matched = self._match(first, effort, effort.stronger())
             self._try("with more pairs and weaker matches", matched, "incremental", relaxed=True)
         if not self._enough(evidence):
@@ -140,6 +141,7 @@ class Reconstruction:
         return self._evidence(matched)
 
     def _match(self, database: Path, effort: Effort, pairing: Effort) -> Matched:
+        """Detect the features of ``effort``, and match the pairs of the effort ``pairing``."""
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
         open_database(database, self.photos, self.options.camera_model, fingerprint)
         extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
@@ -156,6 +158,7 @@ class Reconstruction:
         return lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices])
 
     def _try(self, how: str, matched: Matched, mapper: Mapper, relaxed: bool = False) -> None:
+        """Make an attempt. ``how`` describes it, as text for users; ``relaxed`` as in `Mapping`."""
         mapping = Mapping(
             matched.database, self.folders.images, matched.scale, self.threads, self.progress.report
         )
@@ -169,7 +172,7 @@ class Reconstruction:
         check, left_out = "", dict[str, str]()
         if models:
             repaired = repair(models[0], mapping, _MAX_ERROR * matched.scale)
-            models = usable([repaired.model, *models[1:]])
+            models = usable_models([repaired.model, *models[1:]])
             left_out = repaired.left_out
             check = f"; {repaired.description}" if repaired.description else ""
         attempt = Attempt(matched, models, left_out)

@@ -1,4 +1,4 @@
-"""Takes photos out of a model that are in a wrong place, and places them again."""
+"""Removes the poses of photos that are in a wrong place, and registers these photos again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from snowsplat.sfm.colmap.consistency import CheckedPair, check_pairs, find_part
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
 from snowsplat.sfm.colmap.mapping import MIN_PHOTOS, Mapping
 
-_ROUNDS = 3
+_ROUNDS = 3  # how often photos are registered again
 
 
 @dataclass(frozen=True)
@@ -19,32 +19,35 @@ class Repaired:
     """A model after the check of all photos."""
 
     model: pycolmap.Reconstruction
-    contradicting: int  # number of photos that contradicted their matches
-    left_out: dict[str, str]  # name -> reason, for those that have no pose now
+    contradicting: int  # number of photos whose pose contradicted their matches
+    left_out: dict[str, str]  # name -> reason, for those of them that have no pose now
 
     @property
     def description(self) -> str:
         """What the check found, as text; empty if it found nothing."""
         if not self.contradicting:
             return ""
-        placed = self.contradicting - len(self.left_out)
+        again = self.contradicting - len(self.left_out)
         return (
-            f"{self.contradicting} contradicted their matches: {placed} placed again, "
-            f"{len(self.left_out)} left out"
+            f"the poses of {self.contradicting} contradicted their matches: {again} registered "
+            f"again, {len(self.left_out)} left out"
         )
 
 
 def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -> Repaired:
-    """Check the places of all photos of ``model``, and place those anew that contradict the others.
+    """Find the photos of ``model`` that are in a wrong place, and register them again.
 
-    The photos of all parts but the first (`find_parts`) lose their poses. Matches that link parts
-    are false unless they are torn; without them, the photos are registered again. This is repeated
-    until no part contradicts the others. What still does in the last round is left out.
-    ``max_error`` is that of `check_pairs`. A model without contradictions is returned unchanged.
+    `find_parts` divides the photos into parts that contradict each other. The photos of all parts
+    except the first lose their poses. Matches between photos of different parts are false if they
+    agree with these poses (`_false_links`). Without the false matches, the photos are registered
+    again. This is repeated until no part contradicts the others, at most `_ROUNDS` times. Photos
+    that contradict the others even then are left out.
+
+    A model without contradictions is returned unchanged. ``max_error`` is that of `check_pairs`.
     """
     names = {i: image.name for i, image in model.images.items()}
-    false: set[tuple[int, int]] = set()
-    wrong: dict[int, str] = {}
+    false: set[tuple[int, int]] = set()  # image ids of pairs with false matches, of all rounds
+    wrong: dict[int, str] = {}  # image id -> reason, for all photos that lost their pose
     for number in range(_ROUNDS + 1):
         pairs = check_pairs(model, mapping.database, max_error)
         parts = find_parts(pairs)
@@ -55,15 +58,16 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         model = mapping.without(model, set().union(*parts[1:]))
         if number == _ROUNDS or model.num_reg_images() < MIN_PHOTOS:
             break
-        model = _placed_again(model, mapping, false)
-    placed = set(model.reg_image_ids())
-    left_out = {i: reason for i, reason in wrong.items() if i not in placed}
+        model = _registered_again(model, mapping, false)
+    registered = set(model.reg_image_ids())
+    left_out = {i: reason for i, reason in wrong.items() if i not in registered}
     return Repaired(model, len(wrong), {names[i]: reason for i, reason in left_out.items()})
 
 
-def _placed_again(
+def _registered_again(
     model: pycolmap.Reconstruction, mapping: Mapping, false: set[tuple[int, int]]
 ) -> pycolmap.Reconstruction:
+    """``model`` with poses for more photos, without the matches of the pairs ``false``."""
     reduced = mapping.database.with_suffix(".checked.db")
     try:
         copy_for_mapping(mapping.database, reduced, without=false)
@@ -73,14 +77,16 @@ def _placed_again(
 
 
 def _part_of(parts: Sequence[set[int]]) -> dict[int, int]:
+    """Image id -> index of the part that contains this photo."""
     return {i: number for number, part in enumerate(parts) for i in part}
 
 
 def _false_links(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set[tuple[int, int]]:
-    """The pairs of photos in different parts whose matches the model does not contradict.
+    """The pairs of photos in different parts whose matches are false, as image ids.
 
-    Those of photos that follow each other are kept: they may be the true link of two parts that
-    false matches elsewhere have moved together to a wrong place.
+    These are the pairs that are not tears: the wrong poses agree with their matches. Pairs of
+    photos that follow each other are an exception: their matches may be the only true ones between
+    two parts, and agree with poses that other, false matches have determined.
     """
     part = _part_of(parts)
     return {
@@ -97,14 +103,14 @@ def _reasons(
     part = _part_of(parts)
     reasons = {}
     for number, photos in enumerate(parts[1:], start=1):
-        torn = [
+        tears = [
             p
             for p in pairs
             if p.torn and (part.get(p.first, 0) == number) != (part.get(p.second, 0) == number)
         ]
         for photo in sorted(photos):
-            own = [pair for pair in torn if photo in (pair.first, pair.second)]
-            worst = max(own or torn, key=lambda pair: pair.matches - pair.shared)
+            own = [pair for pair in tears if photo in (pair.first, pair.second)]
+            worst = max(own or tears, key=lambda pair: pair.matches - pair.shared)
             one, other = (model.image(i).name for i in (worst.first, worst.second))
             with_it = "" if len(photos) == 1 else f", with {len(photos) - 1} other photos,"
             reasons[photo] = (

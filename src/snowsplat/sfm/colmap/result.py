@@ -1,4 +1,4 @@
-"""The `SfmResult` of COLMAP models."""
+"""Computes the `SfmResult` from COLMAP models: which photos have a pose, and how good they are."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ def result_of(
     with_focal = {photo.name for photo in photos if photo.focal}
     cameras = []
     for camera_id, camera in sorted(model.cameras.items()):
-        of_it = {n for n in names_in(model) if model.find_image_with_name(n).camera_id == camera_id}
-        if of_it:
+        taken = {n for n in names_in(model) if model.find_image_with_name(n).camera_id == camera_id}
+        if taken:
             cameras.append(
                 {
                     "model": camera.model_name,
                     "width": camera.width,
                     "height": camera.height,
                     "params": [float(value) for value in camera.params],
-                    "focal_from": "exif" if of_it & with_focal else "guessed",
-                    "images": len(of_it),
+                    "focal_from": "exif" if taken & with_focal else "guessed",
+                    "images": len(taken),
                 }
             )
     return SfmResult(
@@ -57,10 +57,11 @@ def names_in(model: pycolmap.Reconstruction) -> set[str]:
 
 
 def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
-    """Statistics of existing models in ``distorted/sparse``, from an unknown source.
+    """Statistics of existing models in ``distorted/sparse``; these may be from an unknown source.
 
     Raises:
-        UserError: there is no model, it is damaged, or it has none of the photos.
+        UserError: there is no model, or the first one is damaged, has none of ``photos``, or has
+            photos outside of ``input/``.
     """
     sparse = dataset / "distorted" / "sparse"
     numbered = sorted(
@@ -86,8 +87,9 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
         raise _cannot_skip(
             f"the model in {numbered[0]} has none of the photos in {dataset / 'input'}"
         )
-    missing = {p.name: "it is not in the existing model" for p in photos}
-    unregistered = {name: why for name, why in missing.items() if name not in names}
+    unregistered = {
+        p.name: "it is not in the existing model" for p in photos if p.name not in names
+    }
     return result_of(models, photos, unregistered, "not matched: the model existed already", [])
 
 

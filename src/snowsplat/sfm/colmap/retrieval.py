@@ -1,10 +1,10 @@
-"""Visual similarity of photos: a descriptor of each photo, from its local features.
+"""Visual similarity of photos, from global descriptors that are computed from local features.
 
-VLAD (Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010),
-with the residuals of each visual word normalised (Arandjelović and Zisserman, "All about VLAD",
-CVPR 2013). The visual words are learned from the photos of the dataset, which show one scene; so
-nothing has to be downloaded. All sums have a fixed order, so the result depends only on the
-features.
+The global descriptor is VLAD (Jégou et al., "Aggregating local descriptors into a compact image
+representation", CVPR 2010), with the residuals of each visual word normalised (Arandjelović and
+Zisserman, "All about VLAD", CVPR 2013). The visual words are learned from the photos of the
+dataset, so no vocabulary has to be downloaded. All sums have a fixed order, so the result depends
+only on the features.
 """
 
 from __future__ import annotations
@@ -17,18 +17,21 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 
-WORDS = 64
-# Number of features of a photo that are used: the largest ones, because the same large features are
-# also detected in photos from other distances.
+WORDS = 64  # number of visual words
+# Number of features of a photo that are used. The largest ones are used, because they are also
+# detected in photos from other distances.
 FEATURES = 1000
-_SAMPLE = 64 * WORDS * 4  # descriptors for k-means
-_ROUNDS = 12  # of k-means
+_SAMPLE = 64 * WORDS * 4  # number of descriptors for k-means
+_ROUNDS = 12  # iterations of k-means
 
 
 def similarity(descriptors: Sequence[Floats]) -> Floats:
-    """(N, N) float32 similarity of N photos, from their descriptors (n, D): −1 … 1.
+    """(N, N) float32 similarity of N photos, from −1 to 1.
 
     The diagonal is 1. A photo without features has the similarity 0 to all others.
+
+    Args:
+        descriptors: for each photo, (n, D): the descriptors of n local features.
     """
     counts = [len(d) for d in descriptors]
     if sum(counts) == 0:
@@ -44,7 +47,7 @@ def similarity(descriptors: Sequence[Floats]) -> Floats:
 
 
 def nearest(alike: Floats, count: int) -> set[tuple[int, int]]:
-    """Pairs (i < j) of each photo with the ``count`` most similar ones."""
+    """Pairs (i < j) of each photo with the ``count`` most similar ones; ``alike`` (N, N)."""
     pairs = set()
     for i, row in enumerate(alike):
         order = np.argsort(-row, kind="stable")
@@ -60,7 +63,7 @@ def _unit(rows: Floats) -> Floats:
 
 
 def _learn_words(points: Floats) -> Floats:
-    # k-means on evenly chosen descriptors; words without members are not moved.
+    # k-means on evenly chosen descriptors. A word to which no descriptor is assigned is not moved.
     sample = points[:: max(1, len(points) // _SAMPLE)]
     words = sample[:: max(1, len(sample) // WORDS)][:WORDS].copy()
     for _ in range(_ROUNDS):
@@ -73,11 +76,13 @@ def _learn_words(points: Floats) -> Floats:
 
 
 def _assign(points: Floats, words: Floats) -> NDArray[np.intp]:
-    # |p − w|² = |p|² − 2 p·w + |w|²; the first term does not affect the minimum.
+    # The index of the nearest word of each point: |p − w|² = |p|² − 2 p·w + |w|², and the first
+    # term does not affect the minimum.
     return np.argmin((words**2).sum(1) - 2 * points @ words.T, axis=1)
 
 
 def _describe(points: Floats, words: Floats) -> Floats:
+    """The VLAD vector of a photo, from its (n, D) descriptors."""
     vector = np.zeros_like(words)
     if len(points):
         word = _assign(points, words)

@@ -2,10 +2,11 @@
 
     python -m snowsplat.sfm.colmap.worker
 
-The job is one line of JSON on stdin. Lines of JSON on stdout are progress, database tables whose
-rows the parent may count, and at the end the result or a user error. Stdin stays open as long as
-the parent runs; when it closes, the child ends immediately. The child ignores Ctrl-C, which the
-parent handles. The output of COLMAP goes to stderr, which the parent writes to a log.
+The parent sends the job as one line of JSON to stdin. The child answers with lines of JSON on
+stdout: its progress, the database tables whose rows the parent may count (`WorkerProgress`), and at
+the end the result or a `UserError`. Stdin stays open as long as the parent runs; when it closes,
+the child ends immediately. The child ignores Ctrl-C, which the parent handles. The output of COLMAP
+goes to stderr, which the parent redirects to a log file.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import pycolmap
 
 from snowsplat.sfm.colmap.features import SEED, Folders, WorkerProgress
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions, SfmResult, thread_count
-from snowsplat.sfm.colmap.reconstruct import Reconstruction
+from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import UserError
 
@@ -32,7 +33,8 @@ from snowsplat.util.errors import UserError
 def main() -> None:
     """Run the job that is read from stdin."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # The handlers of COLMAP's logger allocate memory, so a crash within malloc would hang in them.
+    # COLMAP's logger handles the signals of a crash. Its handlers allocate memory, so the process
+    # would hang after a crash within malloc. The handlers of Python replace them.
     faulthandler.enable()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     answers = _redirected_stdout()
@@ -53,13 +55,15 @@ def main() -> None:
 
 
 def _redirected_stdout() -> TextIO:
-    # C++ code also prints to stdout. Its output is redirected to stderr, separate from the JSON.
+    """The original stdout, for the JSON. All other output to stdout now goes to stderr."""
+    # C++ code of COLMAP also prints to stdout, which would mix with the JSON.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return answers
 
 
 def _end_with_parent() -> None:
+    """Wait until the parent has closed stdin, then end this process immediately."""
     # os.read is used instead of sys.stdin, because Python cannot exit normally while a thread is
     # reading from sys.stdin.
     while os.read(0, 4096):
@@ -71,8 +75,8 @@ def _run(job: dict[str, Any], progress: WorkerProgress) -> SfmResult:
     pycolmap.set_random_seed(SEED)
     pycolmap.logging.alsologtostderr = False
     pycolmap.logging.logtostderr = True
-    # COLMAP's mapper resets the two settings above. With an empty destination, the logger still
-    # creates no log files in /tmp.
+    # COLMAP's mapper resets the two settings above. With an empty destination, the logger creates
+    # no log files in /tmp even then.
     for level in pycolmap.logging.Level.__members__.values():
         pycolmap.logging.set_log_destination(level, "")
     options = SfmOptions(**job["options"])
@@ -81,7 +85,7 @@ def _run(job: dict[str, Any], progress: WorkerProgress) -> SfmResult:
         effort, threads = effort.reduced(), 1
     photos = [Photo(**photo) for photo in job["photos"]]
     folders = Folders(Path(job["capture"]))
-    return Reconstruction(folders, photos, options, threads, progress).run(effort)
+    return PoseEstimation(folders, photos, options, threads, progress).run(effort)
 
 
 if __name__ == "__main__":
