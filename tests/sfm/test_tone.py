@@ -4,7 +4,7 @@ import av
 import numpy as np
 import pytest
 
-from snowsplat.sfm.tone import rgb_picture
+from snowsplat.sfm.tone import rgb_image
 
 
 def frame_of(signals, transfer, height=64):
@@ -33,7 +33,7 @@ def greys(picture):
     ],
 )
 def test_diffuse_white_is_nearly_white_and_highlights_are_brighter(transfer, signals):
-    black, dark, middle, white, light = greys(rgb_picture(frame_of(signals, transfer)))
+    black, dark, middle, white, light = greys(rgb_image(frame_of(signals, transfer)))
     assert black <= 2
     assert 35 < dark < middle < 200
     assert 230 <= white <= 250
@@ -41,13 +41,13 @@ def test_diffuse_white_is_nearly_white_and_highlights_are_brighter(transfer, sig
 
 
 def test_ten_bits_without_hdr():
-    assert np.abs(greys(rgb_picture(frame_of([0, 0.5, 1], 1))) - [0, 127.5, 255]).max() <= 2
+    assert np.abs(greys(rgb_image(frame_of([0, 0.5, 1], 1))) - [0, 127.5, 255]).max() <= 2
 
 
 def test_hdr_colours_keep_their_hue():
     frame = frame_of([0.5, 0.5], 18)
     for plane, value in zip(frame.planes[1:], (470, 580), strict=True):
         plane.update(np.full((plane.height, plane.line_size // 2), value, np.uint16).tobytes())
-    red, green, blue = rgb_picture(frame)[32, 8].astype(int)
+    red, green, blue = rgb_image(frame)[32, 8].astype(int)
     assert red > green + 30
     assert green > blue

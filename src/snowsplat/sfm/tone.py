@@ -30,7 +30,7 @@ _KNEE = 0.7  # of white: luminance below it is unchanged
 _STEPS = 4096  # entries of the lookup tables
 
 
-def rgb_picture(frame: VideoFrame) -> np.ndarray:
+def rgb_image(frame: VideoFrame) -> np.ndarray:
     """(H, W, 3) uint8 of a decoded frame, in the stored orientation."""
     matrix = None  # None: the matrix that the frame declares
     if frame.colorspace == _UNSPECIFIED and frame.height >= 720:

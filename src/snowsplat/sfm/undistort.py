@@ -216,7 +216,7 @@ def _open_photo(path: Path, job: _Job) -> Image.Image:
         image = open_image(path, list(_SAVING))
     except FileNotFoundError:
         raise UserError(f"{path}: missing; restore it, or run sfm again") from None
-    except Exception as error:  # Pillow's parsers raise anything on damaged files
+    except Exception as error:  # Pillow may raise any exception for a damaged file
         raise UserError(f"{path}: cannot be read ({reason_of(error)}); replace it") from None
     if image.size != job.camera_size:
         image.close()

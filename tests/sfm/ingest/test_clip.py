@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.sfm.ingest.clip import Clip, decoded_frames, frames_wanted, open_video, read_clip
+from snowsplat.sfm.ingest.clip import Clip, decoded_frames, max_frame_count, open_video, read_clip
 from snowsplat.util.errors import UserError
 
 from ..pictures import HEIGHT, WIDTH, pan, write_video
@@ -64,11 +64,11 @@ def clip(seconds, rate=30):
     [(0.1, 2), (2, 30), (10, 60), (23.5, 60), (40, 100), (100, 150), (200, 200), (3600, 300)],
 )
 def test_default_number_of_frames(seconds, frames):
-    assert frames_wanted(clip(seconds), None, None) == pytest.approx(frames, abs=1)
+    assert max_frame_count(clip(seconds), None, None) == pytest.approx(frames, abs=1)
 
 
 def test_requested_number_of_frames_is_limited_by_the_video():
-    assert frames_wanted(clip(10), 2.0, None) == 20
-    assert frames_wanted(clip(10), None, 77) == 77
-    assert frames_wanted(clip(10), 1000.0, None) == 300
-    assert frames_wanted(clip(10), 0.01, None) == 1
+    assert max_frame_count(clip(10), 2.0, None) == 20
+    assert max_frame_count(clip(10), None, 77) == 77
+    assert max_frame_count(clip(10), 1000.0, None) == 300
+    assert max_frame_count(clip(10), 0.01, None) == 1

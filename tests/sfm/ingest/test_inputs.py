@@ -280,7 +280,7 @@ def test_a_video_of_a_static_camera(tmp_path):
 
 def test_too_few_photos(tmp_path):
     root = write_photos(tmp_path / "p", 2)
-    with pytest.raises(UserError, match="only 2 usable images; .* at least 3, better 20"):
+    with pytest.raises(UserError, match="only 2 usable images; .* at least 3, preferably 20"):
         gathered(root, tmp_path / "out")
     (root / "broken.jpg").write_text("no photo")
     with pytest.raises(UserError, match=r"only 2 .*; .*broken.jpg cannot be decoded \(not an"):
@@ -333,7 +333,7 @@ def test_the_disk_becomes_full(writes, tmp_path, monkeypatch):
     else:
         source = write_video(tmp_path / "a.mp4", pan(9))
         monkeypatch.setattr("snowsplat.sfm.ingest.video.save", full)
-    with pytest.raises(UserError, match="disk: it is full; free some space"):
+    with pytest.raises(UserError, match="disk: full; free some space"):
         gathered(source, tmp_path / "out")
 
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.motion import PictureMotion, has_moved
-from snowsplat.sfm.ingest.sharpness import PICTURE_SIDE, grey_copy
+from snowsplat.sfm.ingest.motion import FrameMotion, has_moved
+from snowsplat.sfm.ingest.sharpness import CONTENT_SIDE, grey_copy
 
 from ..pictures import blurred, pan, wall
 
 
 def grey(picture: np.ndarray) -> np.ndarray:
-    return grey_copy(Image.fromarray(picture), PICTURE_SIDE)
+    return grey_copy(Image.fromarray(picture), CONTENT_SIDE)
 
 
 def noisy(picture: np.ndarray, level: float, seed: int) -> np.ndarray:
@@ -25,7 +25,7 @@ def textures(count: int) -> list[np.ndarray]:
 
 
 def path(pictures) -> list[float]:
-    motion = PictureMotion()
+    motion = FrameMotion()
     return [motion.add(np.asarray(Image.fromarray(picture).convert("L"))) for picture in pictures]
 
 

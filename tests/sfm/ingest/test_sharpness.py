@@ -7,19 +7,19 @@ from PIL import Image
 from snowsplat.sfm.ingest.sharpness import (
     BLACK,
     BLURRED,
+    CONTENT_SIDE,
     FLAT,
-    PICTURE_SIDE,
     WHITE,
     grey_copy,
     sharpness,
-    why_useless,
+    why_unusable,
 )
 
 from ..pictures import blurred, pan, wall
 
 
 def grey(picture: np.ndarray) -> np.ndarray:
-    return grey_copy(Image.fromarray(picture), PICTURE_SIDE)
+    return grey_copy(Image.fromarray(picture), CONTENT_SIDE)
 
 
 def noisy(picture: np.ndarray, level: float, seed: int) -> np.ndarray:
@@ -50,16 +50,16 @@ def test_motion_blur_decreases_sharpness():
 @pytest.mark.parametrize(("value", "reason"), [(0, BLACK), (255, WHITE), (128, FLAT)])
 def test_uniform_images_are_useless(value, reason, level):
     picture = np.full((960, 1280, 3), value, np.uint8)
-    assert why_useless(grey(noisy(picture, level, seed=1))) == reason
+    assert why_unusable(grey(noisy(picture, level, seed=1))) == reason
 
 
 def test_only_strongly_blurred_images_are_useless():
     large = wall(width=1280, height=960)
-    assert why_useless(grey(large)) is None
-    assert why_useless(grey(blurred(large, 6))) is None
-    assert why_useless(grey(blurred(large, 32))) == BLURRED
+    assert why_unusable(grey(large)) is None
+    assert why_unusable(grey(blurred(large, 6))) is None
+    assert why_unusable(grey(blurred(large, 32))) == BLURRED
 
 
 def test_dark_images_with_little_contrast_are_used():
     dim = (wall(width=640, height=480) / 16).astype(np.uint8)
-    assert why_useless(grey(dim)) is None
+    assert why_unusable(grey(dim)) is None

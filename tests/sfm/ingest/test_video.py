@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.clip import decoded_frames, frames_wanted, read_clip
+from snowsplat.sfm.ingest.clip import decoded_frames, max_frame_count, read_clip
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED
 from snowsplat.sfm.ingest.video import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import silent
@@ -115,7 +115,7 @@ def test_few_files_and_few_frames_in_memory(tmp_path, monkeypatch):
             files.append((len(list((tmp_path / "f").iterdir())), len(alive)))
 
     monkeypatch.setattr("snowsplat.sfm.ingest.video.decoded_frames", decoded)
-    monkeypatch.setattr("snowsplat.sfm.ingest.video._FEW", 5)
+    monkeypatch.setattr("snowsplat.sfm.ingest.video._MIN_STEPS", 5)
     frames = pan(50, step=8)
     made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", 5)
     assert len(made.kept) == 5
@@ -259,7 +259,7 @@ def test_a_real_video(tmp_path):
     clip = read_clip(REAL)
     assert (clip.packets, clip.width, clip.height) == (706, 720, 1280)
     assert clip.seconds == pytest.approx(23.53, abs=0.05)
-    made = extract(REAL, tmp_path / "f", frames_wanted(clip, None, None))
+    made = extract(REAL, tmp_path / "f", max_frame_count(clip, None, None))
     assert made.read == 706
     assert 54 <= len(made.kept) <= 60
     assert {reason for _, reason in made.skipped} == {SAME_VIEW}

@@ -63,7 +63,9 @@ def estimate_poses(
         OSError: the disk is full.
     """
     if len(photos) < 3:
-        raise UserError(f"photos: {len(photos)} are not enough; take at least 3, better 30 or more")
+        raise UserError(
+            f"photos: {len(photos)} are not enough; take at least 3, preferably 30 or more"
+        )
     if options.camera_model not in ("auto", *CAMERA_MODELS):
         raise SettingError(
             "camera_model",

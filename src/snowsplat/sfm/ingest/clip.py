@@ -14,21 +14,23 @@ from typing import TYPE_CHECKING
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
-# Container formats that cameras, phones and programs write, by the names of FFmpeg.
+# Container formats that cameras, phones and programs write, as FFmpeg names them.
 _FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,flv,asf,gif,mpeg,mpegts,mpegvideo,m4v,h264,hevc,"
     "vc1,av1,obu,ivf,ogg,mjpeg,dv,mxf"
 )
-_MOST_PIXELS = 1 << 26  # maximum number of pixels of a frame: 8192×8192
+_MAX_PIXELS = 1 << 26  # maximum number of pixels of a frame: 8192×8192
 
 # An mp4 file consists of nested boxes. A box is a header (its length and its kind) and content.
 _BOX_HEADER = 8  # bytes
 _KIND = re.compile(rb"[ -~\xa9]{4}")
 _NO_COUNTS = (b"mdat", b"free", b"skip", b"wide")  # boxes of frame data and padding
-# Boxes that begin with a count: of frames, of frames in a fragment (trun), or of edits (elst). Each
-# edit may repeat all frames. A compressed header (cmov) could contain such counts.
+# Boxes that begin with a count: of frames, of frames in a fragment (trun), or of edits (elst). A
+# compressed header (cmov) could contain such boxes.
 _COUNTS = re.compile(rb"stsz|stz2|trun|elst|cmov")
-_FEW_EDITS = 16  # this number of edits counts as one repetition of all frames
+# Each edit may repeat all frames. Valid files have only a few edits, so every 16 edits count as one
+# repetition.
+_FEW_EDITS = 16
 _ALWAYS_ALLOWED = 1 << 16  # frames that a file of any size may declare
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Clip:
-    """Properties of a video, from its packets. Only the first frame is decoded."""
+    """Properties of a video, as `read_clip` reads them from its packets and its first frame."""
 
     path: Path
     packets: int  # number of frames that the file contains
@@ -47,7 +49,7 @@ class Clip:
     seconds: float  # from the first frame to the end of the last
     width: int  # pixels, in the upright orientation
     height: int
-    aspect: float = 1.0  # width divided by height of a stored pixel; not 1 for some camcorders
+    aspect: float = 1.0  # width / height of a stored pixel; differs from 1 for some camcorders
 
 
 def _check_boxes(path: Path) -> None:
@@ -122,9 +124,9 @@ def read_clip(path: Path) -> Clip:
         with open_video(path) as container:
             first = next(decoded_frames(container), None)
     except (av.FFmpegError, OSError, ValueError, IndexError) as error:
-        raise nothing_decodes(path, error) from None
+        raise undecodable(path, error) from None
     if first is None or not times:
-        raise nothing_decodes(path, None)
+        raise undecodable(path, None)
     if min(times) < 0 and -1.0 in times:  # a raw stream without timestamps
         times = [i / rate for i in range(len(times))]
     length = max(times) - min(times)
@@ -141,13 +143,14 @@ def read_clip(path: Path) -> Clip:
     )
 
 
-def frames_wanted(clip: Clip, fps: float | None, frames: int | None) -> int:
-    """The maximum number of frames to use of a video.
+def max_frame_count(clip: Clip, fps: float | None, frames: int | None) -> int:
+    """The maximum number of frames to use of a video, for the options ``fps`` and ``frames``.
 
-    The default is 2.5 per second. Walking around an object takes 20 to 40 s, so adjacent frames are
-    a few degrees apart; SIFT matches such frames reliably. The number for a short video is at least
-    60, because it may show as much as a long one. For a long video it is 150, or one per second (up
-    to 300) if that is more, because each frame takes about 2 s later, on two cores.
+    The default is 2.5 frames per second. Walking around an object takes 20 to 40 s, so adjacent
+    frames are a few degrees apart; SIFT matches such frames reliably. For a short video it is at
+    least 60 frames, because a short video may show as much as a long one. For a long video it is
+    150 frames, or one per second (up to 300) if that is more, because the later stages take about
+    2 s per frame on two cores.
     """
     if frames is not None:
         wanted = float(frames)
@@ -166,7 +169,7 @@ def upright_size(frame: VideoFrame, aspect: float) -> tuple[int, int]:
 
 
 def open_video(path: Path) -> InputContainer:
-    """Open a video file of a format that cameras write; raises as `av.open` does.
+    """Open a video file of a format that cameras write; raises the errors of `av.open`.
 
     FFmpeg also reads other formats, for example playlists of other files and URLs; they are
     disabled. Frames larger than those of any camera are rejected before memory is allocated.
@@ -176,16 +179,16 @@ def open_video(path: Path) -> InputContainer:
     options = {
         "format_whitelist": _FORMATS,
         "protocol_whitelist": "file",
-        "max_pixels": str(_MOST_PIXELS),
+        "max_pixels": str(_MAX_PIXELS),
     }
     _check_boxes(path)
-    # The prefix "file:" is needed because a name may look like a URL. Some cameras write metadata
-    # that is not UTF-8; it is not used.
+    # The prefix "file:" is needed because a file name may look like a URL. The metadata are not
+    # used, but those of some cameras are not UTF-8, which must not raise an error.
     container = av.open(f"file:{path.absolute()}", options=options, metadata_errors="replace")
     for stream in container.streams.video:
         if stream.codec_context is None:  # PyAV has no decoder
             raise ValueError("unknown codec")
-        stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
+        stream.codec_context.options = {"max_pixels": str(_MAX_PIXELS)}
     return container
 
 
@@ -209,10 +212,11 @@ def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
             return
 
 
-def nothing_decodes(path: Path, error: Exception | None) -> UserError:
+def undecodable(path: Path, error: Exception | None) -> UserError:
+    """The error to raise if no frame of a video can be decoded."""
     reason = f" ({getattr(error, 'strerror', None) or error})" if error else ""
     return UserError(
         f"{shown(path)}: no frame of this video can be decoded{reason}; if it is truncated or "
-        f"damaged, copy it again; if it has more than {_MOST_PIXELS // 1_000_000} million pixels "
+        f"damaged, copy it again; if it has more than {_MAX_PIXELS // 1_000_000} million pixels "
         "or an unknown codec, convert it to mp4 (H.264)"
     )

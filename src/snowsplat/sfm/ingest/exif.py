@@ -16,8 +16,8 @@ _MODEL = 0x0110
 _EXIF_IFD = 0x8769
 _GPS_IFD = 0x8825
 _FOCAL_LENGTH = 0x920A  # mm
-_FOCAL_35MM = 0xA405  # equivalent on 35 mm film, mm
-_PLANE_X = 0xA20E  # pixels per unit on the sensor
+_FOCAL_35MM = 0xA405  # equivalent focal length on 35 mm film, mm
+_PLANE_X = 0xA20E  # FocalPlaneXResolution: pixels of the sensor per `_PLANE_UNIT`
 _PLANE_Y = 0xA20F
 _PLANE_UNIT = 0xA210
 _MAKER_NOTE = 0x927C
@@ -32,16 +32,19 @@ _JPEG_LIMIT = 65000  # bytes of EXIF that fit into a JPEG segment
 
 @dataclass(frozen=True)
 class ExifInfo:
-    """The metadata that is used. ``focal`` is in pixels of the photo as stored."""
+    """The metadata that snowsplat uses."""
 
     orientation: int = 1  # EXIF value, 1 to 8
     camera: str = ""  # make, model and focal lengths, which identify a lens and its zoom
-    focal: float | None = None
+    focal: float | None = None  # pixels of the stored photo, before any resizing
     location: tuple[float, float, float] | None = None  # latitude, longitude (°), altitude (m)
 
 
 def read_exif(exif: Image.Exif, width: int, height: int) -> ExifInfo:
-    """Read the metadata of a photo of this size; missing and implausible values are left out."""
+    """Read the metadata of a photo with ``width`` × ``height`` stored pixels.
+
+    Missing and implausible values have the default of `ExifInfo`.
+    """
     details, gps = _ifd(exif, _EXIF_IFD), _ifd(exif, _GPS_IFD)
     orientation = exif.get(ORIENTATION, 1)
     named = [str(exif.get(tag) or "").strip("\0 ") for tag in (_MAKE, _MODEL)]
@@ -57,10 +60,10 @@ def read_exif(exif: Image.Exif, width: int, height: int) -> ExifInfo:
 def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
     """Focal length in pixels, or None if it is unknown or implausible.
 
-    Cameras store it in one of two ways. A 35 mm equivalent is converted by the ratio of the
-    diagonals, as in COLMAP. Otherwise, the focal length is divided by the pixel size. The pixel
-    size refers to the original width, which is stored, too: if a photo was resized, its metadata
-    may still be that of the original.
+    Cameras store the focal length in one of two ways. A 35 mm equivalent is converted by the ratio
+    of the diagonals, as in COLMAP. A focal length in mm is divided by the pixel size. This size is
+    that of the original pixels: if a program has resized the photo, the metadata may still describe
+    the original. Therefore the result is multiplied by the ratio of the longest sides.
     """
     focal = None
     equivalent, length = _number(details.get(_FOCAL_35MM)), _number(details.get(_FOCAL_LENGTH))
@@ -72,7 +75,7 @@ def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
         sizes = [_number(details.get(tag)) for tag in (_PIXEL_WIDTH, _PIXEL_HEIGHT)]
         original = max((size for size in sizes if size), default=max(width, height))
         focal = length * density / unit * max(width, height) / original
-    # A field of view above 150° or below 1.5° is a value that was never set correctly.
+    # These limits are fields of view of 150° and 1.5°. Values beyond them were not set correctly.
     plausible = focal is not None and 0.13 < focal / max(width, height) < 40
     return focal if plausible else None
 
@@ -82,7 +85,7 @@ def _location(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     longitude = _degrees(gps.get(4), gps.get(3), "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
         return None
-    if latitude == 0 and longitude == 0:  # stored by receivers without a position
+    if latitude == 0 and longitude == 0:  # GPS receivers store this if they have no position
         return None
     altitude = _number(gps.get(6)) or 0.0
     below_sea = gps.get(5) in (1, b"\x01")
@@ -111,22 +114,25 @@ def _number(value: Any, zero: bool = False) -> float | None:
 def _ifd(exif: Image.Exif, tag: int) -> Mapping[int, Any]:
     try:
         return exif.get_ifd(tag)
-    except Exception:  # damaged metadata raises anything; the pixels may be valid
+    except Exception:  # damaged metadata may raise any exception, but the pixels may be valid
         return {}
 
 
 def exif_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
-    """EXIF data for a copy that is upright and of this size; empty if it does not fit."""
+    """EXIF data for a copy of a photo that is upright and has this size.
+
+    Empty if the data are damaged or do not fit into a JPEG file.
+    """
     try:
         copy = Image.Exif()
         copy.load(exif.tobytes())
         copy[ORIENTATION] = 1
         details = copy.get_ifd(_EXIF_IFD)
-        # A maker note contains offsets into the old file; the pixel density may have changed.
+        # A maker note contains offsets into the old file. The pixels per unit may have changed.
         for tag in (_MAKER_NOTE, _USER_COMMENT, _PLANE_X, _PLANE_Y, _PLANE_UNIT):
             details.pop(tag, None)
         details[_PIXEL_WIDTH], details[_PIXEL_HEIGHT] = width, height
         content = copy.tobytes()
-    except Exception:  # as above
+    except Exception:  # as in `_ifd`
         return b""
     return content if len(content) < _JPEG_LIMIT else b""

@@ -1,4 +1,7 @@
-"""Photos -> ``input/``: chooses names from the headers, then checks and copies the files."""
+"""Copies photos into ``input/``: chooses the file names, then checks, converts or copies the files.
+
+First, `plan_photos` reads only the headers. Then `write_photos` decodes every photo.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from snowsplat.sfm.ingest.photo_files import (
     read_header,
     save,
 )
-from snowsplat.sfm.ingest.sharpness import PICTURE_SIDE, grey_copy, why_useless
+from snowsplat.sfm.ingest.sharpness import CONTENT_SIDE, grey_copy, why_unusable
 from snowsplat.sfm.ingest.sources import Source, free_names
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import shown
@@ -40,7 +43,11 @@ class Planned:
 def plan_photos(
     sources: Sequence[Source], longest: int | None, skipped: list[tuple[str, str]]
 ) -> list[Planned]:
-    """Choose the name of each photo in ``input/``; unchanged names take precedence."""
+    """Choose the name of each photo in ``input/``. Photos are sorted by this name.
+
+    If two photos would have the same name, the one whose name need not change keeps it. Photos that
+    cannot be used are appended to ``skipped``, with the reason.
+    """
     read = []
     for source in sources:
         try:
@@ -63,9 +70,14 @@ def write_photos(
     skipped: list[tuple[str, str]],
     report: Report,
 ) -> list[Photo]:
-    """Write photos to ``input/`` in a few threads, each with one photo in memory; keep the order.
+    """Write photos to ``input/``, and their masks to ``distorted/masks``, in up to four threads.
 
-    Photos that cannot be used are appended to ``skipped``, with the reason.
+    Each thread has one photo in memory. The result has the order of ``planned``. Photos that cannot
+    be used are appended to ``skipped``, with the reason.
+
+    Args:
+        longest: largest allowed longest side in pixels; None: any.
+        in_place: the photos are in ``input/`` already; write only the masks.
     """
 
     def work(plan: Planned) -> Photo | str:
@@ -95,23 +107,23 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
     target = dataset / "input" / plan.name
     ready = header.is_ready(longest)
     if ready and not header.transparent:
-        image = decode_small(source.path, PICTURE_SIDE)
+        image = decode_small(source.path, CONTENT_SIDE)
     else:
         image = decode(source.path, header, longest)
-    counts = read_mask(source.mask, header, header.size(longest)) if source.mask else None
+    used = read_mask(source.mask, header, header.size(longest)) if source.mask else None
     alpha = image.mode == "RGBA"
     if alpha:
         opaque = np.asarray(image.getchannel("A")) > 0
-        counts = opaque if counts is None else counts & opaque
-    _check_content(image, counts)
+        used = opaque if used is None else used & opaque
+    _check_content(image, used)
     if not in_place:
         target.parent.mkdir(parents=True, exist_ok=True)
         if ready:
             link_or_copy(source.path, target)
         else:
             save(image, target, source.path)
-    if counts is not None:
-        write_mask(dataset / "distorted" / "masks" / f"{plan.name}.png", counts)
+    if used is not None:
+        write_mask(dataset / "distorted" / "masks" / f"{plan.name}.png", used)
     width, height = header.size(longest)
     exif = header.exif
     scale = max(width, height) / max(header.width, header.height)
@@ -125,16 +137,16 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
         sequence=None,
         focal=None if exif.focal is None else exif.focal * scale,
         location=exif.location,
-        mask=counts is not None,
+        mask=used is not None,
         alpha=alpha,
     )
 
 
-def _check_content(image: Image.Image, counts: np.ndarray | None) -> None:
-    """Raises Unusable if the photo shows nothing, or if the mask leaves nothing."""
-    if counts is not None and not counts.any():
+def _check_content(image: Image.Image, used: np.ndarray | None) -> None:
+    """Raises Unusable if the photo has no content, or if no pixel is ``used`` (H, W) bool."""
+    if used is not None and not used.any():
         raise Unusable("is completely masked out")
-    grey = grey_copy(image.convert("RGB") if image.mode == "RGBA" else image, PICTURE_SIDE)
-    reason = why_useless(grey)
+    grey = grey_copy(image.convert("RGB") if image.mode == "RGBA" else image, CONTENT_SIDE)
+    reason = why_unusable(grey)
     if reason:
         raise Unusable(reason)

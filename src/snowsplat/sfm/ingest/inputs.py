@@ -1,7 +1,7 @@
-"""Photos and videos -> ``input/``: the images that SfM reads, and their masks.
+"""Fills ``input/`` of a dataset with photos and video frames, and ``distorted/masks`` with masks.
 
 Files in ``input/`` are upright, in a format that COLMAP reads, and have been decoded once as a
-check. Images without content are skipped and reported; enough images must remain.
+check. Images without content are skipped and reported; at least three images must remain.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from snowsplat.sfm.ingest.clip import Clip, frames_wanted, read_clip
+from snowsplat.sfm.ingest.clip import Clip, max_frame_count, read_clip
 from snowsplat.sfm.ingest.gather_photos import Planned, plan_photos, write_photos
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
@@ -27,16 +27,16 @@ from snowsplat.util.files import shown
 
 logger = logging.getLogger(__name__)
 
-_FEWEST = 3  # minimum number of photos
-_SMALLEST_SIZE = 128  # pixels
+_MIN_PHOTOS = 3  # minimum number of photos
+_MIN_SIZE = 128  # pixels
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """The usable photos, sorted by name, and what was skipped."""
+    """The usable photos and frames, sorted by name, and the skipped ones."""
 
     photos: list[Photo]
-    skipped: list[tuple[str, str]]  # source, reason
+    skipped: list[tuple[str, str]]  # file, or file and time of a frame; reason
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class GatherOptions:
 
 
 def find_inputs(inputs: Sequence[Path]) -> list[Path]:
-    """All files that `gather` would read, with masks. It is fast: mostly names are checked.
+    """All files that `gather` would read, including masks. Fast, because few files are opened.
 
     Raises:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
@@ -63,8 +63,9 @@ def gather(
 ) -> Gathered:
     """Fill ``input/`` of a dataset and, for masks and transparency, ``distorted/masks``.
 
-    If the input is ``input/`` itself, it is used in place and never changed. Then all photos must
-    be upright, in a format that COLMAP reads, and not larger than the requested size.
+    If one of ``inputs`` is ``input/`` itself, its photos are used in place and never changed. Then
+    all photos must be upright, in a format that COLMAP reads, and not larger than the requested
+    size.
 
     Photos of one folder form a group, which shares intrinsics, if they have the same size, camera
     and focal length in EXIF. Portrait and landscape photos of one phone are in different groups:
@@ -72,7 +73,7 @@ def gather(
 
     Raises:
         UserError: fewer than three usable photos, a mask whose size differs from its photo, not
-            enough disk space, or photos in place that would have to be changed.
+            enough disk space, or photos used in place that would have to be changed.
         OSError: the dataset cannot be written.
     """
     _check(options)
@@ -93,14 +94,14 @@ def gather(
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
-                "disk: it is full; free some space, or set a smaller size, e.g. 1600"
+                "disk: full; free some space, or set a smaller size, e.g. 1600"
             ) from None
         raise
     for mask in found.unused_masks:
         logger.warning(
             "%s: mask not used, there is no such photo; masks are named IMG.jpg.png", shown(mask)
         )
-    if len(photos) < _FEWEST:
+    if len(photos) < _MIN_PHOTOS:
         raise _too_few(len(photos), skipped)
     return Gathered(sorted(photos, key=lambda photo: photo.name), skipped)
 
@@ -110,16 +111,18 @@ def _check(options: GatherOptions) -> None:
         raise SettingError("fps", "cannot be combined with frames; set only one of them")
     if options.fps is not None and not (options.fps > 0 and math.isfinite(options.fps)):
         raise SettingError("fps", f"{options.fps:g} is not a positive number; use e.g. 2")
-    if options.frames is not None and options.frames < _FEWEST:
-        raise SettingError("frames", f"{options.frames} is too few; use {_FEWEST} or more, e.g. 60")
-    if options.size is not None and options.size < _SMALLEST_SIZE:
-        raise SettingError("size", f"{options.size} is too small; use {_SMALLEST_SIZE} or more")
+    if options.frames is not None and options.frames < _MIN_PHOTOS:
+        raise SettingError(
+            "frames", f"{options.frames} is too few; use {_MIN_PHOTOS} or more, e.g. 60"
+        )
+    if options.size is not None and options.size < _MIN_SIZE:
+        raise SettingError("size", f"{options.size} is too small; use {_MIN_SIZE} or more")
 
 
 def _refuse_changes(
     planned: Sequence[Planned], videos: Sequence[Source], options: GatherOptions
 ) -> None:
-    """Raises UserError if a file cannot be used in place."""
+    """Raises UserError if a photo cannot be used in place, or if the inputs contain a video."""
     changed = [plan.source.path for plan in planned if not plan.header.is_ready(options.size)]
     others = [source.path for source in videos]
     others += [plan.source.path for plan in planned if plan.name != plan.source.name]
@@ -141,10 +144,10 @@ def _take_frames(
     skipped: list[tuple[str, str]],
     report: Report,
 ) -> list[Photo]:
-    below = folder / source.name
-    below.mkdir(parents=True, exist_ok=True)
-    most = frames_wanted(clip, options.fps, options.frames)
-    frames = extract_frames(clip, below, most, options.size, report)
+    frame_folder = folder / source.name
+    frame_folder.mkdir(parents=True, exist_ok=True)
+    max_frames = max_frame_count(clip, options.fps, options.frames)
+    frames = extract_frames(clip, frame_folder, max_frames, options.size, report)
     label = source.path.name if not source.name else source.name
     skipped += [(f"{label} at {seconds:.1f} s", reason) for seconds, reason in frames.skipped]
     return [
@@ -173,7 +176,7 @@ def _check_disk_space(
     clips: Sequence[tuple[Source, Clip]],
     options: GatherOptions,
 ) -> None:
-    """Raises UserError if ``input/`` does not fit on the disk, by a low estimate."""
+    """Raises UserError if ``input/`` certainly does not fit on the disk (by a low estimate)."""
     device = (dataset / "input").stat().st_dev
     needed = 0.0
     for plan in planned:
@@ -185,7 +188,7 @@ def _check_disk_space(
     for _, clip in clips:
         scale = min(1.0, (options.size or math.inf) / max(clip.width, clip.height))
         pixels = clip.width * clip.height * scale**2
-        needed += 0.3 * pixels * frames_wanted(clip, options.fps, options.frames)
+        needed += 0.3 * pixels * max_frame_count(clip, options.fps, options.frames)
     free = shutil.disk_usage(dataset).free
     if needed > free:
         raise UserError(
@@ -195,7 +198,7 @@ def _check_disk_space(
 
 
 def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
-    """The error for too few photos; it explains the most frequent reason for skipping images."""
+    """The error if too few images are usable; it explains the most frequent reason for skipping."""
     reasons = Counter(reason for _, reason in skipped)
     reason, often = reasons.most_common(1)[0] if reasons else ("", 0)
     everything = usable == 0 and often == len(skipped)
@@ -204,7 +207,7 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
         left_out = "".join(f"; {source} {why}" for source, why in skipped[:3])
         left_out += f"; and {len(skipped) - 3} more" if len(skipped) > 3 else ""
         return UserError(
-            f"photos: {_count(usable)}; use at least {_FEWEST}, better 20 or more "
+            f"photos: {_count(usable)}; use at least {_MIN_PHOTOS}, preferably 20 or more, "
             f"from different places around the scene{left_out}"
         )
     if reason == SAME_VIEW:
@@ -226,7 +229,7 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
     first = next(source for source, why in skipped if why == reason)
     return UserError(
         f"photos: {_count(usable)}; {who} cannot be used, e.g. {first}, which {reason}; use at "
-        f"least {_FEWEST}, better 20 or more"
+        f"least {_MIN_PHOTOS}, preferably 20 or more"
     )
 
 

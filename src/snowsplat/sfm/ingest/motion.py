@@ -1,10 +1,10 @@
-"""Camera motion in a video: whether a frame shows a new view, and how far the picture has moved.
+"""Motion in a video: whether the camera has moved, and how far the image content has moved.
 
-All functions use small grey copies, (H, W) uint8. `PICTURE_SIDE` and `FRAME_SIDE` of
-`snowsplat.sfm.ingest.sharpness` are the longest sides of these copies. The shift of each block of a
-copy is estimated by phase correlation. The median over the blocks with texture is the motion, so
-neither a person who walks through the scene nor noise nor a change of light counts. Rotation and
-zoom shift most blocks too.
+All functions use small grey copies of frames, (H, W) uint8. `CONTENT_SIDE` and `SHARPNESS_SIDE` of
+`snowsplat.sfm.ingest.sharpness` are the longest sides of these copies. A copy is divided into
+blocks. The shift of each block is estimated by phase correlation. The motion is the median shift of
+the blocks with texture. So neither a person who walks through the scene nor noise nor a change of
+light counts as motion. A rotation or zoom of the camera does, because it shifts most blocks.
 """
 
 from __future__ import annotations
@@ -12,26 +12,28 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
-# Pixels of a copy of `PICTURE_SIDE`, 0.6% of its longest side. Measured: 0 or 1 for a static
-# camera, even with noise; 3 to 10 within 0.4 s for a camera that is carried while walking.
+# Smallest shift of a moving camera, in pixels of a copy of `CONTENT_SIDE`: 0.6% of its longest
+# side. Measured: 0 or 1 for a static camera, even with noise; 3 to 10 within 0.4 s for a camera
+# that is carried while walking.
 _MOVED = 2.0
 _BLOCK = 32  # pixels: side of a block; phase correlation measures shifts up to half of this side
-_LEAST_CONTRAST = 3.0  # standard deviation of the grey levels of a block with texture
+_MIN_CONTRAST = 3.0  # standard deviation of the grey levels of a block with texture
 
-#: Longest side in pixels of the copies with which `PictureMotion` measures. Blocks of 32 pixels
-#: then measure a shift of up to 12% of the picture, more than a fast pan has between two frames.
+#: Longest side in pixels of the copies with which `FrameMotion` measures. With this size, blocks of
+#: 32 pixels measure a shift of up to 12% of the frame, more than a fast pan has between two frames.
 _MOTION_SIDE = 128
-# Pixels of these copies, 4% of the picture. The motion is measured from a reference frame, which is
-# replaced after this shift. So the rounding to pixels and the shake of a hand do not add up.
+# In pixels of these copies: 4% of the frame. The shift is measured from a reference frame, which is
+# replaced when the shift reaches this value. So the errors of rounding to pixels and the shake of a
+# hand do not add up.
 _NEW_REFERENCE = 5.0
-# Frames with less agreement (`_shift`) show different places. Measured: 0.13 to 0.21 for photos of
-# different scenes; 0.4 to 1 for frames of a video, also blurred ones, with a shift of less than
+# Two frames with less agreement (`_shift`) show different places. Measured: 0.13 to 0.21 for photos
+# of different scenes; 0.4 to 1 for frames of a video (also blurred ones) with a shift of less than
 # `_NEW_REFERENCE`.
-_UNRELATED = 0.25
+_MIN_AGREEMENT = 0.25
 
 
 def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether the camera moved between two frames, given equally large copies of `PICTURE_SIDE`."""
+    """Whether the camera moved between two frames, given equally large copies of `CONTENT_SIDE`."""
     if min(before.shape) < _BLOCK:
         return bool(np.abs(before.astype(np.float32) - after).mean() >= 1.0)
     first, second = _blocks(before), _blocks(after)
@@ -41,55 +43,55 @@ def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
     return _shift(_spectrum(first[textured]), _spectrum(second[textured]))[0] >= _MOVED
 
 
-class PictureMotion:
-    """How far the picture has moved since the first frame of a video.
+class FrameMotion:
+    """How far the image content has moved since the first frame of a video.
 
-    The motion of small steps is added up, whatever their direction. Motion blur does not matter,
-    because it hardly changes the phases of a small copy. A cut counts as motion by about an
-    eighth of the picture, as do other changes that are too large to be measured.
+    The motion is the sum of small shifts, whatever their direction. Motion blur hardly affects it,
+    because blur hardly changes the phases of a small copy. A cut counts as a shift by about an
+    eighth of the frame, and so do other changes that are too large to be measured.
     """
 
     def __init__(self) -> None:
         self._reference: np.ndarray | None = None  # (N, 32, 17) complex: spectra of textured blocks
         self._textured = np.zeros(0, bool)  # (M,): the blocks of the reference that have texture
         self._before = 0.0  # the motion up to the reference
-        self._most = 0.0
+        self._motion = 0.0  # the motion up to the last frame
 
     def add(self, grey: np.ndarray) -> float:
-        """The motion up to the next frame, as a fraction of the longest side of the picture.
+        """Take the next frame; returns the motion from the first frame to this one.
 
-        It never decreases.
+        The motion is a fraction of the longest side of a frame. It never decreases.
 
         Args:
-            grey: (H, W) uint8, a copy of `FRAME_SIDE`. The frames of a video normally have the same
-                size. A change of the size counts as a cut.
+            grey: (H, W) uint8, a copy of `SHARPNESS_SIDE`. The frames of a video normally have the
+                same size. A change of the size counts as a cut.
         """
         height, width = grey.shape
         factor = max(1, min(max(grey.shape) // _MOTION_SIDE, min(grey.shape) // _BLOCK))
         small = np.asarray(Image.fromarray(grey).reduce(factor)) if factor > 1 else grey
         if min(small.shape) < _BLOCK:
-            return self._most  # an icon: too small to be measured
+            return self._motion  # too small to be measured
         blocks = _blocks(small)
         largest = _BLOCK / 2
         if self._reference is None:
-            self._refer_to(blocks)
-            return self._most
+            self._set_reference(blocks)
+            return self._motion
         if len(blocks) != len(self._textured):
             shift = largest
-        elif not self._textured.any():  # black, for example
+        elif not self._textured.any():  # the reference is black, for example
             shift = largest if _textured(blocks).any() else 0.0
         else:
             shift, agreement = _shift(self._reference, _spectrum(blocks[self._textured]))
-            shift = largest if agreement < _UNRELATED else shift
-        self._most = max(self._most, self._before + shift * factor / max(height, width))
+            shift = largest if agreement < _MIN_AGREEMENT else shift
+        self._motion = max(self._motion, self._before + shift * factor / max(height, width))
         if shift >= _NEW_REFERENCE:
-            self._refer_to(blocks)
-        return self._most
+            self._set_reference(blocks)
+        return self._motion
 
-    def _refer_to(self, blocks: np.ndarray) -> None:
+    def _set_reference(self, blocks: np.ndarray) -> None:
         self._textured = _textured(blocks)
         self._reference = _spectrum(blocks[self._textured])
-        self._before = self._most
+        self._before = self._motion
 
 
 def _blocks(grey: np.ndarray) -> np.ndarray:
@@ -102,15 +104,15 @@ def _blocks(grey: np.ndarray) -> np.ndarray:
 
 
 def _textured(blocks: np.ndarray) -> np.ndarray:
-    """(N,) bool: the half of the blocks with the most contrast, without blocks of one colour."""
+    """(N,) bool: the half of the blocks with the most contrast, except blocks without contrast."""
     contrast = blocks.std(axis=(1, 2))
-    return contrast >= max(float(np.median(contrast)), _LEAST_CONTRAST)
+    return contrast >= max(float(np.median(contrast)), _MIN_CONTRAST)
 
 
 def _spectrum(blocks: np.ndarray) -> np.ndarray:
-    """(N, 32, 32) to (N, 32, 17) complex.
+    """The Fourier transforms of blocks: (N, 32, 32) to (N, 32, 17) complex.
 
-    The blocks are faded out at the edges; otherwise the edges would correlate.
+    A Hann window fades the blocks out at their edges; otherwise the edges would correlate.
     """
     fade = np.hanning(_BLOCK + 2)[1:-1].astype(np.float32)
     return np.fft.rfft2((blocks - blocks.mean(axis=(1, 2), keepdims=True)) * fade[:, None] * fade)
@@ -123,7 +125,8 @@ def _shift(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
     shift. There must be at least one block.
 
     Args:
-        first: (N, 32, 17) complex; ``second``: the spectra of the same blocks of another frame.
+        first: (N, 32, 17) complex, the spectra of blocks of one frame (`_spectrum`).
+        second: the spectra of the same blocks of the other frame.
     """
     cross = first * np.conj(second)
     size = np.abs(cross)

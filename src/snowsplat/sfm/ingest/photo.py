@@ -9,13 +9,13 @@ from dataclasses import dataclass
 class Photo:
     """A photo in ``input/``, upright, and its metadata. All fields can be stored as JSON."""
 
-    name: str  # file in input/, relative, "/"; unique
-    source: str  # the original: a path, or "walk.mp4 at 3.2 s"
+    name: str  # path relative to input/, with "/"; unique
+    source: str  # the original, as text for users: a path, or "walk.mp4 at 3.2 s"
     width: int  # pixels, as stored in input/
     height: int
     group: str  # photos of a group have the same camera and zoom, so they share intrinsics
-    sequence: str | None  # the video of a frame (name order is time order); None for photos
+    sequence: str | None  # video of a frame; its frames sorted by name are in the order of time
     focal: float | None  # pixels, from EXIF; None if unknown
     location: tuple[float, float, float] | None  # GPS: latitude, longitude (degrees), altitude (m)
     mask: bool  # whether distorted/masks/NAME.png exists
-    alpha: bool  # whether it has transparent pixels
+    alpha: bool  # whether the photo has transparent pixels

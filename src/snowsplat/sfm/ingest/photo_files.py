@@ -1,7 +1,7 @@
-"""Converts a photo from any format that cameras write to one that COLMAP reads, upright.
+"""Converts a photo from any format that cameras write to an upright one that COLMAP reads.
 
-COLMAP reads pixels as they are stored: pycolmap 4.2 ignores the EXIF orientation. It cannot read
-WebP and HEIC. A photo is linked or copied without a change if it is a JPEG, PNG or TIFF file with
+pycolmap 4.2 reads pixels as they are stored: it ignores the EXIF orientation. It cannot read WebP
+and HEIC. A photo is linked or copied without a change if it is a JPEG, PNG or TIFF file with
 upright pixels in 8-bit RGB or grey. All other photos are converted.
 """
 
@@ -86,11 +86,12 @@ def read_header(path: Path) -> Header:
     """Read the header of a photo, without decoding it.
 
     Raises:
-        Unusable: unknown format, damaged, or too small.
+        Unusable: the format is unknown, or the photo is damaged or too small.
     """
     try:
         with open_image(path, header_only=True) as image:
-            # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
+            # If a PNG has no EXIF data before its pixels, getexif() would decode the pixels, in
+            # order to find EXIF data after them.
             has_exif = "exif" in image.info or image.format == "TIFF"
             exif = image.getexif() if has_exif else Image.Exif()
             transparent = image.mode in _TRANSPARENT or "transparency" in image.info
@@ -106,7 +107,7 @@ def read_header(path: Path) -> Header:
                 transparent=transparent,
                 exif=read_exif(exif, width, height),
             )
-    except Exception as error:  # Pillow's parsers raise anything on damaged files
+    except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
@@ -136,7 +137,7 @@ def _bits(path: Path, image: Image.Image) -> int:
 
 
 def open_image(path: Path, *, header_only: bool = False) -> Image.Image:
-    """Open an image of a photo format, decoded lazily; raises as `image_file.open_image`."""
+    """Open a photo; its pixels are decoded later. Raises the errors of `image_file.open_image`."""
     from pillow_heif import register_heif_opener
 
     register_heif_opener()
@@ -147,12 +148,12 @@ def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
     """The photo, upright and resized: mode L, RGB or, with transparent pixels, RGBA.
 
     Raises:
-        Unusable: damaged.
+        Unusable: the photo is damaged.
     """
     try:
         with open_image(path) as opened:
             image = _eight_bits(ImageOps.exif_transpose(opened))
-    except Exception as error:  # as above
+    except Exception as error:  # as in `read_header`
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if image.mode == "RGBA" and image.getchannel("A").getextrema()[0] == 255:
         image = image.convert("RGB")
@@ -169,11 +170,12 @@ def decode_small(path: Path, side: int) -> Image.Image:
         with open_image(path) as opened:
             opened.draft("RGB", scaled_size(opened.width, opened.height, 2 * side))
             return _eight_bits(opened)
-    except Exception as error:  # as above
+    except Exception as error:  # as in `read_header`
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
 
 
 def _eight_bits(image: Image.Image) -> Image.Image:
+    """Decode and convert to mode L, RGB or RGBA; raises ValueError for floating-point pixels."""
     if image.mode.startswith("I"):  # 16-bit grey: convert() would clip it, not scale it
         values = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255)
         return Image.fromarray(values.astype(np.uint8))
@@ -186,12 +188,17 @@ def _eight_bits(image: Image.Image) -> Image.Image:
 
 
 def resized(image: Image.Image, size: tuple[int, int]) -> Image.Image:
-    """Resize with a Lanczos filter; colours of transparent pixels do not bleed."""
+    """Resize with a Lanczos filter; colours of transparent pixels do not affect their neighbours.
+
+    ``size``: width and height in pixels.
+    """
     return image if image.size == size else image.resize(size, Image.Resampling.LANCZOS)
 
 
 def save(image: Image.Image, path: Path, source: Path | None = None) -> None:
-    """Write as JPEG (nearly lossless) or PNG, by the extension, with the EXIF of ``source``.
+    """Write as JPEG (nearly lossless) or PNG, as the extension of ``path`` says.
+
+    EXIF data and the colour profile are copied from the file ``source``, if it is given.
 
     Raises:
         OSError: the disk is full.
@@ -201,9 +208,9 @@ def save(image: Image.Image, path: Path, source: Path | None = None) -> None:
         with open_image(source, header_only=True) as original:
             exif = exif_for_copy(original.getexif(), *image.size)
             profile = original.info.get("icc_profile")
-            coloured = original.mode not in ("CMYK", "LAB", "I;16")
+            profile_is_valid = original.mode not in ("CMYK", "LAB", "I;16")
         extra = {"exif": exif} if exif else {}
-        if profile and coloured:  # a CMYK profile is not valid for RGB pixels
+        if profile and profile_is_valid:  # a CMYK profile is not valid for RGB pixels
             extra["icc_profile"] = profile
     if path.suffix.lower() == ".png":
         image.save(path, "PNG", compress_level=3, **extra)
@@ -220,8 +227,8 @@ def link_or_copy(source: Path, target: Path) -> None:
     shutil.copyfile(source, target)
 
 
-def turned(image: Image.Image, orientation: int) -> Image.Image:
-    """Rotate pixels that are stored with this EXIF orientation, so that they are upright."""
+def made_upright(image: Image.Image, orientation: int) -> Image.Image:
+    """Rotate and mirror an image as the EXIF ``orientation`` (1 to 8) says."""
     exif = image.getexif()
     exif[ORIENTATION] = orientation
     return ImageOps.exif_transpose(image)

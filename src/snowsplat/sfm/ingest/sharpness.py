@@ -1,7 +1,7 @@
 """Sharpness of an image, and tests for images without content.
 
-All functions use small grey copies, (H, W) uint8. They contain the detail that SfM needs, and
-little noise.
+All functions use small grey copies of images, (H, W) uint8. The copies contain the detail that SfM
+needs, and little noise.
 """
 
 from __future__ import annotations
@@ -11,21 +11,24 @@ from PIL import Image
 
 #: Longest side in pixels of the copies that are compared for sharpness. A blur of half a pixel of
 #: the copy is still detected, while noise of the sensor and of compression is mostly averaged out.
-FRAME_SIDE = 640
+SHARPNESS_SIDE = 640
 #: Longest side in pixels of the copies that are tested for content, and for camera motion.
-PICTURE_SIDE = 320
+CONTENT_SIDE = 320
 
-# An image with less fine detail (`_fine_detail`) is unusable. The limits are given for the longest
-# side of the copy. Measured with pycolmap's SIFT on three real datasets of 1000 to 1280 pixels,
-# blurred by Gaussians and saved as JPEG with quality 75 and 95. Neighbouring photos have 21 to 107
-# inlier matches at σ = 8 pixels, 0 to 20 at σ = 12, and none at σ = 16.
+# Longest side of a copy in pixels -> minimum of `_fine_detail` for this copy. An image with less is
+# unusable. The minima follow from photos of three real datasets (1000 to 1280 pixels), which were
+# blurred by Gaussian filters with a standard deviation of σ pixels and saved as JPEG with quality
+# 75 and 95. With pycolmap's SIFT, neighbouring photos have 21 to 107 inlier matches at σ = 8, 0 to
+# 20 at σ = 12, and none at σ = 16. `_fine_detail` is
 #          longest side      sharp        σ = 8        12           16           24 and 32
 #                   160    0.60 to 0.74  0.18 to 0.24  0.09 to 0.14  0.06 to 0.12  0.04 to 0.15
 #                    80    0.60 to 0.75  0.39 to 0.47  0.24 to 0.32  0.17 to 0.23  0.07 to 0.14
 # At 160, the values increase again for heavily blurred images because of JPEG blocks, which are not
 # visible at 80.
-_BLURRED = {160: 0.09, 80: 0.16}
-_BLANK = 8.0  # range of grey levels (0.5% to 99.5% quantile); a lens cap has 2 to 5
+_MIN_DETAIL = {160: 0.09, 80: 0.16}
+# Minimum range of the grey levels (0.5% to 99.5% quantile) of an image with content. A photo with
+# the lens cap on has 2 to 5.
+_MIN_RANGE = 8.0
 
 # Reasons why an image is unusable.
 BLACK = "is completely black"
@@ -35,7 +38,7 @@ BLURRED = "is too blurred"
 
 
 def grey_copy(image: Image.Image, side: int) -> np.ndarray:
-    """(H, W) uint8 grey copy of an image, with its longest side at most about ``side``."""
+    """(H, W) uint8 grey copy of an image, with its longest side at most about ``side`` pixels."""
     factor = max(1, max(image.size) // (2 * side))
     if factor > 1:  # first by an integer factor, which is several times faster
         image = image.reduce(factor)
@@ -49,31 +52,32 @@ def sharpness(grey: np.ndarray) -> float:
     """Variance of the Laplacian, for comparing frames of one scene; it has no absolute meaning.
 
     In a real video with motion blur in half of its frames, this measure selected an unblurred frame
-    more often than the energy of the gradients, the product of both axes, or a mean of these.
+    more often than the gradient energy, the product of the energies of both axes, or a mean of
+    these measures.
     """
     g = grey.astype(np.int16)  # half the memory of float32, and exact
     detail = 4 * g[1:-1, 1:-1] - g[:-2, 1:-1] - g[2:, 1:-1] - g[1:-1, :-2] - g[1:-1, 2:]
-    if not detail.size:  # a few pixels
+    if not detail.size:  # the copy has only a few pixels
         return 0.0
     total = int(detail.sum(dtype=np.int64))
     squares = int(np.multiply(detail, detail, dtype=np.int32).sum(dtype=np.int64))
     return (squares - total * total / detail.size) / detail.size
 
 
-def why_useless(grey: np.ndarray) -> str | None:
-    """The reason why an image is unusable for SfM, or None. ``grey``: a copy of `PICTURE_SIDE`."""
+def why_unusable(grey: np.ndarray) -> str | None:
+    """The reason why an image is unusable for SfM, or None. ``grey``: a copy of `CONTENT_SIDE`."""
     low, high = np.quantile(grey, [0.005, 0.995])
-    if high - low < _BLANK:
+    if high - low < _MIN_RANGE:
         return BLACK if high < 64 else WHITE if low > 191 else FLAT
-    blurred = any(_fine_detail(grey, side) < least for side, least in _BLURRED.items())
+    blurred = any(_fine_detail(grey, side) < least for side, least in _MIN_DETAIL.items())
     return BLURRED if blurred else None
 
 
 def _fine_detail(grey: np.ndarray, side: int) -> float:
     """The share of the gradient energy, 0..1, that a blur at the scale of 1/``side`` removes.
 
-    It does not depend on the contrast, and hardly on the content, because images of real scenes
-    have detail at all scales, unless defocus or motion blur removes it.
+    This share does not depend on the contrast. It hardly depends on the content, because images of
+    real scenes have detail at all scales, unless defocus or motion blur removes it.
     """
     small = grey_copy(Image.fromarray(grey), side).astype(np.float32)
     if min(small.shape) < 8:

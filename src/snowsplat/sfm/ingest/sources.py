@@ -22,8 +22,8 @@ VIDEO_SUFFIXES = _suffixes(
 )
 _RAW_SUFFIXES = _suffixes("dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw")
 MASKS = "masks"
-# Folders that contain one of these files are output folders of this program, and are skipped.
-_OUR_FILES = ("capture.json", "cfg_args")
+# Folders that contain one of these files are datasets or output folders. They are skipped.
+_OUTPUT_FILES = ("capture.json", "cfg_args")
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,15 @@ class Source:
 
     path: Path
     kind: Literal["photo", "video"]
-    #: Relative to ``input/``, with "/": the file of a photo; the folder of a video's frames or "".
+    #: Relative to ``input/``, with "/": the file of a photo, or the folder for the frames of a video
+    #: ("" for ``input/`` itself).
     name: str
-    mask: Path | None = None  # of a photo
+    mask: Path | None = None  # the mask of a photo
 
 
 @dataclass(frozen=True)
 class Found:
-    """All files in the inputs, in the order of the inputs and of the names within each."""
+    """All files in the inputs, in the order of the inputs; files of a folder are sorted by name."""
 
     sources: list[Source]
     left_out: list[tuple[str, str]]  # path, reason
@@ -49,10 +50,10 @@ class Found:
 def find_sources(inputs: Sequence[Path]) -> Found:
     """Find photos and videos in files and folders; folders are searched recursively.
 
-    Hidden files, ``masks`` folders and output folders of this program are skipped. Videos in a
-    folder with photos are also skipped, because some phones save a video of three seconds with
-    every photo. The names in a single input are kept. With several inputs, each folder and video
-    gets its own folder, so that equal names do not collide.
+    Hidden files, ``masks`` folders, datasets and output folders are skipped. Videos in a folder
+    with photos are also skipped, because some phones save a video of three seconds with every
+    photo. If there is a single input, the files keep their names. If there are several, each input
+    folder and each video gets its own folder in ``input/``, so that equal names do not collide.
 
     Raises:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
@@ -92,7 +93,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
         unused += masks.unused
         for relative in videos:
             if photos:
-                reason = "is a video beside photos; add it as an input to use its frames"
+                reason = "is a video in a folder of photos; add it as an input to use its frames"
                 left_out.append((shown(path / relative), reason))
             else:
                 stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
@@ -116,23 +117,27 @@ def _scan(root: Path) -> tuple[list[str], list[str]]:
 
 
 def _files_below(root: Path, leave_out: Sequence[str] = (MASKS,)) -> list[str]:
-    """Files that are not hidden; relative, with "/", sorted. Links are followed, but only once."""
+    """Files that are not hidden; relative to ``root``, with "/", sorted.
+
+    Links to folders are followed, but every folder is searched only once. Folders named as in
+    ``leave_out``, datasets and output folders are skipped.
+    """
 
     def fail(error: OSError) -> None:
         raise error
 
     found = []
-    been = {root.resolve()}
-    for folder, below, files in os.walk(root, followlinks=True, onerror=fail):
+    visited = {root.resolve()}
+    for folder, subfolders, files in os.walk(root, followlinks=True, onerror=fail):
         here = Path(folder)
         kept = []
-        for name in sorted(below):
+        for name in sorted(subfolders):
             real = (here / name).resolve()
-            ours = any((here / name / file).is_file() for file in _OUR_FILES)
-            if not (name.startswith(".") or name in leave_out or ours or real in been):
-                been.add(real)
+            is_output = any((here / name / file).is_file() for file in _OUTPUT_FILES)
+            if not (name.startswith(".") or name in leave_out or is_output or real in visited):
+                visited.add(real)
                 kept.append(name)
-        below[:] = kept
+        subfolders[:] = kept  # os.walk then searches only these
         found += [
             (here / name).relative_to(root).as_posix()
             for name in files
@@ -142,10 +147,10 @@ def _files_below(root: Path, leave_out: Sequence[str] = (MASKS,)) -> list[str]:
 
 
 class Masks:
-    """The masks of a folder of photos: ``masks/IMG.jpg.png`` or ``masks/IMG.png``.
+    """The masks of a folder of photos: ``masks/IMG.jpg.png`` or ``masks/IMG.png`` for ``IMG.jpg``.
 
-    For a photo in a subfolder, also ``sub/masks/…``. All image formats are accepted; the extension
-    may be in upper or lower case.
+    The mask of ``sub/IMG.jpg`` is in ``masks/sub/`` or in ``sub/masks/``. All image formats are
+    accepted; the extension may be in upper or lower case.
     """
 
     def __init__(self, root: Path) -> None:
@@ -169,7 +174,7 @@ class Masks:
 
     @property
     def unused(self) -> list[Path]:
-        """Masks without a photo, probably misspelt."""
+        """Masks without a photo; their names are probably misspelt."""
         there = {path for listed in self._by_folder.values() for path in listed.values()}
         return sorted(there - self._used)
 
@@ -237,13 +242,17 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
 
 
 def free_names(names: Sequence[str]) -> Iterator[str]:
-    """The names. A name that equals an earlier one, ignoring letter case, gets a suffix."""
+    """The names, made unique: a name that equals an earlier one except for case gets a suffix.
+
+    "a.jpg" becomes "a_2.jpg", "a_3.jpg" and so on.
+    """
     taken: set[str] = set()
     for name in names:
         yield _free(name, taken)
 
 
 def _free(name: str, taken: set[str]) -> str:
+    """``name``, or a variant of it that is not in ``taken``; the result is added to ``taken``."""
     name = shown(name)
     path = PurePosixPath(name)
     candidate, n = name, 1

@@ -1,13 +1,14 @@
-"""Video -> frames: sharp frames, between which the picture moves by about the same amount.
+"""Writes frames of a video as files: sharp frames with about the same motion between them.
 
-Decoding takes most of the time, so all frames are decoded in a single pass. It divides the video
-into short windows. A window ends when the picture has moved by a small step, or after a time. The
-sharpest frame of the current window is kept in memory, and is written as a candidate when the
-window ends. The whole motion is known only at the end, so more candidates than necessary are
-written. The frames to keep are chosen from them at the end, and the other files are deleted.
+Decoding takes most of the time, so all frames are decoded only once. The video is divided into
+short windows. A window ends when the motion in it reaches a small step, or after a maximum time.
+The sharpest frame of the current window is kept in memory, and is written as a candidate when the
+window ends. The motion of the whole video is known only at the end, so more candidates than
+necessary are written. At the end, `choose` selects the frames to keep, and the files of the other
+candidates are deleted.
 
-The length of the video is computed before from the times of the packets, because the length in the
-header is missing in streams that browsers record, and wrong in truncated files.
+The duration of the video is computed before, from the times of the packets (`read_clip`). The
+duration in the header is missing in streams that browsers record, and wrong in truncated files.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ from PIL import Image
 from snowsplat.sfm.ingest.clip import (
     Clip,
     decoded_frames,
-    nothing_decodes,
     open_video,
+    undecodable,
     upright_size,
 )
 from snowsplat.sfm.ingest.key_frames import Candidate, choose
-from snowsplat.sfm.ingest.motion import PictureMotion, has_moved
+from snowsplat.sfm.ingest.motion import FrameMotion, has_moved
 from snowsplat.sfm.ingest.photo_files import resized, save, scaled_size
 from snowsplat.sfm.ingest.sharpness import (
-    FRAME_SIDE,
-    PICTURE_SIDE,
+    CONTENT_SIDE,
+    SHARPNESS_SIDE,
     grey_copy,
     sharpness,
-    why_useless,
+    why_unusable,
 )
 from snowsplat.sfm.progress import Report
-from snowsplat.sfm.tone import rgb_picture
+from snowsplat.sfm.tone import rgb_image
 from snowsplat.util.files import shown
 
 if TYPE_CHECKING:
@@ -48,9 +49,10 @@ logger = logging.getLogger(__name__)
 
 SAME_VIEW = "shows the same view as the previous frame"
 
-# The smallest step between candidates, as a fraction of the picture: nearly the same view.
-_FINEST_STEP = 0.01
-_FEW = 30  # for fewer frames than this, there are as many candidates as for this number
+# The smallest motion in a window, as a fraction of the longest side: nearly the same view.
+_MIN_STEP = 0.01
+# If fewer frames are requested, there are as many candidates as for this number of frames.
+_MIN_STEPS = 30
 
 
 @dataclass(frozen=True)
@@ -68,18 +70,21 @@ class Frames:
     """The result of extracting frames from a video."""
 
     kept: list[Frame] = field(default_factory=list)
-    skipped: list[tuple[float, str]] = field(default_factory=list)  # time (s) and reason
+    # The sharpest frames of windows without a candidate: time (s) and reason.
+    skipped: list[tuple[float, str]] = field(default_factory=list)
     read: int = 0  # number of decoded frames
 
 
-def extract_frames(clip: Clip, folder: Path, most: int, size: int | None, report: Report) -> Frames:
+def extract_frames(
+    clip: Clip, folder: Path, max_frames: int, size: int | None, report: Report
+) -> Frames:
     """Write ``frame_00001.jpg`` … to an existing folder, in the order of time.
 
-    During the pass, the folder contains more files than at the end: up to four times ``most``, or
-    120 if that is more. They are deleted at the end, also after an error.
+    While the video is decoded, the folder contains more files: up to four times ``max_frames``, or
+    120 if that is more. The other files are deleted at the end, also after an error.
 
     Args:
-        most: maximum number of frames, at least 1.
+        max_frames: maximum number of frames, at least 1.
         size: resize larger frames to this longest side in pixels; None keeps the size.
 
     Raises:
@@ -90,8 +95,8 @@ def extract_frames(clip: Clip, folder: Path, most: int, size: int | None, report
 
     frames = Frames()
     name = clip.path.name
-    candidates = _Candidates(clip, folder, most, size)
-    motion = PictureMotion()
+    candidates = _Candidates(clip, folder, max_frames, size)
+    motion = FrameMotion()
     try:
         with open_video(clip.path) as container:
             rate = float(container.streams.video[0].average_rate or 30)
@@ -105,11 +110,11 @@ def extract_frames(clip: Clip, folder: Path, most: int, size: int | None, report
                     report(min(frames.read, clip.packets), clip.packets, f"frames of {name}")
         frames.kept = candidates.finish()
     except (av.FFmpegError, ValueError) as error:
-        raise nothing_decodes(clip.path, error) from None
+        raise undecodable(clip.path, error) from None
     finally:
         candidates.delete()
     if not frames.read:
-        raise nothing_decodes(clip.path, None)
+        raise undecodable(clip.path, None)
     frames.skipped = candidates.skipped
     report(clip.packets, clip.packets, f"frames of {name}")
     _log_summary(clip, frames)
@@ -119,34 +124,44 @@ def extract_frames(clip: Clip, folder: Path, most: int, size: int | None, report
 class _Candidates:
     """Divides a video into windows, and writes the sharpest frame of each as a candidate."""
 
-    def __init__(self, clip: Clip, folder: Path, most: int, size: int | None) -> None:
+    def __init__(self, clip: Clip, folder: Path, max_frames: int, size: int | None) -> None:
         self.skipped: list[tuple[float, str]] = []  # time (s) and reason
-        self._clip, self._folder, self._most, self._size = clip, folder, most, size
-        self._many = max(most, _FEW)
-        self._longest = clip.seconds / most - 1e-3  # seconds; times are rounded to 1 ms
+        self._clip, self._folder, self._max_frames, self._size = clip, folder, max_frames, size
+        self._step_count = max(max_frames, _MIN_STEPS)
+        # The longest window. Times are rounded to 1 ms.
+        self._max_seconds = clip.seconds / max_frames - 1e-3
         self._candidates: list[Candidate] = []
         self._frames: dict[int, Frame] = {}  # by the number of the candidate
         self._written = 0
         self._best = _SharpestFrame()
-        self._opened = (0.0, 0.0)  # time (s) and motion at which the window began
+        self._window_start = (0.0, 0.0)  # time (s) and motion at which the window began
         self._last: np.ndarray | None = None  # small copy of the last candidate
 
     def offer(self, frame: VideoFrame, grey: np.ndarray, seconds: float, moved: float) -> None:
-        """Take the next frame. ``moved``: the result of `PictureMotion`."""
+        """Take the next frame.
+
+        Args:
+            grey: (H, W) uint8, its small copy.
+            seconds: its time, from the first frame.
+            moved: the result of `FrameMotion.add`.
+        """
         if self._best.frame is None:
-            self._opened = seconds, moved
-        # The final step is at least the present motion divided by the number of frames. So this
-        # step is at most half of the final one, at any time.
-        step = max(_FINEST_STEP, moved / (2 * self._many))
-        if seconds - self._opened[0] >= self._longest or moved - self._opened[1] >= step:
+            self._window_start = seconds, moved
+        # The motion only increases. At the end, `choose` uses a step of at least the whole motion
+        # divided by the number of frames, so the step of a window is at most half of it.
+        step = max(_MIN_STEP, moved / (2 * self._step_count))
+        if (
+            seconds - self._window_start[0] >= self._max_seconds
+            or moved - self._window_start[1] >= step
+        ):
             self._close_window()
-            self._opened = seconds, moved
+            self._window_start = seconds, moved
         self._best.offer(frame, grey, seconds, moved)
 
     def finish(self) -> list[Frame]:
         """Delete the candidates that are not chosen, and rename the others."""
         self._close_window()
-        self._thin(self._most)
+        self._thin(self._max_frames)
         kept = []
         for number, candidate in enumerate(self._candidates, 1):
             frame = self._frames.pop(candidate.number)
@@ -161,11 +176,12 @@ class _Candidates:
         self._frames.clear()
 
     def _close_window(self) -> None:
+        """Write the sharpest frame of the window as a candidate, unless it must be skipped."""
         best = self._best
         if best.frame is None or best.grey is None:
             return
-        small = grey_copy(Image.fromarray(best.grey), PICTURE_SIDE)
-        reason = why_useless(small)
+        small = grey_copy(Image.fromarray(best.grey), CONTENT_SIDE)
+        reason = why_unusable(small)
         last = self._last
         if reason is None and last is not None and last.shape == small.shape:
             reason = None if has_moved(last, small) else SAME_VIEW
@@ -175,14 +191,14 @@ class _Candidates:
             self._frames[self._written] = _write(best, self._clip, path, self._size)
             self._candidates.append(Candidate(best.moved, best.sharpness, self._written))
             self._last = small
-            if len(self._candidates) > 4 * self._many:
-                self._thin(2 * self._many)
+            if len(self._candidates) > 4 * self._step_count:
+                self._thin(2 * self._step_count)
         else:
             self.skipped.append((best.seconds, reason))
         best.reset()
 
-    def _thin(self, most: int) -> None:
-        self._candidates = choose(self._candidates, most)
+    def _thin(self, max_frames: int) -> None:
+        self._candidates = choose(self._candidates, max_frames)
         kept = {candidate.number for candidate in self._candidates}
         for number in self._frames.keys() - kept:
             (self._folder / self._frames.pop(number).name).unlink()
@@ -209,7 +225,7 @@ class _SharpestFrame:
 
 
 def _grey(frame: VideoFrame) -> np.ndarray:
-    width, height = scaled_size(frame.width, frame.height, FRAME_SIDE)
+    width, height = scaled_size(frame.width, frame.height, SHARPNESS_SIDE)
     small = frame.reformat(width=width, height=height, format="gray", interpolation="AREA")
     return small.to_ndarray()
 
@@ -217,7 +233,7 @@ def _grey(frame: VideoFrame) -> np.ndarray:
 def _write(best: _SharpestFrame, clip: Clip, path: Path, size: int | None) -> Frame:
     frame = best.frame
     assert frame is not None
-    image = Image.fromarray(rgb_picture(frame))
+    image = Image.fromarray(rgb_image(frame))
     turns = round(frame.rotation / 90) % 4
     if turns:  # counter-clockwise, as in Pillow
         image = image.transpose(Image.Transpose(1 + turns))
@@ -237,7 +253,7 @@ def _log_summary(clip: Clip, frames: Frames) -> None:
     same = sum(reason == SAME_VIEW for _, reason in frames.skipped)
     useless = len(frames.skipped) - same
     line = f"{clip.path.name}: decoded {frames.read} frames ({clip.seconds:.1f} s of video), "
-    line += f"selected {len(frames.kept)} sharp frames, by how far the picture moved"
+    line += f"selected {len(frames.kept)} sharp frames with about the same motion between them"
     line += f"; {same} skipped because the camera did not move" if same else ""
     line += f"; {useless} skipped because they are black, white or blurred" if useless else ""
     logger.info("%s", line)
