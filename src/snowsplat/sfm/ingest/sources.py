@@ -32,8 +32,8 @@ class Source:
 
     path: Path
     kind: Literal["photo", "video"]
-    #: Relative to ``input/``, with "/": the file of a photo, or the folder for the frames of a video
-    #: ("" for ``input/`` itself).
+    #: Relative to ``input/``, with "/": the file of a photo, or the folder for the frames of a
+    #: video ("" for ``input/`` itself).
     name: str
     mask: Path | None = None  # the mask of a photo
 
