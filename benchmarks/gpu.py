@@ -1,6 +1,6 @@
 """All measurements that need a GPU, in one run of less than nine minutes.
 
-    python benchmarks/gpu.py --out OUT --captures CAPTURES
+    python benchmarks/gpu.py --out OUT --datasets DATASETS
     python benchmarks/gpu.py --out OUT --only device stages        some of the parts
 
 The parts are: tests that need a GPU; compute-sanitizer over every op; the stages of a training step
@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PARTS = Path(__file__).with_name("gpu_parts.py")
 GROUPS = ("device", "tests", "sanitizer", "stages", "train", "peer")
 SIZES = ("200k", "1m", "3m")
-CAPTURES = ("fox", "lego400")
+DATASETS = ("fox", "lego400")
 
 
 def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
@@ -51,10 +51,10 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         "TORCH_CUDA_ARCH_LIST": flags.arch,
         "SNOWSPLAT_DEVICE": "",
     }
-    garden = flags.captures / "garden_points.npz"
+    garden = flags.datasets / "garden_points.npz"
     if garden.is_file():
         environment["SNOWSPLAT_GARDEN"] = str(garden)
-    datasets = [str(flags.captures / name) for name in CAPTURES]
+    datasets = [str(flags.datasets / name) for name in DATASETS]
     folder = ["--folder", str(scratch)]
 
     def job(
@@ -191,10 +191,11 @@ def _flags() -> argparse.Namespace:
         "--out", type=Path, default=ROOT / "out" / "gpu", help="folder for the three output files"
     )
     parser.add_argument(
+        "--datasets",
         "--captures",
         type=Path,
         default=ROOT.parent / "shared" / "captures",
-        help=f"a folder with {', '.join(CAPTURES)} and garden_points.npz, or some of them",
+        help=f"a folder with {', '.join(DATASETS)} and garden_points.npz, or some of them",
     )
     parser.add_argument("--only", nargs="+", default=list(GROUPS), choices=GROUPS)
     parser.add_argument("--minutes", type=float, default=8.8, help="time limit of the run")

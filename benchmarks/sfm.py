@@ -1,15 +1,17 @@
-"""Structure from motion: time of each stage, photos placed rightly, memory.
+"""Structure from motion: time of each stage, photos with correct poses, memory.
 
-    python benchmarks/sfm.py                                  the captures and scenes of 60 photos
+    python benchmarks/sfm.py                                  real datasets, scenes of 60 photos
     python benchmarks/sfm.py room twins --photos 60 150       scenes of 60 and of 150 photos
     python benchmarks/sfm.py fern rooms-300 --json sfm.json
-    python benchmarks/sfm.py room --versus ../before/src      another build / this one, alternating
+    python benchmarks/sfm.py room --versus ../before/src      compare another build with this one
 
-A workload is a capture (a photo folder or video; skipped if absent) or a scene of `sfm_scenes.py`
-with its number of photos. The photos of a scene are rendered once, into the folder that
-SNOWSPLAT_SFM_SCENES or --cache names. A photo is placed rightly if its rotation is wrong by less
-than 3° and its centre by less than 3% of the largest distance between two true centres, after the
-model was aligned by the similarity transform that agrees with the most photos (`sfm_placed.py`).
+A workload is a real dataset (a folder of photos or a video; skipped if absent), or a procedural
+scene of `sfm_scenes.py` with a number of photos. The photos of a scene are rendered once, into the
+folder that --cache or the environment variable SNOWSPLAT_SFM_SCENES names.
+
+The estimated poses are aligned with the true ones by the similarity transform that agrees with the
+most photos (`sfm_placed.py`). A photo is placed correctly if the error of its rotation is then less
+than 3°, and that of its centre less than 3% of the largest distance between two true centres.
 """
 
 from __future__ import annotations
@@ -37,8 +39,8 @@ from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Name -> the photos or the video, and a COLMAP model of the same photos, relative to the captures.
-CAPTURES: dict[str, tuple[str, str | None]] = {
+#: Name -> the photos or the video, and a COLMAP model with the true poses, relative to --datasets.
+DATASETS: dict[str, tuple[str, str | None]] = {
     "fern": ("fern/images", "fern/sparse/0"),
     "kitchen25": ("kitchen25/images", "kitchen25/sparse/0"),
     "tree_photos": ("tree_photos", None),
@@ -68,14 +70,17 @@ def poses_in(model: Path) -> dict[str, Tensor]:
     return poses
 
 
-def workload(name: str, captures: Path, cache: Path, size: tuple[int, int]) -> Workload | None:
-    """The workload of a name; None if it is a capture that is absent."""
-    if name in CAPTURES:
-        photos, model = CAPTURES[name]
-        if not (captures / photos).exists():
+def workload(name: str, datasets: Path, cache: Path, size: tuple[int, int]) -> Workload | None:
+    """The workload of a name; None if it is a real dataset that is not in the folder ``datasets``.
+
+    ``size``: width and height of the photos of a procedural scene.
+    """
+    if name in DATASETS:
+        photos, model = DATASETS[name]
+        if not (datasets / photos).exists():
             return None
-        known = model is not None and (captures / model).is_dir()
-        return Workload(name, captures / photos, poses_in(captures / str(model)) if known else None)
+        known = model is not None and (datasets / model).is_dir()
+        return Workload(name, datasets / photos, poses_in(datasets / str(model)) if known else None)
     kind, _, count = name.partition("-")
 
     def report(done: int, total: int, what: str = "") -> None:
@@ -88,7 +93,11 @@ def workload(name: str, captures: Path, cache: Path, size: tuple[int, int]) -> W
 
 
 def measure(work: Workload, folder: Path, options: Mapping[str, Any], source: Path) -> dict:
-    """Make a dataset in ``folder`` with the package in ``source``; returns a row of the table."""
+    """Make a dataset in ``folder`` with the package in the folder ``source``; measure time, memory
+    and quality.
+
+    Returns a row of the tables, with all values that --json writes.
+    """
     job = {"inputs": [str(work.source)], "folder": str(folder), "options": dict(options)}
     run = subprocess.run(
         [sys.executable, str(Path(__file__).with_name("sfm_worker.py"))],
@@ -125,8 +134,9 @@ def measure(work: Workload, folder: Path, options: Mapping[str, Any], source: Pa
     if work.true is not None:
         compared = placed(found, work.true)
         row |= {"photos": len(work.true), "placed": len(found)}
-        row |= {"right": len(compared.right), "wrong": compared.wrong, "missing": compared.missing}
-        if compared.right:
+        row |= {"correct": len(compared.correct), "wrong": compared.wrong}
+        row |= {"missing": compared.missing}
+        if compared.correct:
             row |= {
                 "rotation_error": float(compared.rotations.median()),
                 "centre_error": 100 * float(compared.centres.median()),
@@ -144,12 +154,12 @@ def _cell(value: float | int | None, digits: int = 0) -> str:
 
 
 def print_quality(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
-    heads = ("photos", "right", "wrong", "none", "points", "error px", "rot °", "centre %", "MB")
+    heads = ("photos", "correct", "wrong", "none", "points", "error px", "rot °", "centre %", "MB")
     print(f"{'':22}" + "".join(f"{head:>10}" for head in heads))
     for name, row in zip(names, rows, strict=True):
         photos, found = row.get("photos"), row.get("placed")
         none = None if photos is None else photos - (found or 0)
-        cells = [_cell(photos), _cell(row.get("right"))]
+        cells = [_cell(photos), _cell(row.get("correct"))]
         cells.append(_cell(len(row["wrong"]) if "wrong" in row else None))
         cells += [_cell(none), _cell(row.get("points")), _cell(row.get("reprojection_error"), 2)]
         cells += [_cell(row.get("rotation_error"), 3), _cell(row.get("centre_error"), 3)]
@@ -171,9 +181,9 @@ def print_times(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None
 
 
 def print_ratios(rows: Sequence[Mapping[str, Any]]) -> None:
-    """The least processor time of each stage with this build / with the other one."""
+    """For each stage: the least processor time with this build / that with the other build."""
     a, b = dict.fromkeys(row["source"] for row in rows)
-    print(f"\n{'cpu: this build / ' + a:40}")
+    print(f"\n{'processor time: this build / ' + a:40}")
     for name in dict.fromkeys(row["workload"] for row in rows):
         own = [row for row in rows if row["workload"] == name]
         print(f"  {name}")
@@ -191,17 +201,17 @@ def print_ratios(rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _names(arguments: argparse.Namespace) -> list[str]:
-    """The workloads with their numbers of photos."""
-    chosen = arguments.workloads or [*(n for n in CAPTURES if n not in _LONG), *KINDS]
+    """The names of the workloads; those of scenes end in a number of photos ("room-60")."""
+    chosen = arguments.workloads or [*(n for n in DATASETS if n not in _LONG), *KINDS]
     names = []
     for name in chosen:
         kind, dash, count = name.partition("-")
-        if name in CAPTURES or (kind in KINDS and count.isdecimal() and int(count) >= 3):
+        if name in DATASETS or (kind in KINDS and count.isdecimal() and int(count) >= 3):
             names.append(name)
         elif kind in KINDS and not dash:
             names += [f"{kind}-{photos}" for photos in arguments.photos]
         else:
-            known = ", ".join([*CAPTURES, *KINDS])
+            known = ", ".join([*DATASETS, *KINDS])
             raise UserError(f"workload: unknown name {name!r}; use one of {known}")
     return names
 
@@ -213,19 +223,40 @@ def _size(text: str) -> tuple[int, int]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("workloads", nargs="*", help="a capture, a scene, or SCENE-PHOTOS")
-    parser.add_argument("--photos", type=int, nargs="+", default=[60], help="of a scene")
-    parser.add_argument("--size", type=_size, default=SIZE, help="of these photos (800x600)")
-    parser.add_argument("--captures", type=Path, default=ROOT.parent / "shared" / "captures")
-    parser.add_argument("--cache", type=Path, default=None, help=f"default: ${CACHE_VARIABLE}")
+    parser.add_argument(
+        "workloads", nargs="*", help="a real dataset, a scene, or SCENE-N for N photos of a scene"
+    )
+    parser.add_argument(
+        "--photos", type=int, nargs="+", default=[60], help="numbers of photos of the scenes (60)"
+    )
+    parser.add_argument(
+        "--size", type=_size, default=SIZE, help="size of the photos of the scenes (800x600)"
+    )
+    parser.add_argument(
+        "--datasets",
+        "--captures",
+        type=Path,
+        default=ROOT.parent / "shared" / "captures",
+        help="folder with the real datasets",
+    )
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        default=None,
+        help=f"folder for the photos of the scenes; default: ${CACHE_VARIABLE}",
+    )
     parser.add_argument("--render-only", action="store_true", help="only render the photos")
     parser.add_argument("--effort", default="normal", choices=["draft", "normal", "best"])
     parser.add_argument("--mapper", default="incremental", choices=["incremental", "global"])
-    parser.add_argument("--threads", type=int, default=None)
-    parser.add_argument("--versus", type=Path, metavar="SRC", help="the src folder of a checkout")
-    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument(
+        "--threads", type=int, default=None, help="CPU threads; default: one per processor"
+    )
+    parser.add_argument(
+        "--versus", type=Path, metavar="SRC", help="compare with the package in another src folder"
+    )
+    parser.add_argument("--repeats", type=int, default=1, help="measurements of each workload")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the datasets in DIR")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="also write all values to this file")
     arguments = parser.parse_args()
     cache = arguments.cache or cache_folder()
     options = {key: getattr(arguments, key) for key in ("effort", "mapper", "threads")}
@@ -235,9 +266,9 @@ def main() -> None:
     with ExitStack() as stack:
         out = arguments.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         for name in _names(arguments):
-            work = workload(name, arguments.captures, cache, arguments.size)
+            work = workload(name, arguments.datasets, cache, arguments.size)
             if work is None:
-                print(f"{name}: skipped, not in {arguments.captures}")
+                print(f"{name}: skipped, not in {arguments.datasets}")
                 continue
             if arguments.render_only:
                 continue
@@ -258,7 +289,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # An exception ends the worker, too.
+    # On SIGTERM, exit by an exception: then the worker is ended, too.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         main()

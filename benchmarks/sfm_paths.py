@@ -1,7 +1,7 @@
 """Paths of a hand-held camera through the scenes of `sfm_scenes.py`.
 
-Each function returns ``cam_from_world`` (3, 4) float64 of ``count`` photos: metres, z up, the floor
-at z = 0. Equal arguments return equal paths.
+Each function returns ``cam_from_world`` (3, 4) float64 of ``count`` photos, in metres. z is up, and
+the floor is at z = 0. Equal arguments return equal paths.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from snowsplat.synthetic.photographer import rolled
 
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 _PHOTOS_OF_A_LOOP = 20
-_HEIGHTS = (1.45, 1.75, 1.1)  # metres, of the first loop, the second …
+_HEIGHTS = (1.45, 1.75, 1.1)  # of the camera above the floor in metres: first loop, second loop …
 
 
 def loops(
     count: int, seed: int, half: tuple[float, float] = (1.65, 1.2), down: float = 0.0
 ) -> list[Tensor]:
-    """Elliptical loops with the half axes ``half``. In turn, the camera looks across and outwards.
+    """Elliptical loops with the semi-axes ``half``, in metres.
 
-    ``down`` is the distance in metres by which the point that the camera looks at is lowered.
+    The camera looks across the room in the first, third … loop and outwards in the others. ``down``
+    lowers the point that the camera looks at, in metres.
     """
     random = np.random.default_rng([seed, count])
     rounds = max(1, min(6, count // _PHOTOS_OF_A_LOOP))
@@ -53,7 +54,10 @@ def looking_down(count: int, seed: int) -> list[Tensor]:
 
 
 def around_two(count: int, seed: int, distance: float = 4.4, radius: float = 1.55) -> list[Tensor]:
-    """A figure of eight around two things at x = ± half of ``distance``."""
+    """A figure of eight around two objects at x = ± half of ``distance``, in metres.
+
+    ``radius`` is that of the circle around each object.
+    """
     random = np.random.default_rng([seed, count])
     positions, targets = [], []
     for i in range(count):
@@ -61,7 +65,7 @@ def around_two(count: int, seed: int, distance: float = 4.4, radius: float = 1.5
         side = 1 if second else -1
         rounds = 1 if count < 150 else 2
         angle = 2 * math.pi * share * rounds + (math.pi if second else 0)
-        # The two rounds, if any, differ in height.
+        # If there are two rounds, the camera is higher in the second one.
         height = 1.2 + (0.4 if share * rounds >= 1 else 0)
         middle = np.array([side * distance / 2, 0.0, 0.0])
         around = np.array([math.cos(angle), math.sin(angle) * (-side), 0.0])
@@ -73,10 +77,10 @@ def around_two(count: int, seed: int, distance: float = 4.4, radius: float = 1.5
 def through_two_rooms(
     count: int, seed: int, middles: tuple[float, float], door: float, corridor: float
 ) -> list[Tensor]:
-    """A loop in a room, the way through the passage, a loop in the other room.
+    """Loops in one room, then the way through the passage, then loops in the other room.
 
-    The middles of the rooms are at (x, 0) for the two x of ``middles``. A room has its door at
-    (x + ``door``, −…); the passage runs along y = ``corridor``.
+    The middles of the rooms are at (x, 0) for the two x of ``middles``. The door of a room is at
+    x + ``door``. The passage runs along y = ``corridor``, which is negative. All are in metres.
     """
     random = np.random.default_rng([seed, count])
     between = max(1, round(0.3 * count))
@@ -118,7 +122,8 @@ def _along(corners: list[tuple[float, float]], share: float) -> np.ndarray:
 def _hand_held(
     positions: list[np.ndarray], targets: list[np.ndarray], random: np.random.Generator
 ) -> list[Tensor]:
-    """Poses with small random errors of the position, direction and roll."""
+    """Poses that look at ``targets`` from ``positions``, with small random errors of both and of
+    the roll angle."""
     poses = []
     for position, target in zip(positions, targets, strict=True):
         at = torch.from_numpy(position + random.normal(0, 0.025, 3))

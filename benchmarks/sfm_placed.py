@@ -1,4 +1,4 @@
-"""Which photos of a model are at their true places."""
+"""Compares the poses of a model with the true poses: which photos are placed correctly."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 
 from snowsplat.scene.geometry import Similarity, invert_rigid, similarity_from_points
 
-#: A photo is placed rightly if its errors after the alignment are below these limits.
+#: A photo is placed correctly if its errors after the alignment are below these limits.
 MAX_ROTATION = 3.0  # degrees
-MAX_CENTRE = 0.03  # of the largest distance between two true centres
-_SAMPLES = 1000  # pairs of photos that are tried
-_ROUNDS = 5  # of least squares
+MAX_CENTRE = 0.03  # as a fraction of the largest distance between two true centres
+_SAMPLES = 1000  # maximum number of pairs of photos from which a transform is computed
+_ROUNDS = 5  # maximum number of least-squares fits
 
 
 @dataclass(frozen=True)
@@ -24,27 +24,32 @@ class Placed:
     """The photos of a model, compared with their true poses.
 
     ``rotations`` (degrees) and ``centres`` (fractions of ``extent``) are the errors of the photos
-    in ``right``, in that order.
+    in ``correct``, in that order.
     """
 
-    right: list[str]
+    correct: list[str]
     wrong: list[str]
     missing: list[str]  # photos without a pose in the model
-    rotations: Tensor  # (len(right),) float64
-    centres: Tensor  # (len(right),) float64
+    rotations: Tensor  # (len(correct),) float64
+    centres: Tensor  # (len(correct),) float64
     extent: float  # largest distance between two true centres, in their unit
 
 
 def placed(found: Mapping[str, Tensor], true: Mapping[str, Tensor], seed: int = 0) -> Placed:
-    """Sort the photos of ``true`` into those placed rightly, wrongly and not at all.
+    """Divide the photos of ``true`` into those placed correctly, wrongly and not at all.
 
-    Poses are ``cam_from_world`` (3, 4), the true ones of at least two photos. The world frame of
-    ``found`` differs by an unknown similarity transform. The one with the least sum of squared
-    errors is chosen, where the error of a wrong photo counts as that at the limits: a pair of
-    photos determines a transform, and many pairs are tried. So the wrong photos have no
-    effect on it, even if they are the majority, as long as they do not agree with each other. If a
-    model consists of several parts, each right in itself, the largest part is the right one.
-    Photos of ``found`` without a true pose are ignored. Equal seeds give equal results.
+    The world frames of ``found`` and ``true`` differ by an unknown similarity transform. Many
+    transforms are tried, each computed from a pair of photos. The one with the least sum of squared
+    errors is chosen; an error above the limits counts as an error at the limits. So the wrong
+    photos do not affect the transform, even if they are the majority, as long as they do not agree
+    with each other. If a model consists of several parts that are consistent in themselves but not
+    with each other, the photos of the largest part are placed correctly, and all others wrongly.
+
+    Args:
+        found: photo name -> ``cam_from_world`` (3, 4) in the model. Photos that are not in ``true``
+            are ignored.
+        true: the same for the true poses; at least two photos.
+        seed: equal seeds give equal results.
     """
     names = sorted(found.keys() & true.keys())
     missing = sorted(true.keys() - found.keys())
@@ -64,7 +69,7 @@ def placed(found: Mapping[str, Tensor], true: Mapping[str, Tensor], seed: int = 
             break
         best = refined
     return Placed(
-        right=[name for name, good in zip(names, best.good, strict=True) if good],
+        correct=[name for name, good in zip(names, best.good, strict=True) if good],
         wrong=[name for name, good in zip(names, best.good, strict=True) if not good],
         missing=missing,
         rotations=best.rotations[best.good],
@@ -74,7 +79,10 @@ def placed(found: Mapping[str, Tensor], true: Mapping[str, Tensor], seed: int = 
 
 
 def _hypotheses(a: Tensor, b: Tensor, seed: int) -> list[Similarity]:
-    """The transforms of pairs of photos: the rotation of one of them, the distance of both."""
+    """Transforms that are each computed from a pair of photos.
+
+    The rotation is that of the first photo; scale and translation align the two centres.
+    """
     count = len(a)
     if count * (count - 1) <= _SAMPLES:
         pairs = [(i, j) for i in range(count) for j in range(count) if i != j]
@@ -105,23 +113,28 @@ def _refined(a: Tensor, b: Tensor) -> Similarity | None:
 
 @dataclass(frozen=True)
 class _Fit:
-    """How well a transform agrees with the poses."""
+    """The errors of the poses after a transform; the unit of `MAX_ROTATION` and `MAX_CENTRE`."""
 
     rotations: Tensor  # (N,) errors in degrees
     centres: Tensor  # (N,) errors as fractions of the extent
 
     @property
     def good(self) -> Tensor:
+        """(N,) bool: which photos are placed correctly."""
         return (self.rotations < MAX_ROTATION) & (self.centres < MAX_CENTRE)
 
     @functools.cached_property
     def cost(self) -> float:
-        """The sum of the squared errors in units of their limits, of at most 1 for each photo."""
+        """The sum of (error / limit)², at most 1 for each photo."""
         errors = torch.maximum(self.rotations / MAX_ROTATION, self.centres / MAX_CENTRE)
         return float((errors * errors).clamp(max=1.0).sum())
 
 
 def _fit(similarity: Similarity | None, a: Tensor, b: Tensor, extent: float) -> _Fit:
+    """The errors of poses ``a`` (N, 3, 4) after the transform, compared with the true poses ``b``.
+
+    They are infinite if there is no transform.
+    """
     if similarity is None:
         unknown = torch.full((len(a),), math.inf, dtype=torch.float64)
         return _Fit(unknown, unknown)

@@ -1,13 +1,14 @@
-"""Procedural scenes with known camera poses for `sfm.py`; ray traced once, and then kept.
+"""Procedural scenes with known camera poses for `sfm.py`. Photos are ray traced once and then kept.
 
-    room     a furnished room, several loops
-    around   the still life of the demo, rounds around a table
+    room     a furnished room; the camera path has several loops
+    around   the still life of `snowsplat demo`; the camera goes around the table
     plain    the room with walls of one colour and less furniture
     carpet   a room whose carpet repeats exactly; the camera looks down
-    twins    two identical things in a hall with plain walls, a figure of eight around them
+    twins    two identical objects in a hall with plain walls; a figure of eight around them
     rooms    two identical rooms, and the passage from one to the other
 
-Metres, z up; except in "around", the floor is at z = 0. Textures depend on the seed.
+Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
+the seed.
 """
 
 from __future__ import annotations
@@ -31,33 +32,33 @@ from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
 
-#: Part of the folder names. Increase it with every change that changes the photos.
+#: Part of the folder names of the photos. Increase it with every change that affects the photos.
 VERSION = 1
 CACHE_VARIABLE = "SNOWSPLAT_SFM_SCENES"
 SIZE = (800, 600)
 
 _HEIGHT = 2.6  # metres, of all rooms
-_TEXEL = 0.005  # metres
+_TEXEL = 0.005  # metres per pixel of a texture
 _OAK, _PINE, _DARK = (0.62, 0.45, 0.29), (0.78, 0.62, 0.42), (0.42, 0.28, 0.19)
 _PLASTER = (0.72, 0.70, 0.64)
-# The two rooms: width and depth, x of their middles, the passage.
-_OWN = (4.2, 3.8)
+# The two identical rooms: width and depth; x of their middles; their doors; walls and passage.
+_ROOM_SIZE = (4.2, 3.8)
 MIDDLES = (-2.16, 2.16)
 _DOOR, _DOOR_WIDTH, _DOOR_HEIGHT = 0.9, 0.95, 2.1  # x relative to the middle of the room
 _WALL, _PASSAGE = 0.12, 1.5  # thickness of the walls, width of the passage
-_TWINS = 4.4  # distance of the two things
+_TWIN_DISTANCE = 4.4  # between the two identical objects
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A scene and a path through it, for a seed."""
+    """The functions that make a scene and a camera path through it."""
 
-    build: Callable[[int], Scene]
-    path: Callable[[int, int], list[Tensor]]  # number of photos, seed
+    build: Callable[[int], Scene]  # argument: the seed
+    path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
 
 
 def cache_folder() -> Path:
-    """The folder for the photos: that of the environment variable, or one in the user's cache."""
+    """The folder for the photos: `CACHE_VARIABLE`, or a folder in the user's cache folder."""
     named = os.environ.get(CACHE_VARIABLE, "")
     if named:
         return Path(named)
@@ -147,13 +148,13 @@ def _twins(seed: int) -> Scene:
     walls = [_plain((0.78, 0.77, 0.72)), _plain((0.70, 0.74, 0.74))] * 2
     objects = [_shell((x, y), [*walls, floor, _plain((0.86, 0.86, 0.84))])]
     for side in (-1, 1):
-        objects += _monument(np.random.default_rng([seed, 4]), (side * _TWINS / 2, 0.0))
+        objects += _monument(np.random.default_rng([seed, 4]), (side * _TWIN_DISTANCE / 2, 0.0))
     return Scene(objects, _lamp((6.0, 2.0)))
 
 
 def _two_rooms(seed: int) -> Scene:
     random = np.random.default_rng([seed, 5])
-    width, depth = _OWN
+    width, depth = _ROOM_SIZE
     x, y = 2 * width + 3 * _WALL, depth + _PASSAGE + 2 * _WALL
     middle = (0.0, -(_PASSAGE + _WALL) / 2)
     walls = [
@@ -163,13 +164,13 @@ def _two_rooms(seed: int) -> Scene:
     floor = paint.wood(_pixels(x, y), 26, _DARK, random)
     objects = [_shell((x, y), [*walls, floor, _plain((0.86, 0.86, 0.84))], middle)]
     for at in MIDDLES:
-        objects += own_room(np.random.default_rng([seed, 6]), at)
+        objects += identical_room(np.random.default_rng([seed, 6]), at)
     return Scene(objects, _lamp((7.0, 3.0)))
 
 
-def own_room(random: np.random.Generator, middle: float) -> list[SceneObject]:
+def identical_room(random: np.random.Generator, middle: float) -> list[SceneObject]:
     """One of the two rooms: walls, floor and furniture. Equal generators make equal rooms."""
-    width, depth = _OWN
+    width, depth = _ROOM_SIZE
     size = {"side": _pixels(depth, _HEIGHT), "back": _pixels(width, _HEIGHT)}
     left = _with_pictures(paint.bricks(size["side"], 24, 14, random), 2, random)
     right = _with_pictures(paint.wood(size["side"], 10, _OAK, random), 3, random)
@@ -177,7 +178,8 @@ def own_room(random: np.random.Generator, middle: float) -> list[SceneObject]:
     front = paint.marble(size["back"], (0.42, 0.50, 0.52), (0.62, 0.66, 0.60), random)
     floor = paint.wood(_pixels(width, depth), 18, _PINE, random)
     thick, z = _WALL / 2, _HEIGHT / 2
-    # Half of each wall belongs to the room. Its outer faces are hidden by those of its neighbour.
+    # The walls of the room have half the thickness; the other half belongs to the neighbour. The
+    # outer faces cannot be seen.
     objects = [
         _board((middle - width / 2 - thick / 2, 0, z), (thick, depth, _HEIGHT), left),
         _board((middle + width / 2 + thick / 2, 0, z), (thick, depth, _HEIGHT), right),
@@ -315,7 +317,7 @@ def _monument(random: np.random.Generator, at: tuple[float, float]) -> list[Scen
 
 
 def _through_two_rooms(count: int, seed: int) -> list[Tensor]:
-    corridor = -_OWN[1] / 2 - _WALL - _PASSAGE / 2
+    corridor = -_ROOM_SIZE[1] / 2 - _WALL - _PASSAGE / 2
     return through_two_rooms(count, seed, MIDDLES, _DOOR, corridor)
 
 

@@ -1,11 +1,12 @@
-"""The process in which `sfm.py` makes a dataset: times of the stages, peak memory.
+"""The process in which `sfm.py` makes a dataset; measures the times of the stages and the memory.
 
-The job is a line of JSON on standard input, the response is a line on standard output:
-{"inputs", "folder", "options"} → {"stages", "result", "peak_mb", "own_peak_mb"} or {"stages",
-"error"}. ``options`` are fields of `SfmOptions`. ``stages`` has wall and processor time in seconds
-of each stage; processor time includes all threads and child processes.
+The job is one line of JSON on standard input: "inputs", "folder" and "options", which are fields of
+`SfmOptions`. The response is one line of JSON on standard output: "stages", "peak_mb" (of COLMAP's
+process), "own_peak_mb" (of this process), and "result" or "error". "stages" has the wall time and
+the processor time of each stage in seconds; processor time includes all threads and child
+processes.
 
-Only `make_dataset` and its progress are used, so the process can run any build of the package.
+Only `make_dataset` and its progress are used, so the process can run other builds of the package.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ _COUNTED = {
     "pairs": "match",
     "registered photos": "map",
 }
-_BEFORE = "start"  # until the first progress: the start of COLMAP's process
-# Work between two stages that has no progress of its own.
+_BEFORE = "start"  # the time until the first progress of a stage, mainly to start COLMAP's process
+# Parts without a progress of their own: (the part before, the part after) -> name.
 _BETWEEN = {("features", "match"): "choose pairs"}
 
 
 class Stopwatch:
-    """Receives the progress of `make_dataset` (`Watcher`) and adds up the times of its parts."""
+    """A `Watcher` of `make_dataset` that adds up the times of the parts."""
 
     def __init__(self) -> None:
         self.stages: dict[str, dict[str, float]] = {}
@@ -83,7 +84,7 @@ class Stopwatch:
 
 
 def _descendants(pid: str = "self") -> list[str]:
-    """The ids of the running child processes, and of theirs; none where there is no /proc."""
+    """The ids of all running descendants of a process; none where there is no /proc."""
     found = []
     for file in Path(f"/proc/{pid}/task").glob("*/children"):
         try:
@@ -101,7 +102,7 @@ def processor_time() -> float:
     total = times.user + times.system + times.children_user + times.children_system
     for pid in _descendants():
         try:
-            # The name of the program, in brackets, may contain blanks.
+            # The name of the program, in brackets, may contain spaces.
             fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         except OSError:  # it has ended
             continue
@@ -143,7 +144,7 @@ class PeakMemory:
 
     def _observe(self) -> None:
         while not self._end.wait(_SAMPLE_SECONDS):
-            # Until a new process starts its own program, its memory is that of this process.
+            # After a fork and before the new program starts, the memory is that of this process.
             started = [pid for pid in _descendants() if _command(pid) not in (b"", self._own)]
             self.peak = max([self.peak, *map(_peak_mb, started)])
 

@@ -1,4 +1,4 @@
-"""`benchmarks/sfm.py` runs on a small scene, and sorts photos by their places correctly."""
+"""`benchmarks/sfm.py` runs on a small scene, and tells correct from wrong poses."""
 
 import json
 import math
@@ -61,14 +61,14 @@ def test_wrong_photos_do_not_spoil_the_alignment(sfm_modules):
     for name in names[45:]:
         del found[name]
     result = placed(found, true)
-    assert result.right == names[:20]
+    assert result.correct == names[:20]
     assert result.wrong == names[20:45]
     assert result.missing == names[45:]
     assert result.rotations.max() < 1e-6
     assert result.centres.max() < 1e-9
 
 
-def test_the_limits_of_a_right_place(sfm_modules):
+def test_the_limits_of_a_correct_pose(sfm_modules):
     import sfm_placed
 
     true = poses_on_a_spiral(40)
@@ -117,7 +117,7 @@ def test_scenes_for_structure_from_motion(sfm_modules, tmp_path, monkeypatch):
 def test_the_two_rooms_are_identical(sfm_modules):
     import sfm_scenes
 
-    a, b = (sfm_scenes.own_room(np.random.default_rng(3), at) for at in sfm_scenes.MIDDLES)
+    a, b = (sfm_scenes.identical_room(np.random.default_rng(3), at) for at in sfm_scenes.MIDDLES)
     shift = sfm_scenes.MIDDLES[1] - sfm_scenes.MIDDLES[0]
     assert len(a) == len(b) > 8
     for first, second in zip(a, b, strict=True):
@@ -132,7 +132,7 @@ def test_stages_and_places(tmp_path):
     file = tmp_path / "sfm.json"
     text = benchmark(
         *("room-20", "walkaround.mp4", "--size", "320x240", "--effort", "draft"),
-        *("--captures", tmp_path, "--cache", tmp_path / "scenes", "--threads", 1, "--json", file),
+        *("--datasets", tmp_path, "--cache", tmp_path / "scenes", "--threads", 1, "--json", file),
     )
     assert f"walkaround.mp4: skipped, not in {tmp_path}" in text
     (found,) = json.loads(file.read_text())
@@ -143,16 +143,16 @@ def test_stages_and_places(tmp_path):
         assert stages[stage]["cpu"] > 0, stage
     assert sum(times["cpu"] for times in stages.values()) == pytest.approx(found["cpu"])
     assert found["photos"] == 20
-    assert found["right"] + len(found["wrong"]) == found["placed"]
-    assert found["right"] >= 18
-    assert len(found["rotation_errors"]) == found["right"]
+    assert found["correct"] + len(found["wrong"]) == found["placed"]
+    assert found["correct"] >= 18
+    assert len(found["rotation_errors"]) == found["correct"]
     assert found["rotation_error"] < 1
     assert found["peak_mb"] > 50
     assert found["points"] > 100
     header, line = text.splitlines()[1:3]
-    assert header.split()[:4] == ["photos", "right", "wrong", "none"]
+    assert header.split()[:4] == ["photos", "correct", "wrong", "none"]
     cells = line.split()
-    assert cells[:3] == ["room-20", "20", str(found["right"])]
+    assert cells[:3] == ["room-20", "20", str(found["correct"])]
     assert cells[4] == str(20 - found["placed"])
 
 
@@ -163,4 +163,4 @@ def test_a_failure_is_a_row_of_the_table(tmp_path):
     )
     (found,) = json.loads((tmp_path / "sfm.json").read_text())
     assert found["error"] in text
-    assert (found["placed"], found["right"], len(found["missing"])) == (0, 0, 3)
+    assert (found["placed"], found["correct"], len(found["missing"])) == (0, 0, 3)

@@ -1,10 +1,11 @@
-"""Photos or a video -> the folder of a posed dataset, as `snowsplat.data` reads it.
+"""Makes the folder of a dataset, as `snowsplat.data` reads it, from photos or a video.
 
-    photos    copy photos, video frames and masks         ingest/             -> input/
-    poses     estimate the camera poses                   colmap/             -> distorted/
-    images    remove lens distortion, orient the scene    orient, undistort   -> images/, sparse/0/
-    report    write capture_report.html                   report
+    stage     what it does                                code                files
+    photos    copies photos, video frames and masks       ingest/             input/
+    poses     estimates the camera poses                  colmap/             distorted/
+    images    removes the distortion, orients the scene   orient, undistort   images/, sparse/0/
+    report    writes capture_report.html                  report
 
-Each stage is a plain function from folder to folder. `dataset_folder.make_dataset` runs them in
-this order and skips the stages that are already finished.
+Each stage reads the files of the earlier stages and writes its own. `dataset_folder.make_dataset`
+runs the stages in this order and skips those that are already finished.
 """

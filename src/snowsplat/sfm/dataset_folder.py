@@ -62,10 +62,11 @@ class Watcher(Protocol):
     """Receives the progress of the stages."""
 
     def begin(self, stage: str) -> Report:
-        """Called when a stage begins or is found finished; returns its progress callback."""
+        """Called for every stage, also if an earlier run has finished it; returns its progress
+        callback."""
 
     def end(self, stage: str, outcome: Outcome) -> None:
-        """Called when the stage has finished."""
+        """Called when the stage is finished, now or in an earlier run."""
 
     def note(self, line: str) -> None:
         """Called with a line of information for the user."""
@@ -78,7 +79,7 @@ def make_dataset(
     watcher: Watcher,
     overwrite: bool = False,
 ) -> dict[str, Outcome]:
-    """Make a dataset in ``folder`` from photos, videos and folders of them.
+    """Make a dataset in ``folder`` from photos, videos, and folders of photos or videos.
 
     Stages that an earlier run with the same inputs and settings has finished are skipped. If
     ``folder / "input"`` itself is the input, it is not changed.
@@ -181,7 +182,10 @@ def _run(
 def _gather(
     inputs: Sequence[Path], folder: Path, options: GatherOptions, report: Report, in_place: bool
 ) -> dict[str, Any]:
-    """Gather the photos into a temporary folder, which then replaces the older `input/`."""
+    """Gather the photos into a temporary folder, then replace `input/` and the masks by them.
+
+    If the photos are in `input/` already (``in_place``), only the masks are written.
+    """
     masks = Path("distorted") / "masks"
     if in_place:
         shutil.rmtree(folder / masks, ignore_errors=True)
@@ -228,6 +232,7 @@ def _check_free(
     options: DatasetOptions,
     overwrite: bool,
 ) -> None:
+    """Raises UserError if the dataset must not be written to ``folder``."""
     if not folder.exists():
         return
     if not folder.is_dir():
@@ -268,10 +273,11 @@ def _were_in_place(inputs: Any, folder: Path) -> bool:
 
 @contextmanager
 def _remove_on_failure(folder: Path) -> Iterator[None]:
-    """If the inputs are unusable, remove the files that this run has created.
+    """After an error, remove the files that this run has created, if they are of no use.
 
-    After Ctrl-C, or if the disk is full, the files of finished stages remain, so that the same
-    command can resume.
+    After a `UserError` they are removed, because the inputs are unusable. After Ctrl-C or if the
+    disk is full, they remain if the stage "photos" is finished, so that the same command resumes.
+    If the folder contained a dataset before, nothing is removed.
     """
     existed = folder.exists()
     before = {entry.name for entry in folder.iterdir()} if existed else set()
@@ -312,7 +318,7 @@ def _fingerprint(files: Sequence[Path]) -> str:
 
 
 def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
-    """The photos of the first stage. Raises UserError if the record is damaged."""
+    """The photos that the stage "photos" found. Raises UserError if its record is damaged."""
     try:
         photos = from_json(Gathered, gathered).photos
         if not all(inside(folder / "input", photo.name) for photo in photos):

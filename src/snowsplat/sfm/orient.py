@@ -1,7 +1,7 @@
 """Orientation, origin and scale of the scene, estimated from the camera poses alone.
 
-SfM determines the scene only up to a similarity transform. A viewer also needs the up direction,
-the scale, and the photographed object at the origin.
+SfM determines the scene only up to a similarity transform. A viewer also needs the up direction, a
+known scale, and the photographed object at the origin.
 """
 
 from __future__ import annotations
@@ -29,20 +29,22 @@ class _ModelData:
 
     rotations: np.ndarray  # (N, 3, 3) of cam_from_world: the rows are the cameras' x, y, z axes
     centres: np.ndarray  # (N, 3)
-    points: np.ndarray  # (P, 3)
-    distances: np.ndarray  # (N,) from a camera to the median point that it sees; NaN without points
+    points: np.ndarray  # (P, 3), a sample of the points
+    distances: np.ndarray  # (N,) median distance from a camera to its points; NaN without points
 
     @property
     def forward(self) -> np.ndarray:
+        """(N, 3) the viewing directions."""
         return self.rotations[:, 2]
 
 
 def orientation(model: pycolmap.Reconstruction) -> Similarity:
-    """``scene_from_sfm``. In the scene, y is down, z the mean viewing direction, the centre at 0.
+    """The transform ``scene_from_sfm``, from the world frame of SfM to that of the scene.
 
-    Up is the direction that makes the photos level. The centre is the point that the cameras look
+    In the frame of the scene, y points down, and z is the mean viewing direction, made horizontal.
+    Up is the direction that makes the photos level. The origin is the point that the cameras look
     at. If they look outwards or all in the same direction, it is the median of the points. The
-    scale makes `VIEWING_DISTANCE` the median distance from a camera to the points that it sees.
+    scale makes the median distance from a camera to the points that it sees `VIEWING_DISTANCE`.
 
     Raises:
         ValueError: the model has no cameras.
@@ -51,13 +53,13 @@ def orientation(model: pycolmap.Reconstruction) -> Similarity:
     if not len(data.centres):
         raise ValueError("a model without cameras has no orientation")
     up = up_direction(data.rotations)
-    forward = _heading(data, up)
+    forward = _horizontal_direction(data, up)
     down = -up
     rotation = np.stack([np.cross(down, forward), down, forward])
     scale = VIEWING_DISTANCE / _distance(data)
-    middle = _middle(data)
+    origin = _origin(data)
     return Similarity(
-        scale, torch.from_numpy(rotation), torch.from_numpy(-scale * rotation @ middle)
+        scale, torch.from_numpy(rotation), torch.from_numpy(-scale * rotation @ origin)
     )
 
 
@@ -87,10 +89,13 @@ def _read(model: pycolmap.Reconstruction) -> _ModelData:
     return _ModelData(rotations, centres, points, distances)
 
 
-def _heading(data: _ModelData, up: np.ndarray) -> np.ndarray:
-    """(3,) horizontal: the mean viewing direction; if it is too short, that of the first camera."""
+def _horizontal_direction(data: _ModelData, up: np.ndarray) -> np.ndarray:
+    """(3,) unit vector: the horizontal part of the mean viewing direction.
+
+    If this part is too short, that of the viewing direction of the first camera.
+    """
     level = np.eye(3) - np.outer(up, up)
-    # For a camera that looks straight down, use the direction of its upper image edge.
+    # If the first camera looks straight down, use the direction of its upper image edge.
     candidates = (data.forward.mean(axis=0), data.forward[0], -data.rotations[0, 1])
     for direction, least in zip(candidates, (0.5, 0.1, 0.0), strict=True):
         horizontal = level @ direction
@@ -100,8 +105,8 @@ def _heading(data: _ModelData, up: np.ndarray) -> np.ndarray:
     return horizontal / length
 
 
-def _middle(data: _ModelData) -> np.ndarray:
-    """(3,) the point where the optical axes meet; if they do not, the median of the points."""
+def _origin(data: _ModelData) -> np.ndarray:
+    """(3,) the point where the optical axes meet; if they do not meet, the median of the points."""
     meeting = _meeting_point(data)
     if meeting is not None:
         return meeting
@@ -117,7 +122,8 @@ def _meeting_point(data: _ModelData) -> np.ndarray | None:
     is behind the cameras. Computed by iteratively reweighted least squares.
     """
     axes, centres = data.forward, data.centres
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (N, 3, 3)
+    # (N, 3, 3) matrices that project a vector onto the plane perpendicular to an axis.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     if np.linalg.eigvalsh(across.mean(axis=0))[0] < math.sin(math.radians(10)) ** 2:
         return None
     typical = _distance(data)
@@ -125,15 +131,19 @@ def _meeting_point(data: _ModelData) -> np.ndarray | None:
     for _ in range(30):
         matrix = np.einsum("n,nij->ij", weights, across)
         point = np.linalg.solve(matrix, np.einsum("n,nij,nj->i", weights, across, centres))
-        misses = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=1)
-        weights = 1 / np.maximum(misses, 0.01 * typical)
-    ahead = np.einsum("ni,ni->n", point - centres, axes)
-    is_met = (ahead > 0.2 * typical).mean() > 0.75 and np.median(misses) < 0.5 * np.median(ahead)
+        # The distances of the point from the axes.
+        away = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=1)
+        weights = 1 / np.maximum(away, 0.01 * typical)
+    ahead = np.einsum("ni,ni->n", point - centres, axes)  # its depths in the cameras
+    is_met = (ahead > 0.2 * typical).mean() > 0.75 and np.median(away) < 0.5 * np.median(ahead)
     return point if is_met else None
 
 
 def _distance(data: _ModelData) -> float:
-    """Median distance from a camera to its points; without points, to the median camera."""
+    """Median over the cameras of the distance to their points; at least a positive number.
+
+    Without points, the median distance of the cameras from the median of their centres.
+    """
     distances = data.distances[np.isfinite(data.distances)]
     if not len(distances):
         distances = np.linalg.norm(data.centres - np.median(data.centres, axis=0), axis=1)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _MAP_ERROR = 0.02  # pixels: largest error of the bilinear interpolation between nodes
 _CELLS = (64, 32, 16, 8, 4)  # pixels: approximate cell sizes, tried in this order
-_SMALLEST = 0.2  # fraction of width and height: if less remains, the calibration is wrong
+_MIN_FRACTION = 0.2  # of width and height: if less can be undistorted, the calibration is wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Pinhole:
     height: int
     params: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
     nodes: np.ndarray | None = None
-    cropped: bool = False  # the calibration is valid only near the centre, so a part is cut off
+    cropped: bool = False  # whether the outer part is cut off, because the calibration is invalid
 
 
 def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
@@ -56,7 +56,7 @@ def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
     # COLMAP chooses an image without blank borders, of 0.2 to 2 times the size of the photo.
     whole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     made, cropped = whole, False
-    if not _is_sound(camera, whole):
+    if not _is_valid(camera, whole):
         # Beyond some radius the distortion polynomial may decrease, so that the image is folded
         # there. If COLMAP limits the size of the image, it may have blank borders. Search for the
         # largest part around the principal point without folds and blank borders.
@@ -65,12 +65,12 @@ def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
         while high - low > 1e-3:
             middle = (low + high) / 2
             part = _shrunk(whole, middle)
-            if part is not None and _is_sound(camera, part):
+            if part is not None and _is_valid(camera, part):
                 low, made = middle, part
             else:
                 high = middle
-        small = made.width < _SMALLEST * camera.width or made.height < _SMALLEST * camera.height
-        if low == 0 or small:
+        min_width, min_height = _MIN_FRACTION * camera.width, _MIN_FRACTION * camera.height
+        if low == 0 or made.width < min_width or made.height < min_height:
             raise ValueError("less than a fifth of the width or height can be undistorted")
     fx, fy, cx, cy = (float(value) for value in made.params)
     return Pinhole(made.width, made.height, (fx, fy, cx, cy), _nodes(camera, made), cropped)
@@ -101,13 +101,14 @@ def _shrunk(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera | None:
     return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
 
 
-def _is_sound(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
+def _is_valid(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
     """Whether every pixel of the undistorted image is in the photo, without folds or gaps."""
     x, y = (np.linspace(0, size, 65) for size in (pinhole.width, pinhole.height))
     source = _to_photo(camera, pinhole, x, y)
     if not np.isfinite(source).all():
         return False
-    # Because sizes are rounded, one pixel outside is allowed; there the border pixels are repeated.
+    # Because sizes are rounded, positions up to one pixel outside of the photo are allowed. There,
+    # the border pixels of the photo are repeated.
     if (source < -1).any() or (source > [camera.width + 1, camera.height + 1]).any():
         return False
     right, down = source[:-1, 1:] - source[:-1, :-1], source[1:, :-1] - source[:-1, :-1]
@@ -118,7 +119,7 @@ def _is_sound(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
 
 
 def _nodes(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> np.ndarray:
-    """The nodes of the largest cells in which bilinear interpolation is exact enough."""
+    """`Pinhole.nodes`, with the largest cells for which the error is below `_MAP_ERROR`."""
     for cell in _CELLS:
         x, y = (
             np.linspace(0, size, -(-size // cell) + 1) for size in (pinhole.width, pinhole.height)

@@ -1,4 +1,7 @@
-"""The COLMAP model of the photos -> that of the undistorted images, in the scene's frame."""
+"""Converts the COLMAP model of the photos to a model of the undistorted images.
+
+The new model has pinhole cameras and is in the frame of the scene (see `orient`).
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ def write_model(
         camera.model = pycolmap.CameraModelId.PINHOLE
         camera.width, camera.height = pinhole.width, pinhole.height
         camera.params = list(pinhole.params)
-    # Write under a temporary name, so that ``sparse`` is always complete.
+    # Write to a folder with a temporary name, so that ``sparse`` never contains a part of a model.
     new = sparse.with_name(f".{sparse.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     (new / "0").mkdir(parents=True)
@@ -56,5 +59,6 @@ def _undistort_keypoints(image: pycolmap.Image, camera: pycolmap.Camera, pinhole
     fx, fy, cx, cy = pinhole.params
     pixels = camera.cam_from_img(np.array([point.xy for point in points])) * (fx, fy) + (cx, cy)
     for point, xy in zip(points, pixels, strict=True):
-        # Near the border the lens model may have no inverse; readers need finite numbers.
+        # Near the border, the lens model may have no inverse. Programs that read the model need
+        # finite numbers.
         point.xy = xy if np.isfinite(xy).all() else np.array([-1.0, -1.0])

@@ -9,7 +9,7 @@ class Report(Protocol):
     """A callback that a long job calls repeatedly.
 
     ``done`` of ``total`` items are finished. If ``total`` is 0, the total is unknown. ``what`` is
-    the name of the items, for example "photos".
+    the name of the items, as text for users, for example "photos".
     """
 
     def __call__(self, done: int, total: int, what: str = "") -> None: ...

@@ -20,10 +20,10 @@ from snowsplat.util.html import bar, cards, page, picture, table, text
 from snowsplat.util.safe_json import printable
 
 _FILE = "capture_report.html"
-_THUMBNAILS = 24  # at most, evenly spaced over the photos
+_MAX_THUMBNAILS = 24  # evenly spaced over the photos
 _THUMBNAIL_HEIGHT = 110  # pixels
-_NAMED = 200  # maximum number of listed unused photos; of the others, only the number is shown
-_ERROR_HIGH = 1.5  # pixels; a good reconstruction is below 1
+_MAX_UNUSED = 200  # number of unused photos that are listed; of the others, the number is shown
+_MAX_ERROR = 1.5  # pixels; a larger reprojection error is reported. Good models are below 1
 
 _FOCAL_FROM = {"exif": "from EXIF, refined", "guessed": "estimated from the photos"}
 _STAGES = {"photos": "reading photos", "poses": "estimating poses", "images": "undistorting"}
@@ -46,7 +46,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     Raises:
         UserError: the model in ``sparse/0`` or an image cannot be read.
     """
-    photos = _placed(dataset, facts)
+    photos = _photos_with_poses(dataset, facts)
     name = _name(facts["inputs"])
     body = [
         _headline(name, facts),
@@ -63,7 +63,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     return path
 
 
-def _placed(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto]:
+def _photos_with_poses(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto]:
     sequences = {photo["name"]: photo["sequence"] for photo in facts["gathered"]["photos"]}
     model = read_model(dataset / "sparse" / "0")
     photos = []
@@ -80,12 +80,13 @@ def _placed(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto]:
 
 def _headline(name: str, facts: dict[str, Any]) -> str:
     sfm = facts["sfm"]
-    placed, rest = len(sfm["registered"]), len(sfm["unregistered"])
-    if not rest:
-        verdict = f"The poses of all {placed} photos were found."
+    registered, unregistered = len(sfm["registered"]), len(sfm["unregistered"])
+    if not unregistered:
+        summary = f"The poses of all {registered} photos were found."
     else:
-        verdict = f"The poses of {placed} of {placed + rest} photos were found."
-    lines = [f"<h1>{text(name)}</h1>", f"<p>{verdict}</p>"]
+        total = registered + unregistered
+        summary = f"The poses of {registered} of {total} photos were found."
+    lines = [f"<h1>{text(name)}</h1>", f"<p>{summary}</p>"]
     if len(sfm["sub_models"]) > 1:
         sizes = ", ".join(map(str, sfm["sub_models"]))
         lines.append(
@@ -93,7 +94,7 @@ def _headline(name: str, facts: dict[str, Any]) -> str:
             "photos); only the largest is used. Take more photos in between to connect them.</p>"
         )
     error = sfm["reprojection_error"]
-    if error is not None and error > _ERROR_HIGH:
+    if error is not None and error > _MAX_ERROR:
         lines.append(
             '<p class="bad">The reprojection error is high. Remove photos that are blurred or show '
             "moving objects, or try another camera model.</p>"
@@ -136,7 +137,7 @@ def _maps(dataset: Path, photos: Sequence[PlacedPhoto]) -> str:
 
 
 def _strip(dataset: Path, names: Sequence[str]) -> str:
-    count = min(len(names), _THUMBNAILS)
+    count = min(len(names), _MAX_THUMBNAILS)
     chosen = [names[i * len(names) // count] for i in range(count)]
     images = "".join(
         picture(_thumbnail(dataset / "images" / name), name)
@@ -186,8 +187,8 @@ def _left_out(facts: dict[str, Any]) -> str:
     ]
     if not entries:
         return ""
-    rows = [[text(name), text(why)] for name, why in entries[:_NAMED]]
-    more = len(entries) - _NAMED
+    rows = [[text(name), text(why)] for name, why in entries[:_MAX_UNUSED]]
+    more = len(entries) - _MAX_UNUSED
     rest = f'<p class="soft">… and {more:,} more, see capture.json.</p>' if more > 0 else ""
     return f"<h2>Photos not used</h2>\n{table(['photo', 'reason'], rows, 'names')}{rest}"
 

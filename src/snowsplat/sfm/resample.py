@@ -1,4 +1,4 @@
-"""Resample photos and masks for a `Pinhole`. The centre of a pixel is at one half throughout.
+"""Resamples photos and masks for a `Pinhole`. The centre of the first pixel is at (0.5, 0.5).
 
 Photos are sampled with Catmull-Rom splines, which have at most a quarter of the error of bilinear
 interpolation. Training uses every pixel, so blur added here would limit its quality.
@@ -23,7 +23,7 @@ def undistort_image(image: Image.Image, pinhole: Pinhole) -> Image.Image:
     """A photo, "L", "RGB" or "RGBA", resampled to the pinhole camera; same mode."""
     if pinhole.nodes is None:
         return image
-    # Colours are multiplied by alpha, so that transparent pixels do not bleed into others.
+    # Premultiplied alpha, so that the colours of transparent pixels do not affect other pixels.
     mode = "RGBa" if image.mode == "RGBA" else image.mode
     pixels = np.asarray(image.convert(mode)).reshape(image.height, image.width, -1)
     made = np.empty((pinhole.height, pinhole.width, pixels.shape[2]), np.uint8)
@@ -46,9 +46,11 @@ def undistort_mask(mask: Image.Image, pinhole: Pinhole) -> Image.Image:
 
 
 def _strips(pixels: np.ndarray, pinhole: Pinhole) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """Yields rows of the new image, the part (1, C, h, w) of the photo they need, and positions.
+    """Divide the new image into strips of H rows; yields three values for each strip.
 
-    Positions (1, H, W, 2) are x, y in pixels of the part, float64.
+    - the rows of the strip in the new image;
+    - the part (1, C, h, w) float32 of the photo that contains the pixels they need;
+    - the positions (1, H, W, 2) float64 of the pixels of the strip: x, y in pixels of that part.
     """
     nodes = pinhole.nodes
     assert nodes is not None
@@ -69,7 +71,7 @@ def _strips(pixels: np.ndarray, pinhole: Pinhole) -> Iterator[tuple[slice, Tenso
 
 
 def _cells(size: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """For each of ``size`` pixel centres: the index of its cell of ``count``, and the fraction."""
+    """The cell (of ``count``) of each of ``size`` pixels, and the position in the cell, 0..1."""
     position = (np.arange(size) + 0.5) * (count / size)
     cell = np.minimum(position.astype(np.int64), count - 1)
     return cell, position - cell
@@ -78,11 +80,12 @@ def _cells(size: int, count: int) -> tuple[np.ndarray, np.ndarray]:
 def _catmull_rom(part: Tensor, position: Tensor) -> Tensor:
     """(H, W, C) float32 of a part (1, C, h, w) at positions (1, H, W, 2).
 
-    Kernels of cubic convolution have a free parameter a: the kernel is K₀ + a·G. Torch uses
-    a = −0.75, which sharpens. Catmull-Rom uses a = −0.5, which is exact for quadratics (Keys 1981).
-    So its kernel is 1/3 of K₀ plus 2/3 of torch's. K₀ reaches two pixels: it is bilinear
-    interpolation with its fractions replaced by 3f² − 2f³. (Mixing the 2D products instead of the
-    1D kernels leaves an error of the fourth order.)
+    Kernels of cubic convolution have a free parameter a: the kernel is K₀ + a·G. PyTorch's bicubic
+    mode uses a = −0.75, which sharpens. Catmull-Rom uses a = −0.5, which is exact for quadratics
+    (Keys 1981). So the kernel of Catmull-Rom is 1/3 of K₀ plus 2/3 of PyTorch's. K₀ uses two
+    pixels: it is bilinear interpolation with each fraction f replaced by 3f² − 2f³. (Here the
+    results of the 2D interpolations are added instead of the 1D kernels. This leaves an error of
+    the fourth order.)
     """
     whole = torch.floor(position - 0.5)
     fraction = position - 0.5 - whole
@@ -91,7 +94,7 @@ def _catmull_rom(part: Tensor, position: Tensor) -> Tensor:
 
 
 def _sample(part: Tensor, position: Tensor, how: str) -> Tensor:
-    """(H, W, C) float32; outside of the part its border pixels are repeated."""
+    """(H, W, C) float32: ``part`` interpolated at ``position``; its border pixels are repeated."""
     size = torch.tensor([part.shape[3], part.shape[2]], dtype=position.dtype)
     grid = (2 * position / size - 1).float()
     made = F.grid_sample(part, grid, mode=how, padding_mode="border", align_corners=False)

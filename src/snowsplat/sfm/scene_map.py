@@ -17,13 +17,13 @@ from snowsplat.scene.orientation import VIEWING_DISTANCE
 _WIDTH = 520  # of the largest drawing, in SVG units
 _HEIGHT = 400
 _MARGIN = 16
-_MOST_POINTS = 6000  # per drawing; with more points, the file is larger but the drawing not clearer
+_MAX_POINTS = 6000  # per drawing; with more points, the file is larger but the drawing not clearer
 _SHADES = 12  # levels of red, green and blue: all points of one colour become one SVG path
 
 
 @dataclass(frozen=True)
 class PlacedPhoto:
-    """The data of a photo that a drawing shows."""
+    """A photo with its pose: the data that a drawing shows."""
 
     name: str
     sequence: str | None  # photos of one sequence are joined by a line, in the given order
@@ -69,14 +69,14 @@ class Drawing:
 def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) -> list[Drawing]:
     """One drawing for each projection, of points (P, 3) and their colours (P, 3) uint8.
 
-    All cameras are inside. Points are drawn if they are near the cameras and not outliers.
+    All cameras are drawn. Points are drawn if they are near the cameras and not outliers.
     """
     centres = np.array([photo.centre for photo in photos]).reshape(-1, 3)
     low, high = _box(centres, xyz)
     inside = ((xyz >= low) & (xyz <= high)).all(axis=1)
     shown = np.flatnonzero(inside)
     # Random points, because evenly chosen ones could follow a pattern in the order of the points.
-    shown = shown[np.random.default_rng(0).permutation(len(shown))[:_MOST_POINTS]]
+    shown = shown[np.random.default_rng(0).permutation(len(shown))[:_MAX_POINTS]]
     extents = [
         np.abs((high - low) @ np.stack([projection.right, projection.down], 1))
         for projection in _PROJECTIONS
@@ -99,11 +99,12 @@ def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) 
 
 
 def _fit(extent: np.ndarray) -> float:
+    """The largest scale at which a scene of this extent (2,) fits into a drawing."""
     return min((_WIDTH - 2 * _MARGIN) / extent[0], (_HEIGHT - 2 * _MARGIN) / extent[1])
 
 
 def _box(centres: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest coordinates (3,) of the drawing, without outliers and distant points."""
+    """Lowest and highest coordinates (3,) of what is drawn, without outliers and distant points."""
     low, high = centres.min(axis=0), centres.max(axis=0)
     if len(xyz):
         reach = 3 * VIEWING_DISTANCE

@@ -1,4 +1,4 @@
-"""A video frame as 8-bit RGB: the correct YUV matrix, and tone mapping of HDR."""
+"""Converts video frames to 8-bit RGB, with the correct YUV matrix and tone mapping of HDR video."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _TO_709 = np.array(
     ],
     np.float32,
 )
-_KNEE = 0.7  # of white: luminance below it is unchanged
+_KNEE = 0.7  # as a fraction of white: tone mapping does not change smaller values
 _STEPS = 4096  # entries of the lookup tables
 
 
 def rgb_image(frame: VideoFrame) -> np.ndarray:
-    """(H, W, 3) uint8 of a decoded frame, in the stored orientation."""
+    """(H, W, 3) uint8 sRGB of a decoded frame, in the stored orientation."""
     matrix = None  # None: the matrix that the frame declares
     if frame.colorspace == _UNSPECIFIED and frame.height >= 720:
-        matrix = _BT709  # what players assume for this size
+        matrix = _BT709  # video players assume this matrix for frames of this size
     transfer = frame.color_trc
     if transfer not in (_PQ, _HLG):
         return frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()
@@ -46,12 +46,12 @@ def rgb_image(frame: VideoFrame) -> np.ndarray:
     light = _LIGHT_OF_PQ if transfer == _PQ else _LIGHT_OF_HLG
     out = np.empty(deep.shape, np.uint8)
     for top in range(0, len(deep), 256):
-        out[top : top + 256] = _shown(light[deep[top : top + 256] >> 4])
+        out[top : top + 256] = _tone_mapped(light[deep[top : top + 256] >> 4])
     return out
 
 
-def _shown(light: np.ndarray) -> np.ndarray:
-    """(…, 3) float32 linear BT.2020 in units of white, to sRGB 8 bits."""
+def _tone_mapped(light: np.ndarray) -> np.ndarray:
+    """From (…, 3) float32 linear BT.2020 in units of white to (…, 3) uint8 sRGB."""
     colours = np.clip(light @ _TO_709.T, 0, None)
     # Pixels whose brightest channel is above the knee are compressed, so that it is below 1. The
     # three channels are multiplied by the same factor, which keeps the hue.
@@ -64,7 +64,7 @@ def _shown(light: np.ndarray) -> np.ndarray:
 
 
 def _light_of_pq(signal: np.ndarray) -> np.ndarray:
-    """SMPTE ST 2084, relative to `_WHITE`."""
+    """The luminance of a SMPTE ST 2084 signal (0..1), in units of `_WHITE`."""
     m1, m2 = 2610 / 16384, 2523 / 4096 * 128
     c1, c2, c3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
     power = signal ** (1 / m2)
@@ -72,7 +72,9 @@ def _light_of_pq(signal: np.ndarray) -> np.ndarray:
 
 
 def _light_of_hlg(signal: np.ndarray) -> np.ndarray:
-    """BT.2100, relative to `_WHITE` (a signal of 0.75), with the system gamma of 1.2.
+    """The luminance of a BT.2100 HLG signal (0..1), in units of `_WHITE`: a signal of 0.75.
+
+    The system gamma is 1.2.
 
     BT.2100 applies the gamma to the luminance. Here it is applied to each channel, which differs
     little and needs one table only.

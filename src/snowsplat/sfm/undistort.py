@@ -1,9 +1,9 @@
-"""Remove the lens distortion of photos and of the SfM model.
+"""Removes the lens distortion of photos, their masks and the SfM model.
 
     distorted/sparse/0, input/, distorted/masks/  ->  sparse/0, images/, masks/, images_2/ …
 
-The result has pinhole cameras, in the layout that training reads. The new model is in the scene's
-frame (see `orient`).
+The new model has pinhole cameras and is in the frame of the scene (see `orient`). The files have
+the layout that training reads.
 """
 
 from __future__ import annotations
@@ -61,17 +61,19 @@ class Undistorted:
 
     images: int
     masks: int
-    sizes: list[tuple[int, int, int]]  # width, height, and how many images have it
-    folders: list[str]  # of images, in the dataset
-    resampled: bool  # False if no photo had distortion: then the images are copies
+    sizes: list[tuple[int, int, int]]  # width, height, and the number of images of this size
+    folders: list[str]  # names of the folders with images
+    resampled: bool  # False if no camera has distortion: then the images are copies of the photos
 
 
 @dataclass(frozen=True)
 class _Job:
-    name: str  # of the photo, relative
-    camera_size: tuple[int, int]
+    """One photo to undistort."""
+
+    name: str  # path relative to input/
+    camera_size: tuple[int, int]  # width and height of the distorted camera
     pinhole: Pinhole
-    mask: bool
+    mask: bool  # whether the photo has a mask
 
 
 def undistort(
@@ -197,16 +199,20 @@ def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> bool:
 
 
 def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> bool:
+    """Write the mask, unless it masks only transparent pixels; returns whether it was written.
+
+    ``opaque``: (H, W) bool, the pixels of the photo that are not transparent; None: all.
+    """
     name = f"{job.name}.png"
     path = dataset / "distorted" / "masks" / name
     with _open_photo(path, job) as opened:
         mask = _decode(opened, path).convert("L")
     if opaque is not None:
         # SfM ignores transparent pixels; training uses them as empty space.
-        counts = (np.asarray(mask) >= 128) | ~opaque
-        if counts.all():
+        used = (np.asarray(mask) >= 128) | ~opaque
+        if used.all():
             return False
-        mask = Image.fromarray(counts.astype(np.uint8) * 255)
+        mask = Image.fromarray(used.astype(np.uint8) * 255)
     _save(undistort_mask(mask, job.pinhole), dataset / "masks" / name, "PNG")
     return True
 
@@ -230,7 +236,7 @@ def _open_photo(path: Path, job: _Job) -> Image.Image:
 def _decode(opened: Image.Image, path: Path) -> Image.Image:
     try:
         opened.load()
-    except Exception as error:  # as above
+    except Exception as error:  # as in `_open_photo`
         raise UserError(f"{path}: cannot be decoded ({reason_of(error)}); replace it") from None
     return opened
 
@@ -248,7 +254,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 def _reduced(image: Image.Image, divisor: int) -> Image.Image:
     """The image at 1/``divisor`` of its size, averaged over areas; rounded as in `data`."""
     width, height = (max(1, round(side / divisor)) for side in image.size)
-    # Colours are multiplied by alpha, so that transparent pixels do not bleed into others.
+    # Premultiplied alpha, so that the colours of transparent pixels do not affect other pixels.
     mode = "RGBa" if image.mode == "RGBA" else image.mode
     pixels = np.asarray(image.convert(mode)).reshape(image.height, image.width, -1)
     planes = resize_area(np.ascontiguousarray(pixels.transpose(2, 0, 1)), width, height)
