@@ -7,7 +7,7 @@ from PIL import Image
 
 from snowsplat.data.colmap import read_model
 from snowsplat.scene.geometry import rotation_from_quat, transform_points
-from snowsplat.synthetic import light, write_synthetic_photos
+from snowsplat.synthetic import light, still_life, write_synthetic_photos
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.photographer import photograph, walk
@@ -24,19 +24,21 @@ DISTORTIONS = [
 
 
 @pytest.fixture(scope="module")
-def coarse_light():
-    """The light of the still life is computed at fewer points: the photos of these tests are small.
+def coarse_scene():
+    """The still life with fewer texels and light at fewer points: the photos are small.
 
-    This is most of the time in which the scene is built.
+    Otherwise, most of the time would be spent on building the scene.
     """
+    size = still_life._size
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(still_life, "_size", lambda metres, texel: size(metres, 4 * texel))
         patch.setattr(light, "_SPACING", 0.1)
         patch.setattr(light, "_MOST_POINTS", 12)
         yield
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory, coarse_light):
+def photos(tmp_path_factory, coarse_scene):
     folder = tmp_path_factory.mktemp("photos")
     return folder, write_synthetic_photos(folder, n_views=3, width=96, height=64, seed=1)
 
@@ -109,7 +111,7 @@ def test_marks_are_where_the_poses_project_them(distortion):
     balls = [SceneObject(Ellipsoid(mark, (0.02,) * 3), [white], emissive=True) for mark in marks]
     scene = Scene(balls, Lamp((0, 0, 9), (1, 1), 0.0, 0.0))
     errors = []
-    for pose in walk(12, seed=5):
+    for pose in walk(6, seed=5):
         image = photograph(scene, lens, pose, np.random.default_rng(0))[..., 1]
         x_cam = transform_points(pose, torch.tensor(marks, dtype=torch.float64)).numpy().T
         spots = lens.project(x_cam)
