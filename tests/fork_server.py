@@ -31,17 +31,26 @@ _LARGEST_REQUEST = 1 << 17
 def popen(
     *arguments: object,
     env: Mapping[str, str] = ENVIRONMENT,
+    stdin: int = subprocess.DEVNULL,
+    stdout: int = subprocess.PIPE,
     stderr: int = subprocess.PIPE,
 ) -> Process | subprocess.Popen:
-    """``python arguments``: ``-m module …``, ``-c code …`` or ``script …``; stdout is a pipe.
+    """``python arguments``: ``-m module …``, ``-c code …`` or ``script …``.
 
     Where forks are not possible, it is a new process.
+
+    Args:
+        stdin: or PIPE.
+        stdout: or a file descriptor.
+        stderr: or STDOUT, or a file descriptor.
     """
     texts = [str(argument) for argument in arguments]
     if hasattr(os, "pidfd_open"):
-        return Process(texts, dict(env), stderr)
+        return Process(texts, dict(env), stdin, stdout, stderr)
     command = [sys.executable, *texts]
-    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=stderr, text=True)
+    return subprocess.Popen(
+        command, env=env, stdin=stdin, stdout=stdout, stderr=stderr, text=True
+    )
 
 
 def run(
@@ -56,15 +65,30 @@ def run(
 class Process:
     """A process that the server started. Its methods are those of `subprocess.Popen`."""
 
-    def __init__(self, arguments: list[str], env: dict[str, str], stderr: int) -> None:
+    def __init__(
+        self, arguments: list[str], env: dict[str, str], stdin: int, stdout: int, stderr: int
+    ) -> None:
         self.args = arguments
         self.returncode: int | None = None
-        self.stdout, out = _pipe()
-        self.stderr, err = _pipe() if stderr == subprocess.PIPE else (None, os.dup(out))
+        self.stdin = self.stdout = self.stderr = None
+        if stdin == subprocess.PIPE:
+            theirs, ours = os.pipe()
+            self.stdin = open(ours, "w", encoding="utf-8")
+        else:
+            theirs = os.open(os.devnull, os.O_RDONLY)
+        if stdout == subprocess.PIPE:
+            self.stdout, out = _pipe()
+        else:
+            out = os.dup(stdout)
+        if stderr == subprocess.PIPE:
+            self.stderr, err = _pipe()
+        else:
+            err = os.dup(out if stderr == subprocess.STDOUT else stderr)
         request = {"argv": arguments, "env": env, "cwd": os.getcwd()}
-        self.pid = _server().ask(request, [out, err])
-        os.close(out)
-        os.close(err)
+        streams = [theirs, out, err]
+        self.pid = _server().ask(request, streams)
+        for stream in streams:
+            os.close(stream)
         # Until the server is asked for its exit code, the number belongs to this process.
         self._handle = os.pidfd_open(self.pid)
 
@@ -93,7 +117,7 @@ class Process:
             if thread.is_alive():
                 raise subprocess.TimeoutExpired(self.args, timeout or 0)
         self.wait(timeout)
-        return texts[self.stdout], texts.get(self.stderr, "")
+        return texts.get(self.stdout, ""), texts.get(self.stderr, "")
 
     def send_signal(self, number: int) -> None:
         if self.poll() is None:
@@ -109,7 +133,7 @@ class Process:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for stream in (self.stdout, self.stderr):
+        for stream in (self.stdin, self.stdout, self.stderr):
             if stream:
                 stream.close()
         self.wait()
@@ -135,7 +159,7 @@ class _Server:
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, __file__, str(theirs.fileno())],
-                env=ENVIRONMENT,
+                env=ENVIRONMENT | {"OPENBLAS_NUM_THREADS": "1"},  # forks would lack its threads
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,  # so that the streams of programs are not a terminal's
                 pass_fds=[theirs.fileno()],
@@ -160,7 +184,7 @@ def _server() -> _Server:
 def _serve(ours: socket.socket) -> dict:
     """Answer requests; returns only in a fork, with its request."""
     while True:
-        data, streams, _, _ = socket.recv_fds(ours, _LARGEST_REQUEST, 2)
+        data, streams, _, _ = socket.recv_fds(ours, _LARGEST_REQUEST, 3)
         if not data:  # the tests have ended
             os._exit(0)
         request = json.loads(data)
@@ -171,7 +195,7 @@ def _serve(ours: socket.socket) -> dict:
         pid = os.fork()
         if pid == 0:
             ours.close()
-            for number, stream in enumerate(streams, 1):
+            for number, stream in enumerate(streams):
                 os.dup2(stream, number)
                 os.close(stream)
             return request

@@ -8,6 +8,7 @@ import pytest
 
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
+from ..fork_server import popen
 from ..sfm.colmap import scenes
 from .harness import Zygote
 
@@ -30,5 +31,5 @@ def photos(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def zygote(tmp_path_factory) -> Iterator[Zygote]:
-    with Zygote(tmp_path_factory.mktemp("zygote")) as zygote:
+    with Zygote(tmp_path_factory.mktemp("zygote"), popen) as zygote:
         yield zygote

@@ -23,6 +23,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -62,24 +63,22 @@ class Ended:
 class Zygote:
     """Starts commands from a process that has loaded all modules, so kills do not hit imports.
 
-    Use it as a context manager. ``folder`` is the working folder, for logs and temporary files.
+    Use it as a context manager.
+
+    Args:
+        folder: the working folder, for logs and temporary files.
+        popen: that of fork_server.py.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, popen: Callable[..., Any]) -> None:
         self.folder, self.temporary = folder, folder / "tmp"
         self.temporary.mkdir(parents=True, exist_ok=True)
-        self._process = subprocess.Popen(
-            [sys.executable, Path(__file__).with_name("zygote.py")],
-            env={
-                **os.environ,
-                "PYTHONPATH": _SOURCE,
-                "TMPDIR": str(self.temporary),
-                "OPENBLAS_NUM_THREADS": "1",
-            },
-            cwd=folder,
+        self._process = popen(
+            Path(__file__).with_name("zygote.py"),
+            folder,
+            env={**os.environ, "PYTHONPATH": _SOURCE, "TMPDIR": str(self.temporary)},
             stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
+            stderr=2,  # that of the tests
         )
 
     def __enter__(self) -> Zygote:
@@ -532,7 +531,7 @@ def make_jobs(photos: Path) -> list[Job]:
         if list(record["stages"]) != ["scene", "pictures"]:
             raise Defect("stages are not finished")
         scene = output / f"{photos.name}.ply"
-        last = output / "scene/point_cloud/iteration_120/point_cloud.ply"
+        last = output / "scene/point_cloud/iteration_60/point_cloud.ply"
         if digest(scene) != digest(last):
             raise Defect("the scene is not that of the training")
 

@@ -133,7 +133,7 @@ def test_make_keeps_checkpoints_until_the_scene_is_recorded(killer, zygote, phot
     (out / "make.json").write_text(json.dumps(record))
     command = job.command(out, True)
     checkpoints = out / "scene/checkpoints"
-    last = out / "scene/point_cloud/iteration_120/point_cloud.ply"
+    last = out / "scene/point_cloud/iteration_60/point_cloud.ply"
 
     def kill_when_gone(pid: int) -> None:
         process = Path(f"/proc/{pid}")

@@ -1,6 +1,8 @@
 """Runs `snowsplat` in forks of a process that has loaded all modules: a start takes milliseconds.
 
-    python zygote.py      one line of JSON per run on stdin, lines of JSON on stdout
+    python zygote.py FOLDER      one line of JSON per run on stdin, lines of JSON on stdout
+
+The runs begin in FOLDER. The process is itself a fork of such a process; see fork_server.py.
 
 A run is {"argv", "log", "watched", "at", "delay", "limits", "columns"}. It is a process with its
 own process group. With "at" it kills its group with SIGKILL before the at-th time that its Python
@@ -17,6 +19,7 @@ import resource
 import signal
 import struct
 import sys
+import tempfile
 import termios
 import threading
 import time
@@ -86,8 +89,8 @@ def _child(run: dict) -> None:
     from snowsplat.pipeline import make
 
     # `make` with a very short training that always writes checkpoints.
-    make._CHECKPOINT_SECONDS = 0.1
-    make.PRESETS["draft"] = replace(make.PRESETS["draft"], iterations=120)
+    make._CHECKPOINT_SECONDS = 0.05
+    make.PRESETS["draft"] = replace(make.PRESETS["draft"], iterations=60)
     count = os.open(run["log"] + ".changes", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for name, value in run.get("limits", {}).items():
         which = getattr(resource, name)
@@ -112,6 +115,8 @@ def _child(run: dict) -> None:
 
 def serve() -> None:
     """Execute runs until stdin is closed."""
+    os.chdir(sys.argv[1])
+    tempfile.tempdir = None  # so that TMPDIR is read
     sys.path.insert(0, str(Path(__file__).parents[1]))
     from imports import import_all
 

@@ -20,6 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from fork_server import popen
 from kill.harness import (
     Defect,
     Job,
@@ -74,7 +75,7 @@ def main() -> int:
     share = sum(_SHARES[subcommand] for subcommand in flags.subcommands)
     defects: list[Defect] = []
     start = time.monotonic()
-    with Zygote(folder / "work") as zygote:
+    with Zygote(folder / "work", popen) as zygote:
         killer = Killer(zygote, flags.seed)
         for subcommand in flags.subcommands:
             selected = [job for job in everything if job.subcommand == subcommand]
