@@ -1,11 +1,13 @@
 """The top level of the command line: help, invalid flags, exit codes, imported modules."""
 
 import inspect
+import json
 import logging
 import os
 import subprocess
 import sys
 import warnings
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -53,55 +55,79 @@ def test_help_texts_are_wrapped_to_the_width_of_the_terminal(run, monkeypatch):
     assert all(len(line) > 40 for line in lines[:-2]), lines  # no line breaks of the docstring
 
 
-def imported_by(*arguments: object) -> set[str]:
-    """The names of the heavy modules and of the subcommands that a command imports."""
-    code = (
-        "import sys\nfrom snowsplat.cli.main import main\n"
-        "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
-        "print(*sys.modules, file=sys.stderr)"
-    )
+_IMPORTED = """
+import json, os, sys
+from snowsplat.cli.main import main
+for arguments in json.loads(sys.argv[1]):
+    if os.fork() == 0:
+        try:
+            main(arguments)
+        except SystemExit:
+            pass
+        print(*sys.modules, file=sys.stderr, flush=True)
+        os._exit(0)
+    assert os.wait()[1] == 0
+    print("end", file=sys.stderr, flush=True)
+"""
+
+
+def imported_by(*commands: list[object]) -> list[set[str]]:
+    """The names of the heavy modules and of the subcommands that each command imports.
+
+    Each runs in a fork of a process that has imported only the top level of the command line.
+    """
+    texts = [[str(argument) for argument in arguments] for arguments in commands]
     done = subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)],
+        [sys.executable, "-c", _IMPORTED, json.dumps(texts)],
         env=ENVIRONMENT,
         capture_output=True,
         text=True,
         check=True,
     )
-    modules = set(done.stderr.splitlines()[-1].split())
+    lines = done.stderr.splitlines()
     subcommands = {f"snowsplat.cli.{name}" for name in module.SUBCOMMANDS}
-    return modules & ({"torch", "numpy", "PIL"} | subcommands)
+    relevant = {"torch", "numpy", "PIL"} | subcommands
+    found = [set(before.split()) & relevant for before, line in pairwise(lines) if line == "end"]
+    assert len(found) == len(commands)
+    return found
 
 
 @pytest.mark.slow
 def test_help_and_invalid_flags_import_neither_torch_nor_other_subcommands():
-    assert imported_by("--help") == set()
-    assert imported_by("trian") == set()
-    assert imported_by("info") == {"snowsplat.cli.info"}
-    for arguments in (["train", "--help"], ["train", "--iterations", "many"], ["train"]):
-        assert not {"torch", "numpy", "PIL"} & imported_by(*arguments)
+    no_subcommand, unknown, info, *train = imported_by(
+        ["--help"],
+        ["trian"],
+        ["info"],
+        ["train", "--help"],
+        ["train", "--iterations", "many"],
+        ["train"],
+    )
+    assert no_subcommand == set()
+    assert unknown == set()
+    assert info == {"snowsplat.cli.info"}
+    for imported in train:
+        assert not {"torch", "numpy", "PIL"} & imported
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".ply", ".spz", ".sog", ".glb", ".splat"])
-def test_info_describes_a_scene_without_torch(tmp_path, suffix):
-    path = tmp_path / f"scene{suffix}"
-    write_gaussians(path, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator(), sh_degree=1))
-    assert "torch" not in imported_by("info", path)
-
-
-def test_info_describes_point_clouds_and_checkpoints_without_torch(tmp_path):
+def test_info_describes_each_kind_of_file_and_folder_without_torch(tmp_path):
+    scenes = [
+        tmp_path / f"scene{suffix}"
+        for suffix in (".compressed.ply", ".ply", ".spz", ".sog", ".glb", ".splat")
+    ]
+    for path in scenes:
+        write_gaussians(
+            path, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator(), sh_degree=1)
+        )
     write_points(tmp_path / "points.ply", np.zeros((3, 3)), np.zeros((3, 3)))
-    path = checkpoint.save(tmp_path, 5, {"a": torch.zeros(3)}, {})
-    for file in (tmp_path / "points.ply", path):
-        assert "torch" not in imported_by("info", file)
-
-
-def test_info_describes_an_output_folder_without_torch(tmp_path):
-    scene = tmp_path / "out/point_cloud/iteration_7/point_cloud.ply"
-    scene.parent.mkdir(parents=True)
-    write_gaussians(scene, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator()))
+    saved = checkpoint.save(tmp_path, 5, {"a": torch.zeros(3)}, {})
+    trained = tmp_path / "out/point_cloud/iteration_7/point_cloud.ply"
+    trained.parent.mkdir(parents=True)
+    write_gaussians(trained, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator()))
     (tmp_path / "out/cfg_args").write_text("Namespace(source_path='garden')")
-    assert "torch" not in imported_by("info", tmp_path / "out")
+    described = [*scenes, tmp_path / "points.ply", saved, tmp_path / "out"]
+    found = imported_by(*(["info", path] for path in described))
+    for path, imported in zip(described, found, strict=True):
+        assert "torch" not in imported, path
 
 
 def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):
@@ -183,20 +209,15 @@ def test_out_of_memory_is_a_one_line_error_with_advice(replace_run, refused):
 
 
 @pytest.mark.slow
-def test_a_training_run_whose_standard_output_is_closed_fails(dataset, tmp_path):
+def test_a_training_run_whose_standard_output_is_closed_fails(start, dataset, tmp_path):
     """As with `| head -1`. There is no message, but the exit code is not zero."""
     read, write = os.pipe()
     os.close(read)
     arguments = ["train", dataset, "-o", tmp_path / "out", "--iterations", 9, "--device", "cpu"]
-    done = subprocess.run(
-        [sys.executable, "-m", "snowsplat", *map(str, arguments)],
-        env=ENVIRONMENT,
-        stdout=write,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(*arguments, stdout=write)
     os.close(write)
-    assert (done.returncode, done.stderr) == (141, "")
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (141, "")
     assert not (tmp_path / "out/point_cloud").exists()
 
 
