@@ -4,11 +4,9 @@ Loading the page and training take much processor time. Therefore, the tests sha
 training is paused between them.
 """
 
-import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,18 +14,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import snowsplat
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.viewer.live.server import free_port
 
 from ...browser import Browser, Page
+from ...fork_server import popen
 from ...ports import unused_port
 
 pytestmark = pytest.mark.browser
 
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
-SCALE = 0.5  # a quarter of the pixels
+SCALE = 0.25  # a sixteenth of the pixels
 PAUSED = "document.body.innerText.includes(', paused')"
 LOADED = "/Step [1-9]/.test(document.body.innerText)"
 BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() === '{}')"
@@ -40,13 +37,8 @@ class Training:
         port = unused_port()
         self.url, self.lines, self.out = f"http://127.0.0.1:{port}", [], out
         flags = ["--iterations", "500000", "--threads", "1", "--view", "--port", str(port)]
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "snowsplat", "train", dataset, "-o", out, "--eval", *flags],
-            env=ENVIRONMENT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        command = ("-m", "snowsplat", "train", dataset, "-o", out, "--eval", *flags)
+        self.process = popen(*command, stderr=subprocess.STDOUT)
         while not self.lines or not self.lines[-1].startswith("step"):
             line = self.process.stdout.readline()
             assert line, self.lines
@@ -60,7 +52,8 @@ class Training:
 
 
 @pytest.fixture(scope="module")
-def training(tmp_path_factory) -> Iterator[Training]:
+def training(tmp_path_factory, browser) -> Iterator[Training]:
+    """It starts after the browser, since it uses the processor all the time."""
     root = tmp_path_factory.mktemp("page")
     dataset = write_toy_dataset(root / "capture", "colmap-bin", 9, 96, 72, n_points=600)
     training = Training(dataset, root / "out")
@@ -72,12 +65,20 @@ def training(tmp_path_factory) -> Iterator[Training]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with Browser(640, 480, SCALE) as browser:
+    with Browser(640, 480, SCALE, frames=5.0) as browser:
         yield browser
 
 
 @pytest.fixture(scope="module")
 def tab(training, browser) -> Page:
+    page = browser.open(training.url)
+    page.wait_for(LOADED)
+    return page
+
+
+@pytest.fixture(scope="module")
+def other(training, browser, tab) -> Page:
+    """A second page; the tests that use it come first, and the last of them closes it."""
     page = browser.open(training.url)
     page.wait_for(LOADED)
     return page
@@ -179,10 +180,9 @@ def test_the_page_shows_a_running_training_run(training, page):
     assert [url for url in outside if not url.startswith(("data:", "blob:"))] == []
 
 
-def test_two_pages_have_separate_cameras(training, browser, page):
+def test_two_pages_have_separate_cameras(page, other):
     """It comes before the tests that move the camera of the first page."""
     pause(page)
-    other = browser.open(training.url)
     other.wait_for(PAUSED)
     here, there = settled(page), settled(other)
     assert differ(here, there) < 1
@@ -193,7 +193,21 @@ def test_two_pages_have_separate_cameras(training, browser, page):
     paused = step_of(page)
     press(other, "Resume")  # the training is shared
     wait(lambda: step_of(page) > paused)
-    other.close()
+
+
+def test_a_page_that_closes_during_a_transfer(training, page, other):
+    first = step_of(page)
+    closings = (lambda: other.navigate(training.url), other.close)
+    for close in closings:
+        other.wait_for(LOADED)
+        resume(other)
+        other.drag(100, 240, 300, 340, steps=30)
+        close()
+        assert training.process.poll() is None
+        pause(page)
+    resume(page)
+    wait(lambda: step_of(page) > first + 10)
+    assert training.process.poll() is None
 
 
 def test_pause_step_and_resume(page):
@@ -260,19 +274,6 @@ def test_views_are_stored_for_a_video(page, tmp_path):
     assert float((cameras[0].position - cameras[1].position).norm()) > 0.01
     press(page, "Remove the last view")
     page.wait_for("document.body.textContent.includes('1 stored')")
-
-
-def test_a_page_that_closes_during_a_transfer(training, browser, page):
-    first = step_of(page)
-    for _ in range(3):
-        pause(page)  # while the other page is loading
-        other = browser.open(training.url)
-        other.wait_for(LOADED)
-        resume(other)
-        other.drag(100, 240, 300, 340, steps=30)
-        other.close()
-    wait(lambda: step_of(page) > first + 10)
-    assert training.process.poll() is None
 
 
 def test_ctrl_c_while_paused_saves_and_closes(training, tab):
