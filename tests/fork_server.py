@@ -48,9 +48,7 @@ def popen(
     if hasattr(os, "pidfd_open"):
         return Process(texts, dict(env), stdin, stdout, stderr)
     command = [sys.executable, *texts]
-    return subprocess.Popen(
-        command, env=env, stdin=stdin, stdout=stdout, stderr=stderr, text=True
-    )
+    return subprocess.Popen(command, env=env, stdin=stdin, stdout=stdout, stderr=stderr, text=True)
 
 
 def run(
@@ -72,16 +70,15 @@ class Process:
         self.returncode: int | None = None
         self.stdin = self.stdout = self.stderr = None
         if stdin == subprocess.PIPE:
-            theirs, ours = os.pipe()
-            self.stdin = open(ours, "w", encoding="utf-8")
+            theirs, self.stdin = _pipe("w")
         else:
             theirs = os.open(os.devnull, os.O_RDONLY)
         if stdout == subprocess.PIPE:
-            self.stdout, out = _pipe()
+            out, self.stdout = _pipe("r")
         else:
             out = os.dup(stdout)
         if stderr == subprocess.PIPE:
-            self.stderr, err = _pipe()
+            err, self.stderr = _pipe("r")
         else:
             err = os.dup(out if stderr == subprocess.STDOUT else stderr)
         request = {"argv": arguments, "env": env, "cwd": os.getcwd()}
@@ -145,9 +142,11 @@ class Process:
         return self.returncode
 
 
-def _pipe():
+def _pipe(mode: str):
+    """The descriptor of the other process, and our end, opened in this mode."""
     read, write = os.pipe()
-    return open(read, encoding="utf-8"), write
+    theirs, ours = (write, read) if mode == "r" else (read, write)
+    return theirs, open(ours, mode, encoding="utf-8")
 
 
 class _Server:
