@@ -14,6 +14,7 @@ def import_all() -> None:
     import snowsplat.pipeline.memory_use
     import snowsplat.pipeline.videos
     import snowsplat.scene.edit
+    import snowsplat.sfm.colmap.reconstruct
     import snowsplat.sfm.dataset_folder
     import snowsplat.sfm.orient
     import snowsplat.sfm.report

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.sfm
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
-    """6 photos, 320×240; read-only for the tests."""
+    """6 photos, 256×192; read-only for the tests."""
     return scenes.write_photos(tmp_path_factory.mktemp("capture") / "photos", 6)
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from snowsplat.sfm.ingest.photo import Photo
 
-WIDTH, HEIGHT, FOCAL = 320, 240, 280.0
+WIDTH, HEIGHT, FOCAL = 256, 192, 224.0
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,18 @@ def arc(count: int) -> list[np.ndarray]:
     ]
 
 
-def photograph(scene: list[Board], cam_from_world: np.ndarray, seed: int = 0) -> np.ndarray:
-    """(HEIGHT, WIDTH) uint8: a pinhole camera with four rays per pixel and a little noise."""
+def photograph(
+    scene: list[Board], cam_from_world: np.ndarray, seed: int = 0, *, zoom: float = 1
+) -> np.ndarray:
+    """(HEIGHT, WIDTH) uint8: a pinhole camera with four rays per pixel and a little noise.
+
+    ``zoom``: the same view with this many times as many pixels along each side.
+    """
+    width, height, focal = round(zoom * WIDTH), round(zoom * HEIGHT), zoom * FOCAL
     rotation, translation = cam_from_world[:, :3], cam_from_world[:, 3]
     centre = -rotation.T @ translation
-    x = ((np.arange(2 * WIDTH) + 0.5) / 2 - WIDTH / 2) / FOCAL
-    y = ((np.arange(2 * HEIGHT) + 0.5) / 2 - HEIGHT / 2) / FOCAL
+    x = ((np.arange(2 * width) + 0.5) / 2 - width / 2) / focal
+    y = ((np.arange(2 * height) + 0.5) / 2 - height / 2) / focal
     nearest, grey = np.full((len(y), len(x)), np.inf), np.full((len(y), len(x)), 0.5)
     for board in scene:
         # centre + t ray = corner + u right + v down, so u/t, v/t and 1/t are linear in x and y.
@@ -100,7 +106,7 @@ def photograph(scene: list[Board], cam_from_world: np.ndarray, seed: int = 0) ->
         t = nearest[hit] = t[hit]
         size = len(board.texture)
         grey[hit] = _sample(board.texture, v[hit] * t * (size - 1), u[hit] * t * (size - 1))
-    grey = grey.reshape(HEIGHT, 2, WIDTH, 2).mean((1, 3))
+    grey = grey.reshape(height, 2, width, 2).mean((1, 3))
     noise = np.random.default_rng(seed).normal(0, 1.5, grey.shape)
     return np.clip(20 + 215 * grey + noise, 0, 255).astype(np.uint8)
 

@@ -34,9 +34,12 @@ def main() -> None:
     """Run the job that is read from stdin."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # COLMAP's logger handles the signals of a crash. Its handlers allocate memory, so the process
-    # would hang after a crash within malloc. The handlers of Python replace them.
+    # would hang after a crash within malloc. They are removed, because the handlers of Python would
+    # call them.
+    for name in ("SIGSEGV", "SIGABRT", "SIGFPE", "SIGBUS", "SIGILL", "SIGTERM"):
+        if hasattr(signal, name):  # Windows has no SIGBUS
+            signal.signal(getattr(signal, name), signal.SIG_DFL)
     faulthandler.enable()
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     answers = _redirected_stdout()
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()

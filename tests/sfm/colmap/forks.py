@@ -1,0 +1,31 @@
+"""COLMAP's child processes as forks of a process that has loaded their modules."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import pytest
+
+from snowsplat.sfm.colmap import child
+
+from ... import fork_server
+
+
+def _popen(command, *, env, stdin, stdout, stderr, text, encoding):
+    assert (stdout, text, encoding) == (subprocess.PIPE, True, "utf-8")
+    return fork_server.popen(*command[1:], env=env, stdin=stdin, stderr=stderr.fileno())
+
+
+@contextmanager
+def children_in_forks() -> Iterator[None]:
+    """A fork takes a fifth of the time of a new process.
+
+    Tests of processes start new ones: those of `test_child.py` and of the command line.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        started = SimpleNamespace(Popen=_popen, PIPE=subprocess.PIPE)
+        patch.setattr(child, "subprocess", started)
+        yield
