@@ -367,7 +367,7 @@ def test_output_folders_with_other_files(refused, run, dataset, tmp_path):
         (["--initial-points", 0], "--initial-points: 0 is too small"),
         (["--seed", 2**62], "--seed: 4611686018427387904 is too large"),
         (["--minutes", 1, "--iterations", 100], "cannot be combined"),
-        (["--background", "black", "-w"], "different colors"),
+        (["--background", "black", "-w"], "different colours"),
         (["-s", "elsewhere"], "twice"),
         (["--test-list", "absent.txt"], "absent.txt"),
     ],

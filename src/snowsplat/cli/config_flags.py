@@ -30,10 +30,10 @@ class ConfigFlags:
         Literal["black", "white", "random"] | None,
         flag("{black,white,random}", default="black"),
     ] = None
-    """Color of the background of the scene and of transparent photos."""
+    """Colour of the background of the scene and of transparent photos."""
 
     sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
-    """Degree of the spherical harmonics (view-dependent color). A lower degree needs less
+    """Degree of the spherical harmonics (view-dependent colour). A lower degree needs less
     memory."""
     ssim_weight: Annotated[float | None, flag("F", "--lambda-dssim", default=RECIPE)] = None
     """Weight of 1 - SSIM in the loss. The mean absolute difference has the weight 1 - F."""
@@ -79,9 +79,9 @@ class ConfigFlags:
     lr_opacity_logits: Annotated[float | None, flag("F", "--opacity-lr", default=RECIPE)] = None
     """Learning rate of the opacities."""
     lr_sh_dc: Annotated[float | None, flag("F", default=RECIPE)] = None
-    """Learning rate of the base colors."""
+    """Learning rate of the base colours."""
     lr_sh_rest: Annotated[float | None, flag("F", default=RECIPE)] = None
-    """Learning rate of the view-dependent colors."""
+    """Learning rate of the view-dependent colours."""
 
     def config_settings(self) -> dict[str, Any]:
         """The settings that were given: name -> value."""

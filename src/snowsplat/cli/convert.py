@@ -31,7 +31,7 @@ class Convert:
       .spz              1/8 of the size; for the programs of Niantic and many others
       .sog              1/10 of the size; for the web viewers of PlayCanvas
       .glb              glTF; lossless except for rounding
-      .splat            1/8 of the size; no view-dependent color
+      .splat            1/8 of the size; no view-dependent colour
       .html             a web page that contains the scene and a viewer
 
     Notes:
@@ -45,9 +45,9 @@ class Convert:
     """One or more scenes, followed by the file to write. A scene is a file of any format, or an
     output folder, of which the last scene is used."""
     sh_degree: Annotated[int | None, flag("N", default="that of the scene")] = None
-    """Reduce the spherical harmonics (view-dependent color) to this degree, 0 to 3."""
+    """Reduce the spherical harmonics (view-dependent colour) to this degree, 0 to 3."""
     crop: Annotated[Box | None, flag("X0 Y0 Z0 X1 Y1 Z1", default="all")] = None
-    """Keep only the Gaussians whose centers are in this box."""
+    """Keep only the Gaussians whose centres are in this box."""
     decimate: Annotated[str | None, flag("N|P%", default="all")] = None
     """Number or percentage of Gaussians to keep. The largest and most opaque ones are kept."""
     rotate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)

@@ -47,8 +47,8 @@ class Render(SceneFlags):
     depth: Annotated[
         Literal["none", "16bit", "color"], flag("{none,16bit,color}", default="none")
     ] = "none"
-    """Also write the depth, to depth/00000.png … 16bit: gray values, whose unit is written to
-    world_units_per_step.json; color: colors from yellow (near) to violet (far). With --path, color
+    """Also write the depth, to depth/00000.png … 16bit: grey values, whose unit is written to
+    world_units_per_step.json; color: colours from yellow (near) to violet (far). With --path, color
     writes a second video."""
 
     path: Annotated[str | None, flag("{training,ellipse,spiral,FILE}", default="render images")] = (
@@ -65,7 +65,7 @@ class Render(SceneFlags):
     size: Annotated[str | None, flag("WxH|W", default="that of the photos")] = None
     """Width and height of the video in pixels, or only its width."""
     side_by_side: Annotated[bool, switch()] = False
-    """Write one video with color on the left and depth on the right."""
+    """Write one video with colour on the left and depth on the right."""
     video: Annotated[Path | None, flag("FILE.mp4", "--film", default="in OUT/videos")] = None
     """File to which the video is written."""
 

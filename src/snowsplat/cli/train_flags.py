@@ -112,7 +112,7 @@ class TrainFlags(ConfigFlags, JobFlags):
     def _settings(self) -> dict[str, Any]:
         settings = self.config_settings()
         if self.white_background and settings.setdefault("background", "white") != "white":
-            raise UserError("-w and --background set different colors; use one of them")
+            raise UserError("-w and --background set different colours; use one of them")
         if self.feature_lr is not None:
             settings = {
                 "lr_sh_dc": self.feature_lr,

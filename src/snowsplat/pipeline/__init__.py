@@ -1,12 +1,12 @@
-"""What the subcommands do, as functions for Python.
+"""Python functions that do the work of the subcommands.
 
-    make.py      photos or a video -> a scene
-    train.py     a dataset -> a scene; resuming after an interruption
-    render.py    a scene -> images
-    videos.py    a scene -> a video
-    evaluate.py  a scene -> PSNR, SSIM, LPIPS
-    convert.py   scene files -> an edited scene in another format
-    describe.py  a file or folder -> a description of its contents
+    make.py      makes a scene from photos or a video
+    train.py     trains a scene from a dataset; resumes after an interruption
+    render.py    renders images of a scene
+    videos.py    renders a video of a scene
+    evaluate.py  measures PSNR, SSIM and LPIPS of a scene
+    convert.py   merges, edits and converts scene files
+    describe.py  describes the contents of a file or folder
     watch.py     shows the output folder of a training run in the browser
 
 Each function takes paths and options and returns a result or raises a

@@ -1,4 +1,4 @@
-"""`CheckpointMeta`: the data about the training run that a checkpoint contains with the tensors."""
+"""`CheckpointMeta`: the data in a checkpoint that are not tensors: settings, recipe, time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Recipe = Literal["default", "paper", "mcmc"]
 
 @dataclass(frozen=True)
 class CheckpointMeta:
-    """The JSON value of a checkpoint; the fields are the keys in the file.
+    """The JSON object in a checkpoint; its keys are the names of the fields.
 
     Attributes:
         capture: how the dataset was read.
@@ -37,7 +37,7 @@ class CheckpointMeta:
 
     @classmethod
     def of(cls, start: Checkpoint) -> CheckpointMeta:
-        """The checked value of a checkpoint.
+        """The checked data of the checkpoint ``start``, from which a training run resumes.
 
         Raises:
             UserError: not a checkpoint of a training run, or damaged.

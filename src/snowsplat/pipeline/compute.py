@@ -1,4 +1,4 @@
-"""`Compute`: the device, the number of threads, and whether a GPU sums in a fixed order."""
+"""`Compute`: the device, the number of threads, and whether sums on a GPU have a fixed order."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ class Compute:
         device: "cpu", "cuda" or "cuda:1"; None: a GPU if a usable one is present.
         threads: number of CPU threads; None: all cores. Results do not depend on this number.
         deterministic: on a GPU, compute sums in a fixed order. Results are then bit-identical in
-            every run, but this needs more time and memory.
+            every run, but the computation needs more time and memory. On a CPU, results are always
+            bit-identical.
 
     Raises:
         UserError: fewer than 1 thread.
@@ -48,8 +49,9 @@ class Compute:
         """
         from snowsplat import ops
 
-        # The tensors of a growing scene are each a little larger than the one before, which
-        # fragments the memory of a GPU. PyTorch reads this variable at the first allocation.
+        # While a scene grows, each new tensor is a little larger than the old one. This fragments
+        # the memory of a GPU, unless its segments can be expanded. PyTorch reads this variable at
+        # the first allocation.
         if sys.platform == "linux":
             os.environ.setdefault("PYTORCH_CUDA_ALLOC_CONF", "expandable_segments:True")
         if self.threads is not None:
@@ -63,9 +65,10 @@ class Compute:
 def _sum_in_a_fixed_order() -> None:
     import torch
 
-    # Required by cuBLAS, which reads it at its first use.
+    # cuBLAS requires this variable, and reads it at its first use.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    # As torch.use_deterministic_algorithms, which would also import PyTorch's compiler, in 2 s.
+    # The same as torch.use_deterministic_algorithms(True, warn_only=True), which would also import
+    # PyTorch's compiler (2 s).
     torch.set_deterministic_debug_mode("warn")
-    # Otherwise PyTorch fills all new memory, to make reads of uninitialized memory repeatable.
+    # By default, PyTorch then also fills all uninitialised memory, which takes time.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]

@@ -28,13 +28,13 @@ class Edits:
     forward.
 
     Attributes:
-        crop: keep the Gaussians whose centers are in this box, given as x, y, z of the lower corner
+        crop: keep the Gaussians whose centres are in this box, given as x, y, z of the lower corner
             and x, y, z of the upper corner.
         rotate: angles in degrees of the rotations about x, then about y, then about z.
         scale: scale by this factor about the origin.
         translate: translate by this offset.
         decimate: number of Gaussians to keep, or a percentage such as "50%". The largest and most
-            opaque ones are kept.
+            opaque Gaussians are kept.
         sh_degree: reduce the spherical harmonics to this degree, 0 to 3.
 
     Raises:
@@ -73,17 +73,17 @@ class Edits:
             scene = edit.crop(scene, torch.tensor(self.crop).reshape(2, 3))
             if before and not len(scene):
                 raise SettingError("crop", "no Gaussian is in this box; see snowsplat info")
-        movement = self.movement()
-        if movement:
-            scene = edit.transform(scene, movement)
+        transform = self.transform()
+        if transform:
+            scene = edit.transform(scene, transform)
         if self.decimate is not None:
             scene = edit.decimate(scene, gaussians_to_keep(self.decimate, len(scene)))
         if self.sh_degree is not None:
             scene = edit.with_sh_degree(scene, self.sh_degree)
         return scene
 
-    def movement(self) -> Similarity | None:
-        """The transform of these edits, from the old frame to the new one; None: no transform."""
+    def transform(self) -> Similarity | None:
+        """Rotation, scale and translation of these edits as one transform; None: no change."""
         if not any(self.rotate) and self.scale == 1 and not any(self.translate):
             return None
         rotation = torch.eye(3, dtype=torch.float64)
@@ -126,7 +126,7 @@ def convert(
     given = [sources] if isinstance(sources, Path | str) else sources
     files = [scene_file(Path(source)) for source in given]
     scene = edits.apply(edit.merge([read_gaussians(file) for file in files]))
-    if format.name == "HTML" and len(files) == 1 and edits.movement() is None:
+    if format.name == "HTML" and len(files) == 1 and edits.transform() is None:
         _write_page(target, scene, files[0])
     else:
         write_gaussians(target, scene)
@@ -134,7 +134,7 @@ def convert(
 
 
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
-    """A page that starts at the camera of a photo, if the cameras are known."""
+    """Write an HTML page. Its initial view is the camera of a photo, if the cameras are known."""
     from snowsplat.viewer.web.html import write_html
     from snowsplat.viewer.web.scene import ready
 

@@ -19,9 +19,9 @@ _PERCENTILES = (1, 50, 99)
 
 
 def describe(path: Path | str) -> dict[str, Any]:
-    """What the file or folder ``path`` contains, as names and JSON values.
+    """What the file or folder ``path`` contains, as a JSON object.
 
-    ``kind`` is one of these; the other keys depend on it:
+    The key "kind" has one of these values; the other keys depend on it:
 
     - "scene": format, number of Gaussians, bounds, and percentiles of opacity and scale.
     - "point cloud": number of points, bounds.
@@ -30,8 +30,8 @@ def describe(path: Path | str) -> dict[str, Any]:
       The folder is that of `train` or of `make`.
     - "dataset": number and sizes of the photos, focal lengths, number of points, extent.
 
-    Bounds and lengths are in world units, in the frame of the file. Only datasets need torch; it is
-    not imported for the others.
+    Bounds and lengths are in world units, in the frame of the file. torch is imported only for
+    datasets.
 
     Raises:
         UserError: ``path`` is missing, damaged, or of an unknown kind.

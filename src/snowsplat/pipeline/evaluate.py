@@ -24,7 +24,7 @@ def evaluate(
     lpips: Lpips | Path | str | None = None,
     on_view: Callable[[ViewMetrics], None] | None = None,
 ) -> Evaluation:
-    """Compare the renders of a scene with its photos; write OUT/metrics.json.
+    """Compare the renderings of a scene with its photos; write OUT/metrics.json.
 
         evaluate(load_trained("out/garden")).psnr
 
@@ -47,7 +47,7 @@ def evaluate(
     views = views_of(scene, split)
     if isinstance(lpips, Path | str):
         lpips = Lpips.load(Path(lpips))
-    with single_threaded():  # the figures do not depend on the number of cores
+    with single_threaded():  # so that the metrics do not depend on the number of cores
         evaluation = evaluate_views(
             scene.gaussians, views, background=scene.background, lpips=lpips, on_view=on_view
         )

@@ -1,4 +1,4 @@
-"""Renders as PNG files: colors in 8 bits, depth in 16 bits or in colors."""
+"""Writes renderings as PNG files: colours in 8 bits, depth in 16 bits or in colours."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from torch import Tensor
 
 from snowsplat.util.files import atomic_path
 
-# Anchors of a color map from far (0) to near (1) of increasing lightness: violet to yellow.
+# Anchors of a colour map from far (0) to near (1) of increasing lightness: violet to yellow.
 _DEPTH_COLORS = np.array(
     [[68, 1, 84], [65, 68, 135], [42, 120, 142], [34, 168, 132], [122, 209, 81], [253, 231, 37]],
     np.float32,
 )
-_OPAQUE_ENOUGH = 0.5  # below this alpha a pixel mostly shows the background, which has no depth
+_MIN_ALPHA = 0.5  # below this alpha, a pixel mostly shows the background, which has no depth
 
 
 def to_8bit(image: Tensor) -> np.ndarray:
@@ -38,12 +38,12 @@ def mean_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:
     0 where the pixel mostly shows the background, which has no depth.
     """
     mean = depth / alpha.clamp_min(1e-6)
-    mean[alpha < _OPAQUE_ENOUGH] = 0.0
+    mean[alpha < _MIN_ALPHA] = 0.0
     return mean.cpu().numpy()
 
 
 def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Near and far of depth images (H, W): percentiles 1 and 99 of the depths that are not 0."""
+    """Near and far for depth images (H, W): percentiles 1 and 99 of the depths that are not 0."""
     shown = np.concatenate([np.zeros(0, np.float32), *(depth[depth > 0] for depth in depths)])
     if not shown.size:
         return 1.0, 2.0
@@ -52,7 +52,7 @@ def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def depth_in_16_bits(depth: np.ndarray) -> tuple[np.ndarray, float]:
-    """(H, W) uint16, and the world units of one step."""
+    """(H, W) uint16, and the world units of one step of these values."""
     step = (float(depth.max()) or 1.0) / 65535.0
     return np.clip(np.rint(depth / step), 0, 65535).astype(np.uint16), step
 
@@ -60,7 +60,7 @@ def depth_in_16_bits(depth: np.ndarray) -> tuple[np.ndarray, float]:
 def depth_in_color(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """(H, W, 3) uint8, from near (yellow) to far (violet); black where there is no depth.
 
-    Colors are linear in disparity, 1/z, which resolves near distances better.
+    Colours are linear in disparity, 1/z, so that near distances are resolved better.
     """
     with np.errstate(divide="ignore"):
         t = (1.0 / depth - 1.0 / far) / (1.0 / near - 1.0 / far)
@@ -91,7 +91,7 @@ class PngQueue:
                     self._pending.popleft().result()
 
     def write(self, path: Path, pixels: np.ndarray) -> None:
-        """Queue an image, see `write_png`. Raises: OSError: an earlier one could not be written."""
+        """Queue an image for `write_png`. Raises: OSError: an earlier one could not be written."""
         self._pending.append(self._pool.submit(write_png, path, pixels))
         if len(self._pending) > 8:
             self._pending.popleft().result()

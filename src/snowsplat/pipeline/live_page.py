@@ -1,4 +1,4 @@
-"""`LivePage`: a page that shows a training run, or its output folder, in the browser."""
+"""`LivePage`: the page of the live viewer, for a training run or for its output folder."""
 
 from __future__ import annotations
 
@@ -75,7 +75,12 @@ class LivePage:
         return viewer
 
     def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
-        """As `open`, for a training run, which then calls `after_step` after each step."""
+        """Open the page for a training run, as `open` does; then call `after_step` after each step.
+
+        Args:
+            trainer: the training run to show.
+            label: the title of the page.
+        """
         from snowsplat.viewer.live.curves import SampledPsnr
         from snowsplat.viewer.live.training import TrainingViewer
 
@@ -87,7 +92,10 @@ class LivePage:
         self._trainer = trainer
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
-        """Returns the seconds for which training was paused; see `TrainingViewer.after_step`."""
+        """Update the page after a step, and wait while a user has paused the training.
+
+        Returns the seconds for which the training was paused; see `TrainingViewer.after_step`.
+        """
         assert self._training is not None
         return self._training.after_step(step, steps, loss, gaussians)
 
@@ -104,7 +112,7 @@ class LivePage:
             self._training.end(self._trainer.step, self._trainer.gaussians)
 
     def show(self, scene: Callable[[], Scene]) -> None:
-        """Show the newest scene until Ctrl-C. ``scene`` is called repeatedly."""
+        """Show the newest scene until Ctrl-C. ``scene`` returns it, and is called repeatedly."""
         assert self._viewer is not None
         with suppress(KeyboardInterrupt):
             self._viewer.show_newest(scene)

@@ -33,7 +33,8 @@ HOLD_OUT = 8
 _TRAINING_FIELDS = ("side", "iterations", "max_gaussians", "densify_interval")
 # Time between checkpoints in seconds. If the process is killed, at most this much work is lost.
 _CHECKPOINT_SECONDS = 15.0
-# Minimum time of a training run: in seconds, and as a share of the given time.
+# Minimum time of a training run: in seconds, and as a fraction of the requested time. The larger
+# one applies.
 _MIN_SECONDS = 15.0
 _MIN_SHARE = 0.15
 # Approximate time to render one held-out view, in seconds.
@@ -146,7 +147,7 @@ def make(
 
 
 def _check_free(out: Path) -> None:
-    """Raises UserError if ``out`` is a file, or a folder that `make` has not created."""
+    """Raises UserError if ``out`` is a file, or a folder with files that `make` has not written."""
     if out.exists() and not out.is_dir():
         raise UserError(f"{out}: is a file; use a folder for the output")
     if out.is_dir():
@@ -157,7 +158,7 @@ def _check_free(out: Path) -> None:
 
 @dataclass
 class _Job:
-    """One call of `make`: the stages in their order, except for those that are finished."""
+    """One call of `make`: runs the stages in their order, except for those that are finished."""
 
     inputs: list[Path]
     name: str
@@ -277,7 +278,7 @@ class _Job:
         return outcome
 
     def _train(self, settings: dict[str, Any]) -> dict[str, Any]:
-        """Start or resume the training; copy its scene to the top of the folder."""
+        """Start or resume the training; copy its scene into the output folder of `make`."""
         from snowsplat.pipeline.train import TrainOptions, resume, train
         from snowsplat.training import checkpoint
 
@@ -316,7 +317,7 @@ class _Job:
         )
 
     def _minutes_left(self, given: float) -> float:
-        """The time for the training: what is left of ``given`` seconds, at least the minimum."""
+        """The time for the training in minutes: the rest of ``given`` seconds, or the minimum."""
         photos = sum(path.is_file() for path in (self.dataset / "images").rglob("*"))
         left = given - self._elapsed() - _RENDER_SECONDS * -(-photos // HOLD_OUT)
         shortest = max(_MIN_SECONDS, _MIN_SHARE * given)
@@ -337,7 +338,7 @@ class _Job:
 
 
 def _width(dataset: Path, preset: Preset) -> int | None:
-    """The width to train at; None if the photos are small enough."""
+    """The width in pixels of the photos for training; None if they need not be reduced."""
     cameras = [view.camera for view in DatasetSettings(str(dataset)).load().train]
     camera = max(cameras, key=lambda camera: max(camera.width, camera.height))
     longer = max(camera.width, camera.height)

@@ -1,4 +1,4 @@
-"""The memory of a training run: the plan before it starts, and the memory that it has used."""
+"""`MemoryUse`: the memory plan of a training run, and its peak memory so far."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MemoryUse:
-    """The memory plan of a training run, and the memory that it uses.
+    """The memory plan of a training run, and its peak memory so far.
 
     Attributes:
         device: the device whose memory is planned.
@@ -61,8 +61,8 @@ class MemoryUse:
         where = "memory of the GPU" if self.device.type == "cuda" else "memory"
         return f"{where}: {self.plan}"
 
-    def taken(self) -> str:
-        """The peak so far, as text."""
+    def peak(self) -> str:
+        """The peak memory so far, as text for users."""
         if self.device.type == "cuda":
             import torch
 

@@ -14,17 +14,20 @@ if TYPE_CHECKING:
 
 
 class Observer:
-    """The base class of observers: its methods do nothing; override those that you need.
+    """The base class of observers. Its methods do nothing; a subclass overrides those it needs.
 
-    A job such as `make` consists of stages. `begin` and `end` enclose each stage; the training
-    also reports its steps.
+    A job such as `make` consists of stages. `begin` and `end` are called for each stage. The
+    training also reports its steps.
     """
 
     def note(self, line: str) -> None:
         """A line of information for the user."""
 
     def begin(self, stage: str) -> Report:
-        """A stage begins, or a finished one is found. Returns its progress callback."""
+        """Called for every stage, also if an earlier run has finished it.
+
+        Returns the progress callback of the stage.
+        """
         return silent
 
     def end(self, stage: str, outcome: Outcome) -> None:

@@ -1,18 +1,18 @@
 """`OutputFolder`: the files of a training run, in the layout of the reference implementation.
 
-    OUT/cfg_args                                   settings, in the spelling of the reference
+    OUT/cfg_args                                   settings, in the format of that implementation
     OUT/cameras.json                               all cameras
     OUT/input.ply                                  the points that the training started from
     OUT/point_cloud/iteration_N/point_cloud.ply    the scene after N steps
     OUT/config.json                                *all settings
     OUT/checkpoints/step_N.safetensors             *see snowsplat.training.checkpoint
-    OUT/metrics.json                               figures of the last evaluation
+    OUT/metrics.json                               metrics of the last evaluation
     OUT/history.json                               *the curves of the training
     OUT/report.html                                *a page about the training
     OUT/test/ours_N/renders, gt                    rendered images and photos; also train/
     OUT/videos/                                    *rendered videos (films/ in earlier versions)
 
-Entries marked * are additions. Folders written by the reference are read too.
+The reference implementation does not write the entries marked *. Its folders are read too.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class OutputFolder:
         return self.path / "videos"
 
     def is_output_folder(self) -> bool:
-        """Whether a training run of snowsplat or of the reference has written here."""
+        """Whether snowsplat or the reference implementation has written a training run here."""
         return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))
 
     # Before a training run
@@ -121,8 +121,8 @@ class OutputFolder:
         """Check that a training run may write here; writes nothing.
 
         Raises:
-            UserError: a file, a folder with other files, or a training run that is to be neither
-                resumed nor overwritten.
+            UserError: the path is a file or a folder with other files, or contains a training run
+                that is to be neither resumed nor overwritten.
         """
         if not self.path.exists():
             return
@@ -138,7 +138,7 @@ class OutputFolder:
             )
 
     def begin(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
-        """Create the folder, remove old results, and `describe` the training."""
+        """Create the folder, remove the results of an earlier run, and call `describe`."""
         for name in _RESULTS:
             shutil.rmtree(self.path / name, ignore_errors=True)
         for name in _REPORTS:
@@ -146,7 +146,7 @@ class OutputFolder:
         self.describe(dataset, settings, config)
 
     def describe(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
-        """Write the files whose content is known before the first step."""
+        """Write the files that are known before the first step: settings, cameras, points."""
         from snowsplat.scene.camera_json import write_cameras
 
         self.path.mkdir(parents=True, exist_ok=True)
@@ -185,7 +185,7 @@ class OutputFolder:
         write_text(self.path / "cfg_args", repr(namespace))
 
     def _remove_unwritten_scenes(self) -> None:
-        """Remove folders whose scene was not written because of a kill or a full disk."""
+        """Remove folders without a scene: the process was killed, or the disk was full."""
         for folder in (self.path / "point_cloud").glob("iteration_*"):
             if not (folder / "point_cloud.ply").exists():
                 shutil.rmtree(folder, ignore_errors=True)
@@ -249,14 +249,14 @@ class OutputFolder:
         return chosen, read_gaussians(self.scene_path(chosen))
 
     def write_metrics(self, iteration: int, split: str, evaluation: Evaluation) -> None:
-        """Write `metrics.json`: iteration, split, the mean figures, and those of each view."""
+        """Write `metrics.json`: iteration, split, mean metrics, and the metrics of each view."""
         head = {"iteration": iteration, "split": split}
         write_json(self.path / "metrics.json", head | evaluation.as_json())
 
     # Settings
 
     def settings(self) -> tuple[DatasetSettings, tuple[float, float, float]]:
-        """How the dataset was read, and the background color (red, green, blue in 0..1).
+        """How the dataset was read, and the background colour (red, green, blue in 0..1).
 
         Raises:
             UserError: missing or damaged settings.

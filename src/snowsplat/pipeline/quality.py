@@ -7,25 +7,25 @@ from typing import Literal
 
 Quality = Literal["draft", "normal", "best"]
 
-# Estimates for a video before it is read: its frames, and the comparisons of each frame.
+# Estimates for a video before it is read: number of frames, and of matched pairs per frame.
 _FRAMES_PER_VIDEO = 80
 _PAIRS_PER_FRAME = 12
-# The share of the given time that finding the camera poses may take.
+# The share of the given time that structure from motion may take.
 _SHARE_OF_POSES = 0.4
 
 
 @dataclass(frozen=True)
 class Preset:
-    """The work at one quality. Sizes are those of the longer side, in pixels.
+    """The settings and the time at one quality. Sizes are those of the longer side, in pixels.
 
     Attributes:
-        photos: the size to which photos are reduced when they are read.
-        side: the size at which they are trained on.
+        photos: the size to which photos are reduced when they are copied into the dataset.
+        side: the size of the photos in training.
         iterations: steps of the training.
         max_gaussians, densify_interval: settings of the training; None: those of the recipe.
-        photo_seconds, pair_seconds: time to find the camera poses on two cores, for each photo and
-            for each pair of photos that is compared.
-        pairs: the largest number of photos that a photo is compared with.
+        photo_seconds, pair_seconds: time of structure from motion on two cores, for each photo and
+            for each pair of photos that is matched.
+        pairs: the largest number of photos with which a photo is matched.
     """
 
     photos: int
@@ -38,10 +38,10 @@ class Preset:
     pairs: int
 
     def pose_seconds(self, photos: int, videos: int, threads: int) -> float:
-        """Estimated time to find the camera poses of that many photos and videos."""
+        """Estimated time of structure from motion for these numbers of photos and videos."""
         frames = _FRAMES_PER_VIDEO * videos
-        compared = photos * min((photos - 1) / 2, self.pairs) + frames * _PAIRS_PER_FRAME
-        seconds = self.photo_seconds * (photos + frames) + self.pair_seconds * compared
+        matched = photos * min((photos - 1) / 2, self.pairs) + frames * _PAIRS_PER_FRAME
+        seconds = self.photo_seconds * (photos + frames) + self.pair_seconds * matched
         return seconds * 2 / threads
 
 
@@ -53,7 +53,7 @@ PRESETS: dict[Quality, Preset] = {
 
 
 def quality_within(seconds: float, photos: int, videos: int, threads: int) -> Quality:
-    """The best quality of poses that leaves enough of ``seconds`` for the training."""
+    """The best quality for which enough of ``seconds`` is left for the training."""
     choices: tuple[Quality, ...] = ("best", "normal")
     for quality in choices:
         needed = PRESETS[quality].pose_seconds(photos, videos, threads)

@@ -1,4 +1,4 @@
-"""`render_images`: renders of a scene from the cameras of its photos, and copies of the photos."""
+"""`render_images`: renders a scene from the cameras of its photos, and copies the photos."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Depth = Literal["none", "16bit", "color"]
 
-_RANGE_VIEWS = 8  # number of views that determine the range of the depth colors
+_RANGE_VIEWS = 8  # number of views that determine the range of the depth colours
 
 
 def render_images(
@@ -28,8 +28,8 @@ def render_images(
 
     Files are numbered in the order of the names of the photos: renders/00000.png, the photo
     gt/00000.png, and depth/00000.png. The depth is the mean camera z. It is written either as
-    16-bit gray values, whose unit in world units is in depth/world_units_per_step.json, or in
-    colors from near to far.
+    16-bit grey values, whose unit in world units is in depth/world_units_per_step.json, or in
+    colours from near to far.
 
     Returns:
         The folders renders/ and the number of images in each.

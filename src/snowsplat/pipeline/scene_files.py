@@ -1,6 +1,6 @@
-"""Scene files of every format, including the HTML page, which the viewer writes.
+"""Reads and writes scene files of every format, including the HTML page of the web viewer.
 
-Importing this module registers the page as a format; it does not import torch.
+Importing this module registers the HTML page as a format. It does not import torch.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Loading a scene and its cameras from the output folder of a training run, or from a file."""
+"""Loads a scene and its cameras from the output folder of a training run, or from a file."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def load_trained(
 def load_dataset_of(
     folder: OutputFolder, dataset: Path | str | None = None, resolution: int | None = None
 ) -> tuple[Dataset, Color]:
-    """The dataset of the training in ``folder``, and its background color; see `load_trained`."""
+    """The dataset of the training in ``folder``, and its background colour; see `load_trained`."""
     settings, background = folder.settings()
     if dataset is not None:
         settings = replace(settings, path=str(dataset))
@@ -76,7 +76,7 @@ def load_dataset_of(
 
 
 def existing_folder(path: Path) -> OutputFolder:
-    """As `training_folder`. Raises: UserError: ``path`` is not a folder."""
+    """The same as `training_folder`. Raises: UserError: ``path`` is not a folder."""
     if not path.is_dir():
         raise UserError(f"{path}: no such folder; give the output folder of a training run")
     return training_folder(path)
@@ -104,11 +104,11 @@ def scene_file(path: Path) -> Path:
 
 
 def folder_around(scene: Path) -> OutputFolder:
-    """The output folder of the training that wrote a scene file; if there is none, one without
-    scenes.
+    """The output folder of the training run that wrote a scene file.
 
-    That is OUT of OUT/point_cloud/iteration_N/point_cloud.ply, and OUT/scene of OUT/NAME.ply, the
-    copy that `make` writes.
+    This is OUT for the file OUT/point_cloud/iteration_N/point_cloud.ply, and OUT/scene for the file
+    OUT/NAME.ply, the copy that `make` writes. For other files, it is an `OutputFolder` without
+    scenes.
     """
     scene = scene.resolve()
     made, trained = OutputFolder(scene.parent / SCENE), OutputFolder(scene.parent.parent.parent)
@@ -133,7 +133,7 @@ def cameras_of(folder: OutputFolder) -> list[Camera]:
 
 @dataclass(frozen=True)
 class ViewableScene:
-    """A scene to look at, from a file or an output folder; its photos are not needed.
+    """A scene for a viewer, from a file or an output folder; its photos are not needed.
 
     Attributes:
         file: the scene file.

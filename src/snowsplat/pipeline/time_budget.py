@@ -1,4 +1,4 @@
-"""`TimeBudget`: the time of a training run: what is left of it, and the plan and pace for it."""
+"""`TimeBudget`: the time that a training run may take, and the time that is left."""
 
 from __future__ import annotations
 
@@ -66,26 +66,30 @@ class TimeBudget:
         return self.seconds - self.spent - (time.monotonic() - self.started)
 
     def as_json(self) -> dict[str, float]:
-        """For a checkpoint."""
+        """The JSON value for a checkpoint."""
         return {"seconds": self.seconds, "spent": self.seconds - self.left}
 
     def plan(
-        self, dataset: Dataset, config: TrainConfig, device: torch.device, **may: bool
+        self, dataset: Dataset, config: TrainConfig, device: torch.device, **allowed: bool
     ) -> Plan:
-        """Choose steps, photo size and Gaussians for the time that is left.
+        """Choose the number of steps, the photo size and the limit of the number of Gaussians for
+        the time that is left.
 
-        ``dataset`` has full resolution; ``may``: see `make_plan`.
+        The speed is measured with a separate, short training run. The `Trainer` of the real run
+        cannot be used, because its resolution, limit and schedule depend on the plan.
 
-        The speed is measured with a separate, short training run, because a trainer is created
-        with the resolution, the limit of Gaussians and the schedule of the plan.
+        Args:
+            dataset: at full resolution.
+            allowed: what the plan may change, see `make_plan`.
         """
         from snowsplat.training.time_budget.plan import make_plan, measure_time_ratio
 
-        time_ratio = measure_time_ratio(dataset, config, device, resize=may.get("resize", True))
-        return make_plan(dataset, config, self.left, time_ratio, **may)
+        resize = allowed.get("resize", True)
+        time_ratio = measure_time_ratio(dataset, config, device, resize=resize)
+        return make_plan(dataset, config, self.left, time_ratio, **allowed)
 
     def described(self, plan: Plan) -> str:
-        """The plan in one line."""
+        """The plan in one line, as text for users."""
         return f"{duration(self.seconds)} on this machine: {plan}"
 
     def pace(self, trainer: Trainer, time_ratio: float) -> Pace:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from snowsplat.training.config import TrainConfig
     from snowsplat.training.trainer import Trainer
 
-# Settings that may differ from those of the checkpoint that is resumed.
+# Settings that may be changed when a training run is resumed.
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
 
 
@@ -147,19 +147,19 @@ def resume(
     interruption (on a GPU: only with `Compute.deterministic`).
 
     Args:
-        output: the folder of the training.
+        output: the output folder of the training run.
         options: these may change ``minutes``, the settings iterations, test_iterations and
             checkpoint_every, and options that do not affect the result. All other options must be
             the same as before.
-        dataset: where the photos are now, if they were moved. If there is no checkpoint yet, the
-            training starts from this dataset.
+        dataset: the folder of the dataset, if it was moved. If there is no checkpoint yet, the
+            training starts at step 0 with this dataset.
 
     Returns:
         As `train`.
 
     Raises:
-        UserError: see `train`; there is no checkpoint and no ``dataset`` to start from; settings
-            have changed.
+        UserError: as `train`; or there is neither a checkpoint nor ``dataset``; or settings have
+            changed that must not change.
         TrainingStopped, KeyboardInterrupt: see `train`.
     """
     started = time.monotonic()
@@ -241,7 +241,7 @@ class _Job:
         memory = self._memory(dataset, config, _gaussians_in(start))
         trainer = Trainer(dataset, memory.plan.config, schedule, self.device)
         trainer.load_state(start.tensors)
-        start.tensors.clear()  # the trainer has a copy; the memory plan counts only this one
+        start.tensors.clear()  # the trainer has a copy, which is the one in the memory plan
         self.out.write_config(settings, memory.plan.config)
         self.observer.note(_described(dataset))
         iterations = trainer.schedule.iterations

@@ -1,4 +1,4 @@
-"""`TrainingRun`: the steps of one training run and the files written in between."""
+"""`TrainingRun`: runs the steps of one training run and writes its files."""
 
 from __future__ import annotations
 
@@ -35,10 +35,11 @@ class TrainResult:
         first_step: the step of the checkpoint that was resumed, or 0.
         gaussians: their number.
         seconds: duration of the steps of this run.
-        memory: the peak of the steps, as text.
-        reductions: what more memory would have allowed, as text.
-        evaluation: figures of the last evaluation on held-out photos, and its step.
-        time: seconds spent in all runs and seconds given; None without a time budget.
+        memory: the peak memory of the steps, as text.
+        reductions: what was reduced because of the memory budget, as text.
+        evaluation: the step and the metrics of the last evaluation on held-out photos.
+        time: the seconds that were used, including earlier runs, and the time budget in seconds;
+            None without a time budget.
     """
 
     scene: Path
@@ -71,10 +72,10 @@ class TrainingRun:
     """One training run, to its end or to Ctrl-C.
 
     Attributes:
-        settings, recipe: as they are written to checkpoints.
-        budget, pace: of a training run with a time budget.
-        save_iterations: steps after which the scene is written too.
-        checkpoint_seconds: between checkpoints, where the configuration names no steps.
+        settings, recipe: how the dataset was read, and the recipe; written to checkpoints.
+        budget, pace: the time budget and its pace; None without a time budget.
+        save_iterations: steps after which the scene is written, in addition to the last step.
+        checkpoint_seconds: time between checkpoints, if the configuration has no checkpoint_every.
         page: shows the training in the browser.
     """
 
@@ -94,7 +95,7 @@ class TrainingRun:
         self.config = self.trainer.config
         self.first_step = self.trainer.step
         self.started = self.last_checkpoint = time.monotonic()
-        self.evaluation: tuple[int, Evaluation] | None = None  # the newest, and its step
+        self.evaluation: tuple[int, Evaluation] | None = None  # the last one and its step
         self.history = History.read(self.out.history, self.first_step)
 
     def run(self) -> TrainResult:
@@ -102,8 +103,8 @@ class TrainingRun:
 
         Raises:
             UserError: the loss, gradients or parameters are not finite.
-            TrainingStopped: Ctrl-C; see there.
-            KeyboardInterrupt: Ctrl-C before the first step was finished; nothing is left.
+            TrainingStopped: Ctrl-C; the attributes of the exception say what was saved.
+            KeyboardInterrupt: Ctrl-C before the first step was finished; no files remain.
         """
         from snowsplat.training.finite import Diverged
 
@@ -145,7 +146,7 @@ class TrainingRun:
 
     def _after_step(self, progress: Progress) -> None:
         if progress.metrics is not None and progress.metrics.views:
-            self._measured(progress.step, progress.metrics)
+            self._record_evaluation(progress.step, progress.metrics)
         self.observer.step(progress)
         if self._checkpoint_is_due(progress.step):
             self._save_checkpoint()
@@ -173,9 +174,9 @@ class TrainingRun:
         return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
 
     def _finish_interrupted_writes(self) -> None:
-        """Finish what a kill right after a checkpoint prevented.
+        """Complete the work of an earlier run that was killed directly after saving a checkpoint.
 
-        Remove old checkpoints, and save the scene.
+        Remove old checkpoints, and save the scene if it was requested for this step.
         """
         from snowsplat.training import checkpoint
 
@@ -211,7 +212,7 @@ class TrainingRun:
         return path
 
     def _last_checkpoint_as_text(self) -> str:
-        """The part of an error message that says which checkpoint can be used."""
+        """Which checkpoint can be used, as the end of an error message."""
         from snowsplat.training import checkpoint
 
         saved = checkpoint.files(self.out.checkpoints)
@@ -222,17 +223,17 @@ class TrainingRun:
             f"the last good checkpoint is {path}; `resume` with `iterations` {step} saves its scene"
         )
 
-    def _measured(self, step: int, evaluation: Evaluation) -> None:
+    def _record_evaluation(self, step: int, evaluation: Evaluation) -> None:
         self.evaluation = (step, evaluation)
         self.history.measure(step, evaluation.psnr, evaluation.ssim)
 
     def _finish(self) -> TrainResult:
         step = self.trainer.step
         scene = self._save_scene()
-        seconds, memory = time.monotonic() - self.started, self.memory.taken()
+        seconds, memory = time.monotonic() - self.started, self.memory.peak()
         if self.trainer.dataset.test:
             if self.evaluation is None or self.evaluation[0] != step:
-                self._measured(step, self.trainer.evaluate())
+                self._record_evaluation(step, self.trainer.evaluate())
             assert self.evaluation is not None
             self.out.write_metrics(step, "test", self.evaluation[1])
         self.history.write(self.out.history)

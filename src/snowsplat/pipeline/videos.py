@@ -25,8 +25,8 @@ CAMERA_PATHS = ("training", "ellipse", "spiral")
 
 _LONGEST_SIDE = 1920  # of a video without a requested size
 _SMALLEST, _LARGEST = 16, 8192  # pixels along a side
-_MOST_FRAMES = 100_000
-_RANGE_FRAMES = 8  # number of frames that determine the range of the depth colors
+_MAX_FRAMES = 100_000
+_RANGE_FRAMES = 8  # number of frames that determine the range of the depth colours
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class VideoOptions:
         fps: frames per second.
         size: width and height such as "1280x720", or the width, "1280"; None: the size of the
             photos.
-        depth: render a second video that shows the depth in colors.
-        side_by_side: render only one video, with color on the left and depth on the right.
+        depth: render a second video that shows the depth in colours.
+        side_by_side: render only one video, with colour on the left and depth on the right.
 
     Raises:
         UserError: an unusable length, rate or size.
@@ -104,10 +104,10 @@ class VideoOptions:
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
             if not 0 < value < float("inf"):
                 raise SettingError(name, f"{value:g} is not positive; use a number above 0")
-        if self.seconds * self.fps > _MOST_FRAMES:
+        if self.seconds * self.fps > _MAX_FRAMES:
             raise SettingError(
                 "seconds",
-                f"{self.seconds:g} with `fps` {self.fps:g} is more than {_MOST_FRAMES:,} frames; "
+                f"{self.seconds:g} with `fps` {self.fps:g} is more than {_MAX_FRAMES:,} frames; "
                 "make the video shorter",
             )
         VideoSize.parse(self.size)
@@ -137,8 +137,8 @@ def render_video(
 
     Args:
         scene: the output folder of a training run, or a scene file.
-        target: an .mp4 file; default: OUT/videos/PATH.mp4, or SCENE_PATH.mp4 beside a scene file.
-            A video of the depth has _depth in its name.
+        target: an .mp4 file; default: OUT/videos/PATH.mp4, or for a scene file, SCENE_PATH.mp4 in
+            the same folder. PATH is the camera path. A video of the depth has _depth in its name.
         iteration: an iteration of an output folder; default: the last one.
 
     Returns:
@@ -209,7 +209,7 @@ def cameras_along(
 
     Args:
         path: one of `CAMERA_PATHS`, or a file of key cameras.
-        trained: names and cameras of the photos; None for a scene file without its training.
+        trained: names and cameras of the photos; None for a scene file without an output folder.
 
     Raises:
         UserError: no such path or file, or one that needs the cameras of a training run.
@@ -253,9 +253,9 @@ class Video:
 
     Attributes:
         cameras: one per frame. All have the same size, with even width and height.
-        file: the file of the video in color; that of the depth has _depth in its name.
-        depth: render a video of the depth too.
-        side_by_side: one video instead, with color on the left and depth on the right.
+        file: the file of the colour video; that of the depth has _depth in its name.
+        depth: also render a video of the depth.
+        side_by_side: one video instead, with colour on the left and depth on the right.
     """
 
     gaussians: Gaussians
@@ -305,7 +305,7 @@ class Video:
         return [file for file, _ in files]
 
     def _files(self) -> list[tuple[Path, int]]:
-        """The file of each video, and the number of images that are side by side in it."""
+        """For each video: its file, and the number of images in a frame (2 if side by side)."""
         if self.side_by_side:
             return [(self.file, 2)]
         depth = self.file.with_name(f"{self.file.stem}_depth{self.file.suffix}")
@@ -323,7 +323,7 @@ class Video:
         return [np.concatenate([color, shown], axis=1)] if self.side_by_side else [color, shown]
 
     def _depth_range(self) -> tuple[float, float]:
-        """One range of depths for the whole video, so that its colors do not flicker."""
+        """One range of depths for the whole video, so that its colours do not flicker."""
         from snowsplat.pipeline import image_files
 
         if not (self.depth or self.side_by_side):

@@ -49,13 +49,13 @@ def watch(
     data, background = load_dataset_of(folder, dataset, resolution)
     newest = NewestScene(folder, iteration, (compute or Compute()).apply())
     newest()  # a scene that cannot be shown is reported before the page opens
-    with suppress(KeyboardInterrupt):  # from the moment at which the observer knows the address
+    with suppress(KeyboardInterrupt):  # Ctrl-C is the normal end as soon as the page is open
         page.open(data, background, folder.path.absolute().name, observer)
         page.show(newest)
 
 
 def watched_folder(path: Path) -> OutputFolder:
-    """As `existing_folder`; also finds the training run of `make` if it has no scene yet."""
+    """The same as `existing_folder`, but also finds a training run of `make` without scenes."""
     folder = existing_folder(path)
     made = OutputFolder(folder.path / SCENE)
     return made if made.is_output_folder() and not folder.is_output_folder() else folder
@@ -67,7 +67,11 @@ class NewestScene:
     def __init__(
         self, folder: OutputFolder, iteration: int | None, device: torch.device | None = None
     ) -> None:
-        """``iteration``: always show this one. ``device``: default: the CPU."""
+        """
+        Args:
+            iteration: show only the scene of this iteration; None: the newest.
+            device: the device for the Gaussians; None: the CPU.
+        """
         self._folder, self._iteration, self._device = folder, iteration, device
         self._read: tuple[Path, int] | None = None  # the file shown, and when it was written
         self._scene: Scene | None = None
@@ -90,7 +94,10 @@ class NewestScene:
                 name = path.relative_to(self._folder.path).as_posix()
                 about = [f"After {step:,} steps", f"{len(gaussians):,} Gaussians", name]
                 self._scene, self._read = Scene(gaussians, found[1], about), found
-        except (OSError, UserError):  # replaced or removed while it was read: retried later
+        except (
+            OSError,
+            UserError,
+        ):  # the file was replaced or removed: read again at the next call
             if self._scene is None:
                 raise
         return self._scene

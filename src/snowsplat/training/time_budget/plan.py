@@ -19,10 +19,10 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.time_budget.step_cost import Work
 from snowsplat.training.trainer import Trainer
 
-# The size of the photos is reduced until there is time for both of these numbers of steps:
+# The size of the photos is reduced until there is time for both of these minimum numbers of steps.
 #: Minimum number of steps.
 _MIN_STEPS = 1000
-#: Minimum number of steps per photo.
+#: Minimum number of steps per training photo.
 _MIN_STEPS_PER_PHOTO = 10
 #: Minimum and maximum of the longer side of the photos, in pixels.
 _MIN_SIDE = 400
@@ -42,18 +42,18 @@ _SETUP_SECONDS = 0.5
 # The speed of the machine is measured by a short training run, called the sample.
 #: Maximum duration of the sample, in seconds.
 _SAMPLE_SECONDS = 0.7
-#: Maximum number of steps.
+#: Maximum number of steps of the sample.
 _SAMPLE_STEPS = 100
-#: Minimum number of steps, even if they take longer than `_SAMPLE_SECONDS`.
+#: Minimum number of steps of the sample, even if they take longer than `_SAMPLE_SECONDS`.
 _MIN_SAMPLE_STEPS = 3
-#: Number of photos. It is small, so that decoding takes little time.
+#: Number of photos in the sample. It is small, so that decoding takes little time.
 _SAMPLE_PHOTOS = 2
-#: Maximum number of points. It limits the memory.
+#: Maximum number of initial points in the sample. It limits the memory.
 _SAMPLE_POINTS = 20_000
 #: Photos with more pixels than this are reduced to half the size.
 _SAMPLE_PIXELS = 500_000
-#: Time of a step with a trained scene, divided by that with the initial points. In a trained scene
-#: more splats overlap. Measured with fox and fern: 1.5 to 1.9.
+#: Time of a step with a trained scene, divided by that with the initial points. It is larger than
+#: 1, because more splats overlap in a trained scene. Measured with fox and fern: 1.5 to 1.9.
 _TRAINED_SLOWDOWN = 1.5
 
 
@@ -95,14 +95,15 @@ def make_plan(
     more_gaussians: bool = True,
     more_often: bool = True,
 ) -> Plan:
-    """The best training run that fits into ``seconds``. ``dataset``: at full resolution.
+    """The best training run that fits into ``seconds``.
 
     Args:
+        dataset: at full resolution.
         config: the configuration of the recipe; its ``iterations`` are ignored.
         time_ratio: the result of `measure_time_ratio`.
         resize: whether the photos may be reduced.
         more_gaussians: whether the limit of the number of Gaussians may be raised.
-        more_often: whether a short training run may densify more often.
+        more_often: whether densification may be more frequent in a short training run.
     """
     camera = max((view.camera for view in dataset.train), key=lambda c: c.width * c.height)
     longer = max(camera.width, camera.height)
@@ -203,7 +204,10 @@ def _at_most_max_side(view: View) -> View:
 
 
 def _capped(config: TrainConfig, pixels: int, gaussian_factor: float) -> TrainConfig:
-    """``config`` for photos of ``pixels``, and the limit of Gaussians times ``gaussian_factor``."""
+    """``config`` with the limit of Gaussians for photos of this number of pixels.
+
+    If the configuration has a limit, it is multiplied by ``gaussian_factor`` first.
+    """
     cap = config.density.max_gaussians
     if gaussian_factor > 1.0 and cap:
         config = replace(

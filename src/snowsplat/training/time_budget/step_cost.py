@@ -1,4 +1,4 @@
-"""The time that training steps take: a model of the work, and its calibration while training."""
+"""Predicts the time of training steps: `Work` is a model, and `StepCost` calibrates it."""
 
 from __future__ import annotations
 
@@ -8,28 +8,32 @@ from dataclasses import dataclass
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.step_schedule import Schedule
 
-# Seconds of a step on the machine of docs/performance.md. Only their proportions matter: the ratio
-# of the time on this machine with this scene to these seconds, `time_ratio`, is measured.
+# Seconds of a step on the machine of docs/performance.md. Only their proportions matter: the time
+# on this machine with this scene, divided by these seconds, is measured. It is the `time_ratio`.
 _SECONDS_PER_STEP = 0.001
 _SECONDS_PER_MEGAPIXEL = 0.035
 _SECONDS_PER_MILLION_GAUSSIANS = 0.07
 
 # Seconds after the last step, on the same machine.
-#: Rendering a test view, as a multiple of a training step at full resolution: only a forward pass.
+#: Rendering a test view, as a multiple of a training step at full resolution. It is less than 1,
+#: because there is no backward pass.
 _STEPS_PER_VIEW = 0.5
 #: Decoding the photo of a test view and computing the metrics.
 _SECONDS_PER_VIEW_MEGAPIXEL = 0.05
-#: Writing the scene.
+#: Writing the scene, per million Gaussians.
 _SECONDS_PER_MILLION_WRITTEN = 4.0
 
 #: Factor by which a densification increases the number of Gaussians, below their limit.
 _GROWTH = 1.25
-#: The remaining steps are estimated in this many equal parts.
+#: The remaining steps are divided into this number of equal parts, and the time of each is
+#: estimated.
 _PARTS = 40
 
-#: Weight of the initial value of `time_ratio`, relative to the full weight of measurements.
-_GUESS_WEIGHT = 0.3
-#: If a step takes this many times longer than predicted, it was delayed by something else.
+#: Weight of the initial value of `time_ratio`, relative to the weight of all measurements after a
+#: long time.
+_INITIAL_WEIGHT = 0.3
+#: The measured time of a step is limited to this multiple of the predicted time. A longer step was
+#: delayed by another process.
 _OUTLIER = 5.0
 
 
@@ -70,7 +74,8 @@ class Work:
         """Downscale and number of Gaussians in equal parts of the steps after ``step``.
 
         The number of Gaussians is assumed to increase linearly until densification ends. It then is
-        the limit, or without a limit, twice the present number.
+        the limit or, without a limit, twice the present number; but each densification increases
+        the number at most by the factor `_GROWTH`.
         """
         density = self.config.density
         last = min(schedule.step_of(density.densify_until), schedule.iterations)
@@ -88,37 +93,38 @@ class Work:
 class StepCost:
     """Predicts the seconds of a training step from the times of previous steps."""
 
-    def __init__(self, work: Work, time_ratio: float, memory: float) -> None:
+    def __init__(self, work: Work, time_ratio: float, time_constant: float) -> None:
         """
         Args:
             time_ratio: initial value of the measured seconds divided by `Work.seconds`.
-            memory: seconds after which the weight of a measurement has decreased to 1/e.
+            time_constant: seconds after which the weight of a measurement has decreased to 1/e.
         """
         self._work = work
-        self._memory = memory
+        self._time_constant = time_constant
         # For each downscale: sums of measured and of modelled seconds, with exponentially
-        # decreasing weights. A stage starts with the time ratio of the previous stage. Its weight
-        # is larger than that of the first steps, because these wait until photos are decoded.
+        # decreasing weights. The sums of a stage start with the time ratio of the previous stage.
+        # This initial value has a larger weight than the first steps of the stage, because these
+        # wait until photos are decoded.
         self._measured: dict[int, float] = {}
         self._modelled: dict[int, float] = {}
         self._time_ratio = time_ratio
-        self._guess = _GUESS_WEIGHT * memory / time_ratio
+        self._initial = _INITIAL_WEIGHT * time_constant / time_ratio
 
     def observe(self, seconds: float, downscale: int, gaussians: int) -> None:
-        """Add the measurement of a step."""
+        """Add the measured ``seconds`` of a step."""
         expected = self.predict(downscale, gaussians)
         seconds = min(seconds, _OUTLIER * expected)
         if downscale not in self._measured:
-            self._measured[downscale] = self._guess * self._time_ratio
-            self._modelled[downscale] = self._guess
-        keep = math.exp(-seconds / self._memory)
+            self._measured[downscale] = self._initial * self._time_ratio
+            self._modelled[downscale] = self._initial
+        keep = math.exp(-seconds / self._time_constant)
         modelled = self._work.seconds(downscale, gaussians)
         self._measured[downscale] = keep * self._measured[downscale] + seconds
         self._modelled[downscale] = keep * self._modelled[downscale] + modelled
         self._time_ratio = self._measured[downscale] / self._modelled[downscale]
 
     def predict(self, downscale: int, gaussians: float) -> float:
-        """Seconds of a step; for a future stage, with the time ratio of the present stage."""
+        """Seconds of a step; a stage without measurements has the time ratio of the last step."""
         time_ratio = self._time_ratio
         if downscale in self._measured:
             time_ratio = self._measured[downscale] / self._modelled[downscale]
