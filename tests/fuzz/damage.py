@@ -1,4 +1,4 @@
-"""Damaging the bytes of a file, controlled by numbers from hypothesis or a random generator."""
+"""Damaging the bytes of a file by random changes."""
 
 import json
 import random

@@ -96,7 +96,9 @@ class Reader:
     def write(self, data: bytes) -> int:
         """Write ``data`` to ``file``, packed; return the size of the file."""
         packed = data if self.pack is None else self.pack(data)
-        (self.folder / self.file).write_bytes(packed)
+        path = self.folder / self.file
+        path.unlink()  # some file systems write the content of a truncated file to disk at once
+        path.write_bytes(packed)
         return len(packed)
 
     def memory(self) -> int:
