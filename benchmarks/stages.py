@@ -18,6 +18,7 @@ import platform
 import statistics
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -103,13 +104,16 @@ def main() -> None:
     ghz = flags.ghz or system_ghz()
     print(_machine(ghz))
     results: list[Measured] = []
-    for size in flags.size:
-        if flags.versus is not None:
+    if flags.versus is not None:
+        for size in flags.size:
             results += _paired(flags, size, isas[0])
-        else:
-            results += _absolute(flags, size, isas, ghz)
-    if flags.reference:
-        results += _beside_reference(flags, isas[0])
+    if flags.versus is None or flags.reference:
+        with Worker(isas[0]) as first:
+            if flags.versus is None:
+                for size in flags.size:
+                    results += _absolute(flags, size, isas, ghz, first)
+            if flags.reference:
+                results += _beside_reference(flags, isas[0], first)
     if flags.json is not None:
         flags.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
@@ -117,12 +121,15 @@ def main() -> None:
 # ------------------------------------------------------------------------------------- the tables
 
 
-def _absolute(flags: argparse.Namespace, size: str, isas: list[str], ghz: float) -> list[Measured]:
+def _absolute(
+    flags: argparse.Namespace, size: str, isas: list[str], ghz: float, first: Worker
+) -> list[Measured]:
+    """``first`` is the worker of the first instruction set."""
     results: list[Measured] = []
     pairs = 0  # equal for all libraries
     for isa in isas:
         columns: list[Measured] = []
-        with Worker(isa) as worker:
+        with nullcontext(first) if isa == isas[0] else Worker(isa) as worker:
             for threads in flags.threads:
                 found = worker.ask(
                     size,
@@ -216,27 +223,26 @@ def _paired(flags: argparse.Namespace, size: str, isa: str) -> list[Measured]:
     return results
 
 
-def _beside_reference(flags: argparse.Namespace, isa: str) -> list[Measured]:
+def _beside_reference(flags: argparse.Namespace, isa: str, worker: Worker) -> list[Measured]:
     results = []
     print(f"\n{flags.reference}: plain PyTorch (ops.reference, float32) and {isa}, one iteration")
     print(_row("ms, minimum", [f"{'reference':>10}{'native':>9}{'ratio':>8}{'cpu':>8}"]))
-    with Worker(isa) as worker:
-        for threads in flags.threads:
-            own = worker.ask(flags.reference, threads, flags.repeats)
-            # An iteration takes seconds, so at most three are made.
-            slow = worker.ask(flags.reference, threads, min(3, flags.repeats), reference=True)
-            (theirs, _, their_cpu), (ours, _, our_cpu) = (_least(f, TOTAL) for f in (slow, own))
-            cells = f"{1e3 * theirs:>10.0f}{1e3 * ours:>9.2f}{theirs / ours:>7.0f}x"
-            cells += f"{their_cpu / our_cpu:>7.0f}x"
-            print(_row(f"{threads} thread{'s' * (threads > 1)}", [cells]))
-            results.append(
-                {
-                    "size": flags.reference,
-                    "threads": threads,
-                    "reference": slow["wall"],
-                    "native": own["wall"],
-                }
-            )
+    for threads in flags.threads:
+        own = worker.ask(flags.reference, threads, flags.repeats)
+        # An iteration takes seconds, so at most three are made.
+        slow = worker.ask(flags.reference, threads, min(3, flags.repeats), reference=True)
+        (theirs, _, their_cpu), (ours, _, our_cpu) = (_least(f, TOTAL) for f in (slow, own))
+        cells = f"{1e3 * theirs:>10.0f}{1e3 * ours:>9.2f}{theirs / ours:>7.0f}x"
+        cells += f"{their_cpu / our_cpu:>7.0f}x"
+        print(_row(f"{threads} thread{'s' * (threads > 1)}", [cells]))
+        results.append(
+            {
+                "size": flags.reference,
+                "threads": threads,
+                "reference": slow["wall"],
+                "native": own["wall"],
+            }
+        )
     return results
 
 
