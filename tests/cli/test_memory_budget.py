@@ -57,10 +57,9 @@ def test_a_dataset_of_ten_times_the_memory_trains(dataset: Path, tmp_path: Path)
         str(tmp_path / "out"),
         "--memory",
         f"{BUDGET // 10**6}MB",
-        "--iterations",
-        "50",
+        *("--iterations", "25", "--densify-from-iter", "10", "--densify-interval", "10"),
     )
-    run = snowsplat_cli("train", str(dataset), *arguments, "--densify-from-iter", "20")
+    run = snowsplat_cli("train", str(dataset), *arguments)
     assert run.returncode == 0, run.stderr
     assert re.search(r"^memory: \d+ MB at most \(.*photos \d+ MB\)$", run.stdout, re.MULTILINE)
     assert re.search(r"^for lack of memory: at most [\d,]+ Gaussians", run.stdout, re.MULTILINE)
