@@ -32,7 +32,10 @@ pytestmark = pytest.mark.slow
 def benchmark(script: str, *arguments: object) -> str:
     """The output of a script. It never uses the garden, so it is the same everywhere."""
     # Threads of PyTorch that wait for each other leave the processor to other tests.
-    environment = fork_server.ENVIRONMENT | {"SNOWSPLAT_GARDEN": "none", "OMP_WAIT_POLICY": "passive"}
+    environment = fork_server.ENVIRONMENT | {
+        "SNOWSPLAT_GARDEN": "none",
+        "OMP_WAIT_POLICY": "passive",
+    }
     run = fork_server.run(BENCHMARKS / script, *arguments, env=environment)
     assert run.returncode == 0, run.stderr
     return run.stdout
