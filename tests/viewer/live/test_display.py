@@ -7,7 +7,7 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation
-from snowsplat.viewer.live.display import Placed, Pose, fit
+from snowsplat.viewer.live.display import PhotoRectangle, Pose, fit
 
 
 def pose(fov: float = 1.0, width: int = 640, height: int = 480) -> Pose:
@@ -47,7 +47,7 @@ def test_a_photo_in_a_window_has_its_own_camera(window):
     """A point projects to the same position of the photo, for any rectangle."""
     identity = torch.eye(3, 4, dtype=torch.float64)
     camera = Camera(90, 60, 70.0, 72.0, 44.0, 31.0, identity)
-    placed = Placed.within(camera, *window)
+    placed = PhotoRectangle.within(camera, *window)
     assert placed.width <= window[0]
     assert placed.height <= window[1]
     assert placed.width == window[0] or placed.height == window[1]

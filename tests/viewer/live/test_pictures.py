@@ -10,7 +10,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.render import render
 from snowsplat.viewer.live import palette
-from snowsplat.viewer.live.display import DisplaySettings, Placed
+from snowsplat.viewer.live.display import DisplaySettings, PhotoRectangle
 from snowsplat.viewer.live.pictures import Photo, draw
 
 WIDTH, HEIGHT = 90, 60
@@ -156,7 +156,7 @@ def test_sh_degree():
 
 
 def photo_of(picture: np.ndarray) -> Photo:
-    placed = Placed(10, 0, 70, 60)
+    placed = PhotoRectangle(10, 0, 70, 60)
     return Photo(torch.from_numpy(picture[:, 10:80].copy()), placed)
 
 
@@ -175,7 +175,7 @@ def test_the_error_of_equal_photo_and_render_is_zero():
 
 def test_a_photo_is_wiped_over_the_render():
     colors = draw(TWO, CAMERA, DisplaySettings())
-    white = Photo(torch.full((60, 70, 3), 255, dtype=torch.uint8), Placed(10, 0, 70, 60))
+    white = Photo(torch.full((60, 70, 3), 255, dtype=torch.uint8), PhotoRectangle(10, 0, 70, 60))
     render_only = draw(TWO, CAMERA, DisplaySettings(), photo=white)
     assert np.array_equal(render_only[:, 10:80], colors[:, 10:80])
     half = draw(TWO, CAMERA, DisplaySettings(wipe=0.5), photo=white)

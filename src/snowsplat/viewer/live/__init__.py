@@ -1,18 +1,18 @@
-"""The live viewer: a page of viser whose images are rendered by our own rasterizer.
+"""The live viewer: a page built with viser, whose images the rasterizer of snowsplat renders.
 
 It shows Gaussians during training. Between two training steps, the images that browsers have
-requested are rendered from the tensors that the next step will change. The command line uses
-`viewer.NetworkViewer`.
+requested are rendered, without a copy of the Gaussians. `viewer.NetworkViewer` is the page.
 
-    display.py      display settings and pose of a browser
-    pictures.py     Gaussians + camera + display settings → image; no side effects
+    display.py      display settings and camera pose of a browser
+    pictures.py     renders an image, from Gaussians, a camera and display settings
     session.py      state of the browsers and of the training, next image to render; thread-safe
     curves.py       curves of loss and PSNR
-    server.py       viser on a free port of this machine
-    guard.py        limits what connections may do
+    server.py       starts viser's server on a free port
+    guard.py        checks connections and messages, and limits their cost
     page.py         the controls of the page
-    photos.py       the cameras of the photos: frustums in the scene, and views at their positions
-    key_cameras.py  camera positions stored by a browser, for a video
-    viewer.py       combines all of these
-    training.py     the viewer between the steps of a training run
+    photos.py       the cameras of the photos: frustums in the scene, and views from their poses
+    key_cameras.py  views that a user stores, for a video along them
+    palette.py      colour maps
+    viewer.py       combines these modules
+    training.py     updates the viewer between the steps of a training run
 """

@@ -22,11 +22,14 @@ from snowsplat.viewer.live.display import fit
 
 _POINTS = 512  # maximum number of points per curve; if there are more, adjacent ones are merged
 _VIEWS = 4  # number of views whose PSNR is averaged
-_LONGEST = 480  # pixels: longer side of these views
+_MAX_SIDE = 480  # pixels: longer side of these views
 
 
 class Curve:
-    """Means of a value over equal numbers of steps, with a limited number of points."""
+    """The curve of a value. Each point is the mean of equally many added values.
+
+    The number of points is limited: adjacent points are merged if there are too many.
+    """
 
     def __init__(self) -> None:
         self._points: list[tuple[float, float]] = []
@@ -35,7 +38,7 @@ class Curve:
         self._count = 0
 
     def add(self, step: int, value: float) -> None:
-        """Add a value."""
+        """Add the value of a step."""
         self._steps += step
         self._sum += value
         self._count += 1
@@ -53,16 +56,20 @@ class Curve:
         return len(self._points)
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Steps and values, float64."""
+        """The steps and the values of the points, each (N,) float64."""
         points = np.array(self._points, np.float64).reshape(-1, 2)
         return points[:, 0].copy(), points[:, 1].copy()
 
 
 class SampledPsnr:
-    """PSNR of a few fixed views, measured one at a time, because it interrupts the training."""
+    """PSNR of a few fixed views, measured one at a time, because this delays the training."""
 
     def __init__(self, views: Sequence[View], background: Tensor) -> None:
-        """``views``: a few of them are used."""
+        """
+        Args:
+            views: `_VIEWS` of them are used, evenly spaced.
+            background: (3,) colour, 0..1.
+        """
         self._background = background
         chosen = [views[i * len(views) // _VIEWS] for i in range(_VIEWS)] if views else []
         unique = list(dict.fromkeys(chosen))
@@ -83,7 +90,7 @@ class SampledPsnr:
     @torch.no_grad()
     def _measure_next(self, gaussians: Gaussians) -> None:
         view = next(self._turn)
-        size = fit(view.camera.width, view.camera.height, _LONGEST)
+        size = fit(view.camera.width, view.camera.height, _MAX_SIDE)
         with single_threaded():
             try:
                 photo, mask = self._photo(view, size)

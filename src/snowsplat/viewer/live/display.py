@@ -23,11 +23,11 @@ class DisplaySettings:
     """How Gaussians are displayed.
 
     Attributes:
-        mode: the quantity that is displayed: colour, depth …; "error": the difference from a photo.
+        mode: what is displayed: colours, depth … "error" is the difference from a photo.
         sh_degree: degree of the spherical harmonics that are used for colours.
         scale: factor on the size of every Gaussian.
         crop: lower and upper corner (x, y, z, world) of a box; Gaussians outside are hidden.
-        wipe: fraction of the photo, from its left edge, that is shown over the render.
+        wipe: fraction of the width, from the left, in which the photo covers the rendering.
     """
 
     mode: Mode = "color"
@@ -75,8 +75,11 @@ def fit(width: int, height: int, longest: int) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class Placed:
-    """The largest centred rectangle in an image that has the aspect ratio of a photo."""
+class PhotoRectangle:
+    """The rectangle of a photo in an image of any aspect ratio: centred, as large as possible.
+
+    The unit is a pixel of the image.
+    """
 
     left: int
     top: int
@@ -84,7 +87,7 @@ class Placed:
     height: int
 
     @classmethod
-    def within(cls, camera: Camera, width: int, height: int) -> Placed:
+    def within(cls, camera: Camera, width: int, height: int) -> PhotoRectangle:
         """The rectangle of the photo of ``camera`` in an image of ``width`` × ``height``."""
         scale = min(width / camera.width, height / camera.height)
         w = min(width, max(1, round(camera.width * scale)))
@@ -92,7 +95,7 @@ class Placed:
         return cls((width - w) // 2, (height - h) // 2, w, h)
 
     def camera(self, camera: Camera, width: int, height: int) -> Camera:
-        """The photo's camera, extended to an image of ``width`` × ``height`` around the photo."""
+        """The camera of the whole image, ``width`` × ``height``; ``camera``: of the photo."""
         inner = camera.scaled(self.width, self.height)
         cx, cy = inner.cx + self.left, inner.cy + self.top
         return Camera(width, height, inner.fx, inner.fy, cx, cy, camera.cam_from_world)

@@ -1,15 +1,15 @@
 """Checks requests and messages of browsers to the live viewer, and limits their number and cost.
 
 viser accepts every connection, trusts all messages and processes any number of them, in the process
-that trains. Therefore `Guard.serve` starts its server with additional checks:
+that trains. Therefore `Guard.serve` starts viser's server with additional checks:
 
 - The Host and Origin headers of a request must be those of this server. If other machines can
   connect, the path must begin with a secret token.
 - The numbers of connections, page downloads and browsers are limited.
 - Messages must be of the three types that the page sends, with finite numbers. A connection that
-  sends more messages than a page can send is closed. If a client does not read its data, the server
-  reads no further messages of this client.
-- During training, the server may use a fifth of a processor core.
+  sends more messages than a page can send is closed. If a client does not read the data that the
+  server sends, the server reads no further messages of this client.
+- During training, the server may use at most a fifth of a processor core.
 
 These checks run in the thread of viser's server. Images and updates of the page are sent in the
 same thread (`call_in_server_thread`), because viser's buffers are not thread-safe while browsers
@@ -45,10 +45,10 @@ from snowsplat.viewer.hosts import is_loopback, is_own_host, is_own_page
 _WAITING = 96  # connections without a valid request; a new connection replaces the oldest one
 _PAGES = 16  # connections that download the page
 _BROWSERS = 16  # connected browsers
-_REQUEST = 16 << 10  # bytes of a request
+_REQUEST = 16 << 10  # bytes of an HTTP request
 _MESSAGE = 64 << 10  # bytes of a message
 _RATE = 100.0  # messages per second; a page sends 50 while its camera moves
-_BURST = 1000.0  # messages at once: they accumulate while a training step blocks the process
+_BURST = 1000.0  # messages at once; they accumulate while a training step blocks the process
 _FRAMES = 16  # WebSocket frames of a message; browsers send short messages in one frame
 _SHARE = 0.2  # share of a core that the server uses
 _LONGEST_PAUSE = 1.0  # seconds for which the server is paused at a time
@@ -156,13 +156,13 @@ class Guard:
         return None
 
     def _path(self, path: str) -> str | None:
-        """The path without the token; None if the token is wrong. Nothing is decoded."""
+        """The path without the token; None if the token is wrong. %-encoding is not decoded."""
         path = path.partition("?")[0]
         if self._token is None:
             return path
         given, _, rest = path.removeprefix("/").partition("/")
-        ours = self._token.encode()
-        return f"/{rest}" if hmac.compare_digest(_bytes(given), ours) else None
+        token = self._token.encode()
+        return f"/{rest}" if hmac.compare_digest(_bytes(given), token) else None
 
     def connected(self, connection: _Connection) -> None:
         """Called when a connection is made."""
@@ -193,7 +193,7 @@ class _Connection(ServerConnection):
         self._head = 0  # bytes of the request received so far
         self._budget = _BURST  # number of frames that may be received now
         self._counted = self.loop.time()  # when the budget was updated
-        self._frames = 0  # of the current message
+        self._frames = 0  # number of frames of the current message
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -318,8 +318,9 @@ class ServerTimeLimit:
     def __init__(self, server: viser.ViserServer, training: Callable[[], bool]) -> None:
         self._loop = server.get_event_loop()
         self._training = training
-        self._used = self._measured = 0.0  # thread time and clock at the last measurement, seconds
-        self._uncounted = 0.0  # thread time that is not counted, seconds
+        # At the last measurement, in seconds: processor time of the thread, and the clock.
+        self._used = self._measured = 0.0
+        self._uncounted = 0.0  # processor time since then that is not counted, in seconds
         call_in_server_thread(server, self._begin)
 
     def _begin(self) -> None:
@@ -336,7 +337,7 @@ class ServerTimeLimit:
 
     @contextlib.contextmanager
     def uncounted(self) -> Iterator[None]:
-        """A context for work on behalf of the training: its time does not count."""
+        """A context for work that the training has started: its time is not limited."""
         before = time.thread_time()
         try:
             yield

@@ -1,4 +1,4 @@
-"""Key cameras: views that a user stores in the browser to make a video along them."""
+"""Key cameras: views that a user stores on the page, to render a video along them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from snowsplat.viewer.live.page import in_server_thread, note
 from snowsplat.viewer.live.session import Visitor
 
 FILE = "cameras.json"
-_MOST = 500  # maximum number of views that a browser may store
+_MAX_VIEWS = 500  # maximum number of views that a browser may store
 _PAUSE = 2.0  # minimum time in seconds between two downloads
 _NONE = "Store two or more views to make a video."
 
 
 class KeyCameras:
-    """The views stored by one browser, and the buttons."""
+    """The views that a user has stored in one browser, and the buttons for them."""
 
     def __init__(self, client: viser.ClientHandle, visitor: Visitor) -> None:
         self.cameras: list[Camera] = []
@@ -45,7 +45,7 @@ class KeyCameras:
     def store(self) -> None:
         """Store the current view of the browser."""
         pose = self._visitor.pose
-        if pose is not None and len(self.cameras) < _MOST:
+        if pose is not None and len(self.cameras) < _MAX_VIEWS:
             self.cameras.append(pose.camera(pose.width, pose.height))
             self._show()
 
@@ -55,7 +55,7 @@ class KeyCameras:
         self._show()
 
     def content(self) -> bytes:
-        """The file that `snowsplat render --path` reads."""
+        """The content of the file, which `snowsplat render --path` reads."""
         named = [(f"key_{i:03d}", camera) for i, camera in enumerate(self.cameras)]
         return json.dumps(entries_of(named), indent=1).encode()
 

@@ -40,7 +40,7 @@ _LEGENDS: dict[Mode, str] = {
     "error": "Black: none, pale yellow: a quarter of the range or more.",
 }
 _NOWHERE = "Show the cameras and click one to view the scene from its position."
-_NEEDS_PHOTO = "Only shown at the position of a photo: click a camera, or Next below."
+_NEEDS_PHOTO = "Only available at the position of a photo: click a camera, or Next below."
 
 
 def note(text: str) -> str:
@@ -50,10 +50,10 @@ def note(text: str) -> str:
 
 
 def in_server_thread(run: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
-    """A callback of a control that runs in the server's thread instead of a thread pool.
+    """A callback of a control, which calls ``run`` in the server's thread.
 
-    So events are processed in order, and the next message is read when the previous one is
-    processed.
+    viser would call ``run`` itself in a thread pool. In the server's thread, events are processed
+    in order, and the next message is read only after the previous one is processed.
     """
 
     async def called(_: Any) -> None:
@@ -63,12 +63,12 @@ def in_server_thread(run: Callable[[], None]) -> Callable[[Any], Coroutine[Any, 
 
 
 def within(value: Any, low: float, high: float) -> float:
-    """A slider's value, limited to its range: browsers can send any number."""
+    """The value of a slider, limited to its range, because browsers can send any number."""
     return min(max(float(value), low), high)
 
 
 class TrainingPanel:
-    """State and controls of the training, the same for all browsers."""
+    """The part of the page with state and controls of the training, the same for all browsers."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
@@ -87,7 +87,7 @@ class TrainingPanel:
                 95,
                 5,
                 round(100 * session.share),
-                hint="While a camera moves: share of the time for rendering instead of training",
+                hint="While a camera moves: share of the time for rendering its images",
             )
             self._loss = _plot(server, "Loss", "#4a7fe0")
             self._psnr = _plot(server, "PSNR (dB)", "#e08a2a")
@@ -100,16 +100,16 @@ class TrainingPanel:
             self._session.resume()
         else:
             self._session.pause()
-        self._name_pause()
+        self._update_pause_label()
 
     def _step_clicked(self) -> None:
         self._session.step()
-        self._name_pause()
+        self._update_pause_label()
 
     def _share_changed(self) -> None:
         self._session.share = within(self._share.value, 5, 95) / 100.0
 
-    def _name_pause(self) -> None:
+    def _update_pause_label(self) -> None:
         self._pause.label = "Resume" if self._session.paused else "Pause"
 
     def show(self, status: list[str], share: float, loss: Curve, psnr: Curve) -> None:
@@ -158,7 +158,7 @@ def _plot(server: viser.ViserServer, name: str, color: str) -> viser.GuiUplotHan
 
 
 class ScenePanel:
-    """State of the scene, if there is no training."""
+    """The part of the page with the state of the scene, if there is no training."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -192,10 +192,10 @@ class Controls:
         self._client, self._session, self._visitor = client, session, visitor
         self._photos = photos
         self._photo_index: int | None = None
-        self._next: int | None = None  # the photo to which to go when it has been read
+        self._next: int | None = None  # index of the requested photo, while it is read
         self._going: asyncio.Task[None] | None = None
         self._hidden: viser.FrameHandle | None = None  # hides all frustums in this browser
-        self._add_picture()
+        self._add_display()
         self._add_photos()
         self._add_crop(bounds)
 
@@ -203,11 +203,11 @@ class Controls:
         display = dataclasses.replace(self._visitor.display, **changes)
         self._session.change(self._visitor, display=display)
 
-    # Picture
+    # Display
 
-    def _add_picture(self) -> None:
+    def _add_display(self) -> None:
         gui, display = self._client.gui, self._visitor.display
-        with gui.add_folder("Picture", order=1):
+        with gui.add_folder("Display", order=1):
             self._mode = gui.add_dropdown("Show", list(_MODES))
             self._legend = gui.add_html(note(_LEGENDS["color"]))
             degree = gui.add_slider(
@@ -219,7 +219,7 @@ class Controls:
                 100,
                 2,
                 100,
-                hint="Percent: shrinks every Gaussian, so that each is visible",
+                hint="In percent; small values separate the Gaussians",
             )
             finest = gui.add_slider(
                 "Image size",
@@ -267,7 +267,7 @@ class Controls:
                 1,
                 0,
                 visible=False,
-                hint="Width of the photo over the render, from the left",
+                hint="How much of the rendering the photo covers, from the left",
             )
             self._flip = gui.add_button_group("Show only", ("Render", "Photo"), visible=False)
             self._move = gui.add_button_group("Go to", ("Previous", "Next"))
@@ -295,12 +295,12 @@ class Controls:
         self.go_to_photo(0 if now is None else (now + by) % count)
 
     def go_to_photo(self, index: int) -> None:
-        """Go to the position of a photo when it has been read; a later call replaces this one."""
+        """Read a photo, then go to its position. A later call replaces this one."""
         self._next = index
         if self._going is None or self._going.done():
-            self._going = asyncio.get_running_loop().create_task(self._go_on())
+            self._going = asyncio.get_running_loop().create_task(self._go_to_requested())
 
-    async def _go_on(self) -> None:
+    async def _go_to_requested(self) -> None:
         while self._next is not None:
             index = self._next
             try:
@@ -316,7 +316,7 @@ class Controls:
                 self.follow()
 
     def follow(self) -> None:
-        """Update the controls if the browser has arrived at a photo or left it."""
+        """Update the controls if the browser has reached the position of a photo or left it."""
         photo_view = self._visitor.photo_view
         index = None if photo_view is None else photo_view.index
         if index == self._photo_index:

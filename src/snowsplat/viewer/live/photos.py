@@ -22,7 +22,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.trajectory.focus import up_of
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.live.display import Placed, Pose, fit
+from snowsplat.viewer.live.display import PhotoRectangle, Pose, fit
 from snowsplat.viewer.live.guard import call_in_server_thread
 from snowsplat.viewer.live.pictures import Photo
 from snowsplat.viewer.live.session import PhotoView, Session, Visitor
@@ -32,10 +32,10 @@ FRUSTUMS = "/photos"
 _TRAIN_COLOR = (70, 130, 230)
 _TEST_COLOR = (240, 150, 40)
 _LENGTH = 0.6  # length of a frustum, relative to the distance of neighbouring cameras
-_LONGEST = 0.06  # maximum length of a frustum, relative to the extent of the scene
-_MOST = 400  # maximum number of frustums
-_SMALL = 96  # pixels: longer side of the thumbnails in frustums
-_READING = 0.2  # share of the time for reading thumbnails during training
+_MAX_LENGTH = 0.06  # maximum length of a frustum, relative to the extent of the scene
+_MAX_FRUSTUMS = 400  # maximum number of frustums
+_THUMBNAIL_SIDE = 96  # pixels: longer side of the thumbnails in frustums
+_READING_SHARE = 0.2  # maximum share of the time for reading thumbnails during training
 
 
 class Photos:
@@ -64,7 +64,7 @@ class Photos:
         self.views = [*train, *test]
         self._server, self._session = server, session
         self._extent = extent
-        self._length = _LONGEST * extent
+        self._length = _MAX_LENGTH * extent
         if len(self.views) > 1:
             places = torch.stack([view.camera.position.detach() for view in self.views])
             spacing = ops.neighbours(places.to(torch.float32).contiguous(), k=1).median()
@@ -72,11 +72,11 @@ class Photos:
         self._centre = centre.to(torch.float64)
         self._background = background
         self._reading = asyncio.Semaphore(1)
-        self._began = threading.Event()  # reading thumbnails has begun
+        self._began = threading.Event()  # set when reading thumbnails begins
         self._closed = threading.Event()
         self._frustums: dict[int, viser.CameraFrustumHandle] = {}
         server.scene.add_frame(FRUSTUMS, show_axes=False)
-        every = -(-len(self.views) // _MOST)
+        every = -(-len(self.views) // _MAX_FRUSTUMS)
         for index, view in enumerate(self.views):
             if index % every == 0:
                 color = _TRAIN_COLOR if index < len(train) else _TEST_COLOR
@@ -129,7 +129,7 @@ class Photos:
         async with self._reading:
             started = time.monotonic()
             photo = await asyncio.to_thread(load_image, view.image, self._background.tolist())
-            if self._session.training:  # use at most half of the time
+            if self._session.training:  # read photos during at most half of the time
                 await asyncio.sleep(time.monotonic() - started)
         now = visitor.pose
         width, height = (now.width, now.height) if now else (view.camera.width, view.camera.height)
@@ -146,8 +146,8 @@ class Photos:
             client.camera.look_at = self._look_at(photo_view.camera).numpy()
 
     def _pose(self, camera: Camera, width: int, height: int) -> Pose:
-        """The pose of a browser that shows the whole photo in a window of this size."""
-        placed = Placed.within(camera, width, height).camera(camera, width, height)
+        """The pose at which a browser window of this size shows the whole photo of ``camera``."""
+        placed = PhotoRectangle.within(camera, width, height).camera(camera, width, height)
         pose = camera.world_from_cam.detach().to(torch.float64)
         fov = 2.0 * math.atan(0.5 * height / placed.fy)
         return Pose(quat_from_rotation(pose[:, :3]), pose[:, 3], fov, width, height)
@@ -162,7 +162,7 @@ class Photos:
     # Thumbnails, in the background
 
     def begin(self) -> None:
-        """Start reading thumbnails, if not started yet."""
+        """Start reading thumbnails in a thread, if it has not been started yet."""
         if not self._began.is_set():
             self._began.set()
             threading.Thread(target=self._read, name="snowsplat-photos", daemon=True).start()
@@ -171,19 +171,19 @@ class Photos:
         for index, frustum in self._frustums.items():
             started = time.monotonic()
             source = self.views[index].image
-            width, height = fit(source.width, source.height, _SMALL)
+            width, height = fit(source.width, source.height, _THUMBNAIL_SIDE)
             small = dataclasses.replace(source, width=width, height=height)
             try:
                 planes = load_image(small, self._background.tolist())
             except UserError:
-                continue  # training reports the error, or it is shown when a user goes to the photo
+                continue  # the error is reported by the training, or when a user goes to the photo
             if self._closed.is_set():
                 return
             pixels = planes.permute(1, 2, 0).contiguous().numpy()
             call_in_server_thread(
                 self._server, functools.partial(setattr, frustum, "image", pixels)
             )
-            rest = (1.0 / _READING - 1.0) if self._session.training else 0.0
+            rest = (1.0 / _READING_SHARE - 1.0) if self._session.training else 0.0
             if self._closed.wait(rest * (time.monotonic() - started)):
                 return
 
@@ -192,9 +192,9 @@ class Photos:
         self._closed.set()
 
 
-def placed_photo(photo_view: PhotoView, width: int, height: int) -> Photo:
+def fitted_photo(photo_view: PhotoView, width: int, height: int) -> Photo:
     """The photo, resized to its rectangle in an image of this size."""
-    placed = Placed.within(photo_view.camera, width, height)
+    placed = PhotoRectangle.within(photo_view.camera, width, height)
     image = Image.fromarray(photo_view.photo.permute(1, 2, 0).contiguous().numpy())
     resized = image.resize((placed.width, placed.height), Image.Resampling.BILINEAR)
     pixels = torch.frombuffer(bytearray(resized.tobytes()), dtype=torch.uint8)

@@ -1,4 +1,4 @@
-"""Renders Gaussians for display: `draw`."""
+"""`draw`: renders an image of Gaussians in one of the display modes."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.util.process import single_threaded
 from snowsplat.viewer.live import palette
-from snowsplat.viewer.live.display import DisplaySettings, Placed
+from snowsplat.viewer.live.display import DisplaySettings, PhotoRectangle
 
-_DOT = 0.8  # pixels: standard deviation of the dot of a point
-_ELLIPSOID_END = 1.5  # standard deviations at which ellipsoids end
+_DOT = 0.8  # pixels: standard deviation of the dot that represents a Gaussian as a point
+_ELLIPSOID_END = 1.5  # semi-axes of the ellipsoids, in standard deviations
 _ELLIPSOID_OPACITY = 0.1  # Gaussians below this opacity are not shown as ellipsoids
-# A Gaussian with the opacity exp(_DISC) is a disc: α has its maximum up to ½ d² = _DISC and is 0
-# from ½ d² = _DISC + 5.5 on. The two radii differ by 3%.
+# A Gaussian with the opacity exp(_DISC) looks like a disc. With its scaled conic, d is the
+# Mahalanobis distance from its centre: α has its maximum up to ½ d² = _DISC and is 0 from
+# ½ d² = _DISC + 5.5 on. The radii at these distances differ by 3%.
 _DISC = 80.0
-_WORST = 0.25  # mean absolute colour difference at the end of the palette
-_MANY = 256.0  # number of Gaussians at the end of the palette
-_OPAQUE_ENOUGH = 0.5  # pixels of lower opacity have neither depth nor normal
-_AROUND = 0.35  # brightness of the render around a photo
+_MAX_ERROR = 0.25  # mean absolute colour difference at the end of the palette
+_MAX_COUNT = 256.0  # number of Gaussians at the end of the palette
+_MIN_ALPHA = 0.5  # pixels of lower opacity have neither depth nor normal
+_BRIGHTNESS_AROUND = 0.35  # factor for the rendering outside of the rectangle of a photo
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo with which a render is compared.
+    """A photo with which a rendering is compared.
 
     Attributes:
         pixels: (h, w, 3) uint8, at the size of ``placed``.
@@ -41,7 +42,7 @@ class Photo:
     """
 
     pixels: Tensor
-    placed: Placed
+    placed: PhotoRectangle
 
 
 @torch.no_grad()
@@ -58,20 +59,20 @@ def draw(
     it shows colours.
     """
     with single_threaded():
-        picture = _modes(gaussians, camera, display, background, photo)
+        image = _in_mode(gaussians, camera, display, background, photo)
         if photo is not None:
-            picture = _beside(picture, photo, display)
-        return picture.contiguous().numpy()  # on the CPU, for Gaussians on any device
+            image = _with_photo(image, photo, display)
+        return image.contiguous().numpy()  # on the CPU, for Gaussians on any device
 
 
-def _modes(
+def _in_mode(
     gaussians: Gaussians,
     camera: Camera,
     display: DisplaySettings,
     background: Tensor | None,
     photo: Photo | None,
 ) -> Tensor:
-    """(H, W, 3) uint8, on the CPU."""
+    """(H, W, 3) uint8, on the CPU: the rendering in the display mode, without the photo."""
     if background is not None:
         background = background.to(gaussians.means.device)
     if display.scale != 1.0 and display.mode != "points":
@@ -96,7 +97,7 @@ def _modes(
         splats = _as_ellipsoids(splats, gaussians, camera)
     elif display.mode == "cost":
         counts = ops.count_blended(splats, *size)
-        return palette.HEAT[_steps(torch.log1p(counts) / math.log1p(_MANY))]
+        return palette.HEAT[_palette_indices(torch.log1p(counts) / math.log1p(_MAX_COUNT))]
     image, _, _ = ops.rasterize(splats, *size, background)
     if display.mode == "error" and photo is not None:
         return _error(image.cpu(), photo)
@@ -108,7 +109,7 @@ def _bytes(values: Tensor) -> Tensor:
     return values.clamp(0.0, 1.0).mul_(255.0).add_(0.5).to(torch.uint8).cpu()
 
 
-def _steps(values: Tensor) -> Tensor:
+def _palette_indices(values: Tensor) -> Tensor:
     """0..1 to indices into a palette."""
     return _bytes(values.nan_to_num()).long()
 
@@ -127,20 +128,23 @@ def _cropped(
 
 
 def _depth(depth: Tensor, alpha: Tensor) -> Tensor:
-    """Colours by disparity, 1/z, linear between its 1% and 99% quantiles."""
-    shown = alpha >= _OPAQUE_ENOUGH
+    """Colours that are linear in the disparity, 1/z, between its 1% and 99% quantiles."""
+    shown = alpha >= _MIN_ALPHA
     disparity = alpha / depth.clamp_min(1e-9)
     some = disparity[::4, ::4][shown[::4, ::4]]
     if not len(some):
         return torch.zeros(*depth.shape, 3, dtype=torch.uint8)
     far, near = torch.quantile(some[:: 1 + len(some) // 10_000], some.new_tensor([0.01, 0.99]))
     share = (disparity - far) / (near - far).clamp_min(1e-6 * float(near))
-    return palette.DEPTH[_steps(share)] * shown[:, :, None].cpu()
+    return palette.DEPTH[_palette_indices(share)] * shown[:, :, None].cpu()
 
 
 def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The shortest axis (M, 3) of each splat's Gaussian, camera frame, towards the camera; and the
-    cosine (M,), 0..1, of its angle with the direction to the camera."""
+    """The shortest axes (M, 3) of the Gaussians of splats, and the cosines (M,) of their angles.
+
+    An axis is a unit vector in the camera frame, towards the camera. The angle is between the axis
+    and the direction from the Gaussian to the camera, so the cosine is in 0..1.
+    """
     assert splats.ids is not None
     ids = splats.ids.long()
     unit = torch.eye(3, dtype=gaussians.quats.dtype, device=gaussians.quats.device)
@@ -168,11 +172,11 @@ def _recolored(splats: Splats2D, colors: Tensor) -> Splats2D:
 def _normals(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Tensor:
     """Red: right, green: up, blue: towards the camera."""
     axes, _ = _axes(splats, gaussians, camera)
-    # The axes are blended, then normalised: this gives the direction of the mean axis.
+    # The axes are blended as colours, then normalised: this gives the direction of the mean axis.
     image, alpha, _ = ops.rasterize(_recolored(splats, axes), camera.width, camera.height)
     length = image.permute(2, 0, 1).square().sum(0).sqrt_().clamp_min_(1e-9)  # plane by plane
     normals = image / length[:, :, None] * image.new_tensor([0.5, -0.5, -0.5])
-    return _bytes((normals + 0.5) * (alpha >= _OPAQUE_ENOUGH)[:, :, None])
+    return _bytes((normals + 0.5) * (alpha >= _MIN_ALPHA)[:, :, None])
 
 
 def _as_points(splats: Splats2D) -> Splats2D:
@@ -200,25 +204,28 @@ def _as_ellipsoids(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Sp
 
 
 def _error(image: Tensor, photo: Photo) -> Tensor:
-    """The colour difference inside the photo; the render around it."""
-    picture = _bytes(image)
+    """The colour difference inside the rectangle of the photo; the rendering around it."""
+    image = _bytes(image)
     at = photo.placed
     rows, columns = slice(at.top, at.top + at.height), slice(at.left, at.left + at.width)
-    seen, there = picture[rows, columns].to(torch.float32), photo.pixels.to(torch.float32)
-    error = (seen - there).abs_().mean(2) / (255.0 * _WORST)
-    picture[rows, columns] = palette.HEAT[_steps(error)]
-    return picture
+    rendered, real = image[rows, columns].to(torch.float32), photo.pixels.to(torch.float32)
+    error = (rendered - real).abs_().mean(2) / (255.0 * _MAX_ERROR)
+    image[rows, columns] = palette.HEAT[_palette_indices(error)]
+    return image
 
 
-def _beside(picture: Tensor, photo: Photo, display: DisplaySettings) -> Tensor:
-    """Show the photo up to the wipe position, then a line and the render; darken the rest."""
+def _with_photo(image: Tensor, photo: Photo, display: DisplaySettings) -> Tensor:
+    """Put the photo over the left part of its rectangle, up to ``display.wipe``.
+
+    A white line divides it from the rendering. Outside of the rectangle, the rendering is darkened.
+    """
     at = photo.placed
     rows, columns = slice(at.top, at.top + at.height), slice(at.left, at.left + at.width)
-    inside = picture[rows, columns].clone()
+    inside = image[rows, columns].clone()
     edge = round(display.wipe * at.width)
     inside[:, :edge] = photo.pixels[:, :edge]
     if 0 < edge < at.width:
         inside[:, max(0, edge - 1) : edge + 1] = 255
-    whole = (picture.to(torch.float32) * _AROUND).to(torch.uint8)
+    whole = (image.to(torch.float32) * _BRIGHTNESS_AROUND).to(torch.uint8)
     whole[rows, columns] = inside
     return whole

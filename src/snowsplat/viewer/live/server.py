@@ -1,4 +1,4 @@
-"""Starts a viser server on a free port, without console output and with access control."""
+"""Starts viser's server on a free port, without console output and with the checks of `Guard`."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ class RunningServer:
     guard: Guard
 
     def open(self) -> None:
-        """Accept browsers. From now on, use `call_in_server_thread` for changes."""
+        """Accept browsers. From now on, change the page only through `call_in_server_thread`."""
         self.guard.is_open = True
 
 
 def start_server(host: str, port: int | None, label: str) -> RunningServer:
-    """Listen at ``host`` and ``port``; without a port, at 8080 or the next free one.
+    """Start a server at ``host`` and ``port``; without a port, at 8080 or the next free one.
 
-    Browsers are rejected before `RunningServer.open`. If other machines can connect, the address
-    has a secret token.
+    ``label`` is the title of the page. Browsers are rejected until `RunningServer.open` is called.
+    If other machines can connect, the URL contains a secret token.
 
     Raises:
         UserError: the port is in use, or the host is not an address of this machine.
@@ -60,7 +60,7 @@ def start_server(host: str, port: int | None, label: str) -> RunningServer:
     free = free_port(host, port)
     token = None if is_loopback(host) else secrets.token_urlsafe(16)
     guard = Guard(host, token)
-    # viser prints a welcome, and warns about browsers that have disconnected.
+    # viser prints a welcome message, and warns about browsers that have disconnected.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     with contextlib.redirect_stdout(io.StringIO()), _guarded(guard):
         server = _Server(host=host, port=free, label=label, verbose=False)

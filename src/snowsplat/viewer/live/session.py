@@ -21,7 +21,7 @@ STILL = 0.2  # seconds without motion after which a camera counts as still
 MOVE_SECONDS = 2.0  # maximum time until a browser is at the pose of a photo
 # While the camera moves, images are made so small that rendering takes at most this many seconds.
 _MOVING_SECONDS = 0.05
-_SMALLEST = 160  # pixels: minimum of the longer side of such an image
+_MIN_SIDE = 160  # pixels: minimum of the longer side of such an image
 # An image is "requested" if a user moved the camera or changed a setting, and "idle" if only the
 # scene has changed.
 IDLE_SHARE = 0.05  # maximum share of the training time for idle images
@@ -67,22 +67,23 @@ class RenderRequest:
 
 @dataclass(eq=False)
 class Visitor:
-    """One browser. Change its attributes through `Session.change`."""
+    """One browser that shows the page. Change its attributes through `Session.change`."""
 
     pose: Pose | None = None
     display: DisplaySettings = field(default_factory=DisplaySettings)
     photo_view: PhotoView | None = None
-    arrived: bool = False  # the browser is at the pose of the photo; motion ends the photo view
+    # Whether the browser has reached the pose of the photo. If it then moves, the photo view ends.
+    arrived: bool = False
     photo_view_since: float = 0.0  # time when the browser was moved to the photo
     longest: int = 1280  # pixels of the longer side of a full-size image
     sending: bool = False  # the last image is being sent
     version: int = 0  # incremented with each change of the attributes above
     changed: float = 0.0  # time of the last change
-    # The last image that was sent:
-    shown_version: int = -1
-    shown_full: bool = False
-    shown_scene: int = -1
-    seconds_per_pixel: float = 0.0
+    # About the last image that was rendered:
+    shown_version: int = -1  # `RenderRequest.version`
+    shown_full: bool = False  # whether it had full size
+    shown_scene: int = -1  # the number of the scene
+    seconds_per_pixel: float = 0.0  # rendering time, averaged over the last images
 
     @property
     def going(self) -> bool:
@@ -90,7 +91,10 @@ class Visitor:
         return self.photo_view is not None and not self.arrived
 
     def request(self, scene: int, now: float) -> RenderRequest | None:
-        """The image that is needed at the time ``now``, if any."""
+        """The image that the browser needs at the time ``now``; None if it needs none.
+
+        ``scene``: a number that changes when the scene changes.
+        """
         if self.pose is None or self.sending:
             return None
         full = fit(self.pose.width, self.pose.height, self.longest)
@@ -109,12 +113,12 @@ class Visitor:
         )
 
     def _moving_size(self, full: tuple[int, int]) -> tuple[int, int]:
-        """A size that renders fast enough, from the times of previous images."""
+        """A size that can be rendered fast enough, estimated from the times of previous images."""
         if not self.seconds_per_pixel:
             return fit(*full, max(full) // 2)
         pixels = _MOVING_SECONDS / self.seconds_per_pixel
         scale = min(1.0, (pixels / (full[0] * full[1])) ** 0.5)
-        return fit(*full, max(round(max(full) * scale), _SMALLEST))
+        return fit(*full, max(round(max(full) * scale), _MIN_SIDE))
 
     def record_rendering(self, request: RenderRequest, scene: int, seconds: float) -> None:
         """Record that the image was rendered in ``seconds``."""
@@ -169,8 +173,8 @@ class Session:
 
         While `Visitor.going` is true, a pose that is not near the photo does not end the photo view
         immediately, because the browser may have sent this pose before it was moved to the photo.
-        Call this method again with the last pose after `MOVE_SECONDS`: if the user moved the camera
-        at once, the browser may never have sent a pose near the photo. The photo view then ends.
+        Call this method again with the last pose after `MOVE_SECONDS`: if the user moves the camera
+        immediately, the browser may never send a pose near the photo. The photo view then ends.
         """
         photo_view, arrived = visitor.photo_view, visitor.arrived
         if photo_view is not None:
@@ -220,7 +224,7 @@ class Session:
         return len(self._visitors)
 
     def may_step(self) -> bool:
-        """Whether the training may run a step. While paused, True uses up one single step."""
+        """Whether the training may run a step. While paused, each True uses one allowed step."""
         with self._changed:
             if self._paused and self._steps:
                 self._steps -= 1
@@ -244,7 +248,7 @@ class Session:
             found = [request for v in self._visitors.values() if (request := v.request(scene, now))]
         if training:
             found = [request for request in found if now >= self._next_allowed[_budget_of(request)]]
-        # Moving cameras are first; within one kind, the visitor that has waited longest is first.
+        # Moving cameras are first; of one kind, the browser that has waited longest is first.
         order = ("moving", "still", "idle")
         return min(
             found,
@@ -271,7 +275,9 @@ class Session:
             self._notify()
 
     def charge(self, budget: Literal["requested", "idle"], seconds: float) -> None:
-        """Reserve time for training, so that rendering does not exceed its share of the time.
+        """Record that ``seconds`` were used, and delay the next image of this budget accordingly.
+
+        So rendering does not exceed its share of the time during training.
 
         Requested images also delay the next idle image.
         """

@@ -29,12 +29,12 @@ class TrainingViewer:
         self._losses, self._psnrs = Curve(), Curve()
         self._loss = math.nan
         self._rate = 0.0
-        self._rated = (0, time.monotonic())  # step and time of the last rate
+        self._rated = (0, time.monotonic())  # step and time at which the rate was last computed
         self._next = self._next_psnr = 0.0  # times of the next updates
         self._measured = 0  # step of the last PSNR
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
-        """Render the requested images, and wait while the training is paused.
+        """Render the requested images and update the page; wait while the training is paused.
 
         Args:
             step: number of finished steps.
@@ -79,14 +79,14 @@ class TrainingViewer:
                 self._psnrs.add(step, psnr)
             took = time.monotonic() - now
             self._next_psnr = now + took / _PSNR_SHARE
-        pace = "paused" if self._session.paused else f"{self._steps_a_second(step):.1f} steps/s"
+        pace = "paused" if self._session.paused else f"{self._steps_per_second(step):.1f} steps/s"
         figures = [f"{len(gaussians):,} Gaussians", f"loss {self._loss:.4f}"]
         if len(self._psnrs):
             figures.append(f"PSNR {self._psnrs.arrays()[1][-1]:.2f} dB")
         about = [f"Step {step:,} of {steps:,}, {pace}", ", ".join(figures)]
         self._panel.show(about, step / steps, self._losses, self._psnrs)
 
-    def _steps_a_second(self, step: int) -> float:
+    def _steps_per_second(self, step: int) -> float:
         now = time.monotonic()
         step_before, before = self._rated
         self._rated = step, now
@@ -97,7 +97,7 @@ class TrainingViewer:
         return self._rate
 
     def end(self, step: int, gaussians: Gaussians) -> None:
-        """Show the result of training until Ctrl-C; KeyboardInterrupt is raised."""
+        """Show the result of the training until Ctrl-C, which raises KeyboardInterrupt."""
         self._session.training = False
         self._session.resume()
         self._panel.end()

@@ -18,7 +18,7 @@ from snowsplat.viewer.live.display import Pose
 from snowsplat.viewer.live.guard import ServerTimeLimit, call_in_server_thread
 from snowsplat.viewer.live.key_cameras import KeyCameras
 from snowsplat.viewer.live.page import Controls, ScenePanel
-from snowsplat.viewer.live.photos import Photos, placed_photo
+from snowsplat.viewer.live.photos import Photos, fitted_photo
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.server import start_server, stop_server
 from snowsplat.viewer.live.session import MOVE_SECONDS, RenderRequest, Session, Visitor
@@ -27,7 +27,8 @@ _QUALITY = {"moving": 60, "still": 90, "idle": 90}  # of JPEG images
 _TICK = 0.02  # seconds between two checks for requested images
 _LONG_TICK = 0.5  # the same without browsers
 _POLL = 2.0  # seconds between two checks for a newer scene
-# Norms of quaternions must be above this value. Norms and distances must be below its inverse.
+# The norm of the quaternion of a valid pose is above this value and below its inverse. Its distance
+# from the origin is below the inverse.
 _SMALL = 1e-9
 
 _log = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ class Scene:
 
     Attributes:
         gaussians: None if there are none yet.
-        number: changes when the Gaussians do.
+        number: changes when the Gaussians change.
         about: lines of text for the user.
     """
 
@@ -105,8 +106,8 @@ class NetworkViewer:
         self._photos.close()
         stop_server(self.server)
 
-    # In the thread of the server. Events are processed in order; the next message is read when the
-    # previous one is processed.
+    # The following methods run in the server's thread. Events are processed in order, and the next
+    # message is read only after the previous one is processed.
 
     async def _entered(self, client: viser.ClientHandle) -> None:
         visitor = self.session.enter(client.client_id)
@@ -142,36 +143,37 @@ class NetworkViewer:
         if browser is not None:
             browser[2].go_to_photo(index)
 
-    def _send(self, request: RenderRequest, picture: np.ndarray, drawing: float) -> None:
+    def _send(self, request: RenderRequest, image: np.ndarray, drawing: float) -> None:
         started = time.monotonic()
         client = next((c for c, v, _ in self._browsers.values() if v is request.visitor), None)
         try:
             if client is not None:  # None: the browser has disconnected
                 quality = _QUALITY[request.kind]
                 with self._time_limit.uncounted():
-                    client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+                    client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
                 client.flush()
         finally:
             self.session.end_sending(request, drawing + time.monotonic() - started)
 
-    # In the caller's thread
+    # The following methods run in the thread that trains or shows a scene
 
     def serve(self, gaussians: Gaussians, scene: int, *, training: bool) -> bool:
         """Render the most urgent image and send it; returns whether there was one.
 
         Args:
-            scene: a number that changes when the Gaussians do.
-            training: whether the training waits to continue; then it gets its share of the time.
+            scene: a number that changes when the Gaussians change.
+            training: whether the training waits to continue. If so, images are rendered only in
+                their share of the time.
         """
         request = self.session.next_request(scene, training)
         if request is None:
             return False
         started = time.monotonic()
         try:
-            picture = self._draw(request, gaussians)
+            image = self._draw(request, gaussians)
             self.session.begin_sending(request.visitor)
             seconds = time.monotonic() - started
-            call_in_server_thread(self.server, lambda: self._send(request, picture, seconds))
+            call_in_server_thread(self.server, lambda: self._send(request, image, seconds))
         except Exception:  # an invalid request of a browser must not end the training
             _log.debug("an image was not rendered", exc_info=True)
         self.session.record_rendering(request, scene, time.monotonic() - started)
@@ -181,7 +183,7 @@ class NetworkViewer:
         if request.photo_view is None:
             camera = request.pose.camera(request.width, request.height)
             return draw(gaussians, camera, request.display, self.background)
-        photo = placed_photo(request.photo_view, request.width, request.height)
+        photo = fitted_photo(request.photo_view, request.width, request.height)
         camera = photo.placed.camera(request.photo_view.camera, request.width, request.height)
         return draw(gaussians, camera, request.display, self.background, photo)
 
@@ -190,7 +192,7 @@ class NetworkViewer:
         self.session.wait(_TICK if self.session.visitors else _LONG_TICK)
 
     def show_newest(self, newest: Callable[[], Scene]) -> None:
-        """Show the scene that ``newest`` returns, until Ctrl-C; KeyboardInterrupt is raised."""
+        """Show the scene that ``newest`` returns, until Ctrl-C, which raises KeyboardInterrupt."""
         panel = ScenePanel(self.server)
         scene, checked = None, 0.0
         while True:
