@@ -115,7 +115,7 @@ def test_few_files_and_few_frames_in_memory(tmp_path, monkeypatch):
             files.append((len(list((tmp_path / "f").iterdir())), len(alive)))
 
     monkeypatch.setattr("snowsplat.sfm.ingest.video.decoded_frames", decoded)
-    monkeypatch.setattr("snowsplat.sfm.ingest.video._MIN_STEPS", 5)
+    monkeypatch.setattr("snowsplat.sfm.ingest.video._MIN_COUNT", 5)
     frames = pan(50, step=8)
     made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", 5)
     assert len(made.kept) == 5

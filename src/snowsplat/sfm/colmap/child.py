@@ -76,7 +76,7 @@ def estimate_poses(
     log = distorted / "colmap.log"
     log.unlink(missing_ok=True)
     job = {
-        "capture": str(dataset.absolute()),
+        "dataset": str(dataset.absolute()),
         "photos": [dataclasses.asdict(photo) for photo in photos],
         "options": dataclasses.asdict(options),
     }

@@ -86,7 +86,8 @@ def _false_links(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set
 
     These are the pairs that are not tears: the wrong poses agree with their matches. Pairs of
     photos that follow each other are an exception: their matches may be the only true ones between
-    two parts, and agree with poses that other, false matches have determined.
+    two parts. They agree with the wrong poses if false matches elsewhere have moved both parts
+    together.
     """
     part = _part_of(parts)
     return {

@@ -87,7 +87,7 @@ def _run(job: dict[str, Any], progress: WorkerProgress) -> SfmResult:
     if job["reduced"]:
         effort, threads = effort.reduced(), 1
     photos = [Photo(**photo) for photo in job["photos"]]
-    folders = Folders(Path(job["capture"]))
+    folders = Folders(Path(job["dataset"]))
     return PoseEstimation(folders, photos, options, threads, progress).run(effort)
 
 

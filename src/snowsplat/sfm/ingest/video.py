@@ -52,7 +52,7 @@ SAME_VIEW = "shows the same view as the previous frame"
 # The smallest motion in a window, as a fraction of the longest side: nearly the same view.
 _MIN_STEP = 0.01
 # If fewer frames are requested, there are as many candidates as for this number of frames.
-_MIN_STEPS = 30
+_MIN_COUNT = 30
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class _Candidates:
     def __init__(self, clip: Clip, folder: Path, max_frames: int, size: int | None) -> None:
         self.skipped: list[tuple[float, str]] = []  # time (s) and reason
         self._clip, self._folder, self._max_frames, self._size = clip, folder, max_frames, size
-        self._step_count = max(max_frames, _MIN_STEPS)
+        self._count = max(max_frames, _MIN_COUNT)
         # The longest window. Times are rounded to 1 ms.
         self._max_seconds = clip.seconds / max_frames - 1e-3
         self._candidates: list[Candidate] = []
@@ -149,7 +149,7 @@ class _Candidates:
             self._window_start = seconds, moved
         # The motion only increases. At the end, `choose` uses a step of at least the whole motion
         # divided by the number of frames, so the step of a window is at most half of it.
-        step = max(_MIN_STEP, moved / (2 * self._step_count))
+        step = max(_MIN_STEP, moved / (2 * self._count))
         if (
             seconds - self._window_start[0] >= self._max_seconds
             or moved - self._window_start[1] >= step
@@ -191,8 +191,8 @@ class _Candidates:
             self._frames[self._written] = _write(best, self._clip, path, self._size)
             self._candidates.append(Candidate(best.moved, best.sharpness, self._written))
             self._last = small
-            if len(self._candidates) > 4 * self._step_count:
-                self._thin(2 * self._step_count)
+            if len(self._candidates) > 4 * self._count:
+                self._thin(2 * self._count)
         else:
             self.skipped.append((best.seconds, reason))
         best.reset()
