@@ -95,8 +95,8 @@ PROCESSES = $(if $(filter 1,$(JOBS)),,-n $(JOBS) --dist worksteal)
 # Slow tests have a mark, and `quick` excludes these marks (listed in pyproject.toml).
 QUICK := not (sfm or browser or build or emulated or gpu or kill or slow)
 ISA := isa and not (emulated or gpu)
-# Under sanitizers, one precision is enough: both have the same source.
-SANITIZED := emulated-float32
+# Under sanitizers, one precision is enough: both have the same source. One test is about the sanitizers.
+SANITIZED := emulated-float32 or sanitizers_find
 REPEATED := build/pytest-repeated.log
 
 pytest-quick: native
@@ -110,7 +110,7 @@ pytest: native
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
 
 pytest-best:
-	$(PYTEST) $(if $(SANITIZERS),-k 'not $(SANITIZED)')
+	$(PYTEST) $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
 # Prints everything if a test fails, otherwise only the numbers of tests.
 pytest-repeated:
@@ -132,10 +132,10 @@ pytest-isas:
 SANITIZERS = $(strip $(foreach name,libasan.so libubsan.so,$(wildcard $(shell g++ -print-file-name=$(name) 2>&1))))
 
 sanitized: native
-	@$(if $(SANITIZERS),echo "sanitized: $(PYTEST) tests/ops -m emulated -k $(SANITIZED)"; \
+	@$(if $(SANITIZERS),echo "sanitized: $(PYTEST) tests/ops -m emulated -k '$(SANITIZED)'"; \
 	    LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0:malloc_context_size=1 CXX=g++ \
 	    SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
-	    $(PYTEST) tests/ops -m emulated -k $(SANITIZED), \
+	    $(PYTEST) tests/ops -m emulated -k '$(SANITIZED)', \
 	    echo "sanitized: skipped; it needs g++ with its sanitizers")
 
 clean:

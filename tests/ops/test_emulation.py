@@ -116,25 +116,37 @@ OUT_OF_BOUNDS = {
     "run('beyond_the_tensor', 32, 1, zeros(32))": "heap-buffer-overflow",
     "run('shifted_too_far', 32, 40, zeros(32))": "shift exponent 40 is too large",
 }
-# A sanitizer ends the process, and Python starts slowly under sanitizers: one process starts, and
-# each call is made in a fork of it.
-EACH_IN_A_FORK = """
-import os, sys
-from tests.ops.test_emulation import run, zeros
-for number, call in enumerate(sys.argv[2:]):
-    child = os.fork()
-    if child == 0:
-        log = os.open(f"{sys.argv[1]}/{number}", os.O_WRONLY | os.O_CREAT)
-        os.dup2(log, 2)
-        eval(call)
-        os._exit(0)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
+
+
+def statuses_of_forks(folder: str) -> list[int]:
+    """Exit status of each call of OUT_OF_BOUNDS; standard error goes to a file in ``folder``.
+
+    A sanitizer ends the process, and Python starts slowly under sanitizers: each call is made in a
+    fork of this process.
+    """
+    statuses = []
+    for number, call in enumerate(OUT_OF_BOUNDS):
+        child = os.fork()
+        if child == 0:
+            log = os.open(f"{folder}/{number}", os.O_WRONLY | os.O_CREAT)
+            os.dup2(log, 2)
+            try:
+                eval(call)
+            finally:
+                os._exit(0)
+        statuses.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    return statuses
 
 
 @pytest.fixture(scope="module")
 def sanitized(tmp_path_factory) -> dict[str, tuple[int, str]]:
-    """Exit status and standard error of each call of OUT_OF_BOUNDS under the sanitizers."""
+    """Exit status and standard error of each call of OUT_OF_BOUNDS under the sanitizers.
+
+    The calls are made in a new process, unless this one runs under sanitizers (`make sanitized`).
+    """
+    folder = str(tmp_path_factory.mktemp("sanitized"))
+    if os.environ.get("SNOWSPLAT_EMULATION") == "sanitized":
+        return results(folder, statuses_of_forks(folder))
     compiler = os.environ.get("CXX", "c++")
     libraries = []
     for name in ("libasan.so", "libubsan.so"):
@@ -149,20 +161,25 @@ def sanitized(tmp_path_factory) -> dict[str, tuple[int, str]]:
         "SNOWSPLAT_EMULATION": "sanitized",
         "PYTHONPATH": os.pathsep.join((str(REPOSITORY), str(REPOSITORY / "src"))),
     }
-    folder = tmp_path_factory.mktemp("sanitized")
+    code = (
+        "import sys; from tests.ops.test_emulation import statuses_of_forks;"
+        "print(*statuses_of_forks(sys.argv[1]))"
+    )
     result = subprocess.run(
-        [sys.executable, "-c", EACH_IN_A_FORK, folder, *OUT_OF_BOUNDS],
+        [sys.executable, "-c", code, folder],
         env=environment,
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
     )
     assert result.returncode == 0, result.stderr
+    return results(folder, [int(status) for status in result.stdout.split()])
+
+
+def results(folder: str, statuses: list[int]) -> dict[str, tuple[int, str]]:
     return {
-        call: (int(status), (folder / str(number)).read_text(errors="replace"))
-        for number, (call, status) in enumerate(
-            zip(OUT_OF_BOUNDS, result.stdout.split(), strict=True)
-        )
+        call: (status, Path(folder, str(number)).read_text(errors="replace"))
+        for number, (call, status) in enumerate(zip(OUT_OF_BOUNDS, statuses, strict=True))
     }
 
 

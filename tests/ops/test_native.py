@@ -1,7 +1,6 @@
 import functools
 import os
 import subprocess
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,13 +16,7 @@ from snowsplat.util import native_library
 from snowsplat.util.errors import UserError
 from snowsplat.util.native_layout import Params
 
-SOURCES = Path(snowsplat.__file__).parents[1]
-
-
-def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    clean = {k: v for k, v in os.environ.items() if not k.startswith("SNOWSPLAT_")}
-    clean |= {"PYTHONPATH": str(SOURCES)} | environment
-    return subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True)
+from .. import fork_server
 
 
 @pytest.fixture
@@ -306,10 +299,13 @@ def test_threads_come_from_the_environment_or_the_affinity(monkeypatch):
 
 @pytest.mark.slow
 def test_importing_loads_no_library_and_the_environment_reaches_it():
+    # In a fork of a process that has only imported all modules.
     code = (
         "import os, snowsplat; from snowsplat.ops import native;"
         "print(native._library.cache_info().currsize);"
         "os.environ['SNOWSPLAT_ISA'] = 'baseline'; print(native.isa(), native.get_num_threads())"
     )
-    result = run_python(code, SNOWSPLAT_THREADS="5", SNOWSPLAT_ISA="nonsense")
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("SNOWSPLAT_")}
+    environment = {**clean, "SNOWSPLAT_THREADS": "5", "SNOWSPLAT_ISA": "nonsense"}
+    result = fork_server.run("-c", code, env=environment)
     assert result.stdout == "0\nbaseline 5\n", result.stderr
