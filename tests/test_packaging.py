@@ -83,8 +83,12 @@ def test_wheel_contains_gpu_kernels_as_cubins_and_sources(wheel):
 
 def test_source_distribution_contains_all_files_of_a_build(tmp_path):
     build = pytest.importorskip("scikit_build_core.build")
+    # A copy without the environment, each of whose files would be compared with .gitignore.
+    copy = tmp_path / "checkout"
+    ignored = (".venv", ".git", "build", "out", "_lib", "__pycache__", ".*_cache", "node_modules")
+    shutil.copytree(REPOSITORY, copy, ignore=shutil.ignore_patterns(*ignored))
     before = os.getcwd()
-    os.chdir(REPOSITORY)
+    os.chdir(copy)
     try:
         name = build.build_sdist(str(tmp_path))
     finally:
