@@ -1,5 +1,6 @@
 """Photos and videos as inputs of the tests: a textured wall, seen from positions side by side."""
 
+import functools
 from fractions import Fraction
 
 import av
@@ -9,12 +10,9 @@ from PIL import Image, ImageFilter
 WIDTH, HEIGHT = 320, 240
 
 
-def wall(offset=0, width=WIDTH, height=HEIGHT, seed=0) -> np.ndarray:
-    """(height, width, 3) uint8: blobs of many sizes and colours, shifted left by ``offset``.
-
-    The upper left corner has a white square and the rest of the left edge is dark, so that
-    rotations and reflections are detected.
-    """
+@functools.lru_cache(8)
+def _blobs(width: int, height: int, seed: int) -> np.ndarray:
+    """(height, 3 width, 3) float64: blobs of many sizes and colours; read-only."""
     random = np.random.default_rng(seed)
     total = np.zeros((height, 3 * width, 3))
     for cells in (4, 12, 40, 120):
@@ -22,7 +20,17 @@ def wall(offset=0, width=WIDTH, height=HEIGHT, seed=0) -> np.ndarray:
         layer = Image.fromarray(noise.astype(np.uint8)).resize((3 * width, height), 3)
         total += np.asarray(layer) / 4
     total = np.clip(128 + 1.6 * (total - 128), 0, 255)
-    picture = total[:, offset : offset + width].copy()
+    total.setflags(write=False)
+    return total
+
+
+def wall(offset=0, width=WIDTH, height=HEIGHT, seed=0) -> np.ndarray:
+    """(height, width, 3) uint8: blobs of many sizes and colours, shifted left by ``offset``.
+
+    The upper left corner has a white square and the rest of the left edge is dark, so that
+    rotations and reflections are detected.
+    """
+    picture = _blobs(width, height, seed)[:, offset : offset + width].copy()
     picture[:, : width // 10] *= 0.2
     picture[: height // 6, : width // 8] = 255
     return picture.astype(np.uint8)
