@@ -25,8 +25,8 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 def test_photos_to_scene_from_python(tmp_path, monkeypatch, capsys):
     assert len(EXAMPLES[0].split("\n\n")[1].splitlines()) == 5  # "in five lines"
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=100))
-    scenes.write_photos(tmp_path / "photos", 9)
+    monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=60))
+    scenes.write_photos(tmp_path / "photos", 7)
     example, changes = re.subn("seconds=5", "seconds=0.1", EXAMPLES[0])
     assert changes == 1
     (tmp_path / "example.py").write_text(example)
