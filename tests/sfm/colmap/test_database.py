@@ -14,7 +14,6 @@ from snowsplat.sfm.colmap.database import (
     read_descriptors,
     replace_database,
     set_names,
-    trim_features,
     verified_pairs,
 )
 from snowsplat.sfm.ingest.photo import Photo
@@ -128,7 +127,7 @@ def test_verified_pairs_have_their_kind(path):
     assert pairs == {(0, 1): (20, False), (0, 2): (20, True)}
 
 
-def test_the_largest_features_are_kept(path):
+def test_descriptors_of_the_largest_features_are_read(path):
     random = np.random.default_rng(0)
     scale = random.permutation(30) + 1.0
     keypoints = np.zeros((30, 6), np.float32)
@@ -139,13 +138,7 @@ def test_the_largest_features_are_kept(path):
             data = np.repeat(scale[:count, None], 128, 1).astype(np.uint8)
             sift = pycolmap.FeatureExtractorType.SIFT
             database.write_descriptors(image_id, pycolmap.FeatureDescriptors(sift, data))
-    trim_features(path, 10)
-    assert feature_counts(path, len(PHOTOS))[:2] == [10, 8]
-    with closing_database(path) as database:
-        left = database.read_keypoints(1)
-        assert left.shape == (10, 6)
-        assert np.array_equal(left[:, 0], scale[scale > 20])
-        assert np.array_equal(database.read_descriptors(1).data[:, 5], left[:, 0].astype(np.uint8))
+    assert feature_counts(path, len(PHOTOS))[:2] == [30, 8]
     assert np.array_equal(read_descriptors(path, 0, 3)[:, 0], [30, 29, 28])
 
 

@@ -4,7 +4,8 @@ child        starts the child process and handles its end
 worker       the child process, in which COLMAP runs
 reconstruct  repeated attempts, until enough photos have a pose
 pairs, retrieval   choose the pairs of photos to match
-features, matching   detect features and match them
+sift, features       detect features in a photo, in all photos
+matching, pair_matching   match two sets of features; match all pairs, verify the matches
 mapping      estimates poses and points from the matches in the COLMAP `database`
 consistency, repair   find photos in a wrong place after mapping, and register them again
 diagnosis    explains why photos have no pose

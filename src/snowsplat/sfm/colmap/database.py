@@ -15,8 +15,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -113,10 +113,11 @@ def closing_database(path: Path) -> Iterator[pycolmap.Database]:
 
 
 def fingerprint_of(images: Path, photos: list[Photo], settings: object) -> str:
-    """A hash of all that features and matches depend on: files, settings, version of pycolmap."""
+    """A hash of all that features and matches depend on: files, settings, versions of libraries."""
     files = [(images / photo.name).stat() for photo in photos]
     facts = [
         pycolmap.__version__,
+        cv2.__version__,
         repr(settings),
         [
             [p.name, p.width, p.height, p.group, p.focal, p.mask, s.st_size, s.st_mtime_ns]
@@ -213,6 +214,14 @@ def feature_counts(path: Path, photo_count: int) -> list[int]:
     return counts
 
 
+def match_counts(path: Path) -> dict[tuple[int, int], int]:
+    """Number of matches before verification, by the two indices of photos."""
+    with closing(sqlite3.connect(path)) as connection:
+        rows = connection.execute("SELECT pair_id, rows FROM matches").fetchall()
+    ids = {pair_id: pycolmap.pair_id_to_image_pair(pair_id) for pair_id, _ in rows}
+    return {(ids[key][0] - 1, ids[key][1] - 1): count for key, count in rows}
+
+
 def verified_pairs(path: Path) -> list[Pair]:
     """All pairs that have at least one verified match (consistent with a relative pose)."""
     flat = {
@@ -228,35 +237,6 @@ def verified_pairs(path: Path) -> list[Pair]:
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
         pairs.append(Pair(first - 1, second - 1, inliers, config in flat))
     return pairs
-
-
-def trim_features(path: Path, limit: int) -> None:
-    """Keep the ``limit`` largest features of each photo.
-
-    The time for matching is quadratic in the number of features. COLMAP's own limit
-    (``max_num_features``) is only approximate: it keeps complete octaves, which may contain four
-    times as many features.
-    """
-    with closing(sqlite3.connect(path)) as connection:
-        query = "SELECT image_id FROM keypoints WHERE rows > ?"
-        for (image_id,) in connection.execute(query, (limit,)).fetchall():
-            keypoints = _read_rows(connection, "keypoints", image_id, np.dtype(np.float32))
-            descriptors = _read_rows(connection, "descriptors", image_id, np.dtype(np.uint8))
-            kept = np.sort(_largest(keypoints, limit))
-            with connection:
-                for table, rows in (("keypoints", keypoints), ("descriptors", descriptors)):
-                    connection.execute(
-                        f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?",
-                        (len(kept), rows[kept].tobytes(), image_id),
-                    )
-
-
-def _read_rows(
-    connection: sqlite3.Connection, table: str, image_id: int, dtype: np.dtype[Any]
-) -> NDArray[Any]:
-    query = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
-    rows, columns, data = connection.execute(query, (image_id,)).fetchone()
-    return np.frombuffer(data, dtype).reshape(rows, columns)
 
 
 def _largest(keypoints: NDArray[np.float32], count: int) -> NDArray[np.intp]:

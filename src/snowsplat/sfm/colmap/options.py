@@ -61,7 +61,6 @@ class Effort:
 
     image_size: int  # longest side in pixels; larger photos are resized before feature detection
     features: int  # approximate number per photo
-    first_octave: int  # of SIFT; -1: the photo is enlarged to twice its size, for small features
     exhaustive: int  # up to this number of photos, all pairs are matched
     overlap: int  # number of following frames with which a frame of a video is matched
     neighbours: int  # number of similar or near photos with which a photo is matched
@@ -72,7 +71,6 @@ class Effort:
             self,
             image_size=self.image_size * 3 // 2,
             features=self.features * 2,
-            first_octave=-1,
             exhaustive=self.exhaustive * 3 // 2,
             overlap=self.overlap * 2,
             neighbours=self.neighbours * 2,
@@ -84,14 +82,13 @@ class Effort:
             self,
             image_size=self.image_size * 2 // 3,
             features=self.features // 2,
-            first_octave=0,
         )
 
 
 EFFORTS: dict[EffortName, Effort] = {
-    "draft": Effort(1000, 2048, 0, exhaustive=40, overlap=6, neighbours=15),
-    "normal": Effort(1600, 4096, -1, exhaustive=70, overlap=10, neighbours=25),
-    "best": Effort(2400, 8192, -1, exhaustive=120, overlap=15, neighbours=40),
+    "draft": Effort(1000, 2048, exhaustive=40, overlap=6, neighbours=15),
+    "normal": Effort(1600, 5120, exhaustive=70, overlap=10, neighbours=25),
+    "best": Effort(2400, 10240, exhaustive=120, overlap=15, neighbours=40),
 }
 
 

@@ -29,9 +29,10 @@ from snowsplat.sfm.colmap.database import (
     replace_database,
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
-from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features, match_pairs
+from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
 from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
+from snowsplat.sfm.colmap.pair_matching import match_pairs
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
 from snowsplat.sfm.colmap.repair import repair
 from snowsplat.sfm.colmap.result import names_in, result_of

@@ -1,0 +1,121 @@
+"""Detects SIFT features in a photo (Lowe 2004), with OpenCV.
+
+OpenCV is three to five times as fast as COLMAP's own detection on the CPU: it uses the vector
+instructions of the processor, and computes descriptors only of features that are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from snowsplat.sfm.ingest.photo_files import open_image
+from snowsplat.util.machine import memory_bytes
+
+# Parameters of the detection that COLMAP has, too.
+_CONTRAST_THRESHOLD = 0.02  # for pixels in [0, 1]; divided by the number of layers in an octave
+_EDGE_THRESHOLD = 10
+_LAYERS = 3  # in an octave, the range in which the scale doubles
+_NORM = 512  # Euclidean norm of a uint8 descriptor, except for rounding
+
+# Memory for each pixel of the resized photo: all octaves of its pyramid, float32. The first octave
+# has 4 pixels for each pixel of the photo, with 6 levels of blur and 5 differences between them.
+_BYTES_PER_PIXEL = 4 * 4 * (_LAYERS + 3 + _LAYERS + 2) * 4 // 3
+# The part of the machine's memory that all these pyramids may use.
+_MEMORY_PART = 0.25
+
+
+class Features(NamedTuple):
+    """The features of a photo, in the format of COLMAP's database.
+
+    A keypoint has its position x, y in pixels of the photo, where the centre of the first pixel is
+    (0.5, 0.5); and a 2 x 2 matrix in row order: its scale in pixels times its rotation. The
+    descriptors are "RootSIFT" (Arandjelović and Zisserman 2012): square roots of histograms of the
+    gradients whose sum is 1, multiplied by 512.
+    """
+
+    keypoints: NDArray[np.float32]  # (N, 6)
+    descriptors: NDArray[np.uint8]  # (N, 128)
+
+
+def photos_at_once(image_size: int, threads: int) -> int:
+    """The number of photos that `detect_sift` can process in parallel in the available memory."""
+    needed = _BYTES_PER_PIXEL * image_size**2
+    available = _MEMORY_PART * memory_bytes()
+    return min(threads, max(1, int(available / needed))) if available else threads
+
+
+def detect_sift(photo: Path, mask: Path | None, image_size: int, count: int) -> Features:
+    """The ``count`` largest features of a photo, or fewer.
+
+    If the longest side of the photo has more than ``image_size`` pixels, it is resized to this
+    size. Large features are found again in more of the other photos than small ones. Features at
+    black pixels of ``mask`` are left out.
+
+    Raises:
+        OSError: a file is missing.
+        Exception: any other that Pillow raises for a damaged file.
+        cv2.error: not enough memory.
+    """
+    cv2.setNumThreads(1)  # other photos are processed in parallel
+    grey, size = _read_grey(photo, image_size)
+    allowed = None if mask is None else _read_mask(mask, grey)
+    sift = cv2.SIFT.create(
+        nOctaveLayers=_LAYERS,
+        contrastThreshold=_CONTRAST_THRESHOLD,
+        edgeThreshold=_EDGE_THRESHOLD,
+        enable_precise_upscale=True,  # without it, all positions have an error of 1/4 pixel
+    )
+    found = sorted(sift.detect(grey, allowed), key=lambda keypoint: -keypoint.size)[:count]
+    if not found:
+        return Features(np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8))
+    keypoints, histograms = sift.compute(grey, found)
+    resized = np.array(grey.shape[::-1])
+    return Features(
+        _in_photo(keypoints, np.array(size) / resized), _root_sift(np.asarray(histograms))
+    )
+
+
+def _read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
+    """The grey photo (H, W), resized, and its original width and height."""
+    with open_image(photo) as image:
+        width, height = image.size
+        ratio = min(1.0, image_size / max(width, height))
+        size = (max(1, round(width * ratio)), max(1, round(height * ratio)))
+        # A JPEG is decoded at 1/2, 1/4 or 1/8 of its size if this is not smaller than ``size``.
+        image.draft("L", size)
+        grey = np.asarray(image.convert("L"))
+    if grey.shape[::-1] != size:
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return grey, (width, height)
+
+
+def _read_mask(mask: Path, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = grey.shape
+    with open_image(mask) as image:
+        return np.asarray(image.convert("L").resize((width, height), Image.Resampling.NEAREST))
+
+
+def _in_photo(
+    keypoints: Sequence[cv2.KeyPoint], stretch: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Keypoints (N, 6) in the photo, which is ``stretch`` (2,) times as large as the resized one.
+
+    OpenCV measures positions from the centre of the first pixel.
+    """
+    position = (np.array([k.pt for k in keypoints]) + 0.5) * stretch
+    scale = np.array([k.size for k in keypoints]) / 2 * stretch.mean()  # OpenCV has the diameter
+    angle = np.radians([k.angle for k in keypoints])
+    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
+    return np.column_stack([position, cos, -sin, sin, cos]).astype(np.float32)
+
+
+def _root_sift(histograms: NDArray[Any]) -> NDArray[np.uint8]:
+    total = np.maximum(histograms.sum(1, keepdims=True), 1)
+    return np.rint(_NORM * np.sqrt(histograms / total)).clip(0, 255).astype(np.uint8)
