@@ -408,7 +408,7 @@ def test_divergence_names_the_last_good_checkpoint(refused, run, dataset, tmp_pa
     diverged = int(re.search(r"step (\d+): non-finite .* means \(", line)[1])
     step = diverged // 3 * 3
     path = out / "checkpoints" / f"step_{step:06d}.safetensors"
-    assert f"the last good checkpoint is {path}; --resume with --iterations {step} " in line
+    assert f"the last good checkpoint is {path}; use --resume with --iterations {step} " in line
     assert all(tensor.isfinite().all() for tensor in checkpoint.load(path).tensors.values())
     assert run("train", "-o", out, "--resume", "--iterations", step, "-q").code == 0
     assert read_gaussians(out / f"point_cloud/iteration_{step}/point_cloud.ply").finite_rows().all()

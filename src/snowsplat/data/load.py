@@ -43,8 +43,8 @@ def load_dataset(
             they are complete. Any other number is a width in pixels to which wider images are
             scaled down. None or −1 keeps the size.
         hold_out: every ``hold_out``-th image is held out for testing, starting with the first in
-            the order of names. The dataset's own split, if any, has priority. None trains on all
-            images.
+            the order of names. If the dataset has its own split, this split is used instead. None:
+            no image is held out, even if the dataset has its own split.
         test_list: names of the test images, or a text file with one name per line. It replaces
             ``hold_out`` and the dataset's own split.
 
@@ -154,7 +154,11 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
 
 
 def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> list[PosedImage]:
-    """The same images from ``images_2`` …, if the resolution matches and all images exist there."""
+    """For a resolution N of 2, 4 or 8: the same images from the folder ``images_N``.
+
+    The images are returned unchanged for other resolutions, and if an image in this folder is
+    missing or has another size.
+    """
     if resolution not in _DIVISORS[1:]:
         return posed
     smaller = []
@@ -191,10 +195,10 @@ def _is_close(large: int, small: int, factor: int) -> bool:
 def _file_sizes(posed: list[PosedImage], headers: list[Header]) -> list[tuple[int, int, bool]]:
     """Width and height of each file, and whether to apply its EXIF orientation.
 
-    The sizes are checked against the cameras. A folder of images may be a smaller copy of the
-    images that the poses were estimated from (for example ``images_4``, or a dataset that is
-    distributed without the large images). Then the intrinsics are scaled later. The factor must be
-    an integer and the same for all images of a folder.
+    The sizes are checked against the cameras. The images of a folder may be smaller than the images
+    that the poses were estimated from (for example ``images_4``, or a dataset that is distributed
+    without the large images). The ratio of the sizes must be an integer and the same for all images
+    of a folder. `_view` scales the intrinsics.
     """
     found = [_shrink_factor(image, header) for image, header in zip(posed, headers, strict=True)]
     usual: dict[Path, int] = {}  # the most frequent factor in each folder

@@ -4,8 +4,9 @@
 palette, the i-th pixel, row by row, belongs to the i-th Gaussian. `write_sog` writes version 2,
 which has these images:
 
-- means_l, means_u: sign(x) · log(1 + |x|) of each axis, quantised to 16 bits between mins and maxs:
-  the low and the high byte;
+- means_l, means_u: the low and the high byte of a 16-bit integer for each coordinate x. The integer
+  encodes sign(x) · log(1 + |x|): 0 is the minimum (`mins` in `meta.json`), 65,535 the maximum
+  (`maxs`);
 - scales: logarithms of the standard deviations, as indices into a codebook of 256 values;
 - quats: the three entries that are not the largest, from −1/√2 to 1/√2 in one byte each; alpha is
   252 + the index (wxyz) of the largest entry;
@@ -78,13 +79,13 @@ def sog_version(path: Path) -> str:
 
 @dataclass(frozen=True)
 class _Layout:
-    """`meta.json` of either version; the tables decode the bytes of the images."""
+    """`meta.json` of either version. An array with 256 rows contains the value of each byte."""
 
     count: int
     files: dict[str, str]
-    low: np.ndarray  # (3,) of the logarithmic means
-    high: np.ndarray
-    scales: np.ndarray  # (256, 3)
+    low: np.ndarray  # (3,) `mins` of the means, as sign(x) · log(1 + |x|)
+    high: np.ndarray  # (3,) `maxs`
+    scales: np.ndarray  # (256, 3) logarithms
     colors: np.ndarray  # (256, 3)
     opacity_logits: np.ndarray  # (256,)
     rest: np.ndarray | None  # (256,)

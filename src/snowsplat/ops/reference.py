@@ -133,7 +133,8 @@ def _project_rows(
     RS = _rotation_matrices(quats) * log_scales.exp()[:, None, :]
 
     # J, the affine approximation of the projection at the centre (Zwicker et al. 2001, eq. 29). It
-    # is unbounded far outside of the image, so x/z and y/z are clamped near the border. (M, 2, 3)
+    # is unbounded far outside of the image, so x/z and y/z are clamped to the image and a margin
+    # around it. (M, 2, 3)
     x_margin, y_margin = JACOBIAN_MARGIN * width, JACOBIAN_MARGIN * height
     tx = (x / z).clamp(-(cx + x_margin) / fx, (width - cx + x_margin) / fx)
     ty = (y / z).clamp(-(cy + y_margin) / fy, (height - cy + y_margin) / fy)
@@ -353,7 +354,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 
 
 def _as_unit(target: Tensor, like: Tensor) -> Tensor:
-    """An 8-bit image converted to [0, 1] in the dtype of `like`; a floating image unchanged."""
+    """The image in the dtype of `like`. The values of an 8-bit image are divided by 255."""
     return target.to(like) / 255 if target.dtype == torch.uint8 else target.to(like)
 
 
@@ -451,8 +452,9 @@ def adam_step(
         NaN, the value and its moments stay unchanged, and its row is counted.
 
     Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
-    p −= lr · m̂ / √(v̂ + eps²); the paper has the denominator √v̂ + eps. The two agree for v̂ ≫
-    eps² and for m̂ = v̂ = 0. The former needs only one reciprocal square root.
+    p −= lr · m̂ / √(v̂ + eps²); the paper has the denominator √v̂ + eps. The steps with
+    these two denominators agree for v̂ ≫ eps² and for m̂ = v̂ = 0. √(v̂ + eps²) is used because it
+    needs only one reciprocal square root.
     """
     if valid is not None and not valid:
         return
@@ -483,8 +485,8 @@ def adam_step(
             updated[:, (sh_degree + 1) ** 2 - 1 :] = False
         nonfinite = updated & ~(v.isfinite() & new_value.isfinite())
         if nonfinite_rows is not None:
-            rows_of = nonfinite.reshape(len(p), -1) if p.numel() else nonfinite.new_zeros(0, 1)
-            nonfinite_rows[i] += rows_of.any(dim=1).sum()
+            by_row = nonfinite.reshape(len(p), -1) if p.numel() else nonfinite.new_zeros(0, 1)
+            nonfinite_rows[i] += by_row.any(dim=1).sum()
         updated &= ~nonfinite
         p.copy_(torch.where(updated, new_value, p))
         exp_avg[name].copy_(torch.where(updated, m, exp_avg[name]))

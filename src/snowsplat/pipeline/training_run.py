@@ -73,7 +73,8 @@ class TrainingRun:
 
     Attributes:
         settings, recipe: how the dataset was read, and the recipe; written to checkpoints.
-        budget, pace: the time budget and its pace; None without a time budget.
+        budget: the time budget; None: no time budget.
+        pace: adapts the number of steps to the time budget; None without a time budget.
         save_iterations: steps after which the scene is written, in addition to the last step.
         checkpoint_seconds: time between checkpoints, if the configuration has no checkpoint_every.
         page: shows the training in the browser.
@@ -220,7 +221,8 @@ class TrainingRun:
             return "there is no checkpoint yet"
         step, path = saved[0]
         return (
-            f"the last good checkpoint is {path}; `resume` with `iterations` {step} saves its scene"
+            f"the last good checkpoint is {path}; "
+            f"use `resume` with `iterations` {step} to save its scene"
         )
 
     def _record_evaluation(self, step: int, evaluation: Evaluation) -> None:

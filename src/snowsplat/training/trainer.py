@@ -26,8 +26,8 @@ from snowsplat.training.step_schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import interrupts_between_steps, single_threaded
 
-#: The views of at least this number of future steps are known, so that other threads can decode
-#: their photos in advance.
+#: The order of the views is drawn at least this number of steps in advance, so that other threads
+#: can decode their photos before they are needed.
 LOOKAHEAD = 16
 
 #: There is one random generator for each kind of random choice, so that additional choices of one

@@ -126,7 +126,7 @@ def test_little_evidence_cuts_nothing():
 def test_matches_that_agree_with_the_poses_are_no_tears():
     """Points too far away to be triangulated: the pairs have no points."""
     pairs = [
-        CheckedPair(p.first, p.second, p.matches, p.shared, 0.9 if p.hit_share < 0.1 else 0.0)
+        CheckedPair(p.first, p.second, p.matches, p.hits, 0.9 if p.hit_share < 0.1 else 0.0)
         for p in folded()
     ]
     assert len(find_parts(pairs)) == 1

@@ -16,7 +16,7 @@ from snowsplat.sfm.colmap.mapping import Mapping
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
 from snowsplat.sfm.colmap.pairs import PairChoice
 from snowsplat.sfm.colmap.reconstruct import Matched, PoseEstimation
-from snowsplat.sfm.colmap.repair import _false_links, repair
+from snowsplat.sfm.colmap.repair import _false_pairs, repair
 from snowsplat.sfm.progress import silent
 
 from . import look_alikes
@@ -82,12 +82,12 @@ def test_photos_that_follow_each_other_by_name(mapping, scene):
     assert follow == {(i + 1, j + 1) for i, j in scene.matches if j - i <= 2}
 
 
-def test_which_links_between_parts_are_false():
-    """Tears show the true place, and photos that follow each other may be the only true link."""
+def test_which_pairs_between_parts_have_false_matches():
+    """Tears show the true place. Other true matches are those of photos that follow each other."""
     torn, confirmed = CheckedPair(1, 4, 300, 0), CheckedPair(1, 5, 300, 200)
     following = CheckedPair(3, 4, 300, 200, follows=True)
     inside = CheckedPair(1, 2, 300, 200)
-    assert _false_links([torn, confirmed, following, inside], [{1, 2, 3}, {4, 5}]) == {(1, 5)}
+    assert _false_pairs([torn, confirmed, following, inside], [{1, 2, 3}, {4, 5}]) == {(1, 5)}
 
 
 def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):

@@ -2,18 +2,19 @@
 //
 // Pixels are in SIMD lanes. A block is W adjacent pixels of one row (a whole row of the tile if
 // W = 16). A tile has 256/W blocks, numbered by columns: block = (x / W) · 16 + y. For each pair of
-// a tile and a splat, one vectorised test finds the blocks that the ellipse of the splat touches.
-// The forward pass stores these bits for the backward pass.
+// a tile and a splat, one vectorised test finds the blocks that the ellipse of the splat touches: a
+// bit per block. The forward pass stores these bits for the backward pass.
 //
 // Forward   Chunks of 64 splats are processed block by block, so that the transmittance and the
 //           colour of a block stay in registers during a chunk.
 // Backward  The splats are processed one by one, front to back again. S is the dot product of
 //           g = ∂L/∂C and the contribution of the splats behind the current one. At the start all
 //           splats are behind, so S₀ = g·C is known. The derivative with respect to log α is
-//           w·(g·c) − α S/(1 − α). It needs no division by T and no last index per pixel. The sums
-//           of a splat over its blocks stay in SIMD lanes. At the end, the lanes are added and
-//           written to the slot of the instance. No atomic operations are used, so the result does
-//           not depend on the number of threads.
+//           w·(g·c) − α S/(1 − α) for a splat with the weight w = α T and the colour c. This needs
+//           no division by T, and for each pixel no index of the last splat that contributes to it.
+//           The sums of a splat over its blocks stay in SIMD lanes. At the end, the lanes are added
+//           and written to the slot of the instance. No atomic operations are used, so the result
+//           does not depend on the number of threads.
 #include "cpu/entry.h"
 #include "cpu/pool.h"
 #include "cpu/splat_record.h"
@@ -104,8 +105,9 @@ struct RowTerms {
   }
 };
 
-// For each block, the bits of the splats of the chunk that touch it: the transpose of the block
-// bits of the splats.
+// `add` receives, for each splat of a chunk, the bits of the blocks that it touches. After
+// `finish`, `list` contains, for each block, the bits of the splats that touch it. So this
+// transposes a matrix of bits.
 template <class V>
 struct BlockLists {
   uint64_t list[Tile<V>::kBlocks] = {};
@@ -118,7 +120,7 @@ struct BlockLists {
 template <>
 struct BlockLists<Simd<float, 8>> {
   uint64_t list[32];
-  alignas(32) uint8_t plane[4][kChunk] = {};  // byte p of the block bits of each splat
+  alignas(32) uint8_t plane[4][kChunk] = {};  // byte p of `blocks` of each splat
   SNOW_INLINE void add(int splat, uint64_t blocks) {
     for (int p = 0; p < 4; p++) plane[p][splat] = uint8_t(blocks >> (8 * p));
   }
@@ -184,21 +186,21 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
     V transmittance, color[C], stopped;  // stopped: the final transmittance of finished lanes
   };
   alignas(64) Block block[B];
-  uint32_t alive[B];
-  Bits live = 0;
+  uint32_t open_lanes[B];  // for each block, the bits of the lanes that are not finished
+  Bits open_blocks = 0;    // the bits of the blocks with such lanes
   for (int b = 0; b < B; b++) {
     const int n = tile.lanes(b);
-    alive[b] = V::bits(V::first(n));
+    open_lanes[b] = V::bits(V::first(n));
     block[b].transmittance = zero_unless(V::first(n), V(1.f));
     block[b].stopped = V(0.f);
     for (int k = 0; k < C; k++) block[b].color[k] = V(0.f);
-    if (n) live |= Bits(1) << b;
+    if (n) open_blocks |= Bits(1) << b;
   }
   const uint32_t end = f.tile_start[index + 1];
   uint32_t i = f.tile_start[index];
   RowTerms<V> rows[kChunk];
   const SplatRecord<T>* splat[kChunk];
-  for (; i < end && live; i += kChunk) {
+  for (; i < end && open_blocks; i += kChunk) {
     const int n = end - i < kChunk ? int(end - i) : kChunk;
     Bits* blocks_of = f.instance_blocks + i;
     BlockLists<V> lists;
@@ -207,19 +209,19 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
       const SplatRecord<T>& r = f.records[f.instance_splat[i + j]];
       splat[j] = &r;
       rows[j].set(r.terms, tile);
-      const Bits touched = rows[j].touched_blocks(r.terms, tile) & live;
+      const Bits touched = rows[j].touched_blocks(r.terms, tile) & open_blocks;
       blocks_of[j] = touched;
       lists.add(j, touched);
     }
     lists.finish();
-    for (Bits todo = live; todo; todo &= Bits(todo - 1)) {
+    for (Bits todo = open_blocks; todo; todo &= Bits(todo - 1)) {
       const int b = first_bit(todo), row = b % kTile;
       uint64_t list = lists.list[b];
       if (!list) continue;
       const V X = V::iota() + V(T(b / kTile * V::width));
       V transmittance = block[b].transmittance, color[C];
       for (int k = 0; k < C; k++) color[k] = block[b].color[k];
-      uint32_t still = alive[b];
+      uint32_t lanes_left = open_lanes[b];
       while (list) {
         const int j = first_bit(list);
         list &= list - 1;
@@ -228,15 +230,15 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
         const V a = zero_unless(is_blended(power), capped_alpha(exp2_blend(power)));
         V weight = a * transmittance, next = transmittance - weight;
         const auto open = is_open(next);
-        if (__builtin_expect(V::bits(open) != still, 0)) {
+        if (__builtin_expect(V::bits(open) != lanes_left, 0)) {
           // Lanes in which this splat would reduce the transmittance below the minimum are
           // finished.
-          const auto stops = V::from_bits(still & ~V::bits(open));
+          const auto stops = V::from_bits(lanes_left & ~V::bits(open));
           block[b].stopped = select(stops, transmittance, block[b].stopped);
-          still = V::bits(open);
+          lanes_left = V::bits(open);
           weight = zero_unless(open, weight), next = zero_unless(open, next);
-          if (!still) {
-            live &= Bits(~(Bits(1) << b));
+          if (!lanes_left) {
+            open_blocks &= Bits(~(Bits(1) << b));
             for (; list; list &= list - 1) blocks_of[first_bit(list)] &= Bits(~(Bits(1) << b));
           }
         }
@@ -248,7 +250,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
       }
       block[b].transmittance = transmittance;
       for (int k = 0; k < C; k++) block[b].color[k] = color[k];
-      alive[b] = still;
+      open_lanes[b] = lanes_left;
     }
   }
   f.tile_end[index] = i < end ? i : end;
@@ -266,7 +268,8 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
   }
 }
 
-// grad_alpha may be null. image and grad_image contain the channels of the current group.
+// grad_alpha may be null. image and grad_image contain only the channels of this pass (at most
+// kGroupChannels).
 template <class V, int C, class T = typename V::Scalar>
 void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_t* instance_slot,
                    const T* image, const T* grad_image, const T* alpha, const T* grad_alpha,
@@ -280,11 +283,11 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
     V transmittance, behind, grad[C], grad_alpha;
   };
   alignas(64) Block block[B];
-  uint32_t alive[B];
+  uint32_t open_lanes[B];
   for (int b = 0; b < B; b++) {
     const int n = tile.lanes(b);
     const int64_t at = n ? tile.pixel(b, f.width) : 0;
-    alive[b] = V::bits(V::first(n));
+    open_lanes[b] = V::bits(V::first(n));
     block[b].transmittance = zero_unless(V::first(n), V(1.f));
     V behind(0.f);
 #pragma GCC unroll 4
@@ -335,8 +338,8 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
         const V a = zero_unless(is_blended(power), capped_alpha(e));
         V weight = a * s.transmittance, next = s.transmittance - weight;
         const auto open = is_open(next);
-        if (__builtin_expect(V::bits(open) != alive[b], 0)) {
-          alive[b] = V::bits(open);
+        if (__builtin_expect(V::bits(open) != open_lanes[b], 0)) {
+          open_lanes[b] = V::bits(open);
           weight = zero_unless(open, weight), next = zero_unless(open, next);
         }
         s.transmittance = next;

@@ -1,4 +1,4 @@
-"""Finds photos that a model has in a wrong place, from matches that were not triangulated.
+"""Finds the photos that have a wrong pose in a model, from their verified matches.
 
 docs/cameras.md describes the method with examples.
 
@@ -13,10 +13,11 @@ photo is judged by all of its matches. The photos are the nodes of a graph, and 
 verified matches is an edge. The *demand* of an edge is the squared number of its matches: photos
 taken side by side have many matches, and a few such pairs outweigh many weak ones, which may be
 false. Matches of photos that follow each other count more (`CheckedPair.weight`). The *support* of
-an edge is the part of its demand that the model confirms. If the photos of a model can be divided
-into two parts such that the model confirms little of the demand between them, the parts contradict
-each other (`find_parts`). The best division is the sparsest cut of the graph: the cut with the
-least ratio of support to demand. This problem is relaxed to a generalised eigenvalue problem
+a pair is the share of its matches that the model confirms. The *supported demand* of an edge is its
+demand multiplied by the support of its pair. If the photos of a model can be divided into two parts
+such that only a small share of the demand between them is supported, the parts contradict each
+other (`find_parts`). The best division is the sparsest cut of the graph: the cut with the least
+ratio of supported demand to demand. This problem is relaxed to a generalised eigenvalue problem
 (Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable constrained clustering: a
 generalized spectral method", AISTATS 2016).
 """
@@ -42,15 +43,17 @@ Ints = NDArray[np.integer[Any]]
 # positions (M, 2) of these features in the normalised image plane.
 _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 
-# Pairs with fewer verified matches are ignored: random matches reach this number.
+# Pairs with fewer verified matches are ignored: unrelated photos can have about this number of
+# matches by chance.
 _MIN_MATCHES = 50
 # A match is a hit if its two features observe the same point of the model. It is a miss if one of
 # its features observes a point whose projection into the other photo is far from the matched
 # feature. The support of a pair is hits / (hits + misses); in a correct model, it is nearly 1.
 # Matches whose features observe no point count as neither: the mapper creates no points for
-# surfaces that are too far away, or from photos that are too close together. If less than the share
-# `_MIN_COUNTED` of the matches are hits or misses, the poses decide: the support is 1 if at least
-# the share `_MIN_AGREEING` of the matches agrees with the poses (`agreement`), otherwise 0.
+# surfaces that are too far away, or from photos that are too close together. If the share of the
+# matches that are hits or misses is below `_MIN_COUNTED`, the poses decide: the support is 1 if the
+# share of the matches that agree with the poses (`agreement`) is at least `_MIN_AGREEING`,
+# otherwise 0.
 _MIN_COUNTED = 0.05
 _MIN_AGREEING = 0.5
 # The model confirms a pair if its support is at least `_CONFIRMED`, and contradicts it if its
@@ -65,13 +68,15 @@ _MAX_STEP = 2
 _FOLLOWING_WEIGHT = 20.0
 _MIN_MISS_DISTANCE = 4.0  # in units of the ``max_error`` of `check_pairs`
 _MIN_ANGLE = 2.0  # degrees: two rays with a smaller angle between them count as parallel
-# Two parts contradict each other if at most the share `_MAX_SUPPORT` of the demand between them is
-# confirmed, and if the `_MIN_TEARS` strongest tears between them are stronger than the confirmed
-# pairs between them: the tear at this rank has more matches than the confirmed pair at this rank.
-# (Photos taken side by side have more matches than photos of places that look alike.)
+# Two parts contradict each other if both of these conditions hold:
+# - At most the share `_MAX_SUPPORT` of the demand between them is supported.
+# - Let n be `_MIN_TEARS`, or `_MIN_FOLLOWING_TEARS` if only the pairs of photos that follow each
+#   other are examined. Sort the tears and the confirmed pairs between the parts by weight, the
+#   largest first. The n-th tear has a larger weight than the n-th confirmed pair, if there is one.
+#   (Photos taken side by side have more matches than photos of places that look alike.)
 _MAX_SUPPORT = 0.5
 _MIN_TEARS = 3
-_MIN_FOLLOWING_TEARS = 2  # instead, if only pairs of photos that follow each other are counted
+_MIN_FOLLOWING_TEARS = 2
 _VECTORS = 6  # number of eigenvectors that are tried
 _THRESHOLDS = 10  # number of thresholds that are tried for each eigenvector
 
@@ -86,7 +91,7 @@ class CheckedPair:
     first: int
     second: int
     matches: int  # number of verified matches
-    shared: int  # number of hits: matches whose two features observe the same point of the model
+    hits: int  # number of matches whose two features observe the same point of the model
     agreeing: float = 0.0  # share of the matches that agree with the poses, if computed
     miss_share: float = 0.0  # share of the matches that are misses, if computed
     follows: bool = False  # whether the photos follow each other by name (`_MAX_STEP`)
@@ -99,7 +104,7 @@ class CheckedPair:
     @property
     def hit_share(self) -> float:
         """The share of the matches that are hits."""
-        return self.shared / self.matches
+        return self.hits / self.matches
 
     @property
     def support(self) -> float:
@@ -130,7 +135,7 @@ def check_pairs(
     rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
-        in_order = _pairs_in_order(source)
+        following_pairs = _following_pairs(source)
 
         def rays_of(image_id: int, features: Ints) -> Floats:
             if image_id not in rays:
@@ -145,9 +150,9 @@ def check_pairs(
                 continue
             rows = source.read_two_view_geometry(first, second).inlier_matches
             of_first, of_second = points[first][rows[:, 0]], points[second][rows[:, 1]]
-            is_shared = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
-            follows = (first, second) in in_order
-            pair = CheckedPair(first, second, len(rows), int(is_shared.sum()), follows=follows)
+            is_hit = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
+            follows = (first, second) in following_pairs
+            pair = CheckedPair(first, second, len(rows), int(is_hit.sum()), follows=follows)
             if len(rows) >= _MIN_MATCHES:
                 images = model.image(first), model.image(second)
                 focal = np.mean([model.camera(i.camera_id).mean_focal_length() for i in images])
@@ -160,13 +165,13 @@ def check_pairs(
                 pair = replace(
                     pair,
                     agreeing=agreement(pose, *both, error),
-                    miss_share=float(np.mean(missed & ~is_shared)),
+                    miss_share=float(np.mean(missed & ~is_hit)),
                 )
             checked.append(pair)
     return checked
 
 
-def _pairs_in_order(database: pycolmap.Database) -> set[tuple[int, int]]:
+def _following_pairs(database: pycolmap.Database) -> set[tuple[int, int]]:
     """The image ids (first < second) of the pairs of photos that follow each other by name."""
     names = {image.image_id: image.name for image in database.read_all_images()}
     steps = range(1, _MAX_STEP + 1)
@@ -200,11 +205,11 @@ class _Positions:
 
 
 def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -> NDArray[np.bool_]:
-    """(M,) whether the feature in ``one`` observes a point that is far from the one in ``other``.
+    """(M,) whether each match is a miss because of the point that its feature in ``one`` observes.
 
-    The point is projected into the photo of ``other``. ``max_error`` is the largest distance of the
-    projection from the matched feature that is not a miss, in the normalised image plane. A point
-    behind the camera of ``other`` is a miss.
+    The point is projected into the photo ``other``. The match is a miss if the distance between the
+    projection and its feature in ``other`` is larger than ``max_error``, in the normalised image
+    plane, or if the point is behind the camera of ``other``.
     """
     _, ids, _ = one
     image, _, rays = other
@@ -254,9 +259,9 @@ def agreement(
 def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
     """The parts of a model that contradict each other: sets of image ids.
 
-    The first part is the largest one, and includes all parts that do not contradict it; so a model
-    without contradictions is one part. Photos that have no pair with at least `_MIN_MATCHES`
-    matches are in no part.
+    The first set contains the photos of the largest part, and of all parts that do not contradict
+    it. Each of the other parts is one set. So there is only one set for a model without
+    contradictions. Photos that have no pair with at least `_MIN_MATCHES` matches are in no set.
     """
     pairs = [pair for pair in pairs if pair.matches >= _MIN_MATCHES]
     ids = sorted({i for pair in pairs for i in (pair.first, pair.second)})
@@ -264,16 +269,16 @@ def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
         return []
     index = {image_id: row for row, image_id in enumerate(ids)}
     demand = np.zeros((len(ids), len(ids)))
-    support, torn, confirmed = demand.copy(), demand.copy(), demand.copy()
+    supported, torn, confirmed = demand.copy(), demand.copy(), demand.copy()
     follows = np.zeros(demand.shape, bool)
     for pair in pairs:
         i, j = index[pair.first], index[pair.second]
         demand[i, j] = demand[j, i] = pair.weight**2
-        support[i, j] = support[j, i] = pair.weight**2 * pair.support
+        supported[i, j] = supported[j, i] = pair.weight**2 * pair.support
         torn[i, j] = torn[j, i] = pair.weight * pair.torn
         confirmed[i, j] = confirmed[j, i] = pair.weight * (pair.support >= _CONFIRMED)
         follows[i, j] = follows[j, i] = pair.follows
-    graph = _Graph(demand, support, torn, confirmed, follows)
+    graph = _Graph(demand, supported, torn, confirmed, follows)
     parts = [part for component in _components(demand > 0) for part in _split(graph, component)]
     parts = sorted(_merged(graph, parts), key=lambda part: (-len(part), part[0]))
     kept: list[int] = []
@@ -291,7 +296,7 @@ class _Graph:
     """The pairs of N photos as symmetric (N, N) matrices; the diagonals are zero."""
 
     demand: Floats  # the squared `CheckedPair.weight`
-    support: Floats  # the confirmed part of the demand
+    supported: Floats  # the demand multiplied by `CheckedPair.support`
     torn: Floats  # `CheckedPair.weight` of tears, 0 for other pairs
     confirmed: Floats  # `CheckedPair.weight` of confirmed pairs (`_CONFIRMED`), 0 for other pairs
     follows: NDArray[np.bool_]  # whether the photos follow each other
@@ -301,7 +306,7 @@ class _Graph:
         return self.contradiction(one, other) is not None
 
     def contradiction(self, one: Sequence[int], other: Sequence[int]) -> float | None:
-        """The confirmed share of the demand between two sets of photos that contradict each other.
+        """The supported share of the demand between two sets of photos that contradict each other.
 
         None if they do not. Pairs of photos that follow each other are also examined on their own.
         If these pairs contradict the model, the sets contradict each other, whatever the other
@@ -317,17 +322,17 @@ class _Graph:
     def _contradiction(
         self, across: tuple[Ints, ...], tears: int, pairs: NDArray[np.bool_]
     ) -> float | None:
-        torn = _strongest(self.torn[across] * pairs, tears)
-        if torn <= _strongest(self.confirmed[across] * pairs, tears):
+        torn = _nth_largest(self.torn[across] * pairs, tears)
+        if torn <= _nth_largest(self.confirmed[across] * pairs, tears):
             return None
-        share = float((self.support[across] * pairs).sum() / (self.demand[across] * pairs).sum())
+        share = float((self.supported[across] * pairs).sum() / (self.demand[across] * pairs).sum())
         return share if share <= _MAX_SUPPORT else None
 
 
-def _strongest(matches: Floats, count: int) -> float:
-    """The ``count``-th largest entry; 0 if there are fewer entries."""
-    ordered = np.sort(matches, axis=None)
-    return float(ordered[-count]) if len(ordered) >= count else 0.0
+def _nth_largest(values: Floats, n: int) -> float:
+    """The ``n``-th largest entry; 0 if there are fewer entries."""
+    ordered = np.sort(values, axis=None)
+    return float(ordered[-n]) if len(ordered) >= n else 0.0
 
 
 def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
@@ -350,7 +355,7 @@ def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
 def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
     """Divide photos into parts, until no part can be divided into two that contradict each other.
 
-    Of all candidates, the division with the smallest confirmed share of the demand is used.
+    Of all candidates, the division with the smallest supported share of the demand is used.
     """
     best = None
     for one in itertools.chain(_grown_groups(graph, photos), _sweep_cuts(graph, photos)):
@@ -368,16 +373,16 @@ def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
 
 
 def _grown_groups(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
-    """Candidates for one side of a cut: groups of photos that pairs with support join.
+    """Candidates for one side of a cut: groups of photos that are linked by pairs with support.
 
-    Each photo starts as a group. The pairs are processed in the order of their confirmed weight,
-    the largest first; pairs of photos that follow each other come before all others. Each pair
-    joins the groups of its two photos, unless these groups contradict each other. This finds parts
-    that `_sweep_cuts` does not find: those that many pairs link to the rest.
+    Each photo starts as a group. The pairs of photos that follow each other are processed first,
+    then all other pairs; both in the order of `_Graph.confirmed`, the largest value first. Each
+    pair joins the groups of its two photos, unless these groups contradict each other. This finds
+    parts that `_sweep_cuts` does not find: those that have many pairs with the rest of the photos.
     """
     group = {photo: [photo] for photo in photos}
     apart: set[tuple[int, int, int, int]] = set()
-    rows, columns = np.nonzero(np.triu(graph.support[np.ix_(photos, photos)]))
+    rows, columns = np.nonzero(np.triu(graph.supported[np.ix_(photos, photos)]))
     edges = np.take(photos, rows), np.take(photos, columns)
     for edge in np.lexsort((-graph.confirmed[edges], ~graph.follows[edges])):
         one, other = group[photos[rows[edge]]], group[photos[columns[edge]]]
@@ -398,28 +403,29 @@ def _grown_groups(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
 def _sweep_cuts(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
     """Candidates for one side of the sparsest cut of ``photos``: sweep cuts of eigenvectors.
 
-    The photos are sorted by their entries in an eigenvector. A candidate consists of the first
-    photos in this order; the numbers of photos with the least ratio of support to demand are tried.
+    The photos are sorted by their entries in an eigenvector. The first k photos in this order, for
+    any k, can be one side of a cut. The `_THRESHOLDS` cuts with the least ratio of supported demand
+    to demand are tried.
     """
     count = len(photos)
     if count < 2:
         return
     rows = np.ix_(photos, photos)
-    demand, support = graph.demand[rows], graph.support[rows]
+    demand, supported = graph.demand[rows], graph.supported[rows]
     scale = demand.sum() / count
     ones = np.ones((count, count)) / count
-    # The eigenvalue problem is L(support) v = λ L(demand) v, where L is the Laplacian. A constant v
-    # is a useless solution. Adding `ones` to L(demand) makes this matrix invertible. Adding twice
-    # `ones` to L(support) gives the constant v the eigenvalue 2; all others are between 0 and 1.
-    above = _laplacian(support) / scale + 2 * ones
+    # The eigenvalue problem is L(supported) v = λ L(demand) v, where L is the Laplacian. A constant
+    # v is a useless solution. Adding `ones` to L(demand) makes this matrix invertible. Adding twice
+    # `ones` to L(supported) gives the constant v the eigenvalue 2; all others are between 0 and 1.
+    above = _laplacian(supported) / scale + 2 * ones
     below = _laplacian(demand) / scale + ones
     inverse = np.linalg.inv(np.linalg.cholesky(below))
     vectors = inverse.T @ np.linalg.eigh(inverse @ above @ inverse.T)[1][:, :_VECTORS]
     for vector in vectors.T:
         order = np.argsort(vector, kind="stable")
         across_demand = _cut_weights(demand, order)
-        across_support = _cut_weights(support, order)
-        ratio = across_support / np.maximum(across_demand, 1e-300)
+        across_supported = _cut_weights(supported, order)
+        ratio = across_supported / np.maximum(across_demand, 1e-300)
         torn = _cut_weights((graph.torn[rows] > 0).astype(float), order)
         ratio[torn < _MIN_TEARS] = np.inf
         for size in np.argsort(ratio, kind="stable")[:_THRESHOLDS] + 1:
@@ -432,7 +438,10 @@ def _laplacian(weights: Floats) -> Floats:
 
 
 def _cut_weights(weights: Floats, order: Ints) -> Floats:
-    """(N − 1,) sum of the weights between the first k and the other photos of ``order``, each k."""
+    """(N − 1,) the sum of the weights between the first k photos of ``order`` and the other photos.
+
+    The entries are those for k = 1, …, N − 1.
+    """
     sorted_weights = weights[np.ix_(order, order)]
     # When photo k joins the first photos, its edges to them are not cut any more, and its edges to
     # the other photos are cut.
@@ -441,9 +450,9 @@ def _cut_weights(weights: Floats, order: Ints) -> Floats:
 
 
 def _merged(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
-    """Join parts with support between them that do not contradict each other.
+    """Join parts that have supported demand between them and do not contradict each other.
 
-    The two parts with the largest support between them are joined first.
+    The two parts with the largest supported demand between them are joined first.
     """
     parts = [sorted(part) for part in parts]
     while True:
@@ -451,10 +460,10 @@ def _merged(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
         for i, one in enumerate(parts):
             for j, other in enumerate(parts[:i]):
                 across = np.ix_(one, other)
-                support = graph.support[across].sum()
-                linked = support > 0 and not graph.contradicts(one, other)
-                if linked and (best is None or support > best[0]):
-                    best = support, i, j
+                supported = graph.supported[across].sum()
+                linked = supported > 0 and not graph.contradicts(one, other)
+                if linked and (best is None or supported > best[0]):
+                    best = supported, i, j
         if best is None:
             return parts
         _, i, j = best

@@ -20,7 +20,7 @@ class Repaired:
 
     model: pycolmap.Reconstruction
     contradicting: int  # number of photos whose pose contradicted their matches
-    left_out: dict[str, str]  # name -> reason, for those of them that have no pose now
+    left_out: dict[str, str]  # name -> reason, for contradicting photos without a pose now
 
     @property
     def description(self) -> str:
@@ -38,15 +38,16 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     """Find the photos of ``model`` that are in a wrong place, and register them again.
 
     `find_parts` divides the photos into parts that contradict each other. The photos of all parts
-    except the first lose their poses. Matches between photos of different parts are false if they
-    agree with these poses (`_false_links`). Without the false matches, the photos are registered
-    again. This is repeated until no part contradicts the others, at most `_ROUNDS` times. Photos
-    that contradict the others even then are left out.
+    except the first lose their poses. These poses are wrong, so matches between photos of different
+    parts are false if they agree with these poses (`_false_pairs`). Without the false matches, the
+    photos are registered again. This is repeated until no part contradicts the others, at most
+    `_ROUNDS` times. Photos that contradict the others even then are left out.
 
     A model without contradictions is returned unchanged. ``max_error`` is that of `check_pairs`.
     """
     names = {i: image.name for i, image in model.images.items()}
-    false: set[tuple[int, int]] = set()  # image ids of pairs with false matches, of all rounds
+    # The image ids of the pairs with false matches, of all rounds.
+    false_pairs: set[tuple[int, int]] = set()
     wrong: dict[int, str] = {}  # image id -> reason, for all photos that lost their pose
     for number in range(_ROUNDS + 1):
         pairs = check_pairs(model, mapping.database, max_error)
@@ -54,23 +55,23 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         if len(parts) < 2:
             break
         wrong |= _reasons(model, pairs, parts)
-        false |= _false_links(pairs, parts)
+        false_pairs |= _false_pairs(pairs, parts)
         model = mapping.without(model, set().union(*parts[1:]))
         if number == _ROUNDS or model.num_reg_images() < MIN_PHOTOS:
             break
-        model = _registered_again(model, mapping, false)
+        model = _registered_again(model, mapping, false_pairs)
     registered = set(model.reg_image_ids())
     left_out = {i: reason for i, reason in wrong.items() if i not in registered}
     return Repaired(model, len(wrong), {names[i]: reason for i, reason in left_out.items()})
 
 
 def _registered_again(
-    model: pycolmap.Reconstruction, mapping: Mapping, false: set[tuple[int, int]]
+    model: pycolmap.Reconstruction, mapping: Mapping, false_pairs: set[tuple[int, int]]
 ) -> pycolmap.Reconstruction:
-    """``model`` with poses for more photos, without the matches of the pairs ``false``."""
+    """``model`` with poses for more photos, without the matches of the pairs ``false_pairs``."""
     reduced = mapping.database.with_suffix(".checked.db")
     try:
-        copy_for_mapping(mapping.database, reduced, without=false)
+        copy_for_mapping(mapping.database, reduced, without=false_pairs)
         return replace(mapping, database=reduced).extend([model], relaxed=False)[0]
     finally:
         remove_database(reduced)
@@ -81,13 +82,13 @@ def _part_of(parts: Sequence[set[int]]) -> dict[int, int]:
     return {i: number for number, part in enumerate(parts) for i in part}
 
 
-def _false_links(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set[tuple[int, int]]:
+def _false_pairs(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set[tuple[int, int]]:
     """The pairs of photos in different parts whose matches are false, as image ids.
 
     These are the pairs that are not tears: the wrong poses agree with their matches. Pairs of
-    photos that follow each other are an exception: their matches may be the only true ones between
-    two parts. They agree with the wrong poses if false matches elsewhere have moved both parts
-    together.
+    photos that follow each other are an exception, because they may be the only pairs between two
+    parts whose matches are true. True matches agree with wrong poses, too, if false matches
+    elsewhere have moved both parts in the same way.
     """
     part = _part_of(parts)
     return {
@@ -111,11 +112,11 @@ def _reasons(
         ]
         for photo in sorted(photos):
             own = [pair for pair in tears if photo in (pair.first, pair.second)]
-            worst = max(own or tears, key=lambda pair: pair.matches - pair.shared)
+            worst = max(own or tears, key=lambda pair: pair.matches - pair.hits)
             one, other = (model.image(i).name for i in (worst.first, worst.second))
             with_it = "" if len(photos) == 1 else f", with {len(photos) - 1} other photos,"
             reasons[photo] = (
                 f"it was{with_it} in a place that its matches contradict: {one} and {other} have "
-                f"{worst.matches} matches, but only {worst.shared} points in common"
+                f"{worst.matches} matches, but only {worst.hits} points in common"
             )
     return reasons

@@ -158,10 +158,10 @@ class AdaptiveDensityControl:
         # are different, and the two move apart.
         kept = alive & ~split
         large = torch.zeros_like(alive)
-        after_first_reset = 0 < settings.opacity_reset_interval < step
-        if after_first_reset and settings.prune_world_size > 0:
+        prunes_by_size = 0 < settings.opacity_reset_interval < step
+        if prunes_by_size and settings.prune_world_size > 0:
             large |= torch.where(split, size / SPLIT_SHRINK, size) > settings.prune_world_size
-        if after_first_reset and settings.prune_screen_size > 0:
+        if prunes_by_size and settings.prune_screen_size > 0:
             large |= kept & (self.max_radii > settings.prune_screen_size)
         kept, clones, parents = (
             torch.nonzero(rows & ~large)[:, 0] for rows in (kept, dense & ~split, split)
@@ -184,7 +184,9 @@ class AdaptiveDensityControl:
         return gaussians
 
     def _densified(self, grads: Tensor, alive: Tensor) -> Tensor:
-        """The rows to clone or split, (N,) bool. Each adds one Gaussian, up to ``max_gaussians``.
+        """The rows to clone or split, (N,) bool. Each of these rows adds one Gaussian.
+
+        There are at most as many of them as ``max_gaussians`` permits.
 
         Args:
             grads: (N,) mean norm of the view-space position gradient.

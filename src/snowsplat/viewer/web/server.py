@@ -40,8 +40,9 @@ _REQUEST = 16 << 10  # maximum size of a request, bytes
 # Maximum number of open connections. A new connection replaces the oldest one that has not made a
 # valid request; if there is none, the new connection is closed.
 _CONNECTIONS = 256
-# The request line and headers, exactly as the protocol defines them. For a request with unusual
-# line ends or characters, other parsers could find another end of the request.
+# The request line and headers, exactly as the protocol defines them. Requests with unusual line
+# ends or characters are rejected, because another HTTP parser, such as that of a proxy, could find
+# their end at another position.
 _HEAD = re.compile(
     rb"[!-~]+ [!-~]+ HTTP/1\.[01](\r\n[!#$%&'*+.^_`|~0-9A-Za-z-]+:[\t -~\x80-\xff]*)*\r\n\r\n"
 )
@@ -194,7 +195,7 @@ def _listen(host: str, port: int) -> _Server:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise SettingError(
-                "port", f"{port} is in use; choose another, or do not set it to use a free one"
+                "port", f"{port} is in use; choose another, or omit it: then a free one is used"
             ) from None
         raise SettingError(
             "host", f"cannot listen at {host} ({error.strerror}); use e.g. 127.0.0.1"
@@ -269,7 +270,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._send_empty(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": "GET, HEAD"})
 
     @property
-    def _ours(self) -> _Server:
+    def _web_server(self) -> _Server:
+        """`server` with its type."""
         return cast(_Server, self.server)
 
     def _answer(self, with_body: bool) -> None:
@@ -281,7 +283,7 @@ class _Handler(BaseHTTPRequestHandler):
         if file is None:
             self._send_empty(HTTPStatus.NOT_FOUND)
             return
-        self._ours.mark_verified(self.connection)
+        self._web_server.mark_verified(self.connection)
         common = {"ETag": file.etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
         if file.etag in (self.headers.get("If-None-Match") or ""):
             self._send_empty(HTTPStatus.NOT_MODIFIED, common)
@@ -307,8 +309,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _refusal(self) -> HTTPStatus | None:
         """The status with which a request is rejected; None accepts it."""
         hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
-        # A body, or data that another parser considers to be a body, could be read as a second
-        # request.
+        # Only requests without a body are accepted: this server would read the body as a second
+        # request. The same is true of data that another HTTP parser considers to be a body.
         bodies = (
             self.headers.get_all("Content-Length", []),
             self.headers.get_all("Transfer-Encoding", []),
@@ -317,7 +319,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             return HTTPStatus.BAD_REQUEST
         host = hosts[0] if hosts else ""
-        if not is_own_host(host, self._ours.host):
+        if not is_own_host(host, self._web_server.host):
             return HTTPStatus.MISDIRECTED_REQUEST
         if not all(is_own_page(origin, host) for origin in origins):
             return HTTPStatus.FORBIDDEN
@@ -326,11 +328,11 @@ class _Handler(BaseHTTPRequestHandler):
     def _file(self) -> ServedFile | None:
         """The file at the requested path. The path is not decoded, because all names are ASCII."""
         path = self.path.partition("?")[0]
-        prefix = self._ours.prefix
+        prefix = self._web_server.prefix
         start, name = path[: len(prefix)], path[len(prefix) :]
         if not hmac.compare_digest(start.encode(), prefix.encode()):
             return None
-        return self._ours.files.get(name)
+        return self._web_server.files.get(name)
 
     def _range(self, file: ServedFile) -> tuple[int, int] | None:
         """The first requested byte, and the byte after the last; None: the complete file.
@@ -365,7 +367,7 @@ class _Handler(BaseHTTPRequestHandler):
             "Referrer-Policy": "no-referrer",  # the URL contains the token
             "Cross-Origin-Resource-Policy": "same-origin",
         }
-        for name, value in {**always, **self._ours.headers, **headers}.items():
+        for name, value in {**always, **self._web_server.headers, **headers}.items():
             self.send_header(name, value)
         self.end_headers()
 
