@@ -11,8 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from snowsplat.pipeline import make as make_module
+from snowsplat.pipeline import make_plan
 from snowsplat.pipeline.make import RECORD, STAGES
 from snowsplat.pipeline.quality import PRESETS
+from snowsplat.sfm import cost
 from snowsplat.util.stages import Stages
 
 from ..fork_server import popen
@@ -24,6 +27,7 @@ PROGRAM = """
 import sys
 from dataclasses import replace
 from snowsplat.pipeline import make as make_module
+from snowsplat.pipeline import make_plan
 from snowsplat.cli.main import main
 make_module._CHECKPOINT_SECONDS = 0.2
 make_module.PRESETS["draft"] = replace(make_module.PRESETS["draft"], iterations=120)
@@ -158,6 +162,25 @@ def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
     assert (out / "Häuser am See.ply").is_file()
     assert len(list(out.glob("scene/test/ours_120/renders/*.png"))) == 2
     assert not list(out.rglob("*.tmp"))
+
+
+@pytest.mark.sfm
+def test_a_short_time_for_many_photos_uses_fewer(run, tmp_path, monkeypatch):
+    """On a slow machine; the same command again repeats nothing and keeps the plan."""
+    monkeypatch.setattr(make_module, "_MIN_SECONDS", 1.0)
+    monkeypatch.setattr(make_plan, "_FEWEST", 6)
+    monkeypatch.setattr(cost, "measure_speed", lambda threads: cost.Speed(50.0, 1.0))
+    photos = scenes.write_photos(tmp_path / "many", 12)
+    command = ("make", photos, "-o", tmp_path / "out", "--minutes", 0.1, "--threads", 2)
+    result = run(*command)
+    assert result.code == 0, result.err
+    assert "6.0 s: 6 of 12 photos, 256 pixels, draft effort" in result.out
+    assert len(list((tmp_path / "out/capture/input").iterdir())) == 6
+    assert (tmp_path / "out/many.ply").is_file()
+    again = run(*command)
+    assert again.code == 0, again.err
+    assert again.out.count("done before") == 6
+    assert "of 12 photos" not in again.out
 
 
 # Errors

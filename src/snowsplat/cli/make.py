@@ -56,8 +56,9 @@ class Make:
     quality determines only the effort to estimate the camera poses; the training uses the remaining
     time."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
-    """Finish within this time. If an earlier run was interrupted, the time of its finished stages
-    is not counted, and its training resumes with the time that remained."""
+    """Finish within this time. If there are too many photos for it, some of them are used, evenly
+    spread by name. If an earlier run was interrupted, the time of its finished stages is not
+    counted, and its training resumes with the time that remained."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None

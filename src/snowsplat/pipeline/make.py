@@ -8,14 +8,15 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.make_plan import MakePlan, choose_plan, described, find_photos
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
-from snowsplat.pipeline.quality import PRESETS, Preset, Quality, quality_within
+from snowsplat.pipeline.quality import PRESETS, Preset, Quality
 from snowsplat.pipeline.time_budget import check_minutes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
@@ -49,8 +50,9 @@ class MakeOptions:
         quality: default: "normal" or, with ``minutes``, chosen for that time. With ``minutes``, the
             quality determines only the effort to estimate the camera poses; the training uses the
             rest of the time.
-        minutes: finish within this time. Stages that an earlier run has finished are not counted.
-            A resumed training run has the time that was left at its interruption.
+        minutes: finish within this time; see `make_plan` for the number of photos that are used.
+            Stages that an earlier run has finished are not counted. A resumed training run has the
+            time that was left at its interruption.
         memory: memory limit of the training; see `TrainOptions`.
         compute: device and threads.
 
@@ -173,12 +175,12 @@ class _Job:
         from snowsplat.sfm.ingest.sources import find_sources
         from snowsplat.util.stages import Stages
 
-        kinds = [source.kind for source in find_sources(self.inputs).sources]
+        find_sources(self.inputs)  # raises an error before the folder is created
         existed = self.out.exists()
         self.out.mkdir(parents=True, exist_ok=True)
         self.stages = Stages(self.out / RECORD, STAGES)
         with self._removed_if_empty(existed):
-            self.quality = self._quality(kinds.count("photo"), kinds.count("video"))
+            self.plan = self._plan()
             self.stages.save()  # from now on, the folder is recognised as an output of `make`
             self._make_dataset()
             return self._make_scene()
@@ -194,41 +196,47 @@ class _Job:
                 if not existed:
                     self.out.rmdir()
 
-    def _quality(self, photos: int, videos: int) -> Quality:
-        """The requested quality. If only a time is requested, the quality is chosen for this time.
+    def _plan(self) -> MakePlan:
+        """The plan for the requested quality. If a time is requested, it is made for this time.
 
-        The poses depend on the chosen quality. Therefore it is recorded, and later runs use the
-        recorded quality.
+        The poses depend on the plan. Therefore it is recorded, and later runs use the recorded
+        plan.
         """
         quality, minutes = self.options.quality, self.options.minutes
-        if quality is not None or minutes is None:
-            return quality or "normal"
+        if minutes is None:
+            quality = quality or "normal"
+            return MakePlan(quality, PRESETS[quality].photos)
         from snowsplat import ops
+        from snowsplat.sfm.cost import measure_speed
 
-        about = {"minutes": minutes, "photos": photos, "videos": videos}
-        before = self.stages.about.get("effort", {})
+        found = find_photos(self.inputs)
+        about = {"minutes": minutes, "quality": quality, "found": asdict(found)}
+        before = self.stages.about.get("plan", {})
         if {key: before.get(key) for key in about} != about:
             threads = self.options.compute.threads or ops.get_num_threads()
-            quality = quality_within(60.0 * minutes, photos, videos, threads)
-            self.stages.about["effort"] = about | {"quality": quality}
-        chosen: Quality = self.stages.about["effort"]["quality"]
-        return chosen
+            plan = choose_plan(
+                60.0 * minutes - self._elapsed(), found, measure_speed(threads), quality
+            )
+            self.stages.about["plan"] = about | {"chosen": asdict(plan)}
+            self.observer.note(described(plan, found, 60.0 * minutes))
+        return MakePlan(**self.stages.about["plan"]["chosen"])
 
     def _make_dataset(self) -> None:
         from snowsplat.sfm.colmap import SfmOptions
         from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
         from snowsplat.sfm.ingest.inputs import GatherOptions
 
+        plan = self.plan
         options = DatasetOptions(
-            gather=GatherOptions(size=PRESETS[self.quality].photos),
-            sfm=SfmOptions(effort=self.quality, threads=self.options.compute.threads),
+            gather=GatherOptions(size=plan.size, photos=plan.photos, frames=plan.frames),
+            sfm=SfmOptions(effort=plan.quality, threads=self.options.compute.threads),
         )
         make_dataset(self.inputs, self.dataset, options, self.observer, self.overwrite)
 
     def _make_scene(self) -> MakeResult:
         settings: dict[str, Any] = {"capture": _fingerprint(self.dataset)}
         if self.options.minutes is None:
-            preset = PRESETS[self.quality]
+            preset = PRESETS[self.plan.quality]
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
         else:
             settings |= {"minutes": self.options.minutes}
@@ -307,7 +315,7 @@ class _Job:
         if self.options.minutes is not None:
             minutes = self._minutes_left(60.0 * self.options.minutes)
             return replace(options, hold_out=HOLD_OUT, minutes=minutes)
-        preset = PRESETS[self.quality]
+        preset = PRESETS[self.plan.quality]
         settings = ("iterations", "max_gaussians", "densify_interval")
         return replace(
             options,

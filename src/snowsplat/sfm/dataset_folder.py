@@ -133,9 +133,12 @@ def _run(
     def gather_photos(report: Report) -> dict[str, Any]:
         return _gather(inputs, folder, options.gather, report, in_place)
 
+    chosen = asdict(options.gather)
+    if chosen["photos"] is None:  # earlier versions did not have this setting
+        del chosen["photos"]
     stage(
         "photos",
-        {"input": _fingerprint(sources), **asdict(options.gather)},
+        {"input": _fingerprint(sources), **chosen},
         ["input", "distorted/masks"],
         gather_photos,
     )

@@ -337,6 +337,18 @@ def test_the_disk_becomes_full(writes, tmp_path, monkeypatch):
         gathered(source, tmp_path / "out")
 
 
+def test_fewer_photos_are_evenly_spread_by_name(tmp_path):
+    root = write_photos(tmp_path / "p", 12)
+    names = sorted(path.name for path in root.iterdir())
+    some = gathered(root, tmp_path / "some", photos=4)
+    assert [p.name for p in some.photos] == [names[i] for i in (0, 4, 7, 11)]
+    assert files(tmp_path / "some" / "input") == [p.name for p in some.photos]
+    assert some.skipped == []
+    assert len(gathered(root, tmp_path / "all", photos=20).photos) == 12
+    with pytest.raises(UserError, match="photos"):
+        gathered(root, tmp_path / "none", photos=0)
+
+
 def test_ctrl_c_and_progress(tmp_path):
     root = write_photos(tmp_path / "p", 12)
     calls = []

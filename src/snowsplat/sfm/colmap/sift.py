@@ -66,12 +66,7 @@ def detect_sift(photo: Path, mask: Path | None, image_size: int, count: int) -> 
     cv2.setNumThreads(1)  # other photos are processed in parallel
     grey, size = _read_grey(photo, image_size)
     allowed = None if mask is None else _read_mask(mask, grey)
-    sift = cv2.SIFT.create(
-        nOctaveLayers=_LAYERS,
-        contrastThreshold=_CONTRAST_THRESHOLD,
-        edgeThreshold=_EDGE_THRESHOLD,
-        enable_precise_upscale=True,  # without it, all positions have an error of 1/4 pixel
-    )
+    sift = new_detector()
     found = sorted(sift.detect(grey, allowed), key=lambda keypoint: -keypoint.size)[:count]
     if not found:
         return Features(np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8))
@@ -79,6 +74,16 @@ def detect_sift(photo: Path, mask: Path | None, image_size: int, count: int) -> 
     resized = np.array(grey.shape[::-1])
     return Features(
         _in_photo(keypoints, np.array(size) / resized), _root_sift(np.asarray(histograms))
+    )
+
+
+def new_detector() -> cv2.SIFT:
+    """The detector that `detect_sift` uses. Each thread needs its own."""
+    return cv2.SIFT.create(
+        nOctaveLayers=_LAYERS,
+        contrastThreshold=_CONTRAST_THRESHOLD,
+        edgeThreshold=_EDGE_THRESHOLD,
+        enable_precise_upscale=True,  # without it, all positions have an error of 1/4 pixel
     )
 
 

@@ -62,6 +62,14 @@ def plan_photos(
     return sorted(planned, key=lambda plan: plan.name)
 
 
+def evenly_spread(planned: Sequence[Planned], count: int) -> list[Planned]:
+    """At most ``count`` of the photos, at equal distances in their order, and the last one."""
+    if count >= len(planned):
+        return list(planned)
+    last = len(planned) - 1
+    return [planned[round(i * last / max(1, count - 1))] for i in range(count)]
+
+
 def write_photos(
     planned: Sequence[Planned],
     dataset: Path,

@@ -16,7 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from snowsplat.sfm.ingest.clip import Clip, max_frame_count, read_clip
-from snowsplat.sfm.ingest.gather_photos import Planned, plan_photos, write_photos
+from snowsplat.sfm.ingest.gather_photos import (
+    Planned,
+    evenly_spread,
+    plan_photos,
+    write_photos,
+)
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.sources import Source, find_sources
@@ -41,11 +46,13 @@ class Gathered:
 
 @dataclass(frozen=True)
 class GatherOptions:
-    """Frames and sizes to use. At most one of ``fps`` and ``frames`` may be set."""
+    """Photos, frames and sizes to use. At most one of ``fps`` and ``frames`` may be set."""
 
     fps: float | None = None  # frames per second to use of each video
     frames: int | None = None  # maximum number of frames to use of each video
     size: int | None = None  # resize to this longest side in pixels, if larger; None: keep
+    # Maximum number of photos; they are evenly spread in the order of their names. None: all.
+    photos: int | None = None
 
 
 def find_inputs(inputs: Sequence[Path]) -> list[Path]:
@@ -82,6 +89,8 @@ def gather(
     skipped = list(found.left_out)
     in_place = any(path.resolve() == folder.resolve() for path in inputs)
     planned = plan_photos([s for s in found.sources if s.kind == "photo"], options.size, skipped)
+    if options.photos is not None:
+        planned = evenly_spread(planned, options.photos)
     clips = [(s, read_clip(s.path)) for s in found.sources if s.kind == "video"]
     if in_place:
         _refuse_changes(planned, [s for s, _ in clips], options)
@@ -115,6 +124,8 @@ def _check(options: GatherOptions) -> None:
         raise SettingError(
             "frames", f"{options.frames} is too few; use {_MIN_PHOTOS} or more, e.g. 60"
         )
+    if options.photos is not None and options.photos < 1:
+        raise SettingError("photos", f"{options.photos} is too few; use 1 or more")
     if options.size is not None and options.size < _MIN_SIZE:
         raise SettingError("size", f"{options.size} is too small; use {_MIN_SIZE} or more")
 

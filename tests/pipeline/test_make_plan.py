@@ -1,0 +1,86 @@
+"""The quality, size and number of photos that `make` chooses for a time budget."""
+
+import pytest
+
+from snowsplat.pipeline.make_plan import Found, MakePlan, choose_plan, described
+from snowsplat.sfm.cost import Photos, Speed, predicted_seconds
+
+FAST = Speed(0.1, 16)
+HERE = Speed(1.0, 2)
+
+
+def of_photos(count: int, longest: int = 4000) -> Found:
+    return Found(Photos(stills=count, longest=longest))
+
+
+def seconds_of(plan: MakePlan, found: Found, speed: Speed) -> float:
+    count = found.photos.stills if plan.photos is None else plan.photos
+    photos = Photos(stills=count, longest=found.photos.longest)
+    return sum(predicted_seconds(photos, plan.size, plan.quality, speed).values())
+
+
+@pytest.mark.parametrize("count", [10, 50, 100, 150, 300])
+@pytest.mark.parametrize("minutes", [1, 3, 10, 60])
+@pytest.mark.parametrize("speed", [FAST, HERE, Speed(2.0, 1.2)])
+def test_the_poses_leave_more_than_half_of_the_time_to_the_training(count, minutes, speed):
+    found = of_photos(count)
+    plan = choose_plan(60 * minutes, found, speed)
+    fewest = (plan.photos or count) <= 20
+    assert fewest or seconds_of(plan, found, speed) <= 0.45 * 60 * minutes
+
+
+def test_more_time_never_leads_to_less_quality_or_fewer_photos():
+    order = ["draft", "normal", "best"]
+
+    def rank(minutes: float) -> tuple[int, int, int]:
+        plan = choose_plan(60 * minutes, of_photos(200), HERE)
+        return order.index(plan.quality), plan.size, plan.photos or 200
+
+    ranks = [rank(minutes) for minutes in (0.1, 0.5, 1, 2, 3, 5, 8, 15, 30, 60, 120, 600)]
+    assert ranks == sorted(ranks)
+    assert ranks[0] == (0, 1000, 20)
+    assert ranks[-1] == (2, 3200, 200)
+
+
+def test_a_slow_machine_uses_fewer_photos_than_a_fast_one():
+    found = of_photos(300)
+    slow, fast = (choose_plan(120, found, Speed(slowness, 2)) for slowness in (3.0, 1.0))
+    assert slow.photos is not None
+    assert fast.photos is not None
+    assert 20 <= slow.photos < fast.photos < 300
+
+
+def test_the_requested_quality_is_kept():
+    found = of_photos(300)
+    plan = choose_plan(180, found, HERE, "normal")
+    assert plan.quality == "normal"
+    assert plan.size == 1600
+    assert plan.photos is not None
+    assert choose_plan(1e6, found, HERE, "normal") == MakePlan("normal", 2400)
+
+
+def test_few_photos_are_all_used():
+    assert choose_plan(1, of_photos(12), HERE) == MakePlan("draft", 1000)
+
+
+def test_fewer_frames_of_each_video_and_fewer_photos():
+    photos = Photos(stills=100, longest=4000, frames=200, decoded=1200, video=1920)
+    found = Found(photos, videos=2)
+    plan = choose_plan(100, found, HERE)
+    assert plan.photos is not None
+    assert plan.frames is not None
+    assert plan.photos == pytest.approx(plan.frames, abs=1)  # 1/3 of the count, in both videos
+    assert described(plan, found, 100) == (
+        f"1 min 40 s: {plan.photos} of 100 photos and {2 * plan.frames} of 200 frames, "
+        "1000 pixels, draft effort"
+    )
+
+
+def test_the_description_names_what_was_chosen():
+    found = of_photos(300)
+    assert described(MakePlan("draft", 1000, photos=60), found, 180) == (
+        "3 min 0 s: 60 of 300 photos, 1000 pixels, draft effort"
+    )
+    assert described(MakePlan("best", 3200), of_photos(40, 3000), 3600) == (
+        "1 h 0 min: 40 photos, 3000 pixels, best effort"
+    )
