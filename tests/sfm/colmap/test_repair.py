@@ -16,7 +16,7 @@ from snowsplat.sfm.colmap.mapping import Mapping
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
 from snowsplat.sfm.colmap.pairs import PairChoice
 from snowsplat.sfm.colmap.reconstruct import Matched, PoseEstimation
-from snowsplat.sfm.colmap.repair import _false_pairs, repair
+from snowsplat.sfm.colmap.repair import _false_pairs, _parts, repair
 from snowsplat.sfm.progress import silent
 
 from . import look_alikes
@@ -88,6 +88,22 @@ def test_which_pairs_between_parts_have_false_matches():
     following = CheckedPair(3, 4, 300, 200, follows=True)
     inside = CheckedPair(1, 2, 300, 200)
     assert _false_pairs([torn, confirmed, following, inside], [{1, 2, 3}, {4, 5}]) == {(1, 5)}
+
+
+def test_pairs_that_were_false_before_count_only_if_photos_in_order_are_torn():
+    """Two equal objects: after the repair, hundreds of false matches contradict the true poses."""
+
+    def pairs(last):
+        true = [CheckedPair(i, i + 1, 500, 450, follows=True) for i in range(1, 20) if i != 10]
+        true += [CheckedPair(10, 11, 54, last, follows=True)]
+        true += [CheckedPair(9, 11, 24, last // 2, follows=True)]
+        return true + [CheckedPair(i, i + 10, 2000, 0) for i in range(1, 11)]
+
+    apart = [set(range(1, 11)), set(range(11, 21))]
+    false_pairs = {(i, i + 10) for i in range(1, 11)}
+    assert _parts(pairs(last=50), set()) == apart
+    assert _parts(pairs(last=50), false_pairs) == [set(range(1, 21))]
+    assert _parts(pairs(last=0), false_pairs) == apart
 
 
 def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):
