@@ -23,12 +23,12 @@ def clock(monkeypatch) -> Clock:
 
 
 def last_line(clock, *reports) -> str:
-    """The line after reports (seconds since the previous one, done, total) of one stage."""
+    """The line after reports of one stage: seconds since the previous one, done, total, [left]."""
     stream = io.StringIO()
     report = StageProgress(stream=stream).begin("poses")
-    for seconds, done, total in reports:
+    for seconds, done, total, *left in reports:
         clock.now += seconds
-        report(done, total, "photos")
+        report(done, total, "photos", *left)
     return stream.getvalue().splitlines()[-1]
 
 
@@ -44,3 +44,10 @@ def test_items_that_were_finished_before_take_no_time(clock):
 
 def test_without_a_finished_item_there_is_no_estimate(clock):
     assert last_line(clock, (0, 80, 100), (30, 80, 100)) == "poses     80/100 photos"
+
+
+def test_a_reported_time_left_is_shown(clock):
+    assert last_line(clock, (0, 0, 100), (30, 25, 100, 400.0)) == (
+        "poses     25/100 photos  6 min 40 s left"
+    )
+    assert last_line(clock, (30, 100, 100, 20.0)) == "poses     100/100 photos  20 s left"

@@ -2,21 +2,23 @@
 
 import pytest
 
-from snowsplat.pipeline.make_plan import Found, MakePlan, choose_plan, described
-from snowsplat.sfm.cost import Photos, Speed, predicted_seconds
+from snowsplat.pipeline.make_plan import MakePlan, choose_plan, described
+from snowsplat.sfm.cost import Speed, steps_of
+from snowsplat.sfm.survey import Photos
 
 FAST = Speed(0.1, 16)
 HERE = Speed(1.0, 2)
 
 
-def of_photos(count: int, longest: int = 4000) -> Found:
-    return Found(Photos(stills=count, longest=longest))
+def of_photos(count: int, longest: int = 4000) -> Photos:
+    return Photos(stills=count, longest=longest)
 
 
-def seconds_of(plan: MakePlan, found: Found, speed: Speed) -> float:
-    count = found.photos.stills if plan.photos is None else plan.photos
-    photos = Photos(stills=count, longest=found.photos.longest)
-    return sum(predicted_seconds(photos, plan.size, plan.quality, speed).values())
+def seconds_of(plan: MakePlan, found: Photos, speed: Speed) -> float:
+    count = found.stills if plan.photos is None else plan.photos
+    photos = Photos(stills=count, longest=found.longest)
+    steps = steps_of(photos, plan.size, plan.quality).values()
+    return sum(step.seconds(speed) for step in steps)
 
 
 @pytest.mark.parametrize("count", [10, 50, 100, 150, 300])
@@ -64,8 +66,7 @@ def test_few_photos_are_all_used():
 
 
 def test_fewer_frames_of_each_video_and_fewer_photos():
-    photos = Photos(stills=100, longest=4000, frames=200, decoded=1200, video=1920)
-    found = Found(photos, videos=2)
+    found = Photos(stills=100, longest=4000, frames=200, videos=2, decoded=1200, video=1920)
     plan = choose_plan(100, found, HERE)
     assert plan.photos is not None
     assert plan.frames is not None

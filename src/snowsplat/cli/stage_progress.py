@@ -74,7 +74,7 @@ class StageProgress:
         else:
             print(line, file=self.stream, flush=True)
 
-    def _report(self, done: int, total: int, what: str = "") -> None:
+    def _report(self, done: int, total: int, what: str = "", left: float | None = None) -> None:
         now = time.monotonic()
         if what != self._what or done == 0 or done < self._done:
             # Other items, or a second attempt. Some items may be finished before it begins.
@@ -82,13 +82,15 @@ class StageProgress:
         self._done = done
         elapsed = now - self._start
         counted = f"{done}/{total} {what}" if total else f"{done or ''} {what}"
-        left = ""
-        if self._first < done < total and elapsed > 1.0:
-            left = f"  {duration(elapsed / (done - self._first) * (total - done))} left"
+        text = ""
+        if left is None and self._first < done < total and elapsed > 1.0:
+            left = elapsed / (done - self._first) * (total - done)
+        if left is not None:
+            text = f"  {duration(left)} left"
         if self._bar is not None:
             self._bar.update(
-                self._task, completed=done, total=total or None, text=f"{counted.strip()}{left}"
+                self._task, completed=done, total=total or None, text=f"{counted.strip()}{text}"
             )
         elif now - self._last_line >= _LINE_SECONDS:
             self._last_line = now
-            self.say(f"{self._stage:<{_WIDTH}}{counted.strip()}{left}")
+            self.say(f"{self._stage:<{_WIDTH}}{counted.strip()}{text}")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.make_plan import MakePlan, choose_plan, described, find_photos
+from snowsplat.pipeline.make_plan import MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
@@ -25,6 +25,7 @@ from snowsplat.util.files import atomic_path, remove_temporaries
 if TYPE_CHECKING:
     from snowsplat.pipeline.live_page import LivePage
     from snowsplat.pipeline.train import TrainOptions
+    from snowsplat.sfm.time_left import Later
     from snowsplat.util.stages import Outcome
 
 STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
@@ -208,17 +209,18 @@ class _Job:
             return MakePlan(quality, PRESETS[quality].photos)
         from snowsplat import ops
         from snowsplat.sfm.cost import measure_speed
+        from snowsplat.sfm.survey import survey
 
-        found = find_photos(self.inputs)
-        about = {"minutes": minutes, "quality": quality, "found": asdict(found)}
+        photos = survey(self.inputs)
+        about = {"minutes": minutes, "quality": quality, "photos": asdict(photos)}
         before = self.stages.about.get("plan", {})
         if {key: before.get(key) for key in about} != about:
             threads = self.options.compute.threads or ops.get_num_threads()
             plan = choose_plan(
-                60.0 * minutes - self._elapsed(), found, measure_speed(threads), quality
+                60.0 * minutes - self._elapsed(), photos, measure_speed(threads), quality
             )
             self.stages.about["plan"] = about | {"chosen": asdict(plan)}
-            self.observer.note(described(plan, found, 60.0 * minutes))
+            self.observer.note(described(plan, photos, 60.0 * minutes))
         return MakePlan(**self.stages.about["plan"]["chosen"])
 
     def _make_dataset(self) -> None:
@@ -231,7 +233,20 @@ class _Job:
             gather=GatherOptions(size=plan.size, photos=plan.photos, frames=plan.frames),
             sfm=SfmOptions(effort=plan.quality, threads=self.options.compute.threads),
         )
-        make_dataset(self.inputs, self.dataset, options, self.observer, self.overwrite)
+        make_dataset(
+            *(self.inputs, self.dataset, options, self.observer, self.overwrite), self._later()
+        )
+
+    def _later(self) -> Later:
+        """The work after the dataset is made, for the time left."""
+        from snowsplat import ops
+        from snowsplat.sfm.time_left import Later
+
+        if self.options.minutes is not None:
+            return Later(deadline=self.started + 60.0 * self.options.minutes)
+        if ops.resolve_device(self.options.compute.device).type != "cpu":
+            return Later()  # on a GPU, the training takes a small part of the time
+        return Later(work=PRESETS[self.plan.quality].training)
 
     def _make_scene(self) -> MakeResult:
         settings: dict[str, Any] = {"capture": _fingerprint(self.dataset)}

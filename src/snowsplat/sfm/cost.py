@@ -3,17 +3,19 @@
 The work is a sum of steps. Each step has a cost in seconds of one core of a reference machine:
 
     step      is proportional to                                                   threads
+    start     constant                                                             1
+    videos    pixels of all frames of videos (decoding)                            1
     photos    pixels of the originals (decoding) and of the copies (writing)       up to 4
-              pixels of all frames of videos (decoding)                            1
     features  pixels of the photos in which features are detected; features        all
     pairs     pairs of photos, times the square of the number of features          all
-    verified  pairs of photos, times the number of features                        all
-    poses     photos, times the square root of the number of features; the time    1
-              for a photo grows with the number of photos (bundle adjustment)
+    verified  pairs of photos, times the square root of the number of features     all
+    poses     photos; the time for a photo grows with their number, because of     1
+              bundle adjustment
+    load      constant                                                             1
     images    pixels of the copies, from which the lens distortion is removed      up to 4
-    start     constant
+    report    constant                                                             1
 
-The constants were measured in a run with 100 photos of 12 megapixels and in some smaller ones.
+The constants were measured with 100 photos of 12 megapixels and with 50 photos of 0.9 megapixels.
 `measure_speed` compares this machine, under its present load, with the reference machine. The
 number of matches differs between scenes, so the time of a step may differ by 40% from its
 prediction; the error of the sum is smaller.
@@ -32,6 +34,7 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.options import EFFORTS, EffortName
 from snowsplat.sfm.colmap.sift import new_detector
+from snowsplat.sfm.survey import Photos
 
 # Seconds of one core of the reference machine: a virtual x86-64 server with two cores and AVX-512.
 _PHOTO = 0.02
@@ -40,12 +43,17 @@ _WRITTEN_MEGAPIXEL = 0.1  # of a resized photo: resizing and saving
 _FRAME_MEGAPIXEL = 0.02  # of each frame of a video, also of those that are not used
 _SIFT_MEGAPIXEL = 0.33
 _SIFT_THOUSAND = 0.06  # features
-_MATCHED_PAIR = 0.0011  # of photos with 1000 features each
-_VERIFIED_PAIR = 0.011  # of photos with 1000 features each
-_POSE = 0.2  # of a photo with 1000 features
+_MATCHED_PAIR = 0.001  # of photos with 1000 features each
+_VERIFIED_PAIR = 0.015  # of photos with 1000 features each
+_POSE = 0.33
 _POSE_GROWTH = 60.0  # with this number of photos, a photo takes twice as long as the first ones
+# With this number of photos, they are registered in half of the time of the step "poses". The other
+# half is the bundle adjustment at the end, and the check of the poses.
+_POSE_END = 120.0
 _IMAGE_MEGAPIXEL = 0.24
-_START = 8.0  # loading libraries in two processes; the report
+_START = 2.5  # loading libraries
+_LOAD = 3.0  # loading more libraries, for the images
+_REPORT = 3.0
 
 # Two photos often choose each other as neighbours, so there are fewer pairs than neighbours.
 _PAIRS_PER_NEIGHBOUR = 0.57
@@ -70,64 +78,70 @@ class Speed:
     slowness: float = 1.0
     cores: float = 1.0
 
-    def seconds(self, work: float, threads: float) -> float:
-        """Seconds for ``work`` seconds of one reference core, with at most ``threads``."""
-        return work * self.slowness / max(1.0, min(threads, self.cores))
-
 
 @dataclass(frozen=True)
-class Photos:
-    """The input of structure from motion.
+class Step:
+    """The work of a step.
 
     Attributes:
-        stills: number of photos.
-        frames: number of used frames of all videos.
-        longest: the longer side of an original photo, in pixels.
-        decoded: number of frames of all videos, which are decoded to choose the used ones.
-        video: the longer side of the frames, in pixels.
+        work: seconds of one core of the reference machine.
+        threads: maximum number of threads.
     """
 
-    stills: int
-    frames: int = 0
-    longest: int = 0
-    decoded: int = 0
-    video: int = 0
+    work: float
+    threads: float = math.inf
 
-    @property
-    def count(self) -> int:
-        return self.stills + self.frames
+    def seconds(self, speed: Speed) -> float:
+        """Predicted seconds on a machine with this speed."""
+        return self.work * speed.slowness / max(1.0, min(self.threads, speed.cores))
 
 
-def predicted_seconds(
-    photos: Photos, size: int, effort: EffortName, speed: Speed
-) -> dict[str, float]:
-    """Seconds of each step of the table above, and of "start".
+def steps_of(photos: Photos, size: int | None, effort: EffortName) -> dict[str, Step]:
+    """The steps of the table above, in their order.
 
     Args:
-        size: the longer side to which photos are reduced, in pixels.
+        size: the longer side to which photos are reduced, in pixels; None: they are not reduced.
     """
     parameters = EFFORTS[effort]
-    count, largest = photos.count, max(photos.longest, photos.video)
-    original, frame = _megapixels(photos.longest), _megapixels(photos.video)
-    copy = _megapixels(min(size, largest))
-    features = parameters.features / 1000
-    pairs = expected_pairs(count, effort)
-    detected = _megapixels(min(size, largest, parameters.image_size))
-    reading = photos.stills * (_PHOTO + _DECODED_MEGAPIXEL * original)
-    writing = (photos.stills if size < photos.longest else 0) * _WRITTEN_MEGAPIXEL * copy
-    decoding = photos.decoded * _FRAME_MEGAPIXEL * frame
-    all_threads = speed.cores
+    largest = max(photos.longest, photos.video)
+    size = min(size or largest, largest)
+    count = photos.count
+    copy = _megapixels(size)
+    reading = photos.stills * (_PHOTO + _DECODED_MEGAPIXEL * _megapixels(photos.longest))
+    if size < photos.longest:
+        reading += photos.stills * _WRITTEN_MEGAPIXEL * copy
+    detecting = _SIFT_MEGAPIXEL * _megapixels(min(size, parameters.image_size))
     return {
-        "photos": speed.seconds(reading + writing, _MOST_READERS) + speed.seconds(decoding, 1),
-        "features": speed.seconds(
-            count * (_SIFT_MEGAPIXEL * detected + _SIFT_THOUSAND * features), all_threads
-        ),
-        "pairs": speed.seconds(_MATCHED_PAIR * pairs * features**2, all_threads),
-        "verified": speed.seconds(_VERIFIED_PAIR * pairs * features, all_threads),
-        "poses": speed.seconds(_POSE * math.sqrt(features) * count * (1 + count / _POSE_GROWTH), 1),
-        "images": speed.seconds(_IMAGE_MEGAPIXEL * copy * count, _MOST_READERS),
-        "start": speed.seconds(_START, 1),
+        "start": Step(_START, 1),
+        "videos": Step(photos.decoded * _FRAME_MEGAPIXEL * _megapixels(photos.video), 1),
+        "photos": Step(reading, _MOST_READERS),
+        "features": Step(count * (detecting + _SIFT_THOUSAND * parameters.features / 1000)),
+        **steps_of_pairs(expected_pairs(count, effort), parameters.features),
+        "poses": Step(_POSE * _growing(count), 1),
+        "load": Step(_LOAD, 1),
+        "images": Step(_IMAGE_MEGAPIXEL * copy * count, _MOST_READERS),
+        "report": Step(_REPORT, 1),
     }
+
+
+def steps_of_pairs(pairs: float, features: float) -> dict[str, Step]:
+    """The steps "pairs" and "verified" for this number of pairs, and of features in a photo."""
+    thousands = features / 1000
+    return {
+        "pairs": Step(_MATCHED_PAIR * pairs * thousands**2),
+        "verified": Step(_VERIFIED_PAIR * pairs * math.sqrt(thousands)),
+    }
+
+
+def share_of_poses(registered: int, photos: int) -> float:
+    """The share of the step "poses" that is finished when so many photos are registered."""
+    registration = 1 / (1 + photos / _POSE_END)
+    return registration * _growing(registered) / _growing(max(1, photos))
+
+
+def _growing(photos: int) -> float:
+    """The work of registering ``photos``; 1 for the first one."""
+    return photos * (1 + photos / _POSE_GROWTH)
 
 
 def expected_pairs(count: int, effort: EffortName) -> float:

@@ -25,8 +25,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
+from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, find_inputs, gather
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.survey import survey
+from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import remove_temporaries
 from snowsplat.util.safe_json import from_json, inside
@@ -78,6 +81,7 @@ def make_dataset(
     options: DatasetOptions,
     watcher: Watcher,
     overwrite: bool = False,
+    later: Later | None = None,
 ) -> dict[str, Outcome]:
     """Make a dataset in ``folder`` from photos, videos, and folders of photos or videos.
 
@@ -86,6 +90,7 @@ def make_dataset(
 
     Args:
         overwrite: replace a dataset in ``folder`` that was made from other inputs.
+        later: the rest of the job, which the time left includes.
 
     Returns:
         The outcome of each stage. Its result is a JSON value: a `Gathered` for "photos", an
@@ -105,7 +110,15 @@ def make_dataset(
         stages = Stages(folder / RECORD, STAGES)
         stages.about = {"inputs": [str(path.absolute()) for path in inputs]}
         stages.save()  # from here on the folder is recognised as a dataset
-        return _run(stages, inputs, sources, folder, options, watcher, in_place)
+        left = _time_left(inputs, options, later or Later())
+        return _run(stages, inputs, sources, folder, options, watcher, in_place, left)
+
+
+def _time_left(inputs: Sequence[Path], options: DatasetOptions, later: Later) -> SfmTimeLeft:
+    photos = survey(inputs, options.gather)
+    sfm = options.sfm
+    threads = thread_count(sfm.threads)
+    return SfmTimeLeft(photos, options.gather.size, sfm.effort, threads, later)
 
 
 def _run(
@@ -116,11 +129,12 @@ def _run(
     options: DatasetOptions,
     watcher: Watcher,
     in_place: bool,
+    left: SfmTimeLeft,
 ) -> dict[str, Outcome]:
     outcomes: dict[str, Outcome] = {}
 
     def stage(name: str, settings: dict[str, Any], outputs: Sequence[str], work: Any) -> None:
-        report = watcher.begin(name)
+        report = left.report(name, watcher.begin(name))
         outcomes[name] = stages.run(
             name,
             settings,
@@ -129,6 +143,8 @@ def _run(
             lambda reason: watcher.note(f"{name}: repeated ({reason})"),
         )
         watcher.end(name, outcomes[name])
+        if outcomes[name].again:
+            left.finished_before(name)
 
     def gather_photos(report: Report) -> dict[str, Any]:
         return _gather(inputs, folder, options.gather, report, in_place)
@@ -143,11 +159,14 @@ def _run(
         gather_photos,
     )
     photos = _photos(folder, outcomes["photos"].result)
+    left.gathered(len(photos))
+    if options.skip_matching:
+        left.finished_before("poses")
 
     def find_poses(report: Report) -> dict[str, Any]:
         if options.skip_matching:
             return asdict(describe_model(folder, photos))
-        return asdict(estimate_poses(folder, photos, options.sfm, report))
+        return asdict(estimate_poses(folder, photos, options.sfm, report, left.figures))
 
     settings = {k: v for k, v in asdict(options.sfm).items() if k != "threads"}
     stage(

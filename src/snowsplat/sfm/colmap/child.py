@@ -19,7 +19,7 @@ from typing import Any
 
 from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.progress import Report
+from snowsplat.sfm.progress import Figures, Report, ignored
 from snowsplat.util.errors import SettingError, UserError
 
 # Bytes by which the database may grow in one transaction.
@@ -46,7 +46,11 @@ class Crashed(Exception):
 
 
 def estimate_poses(
-    dataset: Path, photos: list[Photo], options: SfmOptions, report: Report
+    dataset: Path,
+    photos: list[Photo],
+    options: SfmOptions,
+    report: Report,
+    figures: Figures = ignored,
 ) -> SfmResult:
     """Estimate the pose of each photo in ``input/`` of a dataset, and points of the scene.
 
@@ -56,6 +60,9 @@ def estimate_poses(
     output of COLMAP. Features and matches of an interrupted run are reused. The same photos and
     settings lead to the same pairs and matches, and to the same poses except for rounding. With
     more than 150 photos, the coordinate frame may differ, too.
+
+    ``report`` is called at least twice per second, also if nothing has changed. ``figures``
+    is called as often as there is progress.
 
     Raises:
         UserError: fewer than 3 photos, an unknown camera model, no poses found (the message
@@ -82,12 +89,12 @@ def estimate_poses(
     }
     threads = thread_count(options.threads)
     try:
-        return _run({**job, "reduced": False}, log, threads, report)
+        return _run({**job, "reduced": False}, log, threads, report, figures)
     except Crashed as crash:
         first = crash
         _check_disk(distorted)
     try:
-        result = _run({**job, "reduced": True}, log, 1, report)
+        result = _run({**job, "reduced": True}, log, 1, report, figures)
     except Crashed as crash:
         _check_disk(distorted)
         advice = "report it"
@@ -120,7 +127,9 @@ def _last_line(log: Path) -> str:
     return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "none")
 
 
-def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmResult:
+def _run(
+    job: dict[str, Any], log: Path, threads: int, report: Report, figures: Figures
+) -> SfmResult:
     with (
         open(log, "ab") as log_file,
         subprocess.Popen(
@@ -134,7 +143,7 @@ def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmRes
         ) as child,
     ):
         try:
-            answer = _communicate(child, job, report)
+            answer = _communicate(child, job, report, figures)
             code = child.wait()
         finally:
             child.kill()
@@ -146,7 +155,10 @@ def _run(job: dict[str, Any], log: Path, threads: int, report: Report) -> SfmRes
 
 
 def _communicate(
-    child: subprocess.Popen[str], job: dict[str, Any], report: Report
+    child: subprocess.Popen[str],
+    job: dict[str, Any],
+    report: Report,
+    figures: Figures,
 ) -> dict[str, Any]:
     """Send the job, report progress until the child ends, and return its last line.
 
@@ -175,12 +187,15 @@ def _communicate(
         except queue.Empty:
             if "watch" in answer:
                 _report_rows(report, *answer["watch"])
+            elif "progress" in answer:
+                report(*answer["progress"])
             continue
         # If the child has ended, the last line may be incomplete.
         if line is None or not line.endswith("\n"):
             break
         answer = json.loads(line)
         if "progress" in answer:
+            figures(answer["cpu"], answer["features"])
             report(*answer["progress"])
     # stdin is closed only after the last answer, because the child ends when its stdin is closed.
     with contextlib.suppress(BrokenPipeError):

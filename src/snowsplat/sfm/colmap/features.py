@@ -53,11 +53,13 @@ class WorkerProgress:
     ``report`` sends a number of finished items. ``watch`` sends the name of a table of the
     database: the parent process then counts the rows that COLMAP writes into this table. The worker
     must not count them itself: COLMAP contains its own copy of SQLite, and if two copies of SQLite
-    in one process have a database open, each removes the locks of the other.
+    in one process have a database open, each removes the locks of the other. ``features`` is called
+    with the mean number of features of the photos.
     """
 
     report: Report
     watch: Callable[[str, str, int, str], None]  # database, table, final row count, item name
+    features: Callable[[float], None] = lambda mean: None
 
 
 def extract_features(
@@ -77,14 +79,18 @@ def extract_features(
 
     at_once = photos_at_once(size, threads)
     with closing_database(database) as opened, ThreadPoolExecutor(at_once) as pool:
+        counts = []
         left = [i for i in range(len(photos)) if not opened.exists_descriptors(i + 1)]
         found = pool.map(detect, [photos[i] for i in left])
         for done, (i, features) in enumerate(zip(left, found, strict=True)):
             progress.report(len(photos) - len(left) + done, len(photos), "photos with features")
+            counts.append(len(features.descriptors))
             transaction = pycolmap.DatabaseTransaction(opened)
             opened.write_keypoints(i + 1, features.keypoints)
             sift = pycolmap.FeatureExtractorType.SIFT
             descriptors = pycolmap.FeatureDescriptors(sift, features.descriptors)
             opened.write_descriptors(i + 1, descriptors)
             del transaction  # ends it
+        if counts:
+            progress.features(sum(counts) / len(counts))
         progress.report(len(photos), len(photos), "photos with features")

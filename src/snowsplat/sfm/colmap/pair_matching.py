@@ -29,6 +29,10 @@ _CACHED_PHOTOS = 100
 
 # A verified pair has at least this many inliers: matches that are consistent with a relative pose.
 _MIN_INLIERS = 15
+# The pairs of a group are verified in this number of passes over all photos. Pairs with few inliers
+# take several times as long as others. With several passes, each part of the time contains all
+# kinds of pairs, so the time left can be estimated.
+_PASSES = 8
 # Pairs are verified in groups with these smallest inlier ratios. The last one is the default of
 # COLMAP, for all pairs with many matches.
 _INLIER_RATIOS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.32, 0.25)
@@ -97,7 +101,8 @@ def _verify(
     pairing = pycolmap.ImportedPairingOptions()
     pairing.block_size = _PAIRS_PER_BLOCK
     pairing.match_list_path = database.with_suffix(".pairs")
-    Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
+    ordered = [pair for first in range(_PASSES) for pair in pairs[first::_PASSES]]
+    Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in ordered))
     try:
         pycolmap.match_image_pairs(
             database,

@@ -3,10 +3,11 @@
     python -m snowsplat.sfm.colmap.worker
 
 The parent sends the job as one line of JSON to stdin. The child answers with lines of JSON on
-stdout: its progress, the database tables whose rows the parent may count (`WorkerProgress`), and at
-the end the result or a `UserError`. Stdin stays open as long as the parent runs; when it closes,
-the child ends immediately. The child ignores Ctrl-C, which the parent handles. The output of COLMAP
-goes to stderr, which the parent redirects to a log file.
+stdout: its progress, with its processor time and the number of features; the database tables whose
+rows the parent may count (`WorkerProgress`); and at the end the result or a `UserError`. Stdin
+stays open as long as the parent runs; when it closes, the child ends immediately. The child ignores
+Ctrl-C, which the parent handles. The output of COLMAP goes to stderr, which the parent redirects to
+a log file.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
@@ -44,13 +46,20 @@ def main() -> None:
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
+    figures = {"features": 0.0}
+
     def send(**line: Any) -> None:
         answers.write(json.dumps(line) + "\n")
         answers.flush()
 
+    def report(*counts: Any, **_: Any) -> None:
+        send(progress=counts, cpu=time.process_time(), **figures)
+
     try:
         progress = WorkerProgress(
-            report=lambda *counts: send(progress=counts), watch=lambda *table: send(watch=table)
+            report=report,
+            watch=lambda *table: send(watch=table),
+            features=lambda mean: figures.update(features=mean),
         )
         send(result=asdict(_run(job, progress)))
     except UserError as error:

@@ -1,0 +1,249 @@
+"""`TimeLeft`: estimates the time until a job is finished, from the progress of its steps.
+
+The steps of structure from motion have very different costs, and the longest are the last ones. So
+every step has a predicted work (`sfm.cost`), in seconds of one core of a reference machine. Two
+factors convert work to time on this machine. Both are measured while the job runs:
+
+    slowness   seconds of one core here for a second of the reference machine. It is measured in
+               the steps whose work is well predicted (`_PARALLEL`). A step that is in progress has
+               a slowness of its own as soon as a part of it is finished; that of the machine is
+               its initial value, with the weight of `_PRIOR` of the step
+    cores      the number of cores that the job gets, at most its number of threads; less than 1 if
+               other jobs use most of the machine. It is the processor time divided by the time,
+               while all threads work
+
+Some steps become slower while they run: registering a photo takes longer if the model is large. The
+progress of a step is therefore given as a share of its work, not of its items.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from snowsplat.sfm.colmap.options import EFFORTS
+from snowsplat.sfm.cost import Step, expected_pairs, share_of_poses, steps_of, steps_of_pairs
+
+if TYPE_CHECKING:
+    from snowsplat.sfm.colmap.options import EffortName
+    from snowsplat.sfm.progress import Report
+    from snowsplat.sfm.survey import Photos
+
+_PRIOR = 0.1
+#: The slowness is 1 at the start, with the weight of this share of all the work.
+_START = 0.01
+#: Steps in which all threads work all the time, and whose work depends little on the scene.
+_PARALLEL = ("photos", "features", "images")
+#: Cores are measured for at least this time, in seconds.
+_MEASURED_SECONDS = 2.0
+_FEWEST_CORES = 0.05
+#: While nothing is reported, the time left decreases, but not below this share of the silence.
+_SILENCE = 0.25
+
+
+class TimeLeft:
+    """Call `update` when a part of a step is finished. `seconds` is the time that is left."""
+
+    def __init__(
+        self,
+        steps: Mapping[str, Step],
+        threads: int,
+        clock: Callable[[], float] = time.monotonic,
+        cpu_clock: Callable[[], float] = time.process_time,
+    ) -> None:
+        """
+        Args:
+            steps: all steps of the job, in their order.
+            threads: number of threads of the job.
+            clock, cpu_clock: return the time, and the processor time of this process, in seconds.
+        """
+        self._steps = dict(steps)
+        self._clock, self._cpu_clock = clock, cpu_clock
+        self._child = 0.0  # processor time of the child process
+        self._cores = float(threads)
+        self._threads = threads
+        self._step, self._share = next(iter(steps)), 0.0
+        self._began = self._last = clock()  # of this step; of the last progress
+        self._began_cpu = self._last_cpu = cpu_clock()
+        # Core seconds of each step that were measured, and the work that was finished with them.
+        self._measured = dict.fromkeys(steps, 0.0)
+        self._finished = dict.fromkeys(steps, 0.0)
+        self._estimate = self._sum()
+
+    def expect(self, steps: Mapping[str, Step]) -> None:
+        """Replace some of the steps, because more is known about their work."""
+        self._steps |= steps
+        self._estimate = self._sum()
+
+    def child_used(self, cpu_seconds: float) -> None:
+        """The child process of the job has used this processor time so far."""
+        self._child = cpu_seconds
+
+    def update(self, step: str, share: float) -> None:
+        """``share`` (0 to 1) of the work of ``step`` is finished.
+
+        The steps before it are finished. If a step is repeated, its share becomes smaller.
+        """
+        if step == self._step and share == self._share:
+            return
+        now, cpu = self._clock(), self._cpu_clock() + self._child
+        if step != self._step:
+            if 0.0 < self._share < 1.0:
+                seconds = (now - self._last) * self._cores_of(self._step)
+                self._add(self._step, seconds, 1.0 - self._share)
+            self._began, self._began_cpu = now, cpu
+        elif share > self._share:
+            seconds = (now - self._last) * self._cores_of(step)
+            if step in _PARALLEL:
+                seconds = cpu - self._last_cpu
+                elapsed = now - self._began
+                if elapsed > _MEASURED_SECONDS:
+                    cores = (cpu - self._began_cpu) / elapsed
+                    self._cores = min(max(cores, _FEWEST_CORES), self._threads)
+            self._add(step, seconds, share - self._share)
+        self._step, self._share = step, share
+        self._last, self._last_cpu = now, cpu
+        self._estimate = self._sum()
+
+    @property
+    def seconds(self) -> float:
+        """Estimated seconds until the last step is finished."""
+        silence = self._clock() - self._last
+        return max(self._estimate - silence, _SILENCE * silence)
+
+    def _add(self, step: str, core_seconds: float, share: float) -> None:
+        self._measured[step] += core_seconds
+        self._finished[step] += share * self._steps[step].work
+
+    def _cores_of(self, step: str) -> float:
+        return min(self._steps[step].threads, self._cores)
+
+    def _sum(self) -> float:
+        """Seconds of the rest of this step and of the later ones."""
+        names = list(self._steps)
+        later = names[names.index(self._step) + 1 :]
+        rest = (1.0 - self._share) * self._seconds(self._step)
+        return rest + sum(map(self._seconds, later))
+
+    def _seconds(self, step: str) -> float:
+        """Seconds of the whole step on this machine."""
+        work = self._steps[step].work
+        if not work:
+            return 0.0
+        start = _START * sum(step.work for step in self._steps.values())
+        typical = [name for name in _PARALLEL if name in self._steps]
+        measured = sum(self._measured[name] for name in typical)
+        finished = sum(self._finished[name] for name in typical)
+        slowness = (measured + start) / (finished + start)
+        prior = _PRIOR * work
+        own = (self._measured[step] + prior * slowness) / (self._finished[step] + prior)
+        return own * work / self._cores_of(step)
+
+
+# The step whose progress is reported with these names of items.
+_STEP_OF_ITEMS = {
+    "photos with features": "features",
+    "matched pairs": "pairs",
+    "verified pairs": "verified",
+    "registered photos": "poses",
+}
+_STEPS_OF_STAGE = {
+    "photos": ("videos", "photos"),
+    "poses": ("features", "pairs", "verified", "poses"),
+    "images": ("load", "images"),
+    "report": ("report",),
+}
+
+
+@dataclass(frozen=True)
+class Later:
+    """The part of a job after structure from motion.
+
+    Attributes:
+        work: seconds of one core of the reference machine; all threads work.
+        deadline: when the job will end because of its time budget, by `time.monotonic`; None: there
+            is no time budget.
+    """
+
+    work: float = 0.0
+    deadline: float | None = None
+
+
+class SfmTimeLeft:
+    """Adds the time left to the progress of the stages of `dataset_folder.make_dataset`."""
+
+    def __init__(
+        self,
+        photos: Photos,
+        size: int | None,
+        effort: EffortName,
+        threads: int,
+        later: Later,
+    ) -> None:
+        """
+        Args:
+            photos, size, effort: as for `cost.steps_of`.
+            threads: number of threads of the job.
+            later: the part of the job after structure from motion.
+        """
+        self._photos, self._size, self._effort = photos, size, effort
+        self._left = TimeLeft(
+            {**_without_start(steps_of(photos, size, effort)), "later": Step(later.work)}, threads
+        )
+        self._pairs = 0  # that are matched; 0: not known yet, as for the features
+        self._features = 0.0
+        self._deadline = later.deadline
+
+    def report(self, stage: str, report: Report) -> Report:
+        """``report`` of a stage; the returned callback adds the time left."""
+
+        def with_time(done: int, total: int, what: str = "", left: float | None = None) -> None:
+            self._update(stage, done, total, what)
+            left = self._left.seconds
+            if self._deadline is not None:
+                left = max(left, self._deadline - time.monotonic())
+            report(done, total, what, left)
+
+        return with_time
+
+    def _update(self, stage: str, done: int, total: int, what: str) -> None:
+        step = stage
+        if stage == "poses":
+            step = _STEP_OF_ITEMS[what]
+        elif stage == "photos" and what != "photos":
+            step = "videos"
+        if step == "pairs" and total != self._pairs:
+            self._pairs = total
+            self._expect_pairs()
+        share = done / total if total else 0.0
+        self._left.update(step, share_of_poses(done, total) if step == "poses" else share)
+
+    def figures(self, cpu_seconds: float, features: float) -> None:
+        """Figures about the child process that estimates the poses; see `progress.Figures`."""
+        self._left.child_used(cpu_seconds)
+        if features and features != self._features:
+            self._features = features
+            self._expect_pairs()
+
+    def _expect_pairs(self) -> None:
+        pairs = self._pairs or expected_pairs(self._photos.count, self._effort)
+        features = self._features or EFFORTS[self._effort].features
+        self._left.expect(steps_of_pairs(pairs, features))
+
+    def gathered(self, count: int) -> None:
+        """The stage "photos" is finished, with ``count`` photos and frames."""
+        self._photos = replace(self._photos, stills=count, frames=0)
+        steps = steps_of(self._photos, self._size, self._effort)
+        names = (*_STEPS_OF_STAGE["poses"], *_STEPS_OF_STAGE["images"])
+        self._left.expect({name: steps[name] for name in names})
+
+    def finished_before(self, stage: str) -> None:
+        """An earlier run has finished ``stage``, or it does nothing."""
+        self._left.expect(dict.fromkeys(_STEPS_OF_STAGE[stage], Step(0.0)))
+
+
+def _without_start(steps: Mapping[str, Step]) -> dict[str, Step]:
+    """The step "start" is distributed over the others, so that its progress cannot be measured."""
+    return {name: step for name, step in steps.items() if name != "start"}
