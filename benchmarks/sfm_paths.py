@@ -17,6 +17,7 @@ from snowsplat.synthetic.photographer import rolled
 
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 _PHOTOS_OF_A_LOOP = 20
+_PHOTOS_OF_A_TURN = 6
 _HEIGHTS = (1.45, 1.75, 1.1)  # of the camera above the floor in metres: first loop, second loop …
 
 
@@ -56,21 +57,32 @@ def looking_down(count: int, seed: int) -> list[Tensor]:
 def around_two(count: int, seed: int, distance: float = 4.4, radius: float = 1.55) -> list[Tensor]:
     """A figure of eight around two objects at x = ± half of ``distance``, in metres.
 
-    ``radius`` is that of the circle around each object.
+    ``radius`` is that of the circle around each object. Between the two circles, the camera turns
+    from one object to the other.
     """
     random = np.random.default_rng([seed, count])
+    turning = max(_PHOTOS_OF_A_TURN, count // 20)
     positions, targets = [], []
-    for i in range(count):
-        second, share = divmod(2 * i / count, 1.0)
-        side = 1 if second else -1
+
+    def circle(side: int, photos: int) -> None:
         rounds = 1 if count < 150 else 2
-        angle = 2 * math.pi * share * rounds + (math.pi if second else 0)
-        # If there are two rounds, the camera is higher in the second one.
-        height = 1.2 + (0.4 if share * rounds >= 1 else 0)
         middle = np.array([side * distance / 2, 0.0, 0.0])
-        around = np.array([math.cos(angle), math.sin(angle) * (-side), 0.0])
-        positions.append(middle + radius * around + np.array([0, 0, height]))
-        targets.append(middle + np.array([0, 0, 0.62]))
+        for i in range(photos):
+            share = i / photos
+            angle = 2 * math.pi * share * rounds + (math.pi if side > 0 else 0)
+            # If there are two rounds, the camera is higher in the second one.
+            height = 1.2 + (0.4 if share * rounds >= 1 else 0)
+            around = np.array([math.cos(angle), math.sin(angle) * (-side), 0.0])
+            positions.append(middle + radius * around + np.array([0, 0, height]))
+            targets.append(middle + np.array([0, 0, 0.62]))
+
+    first = (count - turning) // 2
+    circle(-1, first)
+    gap = distance / 2 - radius
+    ends = np.array([[-gap, 0, 1.2], [gap, 0, 1.2]])
+    looks = np.array([[-distance / 2, 0, 0.62], [distance / 2, 0, 0.62]])
+    _turn(positions, targets, (ends[0], looks[0]), (ends[1], looks[1]), turning)
+    circle(1, count - turning - first)
     return _hand_held(positions, targets, random)
 
 
@@ -79,15 +91,21 @@ def through_two_rooms(
 ) -> list[Tensor]:
     """Loops in one room, then the way through the passage, then loops in the other room.
 
+    The camera turns from the last view of a loop to the way, and from the way to the next loop.
+
     The middles of the rooms are at (x, 0) for the two x of ``middles``. The door of a room is at
     x + ``door``. The passage runs along y = ``corridor``, which is negative. All are in metres.
     """
     random = np.random.default_rng([seed, count])
     between = max(1, round(0.3 * count))
-    first = (count - between) // 2
-    positions, targets = [], []
+    turning = max(_PHOTOS_OF_A_TURN, count // 20)
+    first = (count - between - 2 * turning) // 2
+    positions: list[np.ndarray] = []
+    targets: list[np.ndarray] = []
 
-    def loop(middle: float, photos: int) -> None:
+    def loop(
+        middle: float, photos: int, positions: list[np.ndarray], targets: list[np.ndarray]
+    ) -> None:
         rounds = max(1, min(4, photos // _PHOTOS_OF_A_LOOP))
         for i in range(photos):
             number, share = divmod(i * rounds / photos, 1.0)
@@ -98,17 +116,51 @@ def through_two_rooms(
             positions.append(at + np.array([middle, 0, lift]))
             targets.append(to + np.array([middle, 0, lift - 0.25]))
 
-    loop(middles[0], first)
+    loop(middles[0], first, positions, targets)
     a, b = middles
     corners = [(a, -0.6), (a + door, -1.3), (a + door, corridor), (b + door, corridor)]
     corners += [(b + door, -1.3), (b, -0.4), (b, 1.0)]
+    way, ahead = [], []
     for i in range(between):
-        at = _along(corners, (i + 0.5) / between * 0.9)
-        to = _along(corners, min(1.0, (i + 0.5) / between * 0.9 + 0.1))
-        positions.append(np.array([*at, 1.45]))
-        targets.append(np.array([*to, 1.3]))
-    loop(middles[1], count - between - first)
+        way.append(np.array([*_along(corners, (i + 0.5) / between * 0.9), 1.45]))
+        share = min(1.0, (i + 0.5) / between * 0.9 + 0.1)
+        ahead.append(np.array([*_along(corners, share), 1.3]))
+    _turn(positions, targets, (positions[-1], targets[-1]), (way[0], ahead[0]), turning)
+    positions += way
+    targets += ahead
+    second: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+    loop(middles[1], count - between - 2 * turning - first, *second)
+    _turn(positions, targets, (way[-1], ahead[-1]), (second[0][0], second[1][0]), turning)
+    positions += second[0]
+    targets += second[1]
     return _hand_held(positions, targets, random)
+
+
+def _turn(
+    positions: list[np.ndarray],
+    targets: list[np.ndarray],
+    start: tuple[np.ndarray, np.ndarray],
+    end: tuple[np.ndarray, np.ndarray],
+    photos: int,
+) -> None:
+    """Append photos between two views, each a position and a target.
+
+    The camera turns evenly, in the direction of the smaller angle.
+    """
+    (at, to), (last_at, last_to) = start, end
+    azimuths = [math.atan2(*(target - position)[1::-1]) for position, target in (start, end)]
+    turn = (azimuths[1] - azimuths[0]) % (2 * math.pi)
+    if turn > math.pi:
+        turn -= 2 * math.pi
+    for i in range(1, photos + 1):
+        share = i / (photos + 1)
+        azimuth = azimuths[0] + share * turn
+        position = at + share * (last_at - at)
+        reach = np.linalg.norm((to - at)[:2])
+        drop = (1 - share) * (to - at)[2] + share * (last_to - last_at)[2]
+        ahead = np.array([reach * math.cos(azimuth), reach * math.sin(azimuth), drop])
+        positions.append(position)
+        targets.append(position + ahead)
 
 
 def _along(corners: list[tuple[float, float]], share: float) -> np.ndarray:

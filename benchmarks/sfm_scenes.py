@@ -4,7 +4,7 @@
     around   the still life of `snowsplat demo`; the camera goes around the table
     plain    the room with walls of one colour and less furniture
     carpet   a room whose carpet repeats exactly; the camera looks down
-    twins    two identical objects in a hall with plain walls; a figure of eight around them
+    twins    two identical objects in a hall with pictures; a figure of eight around the objects
     rooms    two identical rooms, and the passage from one to the other
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
@@ -33,7 +33,7 @@ from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
-VERSION = 1
+VERSION = 2
 CACHE_VARIABLE = "SNOWSPLAT_SFM_SCENES"
 SIZE = (800, 600)
 
@@ -145,7 +145,11 @@ def _twins(seed: int) -> Scene:
     random = np.random.default_rng([seed, 3])
     x, y = 9.4, 5.4
     floor = paint.plain(_pixels(x, y), (0.50, 0.46, 0.40), random, stains=0.1)
-    walls = [_plain((0.78, 0.77, 0.72)), _plain((0.70, 0.74, 0.74))] * 2
+    colours = [(0.78, 0.77, 0.72), (0.70, 0.74, 0.74)] * 2
+    walls = [
+        _with_pictures(paint.plain(_pixels(side, _HEIGHT), colour, random), 4, random)
+        for side, colour in zip((y, y, x, x), colours, strict=True)
+    ]
     objects = [_shell((x, y), [*walls, floor, _plain((0.86, 0.86, 0.84))])]
     for side in (-1, 1):
         objects += _monument(np.random.default_rng([seed, 4]), (side * _TWIN_DISTANCE / 2, 0.0))

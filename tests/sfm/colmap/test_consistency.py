@@ -108,6 +108,23 @@ def test_photos_that_follow_each_other_outweigh_two_equal_rooms():
     assert find_parts(pairs(in_order=True)) == [set(range(1, 21)), set(range(21, 41))]
 
 
+def test_a_few_matches_suffice_if_photos_follow_each_other():
+    """A walk around two equal objects. While the camera turns, photos have few matches."""
+
+    def pairs(border):
+        between = [CheckedPair(i, j, n, 0, follows=True) for i, j, n in border]
+        true = chain(range(1, 21)) + chain(range(21, 41))
+        true = [replace(p, follows=p.second - p.first <= 2) for p in true]
+        return [*true, *between, *(CheckedPair(i, i + 20, 900, 700) for i in range(1, 21))]
+
+    assert find_parts(pairs([(20, 21, 54), (19, 21, 24)])) == [
+        set(range(1, 21)),
+        set(range(21, 41)),
+    ]
+    assert find_parts(pairs([(20, 21, 54), (19, 21, 14)])) == [set(range(1, 41))]
+    assert find_parts(pairs([(20, 21, 54)])) == [set(range(1, 41))]
+
+
 def test_look_alikes_in_a_correct_model_cut_nothing():
     """Two places with many false matches between them; the model confirms the way between them."""
     pairs = chain(range(1, 31))

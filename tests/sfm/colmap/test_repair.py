@@ -16,7 +16,7 @@ from snowsplat.sfm.colmap.mapping import Mapping
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
 from snowsplat.sfm.colmap.pairs import PairChoice
 from snowsplat.sfm.colmap.reconstruct import Matched, PoseEstimation
-from snowsplat.sfm.colmap.repair import _false_pairs, repair
+from snowsplat.sfm.colmap.repair import _false_pairs, _parts, repair
 from snowsplat.sfm.progress import silent
 
 from . import look_alikes
@@ -90,6 +90,22 @@ def test_which_pairs_between_parts_have_false_matches():
     assert _false_pairs([torn, confirmed, following, inside], [{1, 2, 3}, {4, 5}]) == {(1, 5)}
 
 
+def test_pairs_that_were_false_before_count_only_if_photos_in_order_are_torn():
+    """Two equal objects: after the repair, hundreds of false matches contradict the true poses."""
+
+    def pairs(last):
+        true = [CheckedPair(i, i + 1, 500, 450, follows=True) for i in range(1, 20) if i != 10]
+        true += [CheckedPair(10, 11, 54, last, follows=True)]
+        true += [CheckedPair(9, 11, 24, last // 2, follows=True)]
+        return true + [CheckedPair(i, i + 10, 2000, 0) for i in range(1, 11)]
+
+    apart = [set(range(1, 11)), set(range(11, 21))]
+    false_pairs = {(i, i + 10) for i in range(1, 11)}
+    assert _parts(pairs(last=50), set()) == apart
+    assert _parts(pairs(last=50), false_pairs) == [set(range(1, 21))]
+    assert _parts(pairs(last=0), false_pairs) == apart
+
+
 def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):
     first, second = (
         repair(look_alikes.model(scene, folded=True), mapping, 4.0).model for _ in range(2)
@@ -98,7 +114,7 @@ def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):
 
 
 def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(mapping, scene, monkeypatch):
-    monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
+    monkeypatch.setattr(Mapping, "continued", lambda self, model, relaxed: model)
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
     assert set(repaired.model.reg_image_ids()).isdisjoint(FAR)
@@ -115,22 +131,22 @@ def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(mapping, sce
 def test_photos_that_the_mapper_drops_are_named(mapping, scene, monkeypatch, tmp_path):
     """A model of COLMAP does not contain photos that have no matches with others any more."""
 
-    def drop(self, models, relaxed=True):
+    def drop(self, model, relaxed):
         (tmp_path / "registered").mkdir()
-        models[0].write(tmp_path / "registered")
-        return [pycolmap.Reconstruction(tmp_path / "registered")]
+        model.write(tmp_path / "registered")
+        return pycolmap.Reconstruction(tmp_path / "registered")
 
-    monkeypatch.setattr(Mapping, "extend", drop)
+    monkeypatch.setattr(Mapping, "continued", drop)
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.model.images).isdisjoint(FAR)
     assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
 
 
 def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypatch):
-    def fold_again(self, models, relaxed=True):
-        return [look_alikes.model(scene, folded=True)]
+    def fold_again(self, model, relaxed):
+        return look_alikes.model(scene, folded=True)
 
-    monkeypatch.setattr(Mapping, "extend", fold_again)
+    monkeypatch.setattr(Mapping, "continued", fold_again)
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.model.reg_image_ids()).isdisjoint(FAR)
     assert len(repaired.left_out) == len(FAR)
@@ -140,6 +156,7 @@ def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_pa
     folded = look_alikes.model(scene, folded=True)
     monkeypatch.setattr(Mapping, "run", lambda self, mapper, relaxed: [folded])
     monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
+    monkeypatch.setattr(Mapping, "continued", lambda self, model, relaxed: model)
     progress = WorkerProgress(silent, lambda *table: None)
     photos = look_alikes.photos()
     job = PoseEstimation(Folders(tmp_path), photos, SfmOptions(), 1, progress)

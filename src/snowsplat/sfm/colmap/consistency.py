@@ -46,6 +46,7 @@ _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 # Pairs with fewer verified matches are ignored: unrelated photos can have about this number of
 # matches by chance.
 _MIN_MATCHES = 50
+_MIN_FOLLOWING_MATCHES = 15  # instead, for photos that follow each other: they have few of these
 # A match is a hit if its two features observe the same point of the model. It is a miss if one of
 # its features observes a point whose projection into the other photo is far from the matched
 # feature. The support of a pair is hits / (hits + misses); in a correct model, it is nearly 1.
@@ -115,9 +116,14 @@ class CheckedPair:
         return float(self.agreeing >= _MIN_AGREEING)
 
     @property
+    def counts(self) -> bool:
+        """Whether the pair has enough matches to be considered."""
+        return self.matches >= (_MIN_FOLLOWING_MATCHES if self.follows else _MIN_MATCHES)
+
+    @property
     def torn(self) -> bool:
         """Whether the pair is a tear: the model contradicts its matches."""
-        return self.matches >= _MIN_MATCHES and self.support <= _TORN
+        return self.counts and self.support <= _TORN
 
 
 def check_pairs(
@@ -153,7 +159,7 @@ def check_pairs(
             is_hit = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
             follows = (first, second) in following_pairs
             pair = CheckedPair(first, second, len(rows), int(is_hit.sum()), follows=follows)
-            if len(rows) >= _MIN_MATCHES:
+            if pair.counts:
                 images = model.image(first), model.image(second)
                 focal = np.mean([model.camera(i.camera_id).mean_focal_length() for i in images])
                 pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
@@ -261,9 +267,9 @@ def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
 
     The first set contains the photos of the largest part, and of all parts that do not contradict
     it. Each of the other parts is one set. So there is only one set for a model without
-    contradictions. Photos that have no pair with at least `_MIN_MATCHES` matches are in no set.
+    contradictions. Photos without a pair that counts are in no set.
     """
-    pairs = [pair for pair in pairs if pair.matches >= _MIN_MATCHES]
+    pairs = [pair for pair in pairs if pair.counts]
     ids = sorted({i for pair in pairs for i in (pair.first, pair.second)})
     if not ids:
         return []

@@ -51,7 +51,7 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     wrong: dict[int, str] = {}  # image id -> reason, for all photos that lost their pose
     for number in range(_ROUNDS + 1):
         pairs = check_pairs(model, mapping.database, max_error)
-        parts = find_parts(pairs)
+        parts = _parts(pairs, false_pairs)
         if len(parts) < 2:
             break
         wrong |= _reasons(model, pairs, parts)
@@ -60,9 +60,26 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         if number == _ROUNDS or model.num_reg_images() < MIN_PHOTOS:
             break
         model = _registered_again(model, mapping, false_pairs)
+    if wrong:
+        model = mapping.refine(model)
     registered = set(model.reg_image_ids())
     left_out = {i: reason for i, reason in wrong.items() if i not in registered}
     return Repaired(model, len(wrong), {names[i]: reason for i, reason in left_out.items()})
+
+
+def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> list[set[int]]:
+    """The parts of a model that contradict each other, as `find_parts`.
+
+    ``false_pairs`` were found to be false in an earlier model, perhaps by mistake. So they count,
+    too. But they do not count if the model contradicts only them, and no pair of photos that follow
+    each other: then the earlier model was wrong, and this one is not.
+    """
+    parts = find_parts(pairs)
+    if len(parts) > 1 and not any(pair.torn and pair.follows for pair in pairs):
+        others = find_parts([p for p in pairs if (p.first, p.second) not in false_pairs])
+        if len(others) == 1:
+            return others
+    return parts
 
 
 def _registered_again(
@@ -72,7 +89,7 @@ def _registered_again(
     reduced = mapping.database.with_suffix(".checked.db")
     try:
         copy_for_mapping(mapping.database, reduced, without=false_pairs)
-        return replace(mapping, database=reduced).extend([model], relaxed=False)[0]
+        return replace(mapping, database=reduced).continued(model, relaxed=False)
     finally:
         remove_database(reduced)
 
