@@ -12,8 +12,9 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.scene_source import load_trained
 from snowsplat.pipeline.train import TrainOptions, resume, train
-from snowsplat.pipeline.training_run import TrainingStopped
+from snowsplat.pipeline.training_run import TrainingStopped, left_out_line
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training import trainer
 from snowsplat.util.errors import SettingError, UserError
 
 
@@ -22,10 +23,12 @@ class Recorder(Observer):
 
     def __init__(self, interrupt_at: int = 0) -> None:
         self.events: list[str] = []
+        self.notes: list[str] = []
         self.interrupt_at = interrupt_at
 
     def note(self, line: str) -> None:
         self.events.append("note")
+        self.notes.append(line)
 
     def steps_begin(self, step: int, iterations: int) -> None:
         self.events.append(f"begin {step}/{iterations}")
@@ -81,6 +84,63 @@ def test_ctrl_c_and_resume_give_the_same_scene(dataset, tmp_path):
     assert result.scene.read_bytes() == whole.scene.read_bytes()
     with pytest.raises(UserError, match="other settings"):
         resume(tmp_path / "out", TrainOptions(settings={"seed": 3}))
+
+
+def test_photos_that_are_left_out_are_named_also_by_a_resumed_run(dataset, tmp_path, monkeypatch):
+    decided = []
+
+    def unexplained_views(gaussians, views, images, **settings):
+        decided.append([view.name for view in views])
+        return 1, 3
+
+    monkeypatch.setattr(trainer, "unexplained_views", unexplained_views)
+    settings = {"iterations": 12, "leave_out_after": 0.5}
+    names = ("view_02.png", "view_04.png")
+    line = (
+        "2 photos are not explained by the scene and left out of the training: view_02.png, "
+        "view_04.png; their camera poses are probably wrong"
+    )
+
+    recorder = Recorder(interrupt_at=9)
+    with pytest.raises(TrainingStopped):
+        train(dataset, tmp_path, TrainOptions(settings=settings, hold_out=8), observer=recorder)
+    assert len(decided) == 1
+    assert recorder.notes.count(line) == 1
+    assert recorder.events.index("note", 3) == recorder.events.index("step 7") + 1
+
+    recorder = Recorder()
+    result = resume(tmp_path, observer=recorder)
+    assert len(decided) == 1
+    assert recorder.notes.count(line) == 1
+    assert result.left_out == names
+    assert json.loads((tmp_path / "metrics.json").read_text())["left_out"] == list(names)
+    assert "probably wrong: view_02.png, view_04.png." in result.report.read_text()
+
+
+def test_without_photos_that_are_left_out_nothing_is_said(dataset, tmp_path):
+    recorder = Recorder()
+    settings = {"iterations": 4, "leave_out_after": 0.5}
+    result = train(
+        dataset, tmp_path, TrainOptions(settings=settings, hold_out=8), observer=recorder
+    )
+    assert result.left_out == ()
+    assert len(recorder.notes) == 2
+    assert "left_out" not in json.loads((tmp_path / "metrics.json").read_text())
+    assert "does not explain" not in result.report.read_text()
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"),
+    [
+        (1, "1 photo is not explained by the scene and left out of the training: 0.jpg; its camera "
+            "pose is probably wrong"),
+        (12, "12 photos are not explained by the scene and left out of the training: 0.jpg, 1.jpg, "
+            "2.jpg, 3.jpg, 4.jpg, 5.jpg, 6.jpg, 7.jpg, 8.jpg, 9.jpg and 2 more; their camera poses "
+            "are probably wrong"),
+    ],
+)  # fmt: skip
+def test_the_line_about_photos_that_are_left_out(count, expected):
+    assert left_out_line([f"{i}.jpg" for i in range(count)]) == expected
 
 
 def test_options_that_contradict_each_other():

@@ -23,7 +23,7 @@ def test_the_papers_values():
     assert config.initial_points == 100_000
     assert (config.gaussians_per_pixel, config.visible_only) == (0.0, False)
     assert config.coarse_to_fine == (0, 0)
-    assert (config.image_memory, config.checkpoint_every) == (0, 0)
+    assert (config.leave_out_after, config.image_memory, config.checkpoint_every) == (0, 0, 0)
     assert config.test_iterations == (7_000, 30_000)
 
 
@@ -72,6 +72,8 @@ def test_an_unknown_setting_is_named(name):
         ("lr_means_steps", math.inf),
         ("densify_from", math.nan),
         ("densify_until", math.inf),
+        ("leave_out_after", math.nan),
+        ("leave_out_after", -0.2),
     ],
 )
 def test_invalid_values_name_their_setting(name, value):

@@ -31,6 +31,10 @@ class ConfigFlags:
         flag("{black,white,random}", default="black"),
     ] = None
     """Colour of the background of the scene and of transparent photos."""
+    leave_out_after: Annotated[int | float | None, flag("N|F", default="0")] = None
+    """After this step, leave out the training photos that the scene does not explain: their camera
+    poses are probably wrong. A value with a decimal point (0.15) is a fraction of all steps; 0:
+    never."""
 
     sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
     """Degree of the spherical harmonics (view-dependent colour). A lower degree needs less

@@ -39,7 +39,10 @@ class TerminalObserver(Observer):
         self.steps_end()
 
     def note(self, line: str) -> None:
-        self._stages.say(line)
+        if self._steps is not None:
+            self._steps.say(line)
+        else:
+            self._stages.say(line)
 
     def begin(self, stage: str) -> Report:
         return self._stages.begin(stage)

@@ -86,7 +86,7 @@ class StepProgress:
     def say(self, line: str) -> None:
         """Print a line, above the bar."""
         if self._bar is not None:
-            self._bar.console.print(line, highlight=False)
+            self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
         else:
             print(line, file=self.stream, flush=True)
 

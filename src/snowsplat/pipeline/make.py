@@ -33,6 +33,9 @@ RECORD = "make.json"
 HOLD_OUT = 8
 # The fields of a preset that affect the training.
 _TRAINING_FIELDS = ("side", "iterations", "max_gaussians", "densify_interval")
+# Photos that the scene does not explain after this fraction of the steps are left out of the
+# training: see docs/cameras.md.
+_LEAVE_OUT_AFTER = 0.2
 # Time between checkpoints in seconds. If the process is killed, at most this much work is lost.
 _CHECKPOINT_SECONDS = 15.0
 # Minimum time of a training run: in seconds, and as a fraction of the requested time. The larger
@@ -329,14 +332,16 @@ class _Job:
     def _new_training(self, options: TrainOptions) -> TrainOptions:
         if self.options.minutes is not None:
             minutes = self._minutes_left(60.0 * self.options.minutes)
-            return replace(options, hold_out=HOLD_OUT, minutes=minutes)
+            settings: dict[str, Any] = {"leave_out_after": _LEAVE_OUT_AFTER}
+            return replace(options, hold_out=HOLD_OUT, minutes=minutes, settings=settings)
         preset = PRESETS[self.plan.quality]
-        settings = ("iterations", "max_gaussians", "densify_interval")
+        names = ("iterations", "max_gaussians", "densify_interval")
+        settings = {name: getattr(preset, name) for name in names}
         return replace(
             options,
             hold_out=HOLD_OUT,
             resolution=_width(self.dataset, preset),
-            settings={name: getattr(preset, name) for name in settings},
+            settings=settings | {"leave_out_after": _LEAVE_OUT_AFTER},
         )
 
     def _minutes_left(self, given: float) -> float:

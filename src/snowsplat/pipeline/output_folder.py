@@ -248,9 +248,20 @@ class OutputFolder:
             )
         return chosen, read_gaussians(self.scene_path(chosen))
 
-    def write_metrics(self, iteration: int, split: str, evaluation: Evaluation) -> None:
-        """Write `metrics.json`: iteration, split, mean metrics, and the metrics of each view."""
-        head = {"iteration": iteration, "split": split}
+    def write_metrics(
+        self,
+        iteration: int,
+        split: str,
+        evaluation: Evaluation,
+        left_out: tuple[str, ...] = (),
+    ) -> None:
+        """Write `metrics.json`: iteration, split, mean metrics, and the metrics of each view.
+
+        If the training has left photos out, their names are the list "left_out".
+        """
+        head: dict[str, Any] = {"iteration": iteration, "split": split}
+        if left_out:
+            head["left_out"] = list(left_out)
         write_json(self.path / "metrics.json", head | evaluation.as_json())
 
     # Settings

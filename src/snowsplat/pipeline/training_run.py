@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from snowsplat.training.time_budget.pace import Pace
     from snowsplat.training.trainer import Progress, Trainer
 
+#: Largest number of photos that a line for the user names.
+_LISTED = 10
+
 
 @dataclass(frozen=True)
 class TrainResult:
@@ -38,6 +42,8 @@ class TrainResult:
         memory: the peak memory of the steps, as text.
         reductions: what was reduced because of the memory budget, as text.
         evaluation: the step and the metrics of the last evaluation on held-out photos.
+        left_out: names of the training photos that were left out, because the scene does not
+            explain them; see ``TrainConfig.leave_out_after``.
         time: the seconds that were used, including earlier runs, and the time budget in seconds;
             None without a time budget.
     """
@@ -51,6 +57,7 @@ class TrainResult:
     memory: str
     reductions: tuple[str, ...]
     evaluation: tuple[int, Evaluation] | None
+    left_out: tuple[str, ...]
     time: tuple[float, float] | None
 
 
@@ -98,6 +105,7 @@ class TrainingRun:
         self.started = self.last_checkpoint = time.monotonic()
         self.evaluation: tuple[int, Evaluation] | None = None  # the last one and its step
         self.history = History.read(self.out.history, self.first_step)
+        self._told = False  # whether the observer knows which photos are left out
 
     def run(self) -> TrainResult:
         """Run all steps and write the results.
@@ -149,6 +157,9 @@ class TrainingRun:
         if progress.metrics is not None and progress.metrics.views:
             self._record_evaluation(progress.step, progress.metrics)
         self.observer.step(progress)
+        if self.trainer.left_out and not self._told:
+            self.observer.note(left_out_line(self._left_out()))
+            self._told = True
         if self._checkpoint_is_due(progress.step):
             self._save_checkpoint()
         if progress.step in self.save_iterations:
@@ -167,6 +178,9 @@ class TrainingRun:
             )
             if length is not None:
                 schedule.stretch(progress.step, length)
+
+    def _left_out(self) -> tuple[str, ...]:
+        return tuple(self.trainer.dataset.train[i].name for i in self.trainer.left_out)
 
     def _checkpoint_is_due(self, step: int) -> bool:
         every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
@@ -237,7 +251,7 @@ class TrainingRun:
             if self.evaluation is None or self.evaluation[0] != step:
                 self._record_evaluation(step, self.trainer.evaluate())
             assert self.evaluation is not None
-            self.out.write_metrics(step, "test", self.evaluation[1])
+            self.out.write_metrics(step, "test", self.evaluation[1], self._left_out())
         self.history.write(self.out.history)
         report = self._write_report()
         time_used = None
@@ -254,6 +268,7 @@ class TrainingRun:
             memory=memory,
             reductions=self.memory.plan.reductions,
             evaluation=self.evaluation,
+            left_out=self._left_out(),
             time=time_used,
         )
         self.observer.trained(result)
@@ -278,6 +293,7 @@ class TrainingRun:
                 background=self.out.settings()[1],
                 history=self.history,
                 evaluation=None if self.evaluation is None else self.evaluation[1],
+                left_out=self._left_out(),
                 settings={
                     "recipe": self.recipe,
                     "capture": dataset,
@@ -287,3 +303,16 @@ class TrainingRun:
             ),
         )
         return self.out.report
+
+
+def left_out_line(names: Sequence[str]) -> str:
+    """The line for the user about photos that the scene does not explain; at least one name."""
+    one = len(names) == 1
+    photos, poses = ("photo is", "pose is") if one else ("photos are", "poses are")
+    listed = ", ".join(names[:_LISTED])
+    if len(names) > _LISTED:
+        listed += f" and {len(names) - _LISTED} more"
+    return (
+        f"{len(names)} {photos} not explained by the scene and left out of the training: {listed}; "
+        f"{'its' if one else 'their'} camera {poses} probably wrong"
+    )

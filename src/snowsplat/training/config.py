@@ -46,6 +46,9 @@ class TrainConfig:
             without a measurable loss of quality.
         coarse_to_fine: until the first moment, images have a quarter of the resolution; until the
             second one, half of it; 0: never.
+        leave_out_after: the moment after which training views are left out if the scene does not
+            explain them, because their camera poses are probably wrong; see `unexplained`. 0:
+            never.
         image_memory: bytes for decoded images; 0: half of the available memory.
         test_iterations: steps after which `Trainer.run` evaluates the test views.
         checkpoint_every: number of steps between two checkpoints; 0: none. The caller of
@@ -69,6 +72,7 @@ class TrainConfig:
     gaussians_per_pixel: float = 0.0
     visible_only: bool = False
     coarse_to_fine: tuple[When, When] = (0, 0)
+    leave_out_after: When = 0
     image_memory: int = 0
     test_iterations: tuple[int, ...] = (7_000, 30_000)
     checkpoint_every: int = 0
@@ -93,9 +97,14 @@ class TrainConfig:
             ("densify_from", density.densify_from),
             ("densify_until", density.densify_until),
             ("lr_means_steps", rates.means_steps),
+            ("leave_out_after", self.leave_out_after),
         ):
             if not math.isfinite(when):
                 raise SettingError(name, f"{when} is not a step; use e.g. 500, or a fraction, 0.5")
+        if self.leave_out_after < 0:
+            raise SettingError(
+                "leave_out_after", f"{self.leave_out_after} is negative; use 0 for never"
+            )
 
     def capped(self, pixels: int) -> TrainConfig:
         """This configuration with the limit of Gaussians for photos of ``pixels`` pixels."""

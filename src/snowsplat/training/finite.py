@@ -63,13 +63,18 @@ def check_state(own: Mapping[str, Tensor], given: Mapping[str, Tensor], views: i
         for mine, other in ((own[name], given[name]) for name in own)
     )
     # The kernels take one number of rows for all tensors of Gaussians.
-    others = ("random.", "step", "order")
+    others = ("random.", "step", "order", "checked", "left_out")
     rows = {len(t) for name, t in given.items() if not name.startswith(others) and t.ndim}
     fits = fits and len(rows) == 1
     fits = fits and all(
         own[name].shape == given[name].shape for name in own if name.startswith("random.")
     )
-    if not fits or int(given["step"]) < 0 or not set(given["order"].tolist()) <= set(range(views)):
+    every = set(range(views))
+    if fits and "left_out" in given:
+        left_out = set(given["left_out"].tolist())
+        fits = left_out < every
+        every -= left_out
+    if not fits or int(given["step"]) < 0 or not set(given["order"].tolist()) <= every:
         raise UserError(
             "the checkpoint: made with another dataset or recipe; resume with the original ones"
         )

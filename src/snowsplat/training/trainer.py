@@ -23,6 +23,7 @@ from snowsplat.training.losses import view_loss
 from snowsplat.training.optim import Adam
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.unexplained import unexplained_views
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import interrupts_between_steps, single_threaded
 
@@ -68,6 +69,8 @@ class Trainer:
 
     Attributes:
         gaussians: the scene after ``step`` steps, on ``device``.
+        left_out: indices of the training views that are not used any more, because the scene does
+            not explain them; see ``TrainConfig.leave_out_after``.
         within_step: True during a step. It stays True if an error or a second Ctrl-C interrupts a
             step: the state is then inconsistent and must not be saved.
     """
@@ -96,6 +99,8 @@ class Trainer:
         self.schedule = schedule or Schedule(config.iterations)
         self.step = 0
         self.within_step = False
+        self.left_out: tuple[int, ...] = ()
+        self._checked = False  # whether `left_out` is decided
         self._generators = {
             name: torch.Generator().manual_seed(4 * config.seed + i)
             for i, name in enumerate(GENERATORS)
@@ -163,6 +168,7 @@ class Trainer:
         """
         self.within_step = True
         with single_threaded():
+            self._leave_out_unexplained()
             # In the paper, a step ends with density control. Here, density control runs at the
             # beginning of the next step, so that a scene is never evaluated or saved directly after
             # a change by density control.
@@ -207,13 +213,32 @@ class Trainer:
         if len(self._order) <= LOOKAHEAD:
             while len(self._order) <= LOOKAHEAD:
                 count = len(self.dataset.train)
-                self._order += torch.randperm(count, generator=self._generators["views"]).tolist()
+                order = torch.randperm(count, generator=self._generators["views"]).tolist()
+                self._order += [i for i in order if i not in self.left_out]
             self._prefetch(downscale)
         elif downscale != self._downscale(step - 1):
             self._prefetch(downscale)
         i = self._order.pop(0)
         view, camera = self.dataset.train[i], self._cameras[i].downscaled(downscale)
         return view, camera, self._images.get(view, downscale)
+
+    def _leave_out_unexplained(self) -> None:
+        """Decide once, after the step of ``leave_out_after``, which views are used from now on."""
+        after = self.config.leave_out_after
+        if self._checked or not after or self.step < self.schedule.step_of(after):
+            return
+        black = torch.zeros(3, device=self.device)
+        self.left_out = unexplained_views(
+            self.gaussians,
+            self.dataset.train,
+            self._images,
+            background=black if self._background is None else self._background,
+            sh_degree=self.config.sh_degree_at(self.step),
+        )
+        self._checked = True
+        if self.left_out:
+            self._order = [i for i in self._order if i not in self.left_out]
+        self._prefetch(self._downscale(self.step + 1))
 
     def _next_background(self) -> Tensor:
         """The background colour, (3,) on the device: the fixed colour, or a random one."""
@@ -241,7 +266,11 @@ class Trainer:
         }
         tensors = {f"{part}.{key}": t for part, named in parts.items() for key, t in named.items()}
         order = torch.tensor(self._order, dtype=torch.int64)
-        return tensors | {"step": torch.tensor(self.step), "order": order}
+        tensors |= {"step": torch.tensor(self.step), "order": order}
+        if self.config.leave_out_after:  # otherwise, as in earlier versions of the format
+            tensors["checked"] = torch.tensor(self._checked)
+            tensors["left_out"] = torch.tensor(self.left_out, dtype=torch.int64)
+        return tensors
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Copy a state of `state_tensors`, from a trainer with the same dataset and configuration.
@@ -268,5 +297,8 @@ class Trainer:
                 ) from None
         self.step = int(tensors["step"])
         self.within_step = False
+        if self.config.leave_out_after:
+            self._checked = bool(tensors["checked"])
+            self.left_out = tuple(tensors["left_out"].tolist())
         self._order = tensors["order"].tolist()
         self._prefetch(self._downscale(self.step + 1))

@@ -107,6 +107,18 @@ def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path
     assert "8 to train on, 0 held out" in content
 
 
+def test_photos_that_are_left_out_are_named_and_not_evaluated(trained, tmp_path):
+    dataset = trained["dataset"]
+    names = tuple(view.name for view in dataset.train[:2])
+    without_test = type(dataset)(dataset.train, [], dataset.points, dataset.extent)
+    changed = trained | {"dataset": without_test, "evaluation": None, "left_out": names}
+    write_training_report(tmp_path / "report.html", Trained(**changed))
+    content = words(tmp_path / "report.html")
+    assert f"camera poses are probably wrong: {names[0]}, {names[1]}." in content
+    assert "6 photos used for training" in content
+    assert content.count(names[0]) == 1
+
+
 def test_train_writes_the_report_and_a_resumed_run_continues_its_curves(tmp_path):
     """The command line is used. The page contains names, but no absolute paths."""
     from snowsplat.cli.main import main

@@ -52,6 +52,7 @@ class Trained:
         evaluation: metrics of the held-out views; if there are none, some training views are
             evaluated.
         settings: the settings by name, as JSON values.
+        left_out: names of the training views that the training has left out.
         peak_bytes: peak memory; 0 if unknown.
     """
 
@@ -63,6 +64,7 @@ class Trained:
     history: History
     evaluation: Evaluation | None
     settings: dict[str, Any]
+    left_out: tuple[str, ...] = ()
     peak_bytes: int = 0
 
 
@@ -76,7 +78,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
     held_out = trained.evaluation is not None and bool(trained.evaluation.views)
     views = trained.dataset.test
     if not held_out:
-        views = trained.dataset.train
+        views = [v for v in trained.dataset.train if v.name not in trained.left_out]
         views = views[:: -(-len(views) // _TRAINING_VIEWS)]
     with single_threaded():
         evaluation = trained.evaluation
@@ -85,6 +87,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
         body = [
             _headline(trained, evaluation, held_out),
             _cards(trained, evaluation, held_out),
+            _left_out(trained.left_out),
             _curves(trained.history),
             pictures.compared(trained.gaussians, views, evaluation, trained.background),
             _figures(evaluation, held_out),
@@ -121,6 +124,17 @@ def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
         (duration(trained.history.seconds), "of training"),
     ]
     return cards(figures)
+
+
+def _left_out(names: tuple[str, ...]) -> str:
+    """The photos whose poses are probably wrong."""
+    if not names:
+        return ""
+    rest = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
+    return (
+        f"<h2>Photos that the scene does not explain</h2>\n<p>Left out of the training, because "
+        f"their camera poses are probably wrong: {text(', '.join(names[:_LISTED]))}{rest}.</p>"
+    )
 
 
 def _curves(history: History) -> str:
