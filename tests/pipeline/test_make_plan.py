@@ -77,6 +77,14 @@ def test_fewer_frames_of_each_video_and_fewer_photos():
     )
 
 
+def test_a_single_photo_beside_a_long_video_is_kept():
+    found = Photos(stills=1, longest=4000, frames=300, videos=1, decoded=9000, video=1920)
+    plan = choose_plan(30, found, HERE)
+    assert plan.photos in (1, None)
+    assert plan.frames is not None
+    assert 3 <= plan.frames <= 20
+
+
 def test_the_description_names_what_was_chosen():
     found = of_photos(300)
     assert described(MakePlan("draft", 1000, photos=60), found, 180) == (

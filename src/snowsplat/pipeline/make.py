@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.make_plan import MakePlan, choose_plan, described
+from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
@@ -234,7 +234,11 @@ class _Job:
         plan = self.plan
         options = DatasetOptions(
             gather=GatherOptions(size=plan.size, photos=plan.photos, frames=plan.frames),
-            sfm=SfmOptions(effort=plan.quality, threads=self.options.compute.threads),
+            sfm=SfmOptions(
+                effort=plan.quality,
+                threads=self.options.compute.threads,
+                seconds=self.options.minutes and POSES_SHARE * 60.0 * self.options.minutes,
+            ),
         )
         make_dataset(
             *(self.inputs, self.dataset, options, self.observer, self.overwrite), self._later()

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 #: The share of the time that everything before the training may take.
 _SHARE = 0.45
+#: No further attempt to find poses begins if it would probably end after this share of the time.
+POSES_SHARE = 0.6
 #: With fewer photos, their distances may be too large for matches.
 _FEWEST = 20
 
@@ -80,7 +82,7 @@ def choose_plan(
     return MakePlan(
         quality,
         size,
-        photos=fewer.stills if fewer.stills < photos.stills else None,
+        photos=max(1, fewer.stills) if fewer.stills < photos.stills else None,
         frames=max(3, fewer.frames // photos.videos) if fewer.frames < photos.frames else None,
     )
 

@@ -168,7 +168,7 @@ def _run(
             return asdict(describe_model(folder, photos))
         return asdict(estimate_poses(folder, photos, options.sfm, report, left.figures))
 
-    settings = {k: v for k, v in asdict(options.sfm).items() if k != "threads"}
+    settings = {k: v for k, v in asdict(options.sfm).items() if k not in ("threads", "seconds")}
     stage(
         "poses",
         settings | {"skip_matching": options.skip_matching},

@@ -36,6 +36,9 @@ class SfmOptions:
     mapper: Mapper = "incremental"
     effort: EffortName = "normal"
     threads: int | None = None  # None: one per processor
+    # If this time is set, no further attempt begins that would probably end later. There is always
+    # a first attempt, and further ones until poses are found.
+    seconds: float | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ registered photos.
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,8 @@ from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
+# The expected time at the end of the next attempt, divided by the time now.
+_NEXT_ATTEMPT = 3.0
 # Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
 # which the features were detected.
 _MAX_ERROR = 4.0
@@ -84,6 +87,7 @@ class PoseEstimation:
         self.options = options
         self.threads = threads
         self.progress = progress
+        self.started = time.monotonic()
         self.attempts: list[Attempt] = []
         self.log: list[str] = []  # a description of each attempt, as text for users
 
@@ -187,8 +191,15 @@ class PoseEstimation:
         )
 
     def _enough(self, evidence: Evidence) -> bool:
+        """Whether no further attempt is made: enough photos are registered, or no time is left."""
         registered = max(attempt.registered for attempt in self.attempts)
-        return registered > 0 and registered >= _ENOUGH * evidence.usable
+        least = 1.0 if self._late() else _ENOUGH * evidence.usable
+        return registered > 0 and registered >= least
+
+    def _late(self) -> bool:
+        if self.options.seconds is None:
+            return False
+        return _NEXT_ATTEMPT * (time.monotonic() - self.started) > self.options.seconds
 
     def _evidence(self, matched: Matched) -> Evidence:
         return gather_evidence(matched.database, self.photos, len(matched.choice.pairs))
