@@ -8,34 +8,30 @@
 #include <thread>
 #include <vector>
 
-#define ENTRY extern "C" int64_t
+#include "params.h"
+
+using namespace snow;
 using F = float;
 using U = uint32_t;
-ENTRY set_num_threads(int64_t);
-ENTRY neighbours(int64_t, const F*, int64_t, F*);
-ENTRY project_cull(int64_t, const F*, const F*, const F*, const F*, const F*, double, double,
-                   double, double, double, double, double, int32_t*);
-ENTRY project_fwd(int64_t, const int32_t*, const F*, const F*, const F*, const F*, const F*,
-                  const F*, int64_t, int64_t, const F*, double, double, double, double, double,
-                  double, double, F*);
-ENTRY splat_record_bytes(int64_t);
-ENTRY splats_prepare(int64_t, const F*, int64_t, double, double, const int64_t*, void*, U*);
-ENTRY splats_sort(int64_t, U*, U*, U*, U*);
-ENTRY tiles_parts(int64_t);
-ENTRY tiles_workspace_bytes(int64_t, int64_t, int64_t);
-ENTRY tiles_count(int64_t, const U*, const F*, int64_t, const void*, int64_t, int64_t, int64_t,
-                  void*, U*, int64_t, int64_t*);
-ENTRY tiles_fill(int64_t, const U*, const F*, int64_t, const void*, int64_t, int64_t, int64_t,
-                 void*, U*, int64_t, U*, U*, U*);
-ENTRY blend_block_bytes(int64_t);
-ENTRY blend_fwd(int64_t, int64_t, int64_t, const F*, int64_t, const int64_t*, const void*, const U*,
-                U*, const U*, void*, int64_t, const F*, F*, F*);
-ENTRY blend_bwd(int64_t, int64_t, int64_t, const F*, int64_t, const int64_t*, const void*, const U*,
-                U*, const U*, void*, int64_t, const U*, const F*, const F*, const F*, const F*, F*,
-                F*);
-ENTRY splats_reduce(int64_t, const F*, const U*, const F*, int64_t, int64_t, const int64_t*,
-                    int64_t, F*);
-ENTRY photometric(int64_t, int64_t, int64_t, const F*, const F*, double, double, F*, double*);
+
+#define ENTRY(NAME, ...) extern "C" int64_t NAME(const __VA_ARGS__&)
+extern "C" int64_t set_num_threads(int64_t);
+ENTRY(neighbours, NeighboursParams<F>);
+ENTRY(project_cull, ProjectCullParams<F>);
+ENTRY(project_fwd, ProjectForwardParams<F>);
+ENTRY(splat_record_bytes, SizeQueryParams);
+ENTRY(splats_prepare, SplatsPrepareParams<F>);
+ENTRY(splats_sort, SplatsSortParams<F>);
+ENTRY(tiles_parts, SizeQueryParams);
+ENTRY(tiles_workspace_bytes, SizeQueryParams);
+ENTRY(tiles_count, TilesCountParams<F>);
+ENTRY(tiles_fill, TilesFillParams<F>);
+ENTRY(rasterize_block_bytes, SizeQueryParams);
+ENTRY(rasterize_fwd, RasterizeForwardParams<F>);
+ENTRY(rasterize_bwd, RasterizeBackwardParams<F>);
+ENTRY(splats_reduce, SplatsReduceParams<F>);
+ENTRY(photometric, PhotometricParams<F, F>);
+ENTRY(adam_step, AdamStepParams<F>);
 
 namespace {
 
@@ -58,51 +54,105 @@ struct Scene {
   }
 };
 
+// A vector whose first element is at a multiple of 64 bytes, as PyTorch allocates tensors.
+template <class T>
+struct Aligned {
+  std::vector<char> bytes;
+  T* data;
+  explicit Aligned(int64_t n) : bytes(size_t(n) * sizeof(T) + 64) {
+    data = (T*)(((uintptr_t)bytes.data() + 63) & ~uintptr_t(63));
+  }
+};
+
+// A copy of a parameter, and its moments.
+struct Tensor {
+  std::vector<F> value, m, v;
+  explicit Tensor(const std::vector<F>& from) : value(from), m(from.size()), v(from.size()) {}
+  AdamTensor<F> with_rate(double rate) { return {value.data(), m.data(), v.data(), nullptr, rate}; }
+};
+
 std::vector<F> frame(const Scene& s) {
   const F pose[12] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0};
-  const double w = kWidth, h = kHeight, f = 150;
+  const double f = 150;
+  const CameraParams<F> camera = {pose, kWidth, kHeight, f, f, kWidth / 2.0, kHeight / 2.0, 0.2};
+  const GaussianTensors<F> gaussians = {s.means.data(),
+                                        s.log_scales.data(),
+                                        s.quats.data(),
+                                        s.logits.data(),
+                                        s.dc.data(),
+                                        s.rest.data(),
+                                        15,
+                                        3};
   std::vector<int32_t> ids(kCount);
-  const int64_t m = project_cull(kCount, s.means.data(), s.log_scales.data(), s.quats.data(),
-                                 s.logits.data(), pose, w, h, f, f, w / 2, h / 2, 0.2, ids.data());
+  const int64_t m = project_cull({kCount, gaussians, camera, ids.data()});
   std::vector<F> packed(size_t(m * kStride)), grad(packed.size());
-  project_fwd(m, ids.data(), s.means.data(), s.log_scales.data(), s.quats.data(), s.logits.data(),
-              s.dc.data(), s.rest.data(), 15, 3, pose, w, h, f, f, w / 2, h / 2, 0.2,
-              packed.data());
+  project_fwd({m, ids.data(), gaussians, camera, packed.data()});
+
   const int64_t columns[4] = {8, 9, 10, -1};
-  std::vector<double> aligned(size_t(splat_record_bytes(0) * m / 8 + 8));  // 64 bytes, see below
-  void* records = (void*)(((uintptr_t)aligned.data() + 63) & ~uintptr_t(63));
+  Aligned<char> memory(splat_record_bytes({0, 0, 0}) * m);
+  auto* records = (SplatRecord<F>*)memory.data;
   std::vector<U> keys(size_t(m), 0), keys2(keys), order(keys), order2(keys);
-  splats_prepare(m, packed.data(), kStride, w, h, columns, records, keys.data());
-  splats_sort(m, keys.data(), keys2.data(), order.data(), order2.data());
+  splats_prepare({m, packed.data(), kStride, kWidth, kHeight, columns, records, keys.data()});
+  splats_sort({m, keys.data(), keys2.data(), order.data(), order2.data()});
+
   const int64_t tx = (kWidth + 15) / 16, ty = (kHeight + 15) / 16, tiles = tx * ty;
-  const int64_t parts = tiles_parts(m);
-  std::vector<double> workspace(size_t(tiles_workspace_bytes(m, tiles, parts) / 8 + 1));
+  const int64_t parts = tiles_parts({m, 0, 0});
+  Aligned<char> workspace(tiles_workspace_bytes({m, tiles, parts}));
   std::vector<U> start(size_t(tiles + 1)), end(size_t(tiles), 0), range(size_t(2 * m));
   int64_t needed = 0;
-  const int64_t n = tiles_count(m, order.data(), packed.data(), kStride, records, tx, ty, parts,
-                                workspace.data(), start.data(), -1, &needed);
+  const TileBinning<F> binning = {order.data(), packed.data(), kStride,        records,     tx,
+                                  ty,           parts,         workspace.data, start.data()};
+  const int64_t n = tiles_count({m, binning, -1, &needed});
   std::vector<U> splat(size_t(n), 0), slot(splat);
-  tiles_fill(m, order.data(), packed.data(), kStride, records, tx, ty, parts, workspace.data(),
-             start.data(), n, splat.data(), slot.data(), range.data());
-  std::vector<double> blocks(size_t(n * blend_block_bytes(0) / 8 + 1));
+  tiles_fill({m, binning, n, splat.data(), slot.data(), range.data()});
+
+  Aligned<char> blocks(n * rasterize_block_bytes({0, 0, 0}));
+  const FrameParams<F> sorted = {kWidth,  kHeight,      packed.data(), kStride,      columns,
+                                 records, start.data(), end.data(),    splat.data(), blocks.data};
   const int64_t pixels = kWidth * kHeight;
   std::vector<F> image(size_t(3 * pixels)), alpha(image.size() / 3), d_image(image.size());
   const F background[4] = {0, 0, 0, 0};
-  blend_fwd(tiles, kWidth, kHeight, packed.data(), kStride, columns, records, start.data(),
-            end.data(), splat.data(), blocks.data(), 3, background, image.data(), alpha.data());
+  rasterize_fwd({tiles, sorted, 3, background, image.data(), alpha.data()});
   double means[2];
-  photometric(3, kWidth, kHeight, image.data(), s.target.data(), 0.8, -0.2, d_image.data(), means);
-  std::vector<F> slots(size_t(16 * n + 16));
-  F* aligned_slots = (F*)(((uintptr_t)slots.data() + 63) & ~uintptr_t(63));
-  blend_bwd(tiles, kWidth, kHeight, packed.data(), kStride, columns, records, start.data(),
-            end.data(), splat.data(), blocks.data(), 3, slot.data(), image.data(), d_image.data(),
-            alpha.data(), nullptr, aligned_slots, nullptr);
-  splats_reduce(m, aligned_slots, range.data(), packed.data(), kStride, 3, columns, 0, grad.data());
+  photometric(
+      {3, kWidth, kHeight, image.data(), s.target.data(), 0.8, -0.2, d_image.data(), means});
+  Aligned<F> slots(16 * n);
+  rasterize_bwd({tiles, sorted, 3, slot.data(), image.data(), d_image.data(), alpha.data(), nullptr,
+                 slots.data, nullptr});
+  splats_reduce({m, slots.data, range.data(), packed.data(), kStride, 3, columns, 0, grad.data()});
+
+  Tensor centres(s.means), scales(s.log_scales), quats(s.quats), logits(s.logits), dc(s.dc);
+  Tensor rest(s.rest);
+  int32_t nonfinite[6] = {};
+  adam_step({kCount,
+             m,
+             ids.data(),
+             grad.data(),
+             camera,
+             15,
+             3,
+             centres.with_rate(1e-3),
+             scales.with_rate(1e-3),
+             quats.with_rate(1e-3),
+             logits.with_rate(1e-3),
+             dc.with_rate(1e-3),
+             rest.with_rate(1e-3),
+             0.9,
+             0.999,
+             1000,
+             1e-30,
+             0,
+             nullptr,
+             nonfinite});
   std::vector<F> near(size_t(3 * kCount));
-  neighbours(kCount, s.means.data(), 3, near.data());
-  grad.insert(grad.end(), image.begin(), image.end());
-  grad.insert(grad.end(), near.begin(), near.end());
-  return grad;
+  neighbours({kCount, s.means.data(), 3, near.data()});
+
+  std::vector<F> results = grad;
+  for (const Tensor* t : {&centres, &scales, &quats, &logits, &dc, &rest})
+    results.insert(results.end(), t->value.begin(), t->value.end());
+  results.insert(results.end(), image.begin(), image.end());
+  results.insert(results.end(), near.begin(), near.end());
+  return results;
 }
 
 }  // namespace
