@@ -56,32 +56,44 @@ class Mapping:
     def run(self, mapper: Mapper, relaxed: bool = False) -> list[pycolmap.Reconstruction]:
         """Estimate poses and points; returns the models, the one with the most photos first.
 
-        The models are not yet refined, see `refine`.
         ``relaxed``: accept weaker matches than COLMAP does by default (incremental mapper only).
         """
         if mapper == "global":
             models = self._map_globally()
         else:
             models = self._map_incrementally(self._options(relaxed), start=None)
-        return usable_models(models)
+        return usable_models([self.refine(model) for model in models])
 
     def extend(
         self, models: list[pycolmap.Reconstruction], relaxed: bool = True
     ) -> list[pycolmap.Reconstruction]:
-        """Try to add photos to the first of ``models``, and return all models, as `run`.
+        """Try to add photos to the first of ``models``, and return all models.
 
         Photos of the other models are tried, too, so that separate models may be joined. If no
         photo can be added, ``models`` are returned unchanged. ``relaxed`` as in `run`.
         """
-        grown = self._map_incrementally(self._options(relaxed), start=models[0])
-        if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():
+        grown = self.continued(models[0], relaxed)
+        if grown is models[0]:
             return models
-        return usable_models([grown[0], *models[1:]])
+        refined = self.refine(grown)
+        if refined.num_reg_images() <= models[0].num_reg_images():
+            return models
+        return usable_models([refined, *models[1:]])
+
+    def continued(self, model: pycolmap.Reconstruction, relaxed: bool) -> pycolmap.Reconstruction:
+        """A larger model: ``model`` with more photos, before `refine`. ``relaxed`` as in `run`.
+
+        If no photo can be added, this is ``model`` itself.
+        """
+        models = self._map_incrementally(self._options(relaxed), start=model)
+        if not models or models[0].num_reg_images() <= model.num_reg_images():
+            return model
+        return models[0]
 
     def without(
         self, model: pycolmap.Reconstruction, photos: Iterable[int]
     ) -> pycolmap.Reconstruction:
-        """Remove the poses of ``photos`` (image ids) from ``model``. The result is not refined.
+        """Remove the poses of ``photos`` (image ids) from ``model``; the result is not yet refined.
 
         One bundle adjustment removes most of the influence of these photos on the others. Changes
         ``model`` and returns it.

@@ -177,8 +177,7 @@ class PoseEstimation:
         check, left_out = "", dict[str, str]()
         if models:
             repaired = repair(models[0], mapping, _MAX_ERROR * matched.scale)
-            refined = [mapping.refine(model) for model in (repaired.model, *models[1:])]
-            models = usable_models(refined)
+            models = usable_models([repaired.model, *models[1:]])
             left_out = repaired.left_out
             check = f"; {repaired.description}" if repaired.description else ""
         attempt = Attempt(matched, models, left_out)

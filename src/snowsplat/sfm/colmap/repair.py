@@ -19,23 +19,18 @@ class Repaired:
     """A model after the check of all photos."""
 
     model: pycolmap.Reconstruction
-    wrong: dict[str, str]  # name -> reason, for photos whose pose contradicted their matches
-
-    @property
-    def left_out(self) -> dict[str, str]:
-        """The part of `wrong` that has no pose now."""
-        registered = {self.model.image(i).name for i in self.model.reg_image_ids()}
-        return {name: reason for name, reason in self.wrong.items() if name not in registered}
+    contradicting: int  # number of photos whose pose contradicted their matches
+    left_out: dict[str, str]  # name -> reason, for contradicting photos without a pose now
 
     @property
     def description(self) -> str:
         """What the check found, as text; empty if it found nothing."""
-        if not self.wrong:
+        if not self.contradicting:
             return ""
-        count, left_out = len(self.wrong), len(self.left_out)
+        again = self.contradicting - len(self.left_out)
         return (
-            f"the poses of {count} contradicted their matches: {count - left_out} registered "
-            f"again, {left_out} left out"
+            f"the poses of {self.contradicting} contradicted their matches: {again} registered "
+            f"again, {len(self.left_out)} left out"
         )
 
 
@@ -48,8 +43,7 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     photos are registered again. This is repeated until no part contradicts the others, at most
     `_ROUNDS` times. Photos that contradict the others even then are left out.
 
-    A model without contradictions is returned unchanged; others have to be refined afterwards.
-    ``max_error`` is that of `check_pairs`.
+    A model without contradictions is returned unchanged. ``max_error`` is that of `check_pairs`.
     """
     names = {i: image.name for i, image in model.images.items()}
     # The image ids of the pairs with false matches, of all rounds.
@@ -66,7 +60,11 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         if number == _ROUNDS or model.num_reg_images() < MIN_PHOTOS:
             break
         model = _registered_again(model, mapping, false_pairs)
-    return Repaired(model, {names[i]: reason for i, reason in wrong.items()})
+    if wrong:
+        model = mapping.refine(model)
+    registered = set(model.reg_image_ids())
+    left_out = {i: reason for i, reason in wrong.items() if i not in registered}
+    return Repaired(model, len(wrong), {names[i]: reason for i, reason in left_out.items()})
 
 
 def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> list[set[int]]:
@@ -91,7 +89,7 @@ def _registered_again(
     reduced = mapping.database.with_suffix(".checked.db")
     try:
         copy_for_mapping(mapping.database, reduced, without=false_pairs)
-        return replace(mapping, database=reduced).extend([model], relaxed=False)[0]
+        return replace(mapping, database=reduced).continued(model, relaxed=False)
     finally:
         remove_database(reduced)
 
