@@ -114,7 +114,7 @@ def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):
 
 
 def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(mapping, scene, monkeypatch):
-    monkeypatch.setattr(Mapping, "continued", lambda self, model, relaxed: model)
+    monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
     assert set(repaired.model.reg_image_ids()).isdisjoint(FAR)
@@ -131,22 +131,22 @@ def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(mapping, sce
 def test_photos_that_the_mapper_drops_are_named(mapping, scene, monkeypatch, tmp_path):
     """A model of COLMAP does not contain photos that have no matches with others any more."""
 
-    def drop(self, model, relaxed):
+    def drop(self, models, relaxed=True):
         (tmp_path / "registered").mkdir()
-        model.write(tmp_path / "registered")
-        return pycolmap.Reconstruction(tmp_path / "registered")
+        models[0].write(tmp_path / "registered")
+        return [pycolmap.Reconstruction(tmp_path / "registered")]
 
-    monkeypatch.setattr(Mapping, "continued", drop)
+    monkeypatch.setattr(Mapping, "extend", drop)
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.model.images).isdisjoint(FAR)
     assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
 
 
 def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypatch):
-    def fold_again(self, model, relaxed):
-        return look_alikes.model(scene, folded=True)
+    def fold_again(self, models, relaxed=True):
+        return [look_alikes.model(scene, folded=True)]
 
-    monkeypatch.setattr(Mapping, "continued", fold_again)
+    monkeypatch.setattr(Mapping, "extend", fold_again)
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.model.reg_image_ids()).isdisjoint(FAR)
     assert len(repaired.left_out) == len(FAR)
@@ -156,7 +156,6 @@ def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_pa
     folded = look_alikes.model(scene, folded=True)
     monkeypatch.setattr(Mapping, "run", lambda self, mapper, relaxed: [folded])
     monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
-    monkeypatch.setattr(Mapping, "continued", lambda self, model, relaxed: model)
     progress = WorkerProgress(silent, lambda *table: None)
     photos = look_alikes.photos()
     job = PoseEstimation(Folders(tmp_path), photos, SfmOptions(), 1, progress)

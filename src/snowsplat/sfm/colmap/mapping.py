@@ -62,7 +62,7 @@ class Mapping:
             models = self._map_globally()
         else:
             models = self._map_incrementally(self._options(relaxed), start=None)
-        return usable_models([self.refine(model) for model in models])
+        return usable_models([self._refine(model) for model in models])
 
     def extend(
         self, models: list[pycolmap.Reconstruction], relaxed: bool = True
@@ -72,37 +72,25 @@ class Mapping:
         Photos of the other models are tried, too, so that separate models may be joined. If no
         photo can be added, ``models`` are returned unchanged. ``relaxed`` as in `run`.
         """
-        grown = self.continued(models[0], relaxed)
-        if grown is models[0]:
+        grown = self._map_incrementally(self._options(relaxed), start=models[0])
+        if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():
             return models
-        refined = self.refine(grown)
+        refined = self._refine(grown[0])
         if refined.num_reg_images() <= models[0].num_reg_images():
             return models
         return usable_models([refined, *models[1:]])
 
-    def continued(self, model: pycolmap.Reconstruction, relaxed: bool) -> pycolmap.Reconstruction:
-        """A larger model: ``model`` with more photos, before `refine`. ``relaxed`` as in `run`.
-
-        If no photo can be added, this is ``model`` itself.
-        """
-        models = self._map_incrementally(self._options(relaxed), start=model)
-        if not models or models[0].num_reg_images() <= model.num_reg_images():
-            return model
-        return models[0]
-
     def without(
         self, model: pycolmap.Reconstruction, photos: Iterable[int]
     ) -> pycolmap.Reconstruction:
-        """Remove the poses of ``photos`` (image ids) from ``model``; the result is not yet refined.
+        """Remove the poses of ``photos`` (image ids) from ``model``, and run bundle adjustment.
 
-        One bundle adjustment removes most of the influence of these photos on the others. Changes
-        ``model`` and returns it.
+        Changes ``model`` and returns it.
         """
         observations = pycolmap.ObservationManager(model)
         for image_id in sorted(photos):
             observations.deregister_frame(model.image(image_id).frame_id)
-        self._adjust(model, _GLOBAL_TOLERANCE)
-        return model
+        return self._refine(model)
 
     def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()
@@ -191,31 +179,27 @@ class Mapping:
         finally:
             shutil.rmtree(output, ignore_errors=True)
 
-    def refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """Twice: remove outliers and cameras with few points, then run bundle adjustment.
 
         Changes ``model`` and returns it.
         """
-        for _ in range(2):
-            self._adjust(model, _FINAL_TOLERANCE)
-        model.update_point_3d_errors()
-        return model
-
-    def _adjust(self, model: pycolmap.Reconstruction, tolerance: float) -> None:
-        """Remove outliers and cameras with few points, then run bundle adjustment."""
-        observations = pycolmap.ObservationManager(model)
-        observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
-        for image_id in list(model.reg_image_ids()):
-            image = model.image(image_id)
-            if image.num_points3D < MIN_POINTS:
-                observations.deregister_frame(image.frame_id)
-        if model.num_reg_images() < MIN_PHOTOS:
-            return
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.ceres.solver_options.num_threads = self.threads
-        options.ceres.solver_options.function_tolerance = tolerance
-        pycolmap.bundle_adjustment(model, options)
+        options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
+        observations = pycolmap.ObservationManager(model)
+        for _ in range(2):
+            observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
+            for image_id in list(model.reg_image_ids()):
+                image = model.image(image_id)
+                if image.num_points3D < MIN_POINTS:
+                    observations.deregister_frame(image.frame_id)
+            if model.num_reg_images() < MIN_PHOTOS:
+                break
+            pycolmap.bundle_adjustment(model, options)
+        model.update_point_3d_errors()
+        return model
 
 
 def usable_models(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:

@@ -60,8 +60,6 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         if number == _ROUNDS or model.num_reg_images() < MIN_PHOTOS:
             break
         model = _registered_again(model, mapping, false_pairs)
-    if wrong:
-        model = mapping.refine(model)
     registered = set(model.reg_image_ids())
     left_out = {i: reason for i, reason in wrong.items() if i not in registered}
     return Repaired(model, len(wrong), {names[i]: reason for i, reason in left_out.items()})
@@ -89,7 +87,7 @@ def _registered_again(
     reduced = mapping.database.with_suffix(".checked.db")
     try:
         copy_for_mapping(mapping.database, reduced, without=false_pairs)
-        return replace(mapping, database=reduced).continued(model, relaxed=False)
+        return replace(mapping, database=reduced).extend([model], relaxed=False)[0]
     finally:
         remove_database(reduced)
 
