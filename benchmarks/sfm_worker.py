@@ -57,7 +57,7 @@ class Stopwatch:
         if stage == "poses":
             self.memory.start()
 
-        def report(done: int, total: int, what: str = "") -> None:
+        def report(done: int, total: int, what: str = "", left: float | None = None) -> None:
             if stage == "poses":
                 self._switch(_COUNTED.get(what, what))
 
