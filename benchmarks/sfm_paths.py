@@ -18,7 +18,7 @@ from snowsplat.synthetic.photographer import rolled
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 _PHOTOS_OF_A_LOOP = 20
 _PHOTOS_OF_A_TURN = 6
-_HEIGHTS = (1.45, 1.75, 1.1)  # of the camera above the floor in metres: first loop, second loop …
+_HEIGHTS = (1.45, 1.75, 1.1)  # of the camera above the floor, in metres; one for each loop in turn
 
 
 def loops(
@@ -91,7 +91,8 @@ def through_two_rooms(
 ) -> list[Tensor]:
     """Loops in one room, then the way through the passage, then loops in the other room.
 
-    The camera turns from the last view of a loop to the way, and from the way to the next loop.
+    Before the passage, the camera turns gradually from the last view of a loop to the direction of
+    the passage. After the passage, it turns gradually to the first view of the next loop.
 
     The middles of the rooms are at (x, 0) for the two x of ``middles``. The door of a room is at
     x + ``door``. The passage runs along y = ``corridor``, which is negative. All are in metres.

@@ -113,7 +113,7 @@ def _refined(a: Tensor, b: Tensor) -> Similarity | None:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The errors of the poses after a transform; the unit of `MAX_ROTATION` and `MAX_CENTRE`."""
+    """The errors of poses after a transform, in the units of `MAX_ROTATION` and `MAX_CENTRE`."""
 
     rotations: Tensor  # (N,) errors in degrees
     centres: Tensor  # (N,) errors as fractions of the extent
@@ -133,7 +133,7 @@ class _Fit:
 def _fit(similarity: Similarity | None, a: Tensor, b: Tensor, extent: float) -> _Fit:
     """The errors of poses ``a`` (N, 3, 4) after the transform, compared with the true poses ``b``.
 
-    They are infinite if there is no transform.
+    The errors are infinite if there is no transform.
     """
     if similarity is None:
         unknown = torch.full((len(a),), math.inf, dtype=torch.float64)

@@ -41,10 +41,10 @@ _HEIGHT = 2.6  # metres, of all rooms
 _TEXEL = 0.005  # metres per pixel of a texture
 _OAK, _PINE, _DARK = (0.62, 0.45, 0.29), (0.78, 0.62, 0.42), (0.42, 0.28, 0.19)
 _PLASTER = (0.72, 0.70, 0.64)
-# The two identical rooms: width and depth; x of their middles; their doors; walls and passage.
-_ROOM_SIZE = (4.2, 3.8)
-MIDDLES = (-2.16, 2.16)
-_DOOR, _DOOR_WIDTH, _DOOR_HEIGHT = 0.9, 0.95, 2.1  # x relative to the middle of the room
+# The two identical rooms, in metres:
+_ROOM_SIZE = (4.2, 3.8)  # width, depth
+MIDDLES = (-2.16, 2.16)  # x of the middle of each room
+_DOOR, _DOOR_WIDTH, _DOOR_HEIGHT = 0.9, 0.95, 2.1  # _DOOR: x relative to the middle of the room
 _WALL, _PASSAGE = 0.12, 1.5  # thickness of the walls, width of the passage
 _TWIN_DISTANCE = 4.4  # between the two identical objects
 
@@ -128,7 +128,7 @@ def _plain_room(seed: int) -> Scene:
 
 def _carpeted_room(seed: int) -> Scene:
     random = np.random.default_rng([seed, 2])
-    across, down, tile = 10, 8, 0.6  # metres of a tile
+    across, down, tile = 10, 8, 0.6  # numbers of tiles, and the side of a tile in metres
     colours = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
     one = paint.woven(_pixels(tile, tile), 5, colours, random)
     carpet = np.tile(one, (down, across, 1))
@@ -222,7 +222,7 @@ def _plain(colour: Sequence[float]) -> np.ndarray:
 
 
 def _lamp(size: tuple[float, float]) -> Lamp:
-    # A larger lamp is on average farther away from a surface.
+    # A larger lamp needs more power, because it is on average farther away from a surface.
     power = 3.0 * math.sqrt(size[0] * size[1])
     return Lamp((0.0, 0.0, _HEIGHT - 0.02), size, power=power, ambient=0.55)
 

@@ -78,7 +78,7 @@ class Stopwatch:
             _BETWEEN.get((self._now, to), self._now), {"wall": 0.0, "cpu": 0.0}
         )
         times["wall"] += now[0] - self._last[0]
-        # The time of a child that ends right now may be counted late.
+        # When a child process ends, its processor time may be missing from the sum for a moment.
         times["cpu"] += max(0.0, now[1] - self._last[1])
         self._now, self._last = to, now
 

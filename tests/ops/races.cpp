@@ -1,6 +1,7 @@
-// For ThreadSanitizer, by tests/nightly/sanitize_native.py: a frame forward and backward and an Adam
-// step on random Gaussians, by several threads, while other threads do the same and the number of threads
-// changes. The results must be bit-identical each time.
+// tests/nightly/sanitize_native.py runs this program under ThreadSanitizer. `frame` calls the
+// kernels of a training step on random Gaussians: forward pass, backward pass and Adam. Three
+// threads call `frame` at the same time. The kernels share a pool of threads, and the test is
+// repeated with pools of different sizes. The results must always be bit-identical.
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
@@ -54,7 +55,7 @@ struct Scene {
   }
 };
 
-// A vector whose first element is at a multiple of 64 bytes, as PyTorch allocates tensors.
+// An array that begins at a multiple of 64 bytes, like the tensors that PyTorch allocates.
 template <class T>
 struct Aligned {
   std::vector<char> bytes;
@@ -64,7 +65,7 @@ struct Aligned {
   }
 };
 
-// A copy of a parameter, and its moments.
+// A copy of a parameter tensor, and the two moments that Adam stores for it.
 struct Tensor {
   std::vector<F> value, m, v;
   explicit Tensor(const std::vector<F>& from) : value(from), m(from.size()), v(from.size()) {}

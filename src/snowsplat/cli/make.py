@@ -39,7 +39,7 @@ class Make:
     Notes:
       OUT/capture contains the photos, their cameras and a report. OUT/scene is
       the output folder of the training. OUT/scene/test/ours_N contains the
-      held-out photos and renders of the same views.
+      held-out photos and renders of the same views; N is the number of steps.
       If the command is interrupted, run it again to resume. Finished stages are
       repeated only if the photos or the settings change.
     """
@@ -56,8 +56,8 @@ class Make:
     quality determines only the effort to estimate the camera poses; the training uses the remaining
     time."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
-    """Finish within this time. If there are too many photos for it, some of them are used, evenly
-    spread by name. If an earlier run was interrupted, the time of its finished stages is not
+    """Finish within this time. If there are too many photos for this time, some of them are used,
+    evenly spread by name. If an earlier run was interrupted, the time of its finished stages is not
     counted, and its training resumes with the time that remained."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""

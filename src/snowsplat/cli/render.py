@@ -30,8 +30,9 @@ class Render(SceneFlags):
     Notes:
       Images are written to OUT/test/ours_N/renders (for held-out photos) and
       OUT/train/ours_N/renders (for training photos) as 00000.png …, in the order
-      of the names of the photos. Copies of the photos are written to the folder
-      gt next to renders. Videos are written to OUT/videos.
+      of the names of the photos. N is the number of steps. Copies of the photos
+      are written to the folder gt next to renders. Videos are written to
+      OUT/videos.
       For a video along an ellipse or through the cameras of a file, a scene file
       in place of OUT is sufficient.
     """

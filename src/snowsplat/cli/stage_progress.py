@@ -77,7 +77,8 @@ class StageProgress:
     def _report(self, done: int, total: int, what: str = "", left: float | None = None) -> None:
         now = time.monotonic()
         if what != self._what or done == 0 or done < self._done:
-            # Other items, or a second attempt. Some items may be finished before it begins.
+            # Other items are counted now, or a second attempt begins. Some items may already be
+            # finished.
             self._what, self._start, self._first = what, now, done
         self._done = done
         elapsed = now - self._start

@@ -79,7 +79,7 @@ def sog_version(path: Path) -> str:
 
 @dataclass(frozen=True)
 class _Layout:
-    """`meta.json` of either version. An array with 256 rows contains the value of each byte."""
+    """`meta.json` of either version. Row i of an array with 256 rows is the value of the byte i."""
 
     count: int
     files: dict[str, str]

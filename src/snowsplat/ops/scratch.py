@@ -94,9 +94,9 @@ def _make(size: int) -> np.ndarray:
 def take_rows(tensor: Tensor, index: Tensor) -> Tensor:
     """`tensor[index]` along the first dimension, for long-lived tensors: parameters, moments.
 
-    The memory has huge pages and page offsets as the blocks of the pool have, but is not part of
-    the
-    pool: it is returned to the operating system, because the next size will be different.
+    Like the blocks of the pool, the memory has huge pages, and blocks begin at different offsets in
+    a page. But it is not part of the pool: it is returned to the operating system, because the next
+    size will be different.
     """
     if tensor.requires_grad or tensor.device.type != "cpu" or index.dtype == torch.bool:
         return tensor[index]

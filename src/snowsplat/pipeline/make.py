@@ -245,7 +245,7 @@ class _Job:
         )
 
     def _later(self) -> Later:
-        """The work after the dataset is made, for the time left."""
+        """The work after the dataset is made, for the estimate of the time left."""
         from snowsplat import ops
         from snowsplat.sfm.time_left import Later
 

@@ -4,7 +4,7 @@ Structure from motion must be finished after `_SHARE` of the time; training uses
 `sfm.cost` predicts the time of structure from motion on this machine. The plan is the first of
 these that is fast enough:
 
-    all photos      at the size of "best", then at the size in which "best" detects features;
+    all photos      at the size of "best", then at the size at which "best" detects features;
                     the same for "normal", then for "draft"
     fewer photos    for "draft", at the smaller size: as many as there is time for, but at least
                     `_FEWEST`. Photos are evenly spread in the order of their names; frames of a
@@ -13,8 +13,9 @@ these that is fast enough:
 At the smaller size of a quality, the poses are as accurate as at the larger one, and a short
 training uses even smaller photos.
 
-The prediction may be too low, because the number of features and the load of the machine change.
-The training then has less time. If the prediction is too low by 45%, it still has a third.
+The prediction may be too low, because the number of features and the load of the machine vary. The
+training then has less time. If structure from motion takes 45% longer than predicted, a third of
+the time is still left for the training.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 _SHARE = 0.45
 #: No further attempt to find poses begins if it would probably end after this share of the time.
 POSES_SHARE = 0.6
-#: With fewer photos, their distances may be too large for matches.
+#: With fewer photos, the cameras may be too far apart for matches.
 _FEWEST = 20
 
 
@@ -43,7 +44,7 @@ class MakePlan:
     """The work of structure from motion in `make`.
 
     Attributes:
-        quality: its effort.
+        quality: the effort to estimate the camera poses.
         size: photos are reduced to this longer side, in pixels.
         photos: number of photos to use; None: all.
         frames: number of frames to use of each video; None: as many as usual.

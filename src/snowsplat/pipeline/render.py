@@ -24,7 +24,7 @@ _RANGE_VIEWS = 8  # number of views that determine the range of the depth colour
 def render_images(
     scene: TrainedScene, *, splits: Sequence[Split] = ("test", "train"), depth: Depth = "none"
 ) -> dict[Path, int]:
-    """Render the views of a scene into OUT/SPLIT/ours_N.
+    """Render the views of a scene into OUT/SPLIT/ours_N, where N is the number of steps.
 
     Files are numbered in the order of the names of the photos: renders/00000.png, the photo
     gt/00000.png, and depth/00000.png. The depth is the mean camera z. It is written either as

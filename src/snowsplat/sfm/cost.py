@@ -42,12 +42,13 @@ _DECODED_MEGAPIXEL = 0.016  # of an original photo
 _WRITTEN_MEGAPIXEL = 0.1  # of a resized photo: resizing and saving
 _FRAME_MEGAPIXEL = 0.02  # of each frame of a video, also of those that are not used
 _SIFT_MEGAPIXEL = 0.33
-_SIFT_THOUSAND = 0.06  # features
-_MATCHED_PAIR = 0.001  # of photos with 1000 features each
-_VERIFIED_PAIR = 0.015  # of photos with 1000 features each
+_SIFT_THOUSAND = 0.06  # for each thousand features
+_MATCHED_PAIR = 0.001  # a pair of photos with 1000 features each
+_VERIFIED_PAIR = 0.015  # a pair of photos with 1000 features each
 _POSE = 0.33
-_POSE_GROWTH = 60.0  # with this number of photos, a photo takes twice as long as the first ones
-# With this number of photos, they are registered in half of the time of the step "poses". The other
+# With this number of photos, the mean time to register a photo is twice that of the first photos.
+_POSE_GROWTH = 60.0
+# With this number of photos, registering them takes half of the time of the step "poses". The other
 # half is the bundle adjustment at the end, and the check of the poses.
 _POSE_END = 120.0
 _IMAGE_MEGAPIXEL = 0.24
@@ -71,8 +72,8 @@ class Speed:
     """The speed of this machine.
 
     Attributes:
-        slowness: seconds of one thread here for a second of the reference machine.
-        cores: how many times as much work all threads do as one.
+        slowness: time of one thread on this machine, divided by that on the reference machine.
+        cores: the work that all threads do in a second, divided by that of one thread.
     """
 
     slowness: float = 1.0
@@ -134,13 +135,13 @@ def steps_of_pairs(pairs: float, features: float) -> dict[str, Step]:
 
 
 def share_of_poses(registered: int, photos: int) -> float:
-    """The share of the step "poses" that is finished when so many photos are registered."""
+    """The share of the step "poses" that is finished with ``registered`` of ``photos`` photos."""
     registration = 1 / (1 + photos / _POSE_END)
     return registration * _growing(registered) / _growing(max(1, photos))
 
 
 def _growing(photos: int) -> float:
-    """The work of registering ``photos``; 1 for the first one."""
+    """The work of registering this number of photos; about 1 for one photo."""
     return photos * (1 + photos / _POSE_GROWTH)
 
 
@@ -174,7 +175,7 @@ def measure_speed(threads: int) -> Speed:
 
 
 def _sample() -> NDArray[np.uint8]:
-    """A grey picture (320, 320) with blobs of several sizes, the same in each call."""
+    """A grey image (320, 320) with blobs of several sizes, the same in each call."""
     random = np.random.default_rng(0)
     total = np.zeros((_SAMPLE_SIDE, _SAMPLE_SIDE), np.float32)
     for cells in (8, 16, 32, 64):
@@ -184,5 +185,5 @@ def _sample() -> NDArray[np.uint8]:
 
 
 def _megapixels(side: float) -> float:
-    """Of a photo with this longer side in pixels, and an aspect ratio of 4:3."""
+    """The megapixels of a photo with this longer side in pixels and an aspect ratio of 4:3."""
     return 0.75e-6 * side**2

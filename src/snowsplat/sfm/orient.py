@@ -134,7 +134,7 @@ def _meeting_point(data: _ModelData) -> np.ndarray | None:
         # The distances of the point from the axes.
         away = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=1)
         weights = 1 / np.maximum(away, 0.01 * typical)
-    ahead = np.einsum("ni,ni->n", point - centres, axes)  # its depths in the cameras
+    ahead = np.einsum("ni,ni->n", point - centres, axes)  # the depth of the point in each camera
     is_met = (ahead > 0.2 * typical).mean() > 0.75 and np.median(away) < 0.5 * np.median(ahead)
     return point if is_met else None
 

@@ -22,7 +22,7 @@ from snowsplat.util.safe_json import printable
 _FILE = "capture_report.html"
 _MAX_THUMBNAILS = 24  # evenly spaced over the photos
 _THUMBNAIL_HEIGHT = 110  # pixels
-_MAX_UNUSED = 200  # number of unused photos that are listed; of the others, the number is shown
+_MAX_UNUSED = 200  # number of unused photos that are listed; the others are only counted
 _MAX_ERROR = 1.5  # pixels; a larger reprojection error is reported. Good models are below 1
 
 _FOCAL_FROM = {"exif": "from EXIF, refined", "guessed": "estimated from the photos"}

@@ -19,15 +19,15 @@ _HEADERS = 10
 
 @dataclass(frozen=True)
 class Photos:
-    """The input of structure from motion, as far as its time depends on it.
+    """The properties of the input that determine the time of structure from motion.
 
     Attributes:
         stills: number of photos.
         frames: number of used frames of all videos.
         longest: the longer side of an original photo, in pixels (median).
         videos: number of videos.
-        decoded: number of frames of all videos, which are decoded to choose the used ones.
-        video: the longer side of the frames, in pixels (maximum).
+        decoded: number of frames of all videos. All of them are decoded, to choose the used ones.
+        video: the longer side of the frames, in pixels (maximum of all videos).
     """
 
     stills: int

@@ -4,13 +4,15 @@ The steps of structure from motion have very different costs, and the longest ar
 every step has a predicted work (`sfm.cost`), in seconds of one core of a reference machine. Two
 factors convert work to time on this machine. Both are measured while the job runs:
 
-    slowness   seconds of one core here for a second of the reference machine. It is measured in
-               the steps whose work is well predicted (`_PARALLEL`). A step that is in progress has
-               a slowness of its own as soon as a part of it is finished; that of the machine is
-               its initial value, with the weight of `_PRIOR` of the step
+    slowness   the time that one core of this machine needs for some work, divided by the time that
+               one core of the reference machine needs. The slowness of the machine is measured in
+               the steps whose work is well predicted (`_PARALLEL`). In addition, each step has its
+               own slowness. It starts at that of the machine, and is measured as soon as a part of
+               the step is finished. The initial value counts as much as the share `_PRIOR` of the
+               step
     cores      the number of cores that the job gets, at most its number of threads; less than 1 if
-               other jobs use most of the machine. It is the processor time divided by the time,
-               while all threads work
+               other jobs use most of the machine. It is measured while all threads work: processor
+               time divided by wall time
 
 Some steps become slower while they run: registering a photo takes longer if the model is large. The
 progress of a step is therefore given as a share of its work, not of its items.
@@ -31,15 +33,18 @@ if TYPE_CHECKING:
     from snowsplat.sfm.progress import Report
     from snowsplat.sfm.survey import Photos
 
+#: The initial value of the slowness of a step counts as much as this share of its work.
 _PRIOR = 0.1
-#: The slowness is 1 at the start, with the weight of this share of all the work.
+#: The slowness of the machine starts at 1. This value counts as much as this share of all work.
 _START = 0.01
 #: Steps in which all threads work all the time, and whose work depends little on the scene.
 _PARALLEL = ("photos", "features", "images")
 #: Cores are measured for at least this time, in seconds.
 _MEASURED_SECONDS = 2.0
+#: Minimum of the measured number of cores.
 _FEWEST_CORES = 0.05
-#: While nothing is reported, the time left decreases, but not below this share of the silence.
+#: Between two progress reports, the time left decreases. It is at least this share of the time
+#: since the last report.
 _SILENCE = 0.25
 
 
@@ -65,9 +70,10 @@ class TimeLeft:
         self._cores = float(threads)
         self._threads = threads
         self._step, self._share = next(iter(steps)), 0.0
-        self._began = self._last = clock()  # of this step; of the last progress
+        # Wall time and processor time: at the start of the current step, and at the last progress.
+        self._began = self._last = clock()
         self._began_cpu = self._last_cpu = cpu_clock()
-        # Core seconds of each step that were measured, and the work that was finished with them.
+        # For each step: the measured core seconds, and the work that was finished in this time.
         self._measured = dict.fromkeys(steps, 0.0)
         self._finished = dict.fromkeys(steps, 0.0)
         self._estimate = self._sum()
@@ -192,12 +198,12 @@ class SfmTimeLeft:
         self._left = TimeLeft(
             {**_without_start(steps_of(photos, size, effort)), "later": Step(later.work)}, threads
         )
-        self._pairs = 0  # that are matched; 0: not known yet, as for the features
-        self._features = 0.0
+        self._pairs = 0  # number of pairs that are matched; 0: not known yet
+        self._features = 0.0  # mean number of features of a photo; 0: not known yet
         self._deadline = later.deadline
 
     def report(self, stage: str, report: Report) -> Report:
-        """``report`` of a stage; the returned callback adds the time left."""
+        """A progress callback for a stage: it adds the time left and calls ``report``."""
 
         def with_time(done: int, total: int, what: str = "", left: float | None = None) -> None:
             self._update(stage, done, total, what)
@@ -240,10 +246,10 @@ class SfmTimeLeft:
         self._left.expect({name: steps[name] for name in names})
 
     def finished_before(self, stage: str) -> None:
-        """An earlier run has finished ``stage``, or it does nothing."""
+        """``stage`` takes no time: an earlier run finished it, or it has nothing to do."""
         self._left.expect(dict.fromkeys(_STEPS_OF_STAGE[stage], Step(0.0)))
 
 
 def _without_start(steps: Mapping[str, Step]) -> dict[str, Step]:
-    """The step "start" is distributed over the others, so that its progress cannot be measured."""
+    """The steps except "start". Its time is spread over other steps, so it is not measured."""
     return {name: step for name, step in steps.items() if name != "start"}

@@ -72,12 +72,11 @@ def _light_of_pq(signal: np.ndarray) -> np.ndarray:
 
 
 def _light_of_hlg(signal: np.ndarray) -> np.ndarray:
-    """The luminance of a BT.2100 HLG signal (0..1), in units of `_WHITE`: a signal of 0.75.
+    """The luminance of a BT.2100 HLG signal (0..1), in units of `_WHITE`.
 
-    The system gamma is 1.2.
-
-    BT.2100 applies the gamma to the luminance. Here it is applied to each channel, which differs
-    little and needs one table only.
+    A signal of 0.75 has the luminance `_WHITE`. The system gamma is 1.2. BT.2100 applies the gamma
+    to the luminance. Here it is applied to each channel: the result differs little, and one lookup
+    table is enough.
     """
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     scene = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)

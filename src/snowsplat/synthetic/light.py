@@ -108,7 +108,7 @@ def _indirect(
 def _blocked(
     blockers: Sequence[Shape], positions: np.ndarray, directions: np.ndarray, within: np.ndarray
 ) -> np.ndarray:
-    """Whether (D, P) a shape is in direction (3, D, P), nearer than ``within`` (D, P)."""
+    """(D, P) bool: whether a shape is hit in direction (3, D, P), nearer than ``within`` (D, P)."""
     blocked = np.zeros(within.shape, bool)
     at_once = max(1, _RAYS // positions.shape[1])
     for start in range(0, len(within), at_once):

@@ -75,7 +75,8 @@ class MemoryPlan:
         images: bytes for renderings and their gradients.
         photos: bytes for photos that stay decoded.
         reductions: descriptions of the reductions that a larger budget would not need.
-        limit: maximum number of Gaussians; None: no limit, and ``scene`` is for a million.
+        limit: maximum number of Gaussians. None: no limit; ``scene`` is then the number of bytes of
+            a million Gaussians.
     """
 
     config: TrainConfig

@@ -58,9 +58,8 @@ def paper() -> TrainConfig:
 
     Densification ends at step 15,000, and the decay of the means' learning rate at step 30,000.
     Both are given as fractions, 0.5 and 1, so that a shorter training run also reaches them. The
-    other moments are steps. Pruning by screen size is disabled, because its limit in pixels depends
-    on
-    the resolution: at 270×480 it reduces the PSNR by 0.5 dB.
+    other moments are steps. Pruning by screen size is disabled, because its limit in pixels does
+    not suit every resolution: at 270×480 it reduces the PSNR by 0.5 dB.
     """
     return TrainConfig(
         learning_rates=LearningRates(means_steps=1.0),

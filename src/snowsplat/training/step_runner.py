@@ -45,11 +45,10 @@ from snowsplat.training.view_gradient import ViewGradient
 #: view shows only a part of the scene. If the capacity is too small, one step is repeated.
 INITIAL_INSTANCES_PER_GAUSSIAN = 4
 #: The capacity grows when a step uses more than this fraction of it. So it usually grows before a
-#: view
-#: exceeds it: the requirement differs between views, but changes slowly during training.
+#: view exceeds it: the required number differs between views, but changes slowly during training.
 GROW_ABOVE = 0.9
-#: A new capacity is this multiple of the required instances: enough for one densification, which
-#: adds up to about a quarter of the Gaussians.
+#: A new capacity is this multiple of the required instances. This is enough for one densification:
+#: it increases the number of Gaussians by at most about a quarter.
 GROWTH = 1.3
 
 

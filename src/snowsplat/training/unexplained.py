@@ -1,9 +1,9 @@
 """Training views that the scene does not explain, because their camera poses are wrong.
 
 A photo with a wrong pose does not show what the other photos show at this place. The scene explains
-the other photos; it can reproduce this one only by fog in front of its camera. Early in training
-there is no such fog yet: the rendering of the view and its photo are then almost unrelated, while
-the views around it are already similar to their photos.
+the other photos. It can reproduce the photo with the wrong pose only by fog in front of the camera.
+Early in training there is no such fog yet: the rendering of this view is then almost unrelated to
+its photo, while the renderings of the views around it are already similar to their photos.
 """
 
 from __future__ import annotations
@@ -20,25 +20,30 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 
-#: Width and height of the photos are divided by this number. More pixels do not separate right and
-#: wrong poses better, and in the first steps of the recipes the photos have this size, too.
+#: Width and height of the photos are divided by this number. More pixels do not help to
+#: distinguish wrong poses from correct ones. In the first steps of the recipes, the photos have
+#: this size, too.
 _DOWNSCALE = 4
 #: A view is compared with this number of views around it.
 _NEIGHBOURS = 8
-#: With fewer views, too few are left to compare with.
+#: With fewer views, no view is left out: there are too few views around a view.
 _FEWEST_VIEWS = 10
-#: A view stands out if the scene explains at most this share of the variance of its photo,
+
+# A view stands out if it meets all of the following conditions. The explained share of a view is
+# the share of the variance of its photo that the scene explains.
+#: The explained share of the view is at most this number.
 _EXPLAINED = 0.65
-#: at least this share of those of the views around it, in the median,
+#: The median of the explained shares of the views around it is at least this number.
 _EXPLAINED_AROUND = 0.6
-#: if the difference of the two shares is at least this number,
+#: This median minus the explained share of the view is at least this number.
 _DIFFERENCE = 0.3
-#: and this multiple of its usual deviation,
+#: This difference is at least this number of standard deviations of the differences of all views.
 _DEVIATIONS = 4.0
-#: if the PSNR is lower than that of the views around it by at least this number of decibels,
+#: The PSNR is lower than the median PSNR of the views around it by at least this number, in dB.
 _WORSE_PSNR = 3.0
-#: and if the PSNR is at most this number of decibels.
+#: The PSNR is at most this number, in dB.
 _LOW_PSNR = 20.0
+
 #: `fitted` returns at most this PSNR.
 _HIGHEST_PSNR = 60.0
 #: If more than this share of the views stand out, the scene is unsuitable for this comparison.
@@ -82,10 +87,10 @@ def unexplained_views(
 
 
 def fitted(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> tuple[float, float]:
-    """How well an image explains a photo, if each channel may have another gain and offset.
+    """How well an image explains a photo, apart from a gain and an offset of each channel.
 
-    Gain and offset are fitted by least squares, so that the exposure and the white balance of the
-    photo do not count.
+    For each channel, a gain and an offset of the image are fitted by least squares, so that the
+    exposure and the white balance of the photo do not count.
 
     Args:
         image: (H, W, 3).
@@ -94,8 +99,8 @@ def fitted(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> tuple[fl
 
     Returns:
         The PSNR in dB after the fit, at most 60, and the share of the variance of the photo that
-        the image explains, 0 to 1. Both are as large as possible for a photo of one colour, or if
-        the mask leaves no pixel.
+        the image explains, 0 to 1. Both have their largest value for a photo of one colour, and
+        if the mask leaves no pixel.
     """
     if mask is None:
         x, y = image.flatten(0, 1), photo.flatten(0, 1)
@@ -106,7 +111,7 @@ def fitted(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> tuple[fl
     x, y = x.double(), y.double()
     x, y = x - x.mean(0), y - y.mean(0)
     gain = (x * y).sum(0) / x.square().sum(0).clamp_min(1e-12)
-    # A negative gain would make a negative of the photo.
+    # A negative gain would invert the image.
     rest = y - gain.clamp_min(0.0) * x
     error, variance = torch.stack([rest.square().mean(), y.square().mean()]).tolist()
     psnr = -10.0 * math.log10(max(error, 10.0 ** (-_HIGHEST_PSNR / 10.0)))
@@ -118,12 +123,13 @@ def standing_out(
 ) -> tuple[int, ...]:
     """The views that are explained much less than the views around them.
 
-    A view is compared with the median of its neighbours. The view that is worst in this comparison
-    is taken out, until no view stands out. So the views that are found do not hide each other.
+    A view is compared with the median of the views around it. Of the views that stand out, the one
+    with the largest difference of the explained shares is found first. The comparison is then
+    repeated without this view, until no view stands out.
 
     The explained share is also low if a photo shows plain surfaces, because noise cannot be
-    explained, and little texture only late. Such a photo has a high PSNR and therefore does not
-    stand out.
+    explained, and weak texture is explained late in the training. Such a photo has a high PSNR and
+    therefore does not stand out.
 
     Args:
         psnr: (V,) in dB, see `fitted`.
@@ -132,8 +138,9 @@ def standing_out(
         directions: (V, 3), the viewing directions, of length 1.
 
     Returns:
-        Their indices, ascending. None if there are fewer than 10 views, or if more than a quarter
-        of the views stand out: then the scene does not explain the photos in general.
+        The indices of the views found, ascending. No indices if there are fewer than 10 views, or
+        if more than a quarter of the views stand out: then the scene does not explain the photos in
+        general.
     """
     count = len(psnr)
     if count < _FEWEST_VIEWS:
@@ -141,7 +148,7 @@ def standing_out(
     order = np.argsort(_distances(positions, directions), axis=1, kind="stable")
     fine = np.ones(count, bool)
     while True:
-        # Of each row, the first views that are fine; the view itself is the first of its row.
+        # For each view, the nearest views that were not found. A row begins with the view itself.
         around = np.stack([row[1:][fine[row[1:]]][:_NEIGHBOURS] for row in order])
         explained_around = np.median(explained[around], axis=1)
         difference = explained_around - explained
@@ -163,9 +170,11 @@ def standing_out(
 
 
 def _distances(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(V, V): distances between cameras; the median distance counts as much as one radian.
+    """(V, V): how far the cameras of two views are apart, in position and direction.
 
-    The distance of a camera from itself is negative, so that it is the first of its row.
+    This is the distance between the cameras, divided by the median distance, plus the angle between
+    their viewing directions in radians. It is negative for a camera and itself, so that each camera
+    is the first of its row.
     """
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
     angles = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))

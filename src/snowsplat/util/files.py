@@ -33,7 +33,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     the process is killed, the temporary file stays; the next write of ``path`` reuses it.
 
     Raises:
-        OSError: the folder is missing or not writable, or the disk is full. It names ``path``.
+        OSError: the folder is missing or not writable, or the disk is full. The error names
+            ``path``.
     """
     path = Path(path)
     try:
@@ -65,9 +66,9 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 def _temporary(path: Path) -> tuple[int | None, Path]:
     """An empty file beside ``path``, and the handle of its lock (None without a lock).
 
-    The name of the file is always the same, and the writer holds a lock on it. Without the lock, a
-    file that remains from a killed process is reused. If another process or thread holds the lock,
-    or if the system has no locks, the file gets a random name.
+    The name of the file is always the same, and the writer holds a lock on it. A killed process has
+    no lock any more, so the file that it left is reused. If another process or thread holds the
+    lock, or if the system has no locks, the file gets a random name.
     """
     if fcntl is not None:
         temporary = path.with_name(f".{path.name}.tmp")

@@ -1,4 +1,4 @@
-"""COLMAP's child processes as forks of a process that has loaded their modules."""
+"""Starts the child processes of COLMAP as forks of a process that has loaded their modules."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def _popen(command, *, env, stdin, stdout, stderr, text, encoding):
 
 @contextmanager
 def children_in_forks() -> Iterator[None]:
-    """A fork takes a fifth of the time of a new process.
+    """In this context, child processes are forks: a fork takes a fifth of the time of a new one.
 
-    Tests of processes start new ones: those of `test_child.py` and of the command line.
+    Tests of the child process itself and of the command line start new processes.
     """
     with pytest.MonkeyPatch.context() as patch:
         started = SimpleNamespace(Popen=_popen, PIPE=subprocess.PIPE)

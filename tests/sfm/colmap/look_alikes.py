@@ -1,8 +1,8 @@
 """A walk past points, of which one group occurs twice, and a model that confuses the two groups.
 
-The cameras 0 … 15 stand 1.5 apart on a line. The cameras from 9 on belong to the far part. In the
-folded model this part is shifted, so that its group of points coincides with that of the near part.
-No photos are needed: the database contains features and verified matches.
+The cameras 0 … 15 stand on a line, 1.5 units apart. The cameras from 9 on belong to the far part.
+In the folded model, the far part is shifted, so that its group of points coincides with the group
+of the near part. No photos are needed: the database contains features and verified matches.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Walk:
     """The true scene, and which features and matches the photos have."""
 
     xyz: np.ndarray  # (P, 3) points
-    twins: np.ndarray  # (T, 2) two points each that look alike, the near one first
+    twins: np.ndarray  # (T, 2) pairs of points that look alike, the near point first
     centres: np.ndarray  # (COUNT, 3) of the cameras
     rotations: list[pycolmap.Rotation3d]  # of the cameras, from the world
     seen: list[np.ndarray]  # for each camera, the points of its features

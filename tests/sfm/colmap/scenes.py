@@ -1,4 +1,4 @@
-"""Small rendered photos of textured boards from known cameras: SfM runs in seconds."""
+"""Renders small photos of textured boards from known cameras. SfM takes only seconds with them."""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ from .forks import children_in_forks
 DRAFT = SfmOptions(effort="draft", threads=2)
 CHILDREN = Path("/proc/self/task") / str(os.getpid()) / "children"
 
-# It stops its child at a step of the progress, so that the child does not end before it is killed.
+# This program stops its child process when a given step of the progress begins. So the child does
+# not end before the test kills this program.
 PARENT = """
 import json, os, signal, sys
 from pathlib import Path
@@ -112,11 +113,13 @@ def test_after_one_crash_it_is_repeated_with_less_effort(tmp_path, photos, numbe
 @needs_proc
 @pytest.mark.parametrize("what", ["photos with features", "verified pairs", "registered photos"])
 def test_two_crashes_are_reported_in_one_line(tmp_path, photos, what):
-    if what != "registered photos":  # the mapper needs time, so that it is killed before its end
+    # Four photos keep the mapper busy until it is killed. The other steps need only three.
+    if what != "registered photos":
         photos = photos[:3]
 
     def report(done, total, now):
-        if now == "photos with features":  # this process runs earlier than its child
+        # With a low priority, the child does not finish the step before this process kills it.
+        if now == "photos with features":
             for child in children_of(os.getpid()):
                 os.setpriority(os.PRIO_PROCESS, child, 19)
         if now == what:

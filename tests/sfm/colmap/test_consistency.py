@@ -15,7 +15,7 @@ from snowsplat.sfm.colmap.consistency import (
 
 
 def chain(photos, share=0.7, matches=400, neighbours=3):
-    """Each photo and the following ones, of which the model confirms a share."""
+    """Pairs of each photo with the next ones; ``share`` of their matches are hits."""
     return [
         CheckedPair(i, j, matches, round(share * matches))
         for i, j in itertools.combinations(photos, 2)
@@ -24,7 +24,10 @@ def chain(photos, share=0.7, matches=400, neighbours=3):
 
 
 def folded():
-    """Photos 1 … 20 and 21 … 30: torn apart, linked by weak matches of look-alikes."""
+    """Photos 1 … 20 and 21 … 30: tears between the parts, and confirmed pairs with few matches.
+
+    The confirmed pairs are look-alikes.
+    """
     pairs = chain(range(1, 21)) + chain(range(21, 31))
     pairs += [CheckedPair(i, j, 900, 20) for i in (18, 19, 20) for j in (21, 22, 23)]
     return pairs + [CheckedPair(i, i + 20, 90, 60) for i in range(1, 11)]
@@ -46,7 +49,10 @@ def test_the_order_of_the_pairs_does_not_matter():
 
 
 def test_a_long_part_with_many_weak_links_is_cut_off():
-    """Two walks of 300 and 200 photos, torn at one place; 199 weak false pairs link them."""
+    """Two walks of 300 and 200 photos, with tears where the second walk begins.
+
+    199 false pairs with few matches agree with the model.
+    """
 
     def near(photos):
         return [
@@ -79,9 +85,10 @@ def test_a_single_photo_is_cut_off():
 
 
 def test_photos_that_follow_each_other_outweigh_look_alikes():
-    """Two walks, linked only where the second one begins; look-alikes have nearly as many matches.
+    """Two walks with true matches only where the second one begins.
 
-    So it is in bonsai_photos: true matches of 5763 and 5764, false ones of 5750 and 5845.
+    Look-alikes have nearly as many matches. This occurs in bonsai_photos: the photos 5763 and 5764
+    have true matches, and the photos 5750 and 5845 have nearly as many false matches.
     """
 
     def pairs(follows):
@@ -95,7 +102,7 @@ def test_photos_that_follow_each_other_outweigh_look_alikes():
 
 
 def test_photos_that_follow_each_other_outweigh_two_equal_rooms():
-    """A walk through two equal rooms: the photos of both are in one room, torn at the door."""
+    """A walk through two equal rooms. In the model they are one room, with tears at the door."""
 
     def pairs(in_order):
         door = [(20, 21, 400), (19, 21, 200), (20, 22, 200)]
@@ -126,7 +133,7 @@ def test_a_few_matches_suffice_if_photos_follow_each_other():
 
 
 def test_look_alikes_in_a_correct_model_cut_nothing():
-    """Two places with many false matches between them; the model confirms the way between them."""
+    """Two places with false matches; the model confirms all pairs on the way between the places."""
     pairs = chain(range(1, 31))
     pairs += [CheckedPair(i, j, 300, 0) for i in range(1, 6) for j in range(26, 31)]
     assert find_parts(pairs) == [set(range(1, 31))]
@@ -141,7 +148,7 @@ def test_little_evidence_cuts_nothing():
 
 
 def test_matches_that_agree_with_the_poses_are_no_tears():
-    """Points too far away to be triangulated: the pairs have no points."""
+    """The surfaces are too far away, so the model has no points for these matches."""
     pairs = [
         CheckedPair(p.first, p.second, p.matches, p.hits, 0.9 if p.hit_share < 0.1 else 0.0)
         for p in folded()
@@ -153,7 +160,7 @@ def test_matches_that_agree_with_the_poses_are_no_tears():
     ("hits", "misses", "agreeing", "support"),
     [
         (0.9, 0.0, 1.0, 1.0),
-        (0.06, 0.0, 0.0, 1.0),  # the others have no points
+        (0.06, 0.0, 0.0, 1.0),  # the other matches have no points
         (0.3, 0.1, 0.9, 0.75),
         (0.1, 0.3, 0.9, 0.25),
         (0.0, 0.4, 1.0, 0.0),  # poses at a wrong distance agree with the matches

@@ -23,7 +23,7 @@ from .forks import children_in_forks
 
 COUNT = 8
 DRAFT = SfmOptions(effort="draft", threads=2)
-#: A photo of this size has so many features that it shows another scene if none of them matches.
+#: With this zoom, a photo has many features. If it has no matches, it must show another scene.
 MANY_FEATURES = 1.5
 BLACK = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
 

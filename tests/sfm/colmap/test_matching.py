@@ -12,7 +12,7 @@ from snowsplat.util import native_library
 
 
 def reference(first, second):
-    """`two_nearest` of at least one descriptor each, by the whole matrix of products."""
+    """The result of `two_nearest`, from the matrix of all products; no array may be empty."""
     products = first.astype(np.int64) @ second.astype(np.int64).T
     for matrix in (products, products.T):
         with_zero = np.concatenate([np.sort(matrix, 1), np.zeros((len(matrix), 1), int)], 1)
@@ -42,7 +42,7 @@ def normalised(values):
 )
 @pytest.mark.parametrize("values", [2, 256])
 def test_the_result_is_exact(n, m, values):
-    """With two values there are many equal products, of which the first counts."""
+    """With two values, many products are equal; the first of them must be found."""
     random = np.random.default_rng(n + values)
     first, second = (random_descriptors(random, count, values) for count in (n, m))
     if values == 256:

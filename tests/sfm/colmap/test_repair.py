@@ -83,7 +83,7 @@ def test_photos_that_follow_each_other_by_name(mapping, scene):
 
 
 def test_which_pairs_between_parts_have_false_matches():
-    """Tears show the true place. Other true matches are those of photos that follow each other."""
+    """All pairs except tears, and except photos that follow each other."""
     torn, confirmed = CheckedPair(1, 4, 300, 0), CheckedPair(1, 5, 300, 200)
     following = CheckedPair(3, 4, 300, 200, follows=True)
     inside = CheckedPair(1, 2, 300, 200)
@@ -91,7 +91,7 @@ def test_which_pairs_between_parts_have_false_matches():
 
 
 def test_pairs_that_were_false_before_count_only_if_photos_in_order_are_torn():
-    """Two equal objects: after the repair, hundreds of false matches contradict the true poses."""
+    """Two equal objects: after the repair, pairs with false matches contradict the true poses."""
 
     def pairs(last):
         true = [CheckedPair(i, i + 1, 500, 450, follows=True) for i in range(1, 20) if i != 10]

@@ -24,7 +24,7 @@ def saved(image, path):
 
 
 def matched(first, second):
-    """Keypoints of both photos, (K, 6) each, row by row the same place."""
+    """The matched keypoints of both photos, (K, 6) each. Equal rows belong to one match."""
     pairs = match_descriptors(first.descriptors, second.descriptors)
     assert len(pairs) > 50
     return first.keypoints[pairs[:, 0]], second.keypoints[pairs[:, 1]]
@@ -36,7 +36,7 @@ def test_positions_and_matrices_turn_with_the_photo(tmp_path, picture):
     a, b = matched(upright, detect_sift(saved(turned, tmp_path / "b.png"), None, 1000, ALL))
     expected = np.stack([a[:, 1], picture.width - a[:, 0]], 1)
     assert np.abs(np.median(b[:, :2] - expected, 0)).max() < 0.02
-    # Column by column, the matrix has the axes of the feature in the photo.
+    # The columns of the matrix are the axes of the feature in the photo.
     axes = a[:, 2:].reshape(-1, 2, 2)
     expected = np.stack([axes[:, 1], -axes[:, 0]], 1).reshape(-1, 4)
     assert np.median(np.abs(b[:, 2:] - expected)) < 0.05 * np.median(np.abs(expected))

@@ -10,16 +10,18 @@ point in common. A pair of photos whose verified matches contradict the model is
 
 Correct models have tears, too: places that look alike have verified matches that are false. So a
 photo is judged by all of its matches. The photos are the nodes of a graph, and each pair with
-verified matches is an edge. The *demand* of an edge is the squared number of its matches: photos
-taken side by side have many matches, and a few such pairs outweigh many weak ones, which may be
-false. Matches of photos that follow each other count more (`CheckedPair.weight`). The *support* of
-a pair is the share of its matches that the model confirms. The *supported demand* of an edge is its
-demand multiplied by the support of its pair. If the photos of a model can be divided into two parts
-such that only a small share of the demand between them is supported, the parts contradict each
-other (`find_parts`). The best division is the sparsest cut of the graph: the cut with the least
-ratio of supported demand to demand. This problem is relaxed to a generalised eigenvalue problem
-(Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable constrained clustering: a
-generalized spectral method", AISTATS 2016).
+verified matches is an edge. The *demand* of an edge is the squared number of its matches. Photos
+taken side by side have many matches. Because of the square, a few such pairs have more demand than
+many pairs with few matches, whose matches may be false. Matches of photos that follow each other
+count more (`CheckedPair.weight`). The *support* of a pair is the share of its matches that the
+model confirms. The *supported demand* of an edge is its demand multiplied by the support of its
+pair.
+
+The photos of a model are divided into two parts. If only a small share of the demand between the
+parts is supported, the parts contradict each other (`find_parts`). The best division is the
+sparsest cut of the graph: the cut with the least ratio of supported demand to demand. This problem
+is relaxed to a generalised eigenvalue problem (Cucuringu, Koutis, Chawla, Miller and Peng, "Simple
+and scalable constrained clustering: a generalized spectral method", AISTATS 2016).
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 # Pairs with fewer verified matches are ignored: unrelated photos can have about this number of
 # matches by chance.
 _MIN_MATCHES = 50
-_MIN_FOLLOWING_MATCHES = 15  # instead, for photos that follow each other: they have few of these
+_MIN_FOLLOWING_MATCHES = 15  # for photos that follow each other: their matches are rarely false
 # A match is a hit if its two features observe the same point of the model. It is a miss if one of
 # its features observes a point whose projection into the other photo is far from the matched
 # feature. The support of a pair is hits / (hits + misses); in a correct model, it is nearly 1.
@@ -67,14 +69,14 @@ _TORN = 0.3
 # the model confirms all 692 pairs of this kind.
 _MAX_STEP = 2
 _FOLLOWING_WEIGHT = 20.0
-_MIN_MISS_DISTANCE = 4.0  # in units of the ``max_error`` of `check_pairs`
+_MIN_MISS_DISTANCE = 4.0  # of a miss, in units of the ``max_error`` of `check_pairs`
 _MIN_ANGLE = 2.0  # degrees: two rays with a smaller angle between them count as parallel
 # Two parts contradict each other if both of these conditions hold:
 # - At most the share `_MAX_SUPPORT` of the demand between them is supported.
 # - Let n be `_MIN_TEARS`, or `_MIN_FOLLOWING_TEARS` if only the pairs of photos that follow each
-#   other are examined. Sort the tears and the confirmed pairs between the parts by weight, the
-#   largest first. The n-th tear has a larger weight than the n-th confirmed pair, if there is one.
-#   (Photos taken side by side have more matches than photos of places that look alike.)
+#   other are examined. Sort the tears between the parts by weight, the largest first, and the
+#   confirmed pairs, too. The n-th tear has a larger weight than the n-th confirmed pair, if there
+#   is one. (Photos taken side by side have more matches than photos of places that look alike.)
 _MAX_SUPPORT = 0.5
 _MIN_TEARS = 3
 _MIN_FOLLOWING_TEARS = 2
@@ -109,7 +111,7 @@ class CheckedPair:
 
     @property
     def support(self) -> float:
-        """How far the model confirms the matches: from 0 (it contradicts them) to 1."""
+        """The share of the matches that the model confirms: from 0 (it contradicts them) to 1."""
         hits, misses = self.hit_share, self.miss_share
         if hits + misses >= _MIN_COUNTED:
             return hits / (hits + misses)

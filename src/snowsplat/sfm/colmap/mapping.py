@@ -49,7 +49,7 @@ class Mapping:
 
     database: Path
     images: Path
-    scale: float  # size of a photo over the size at which features were detected (1 or more)
+    scale: float  # size of a photo / size at which its features were detected (1 or more)
     threads: int
     report: Report
 

@@ -30,11 +30,11 @@ _CACHED_PHOTOS = 100
 # A verified pair has at least this many inliers: matches that are consistent with a relative pose.
 _MIN_INLIERS = 15
 # The pairs of a group are verified in this number of passes over all photos. Pairs with few inliers
-# take several times as long as others. With several passes, each part of the time contains all
-# kinds of pairs, so the time left can be estimated.
+# take several times as long as others. Each pass contains pairs of all kinds, so the time left can
+# be estimated from the number of verified pairs.
 _PASSES = 8
-# Pairs are verified in groups with these smallest inlier ratios. The last one is the default of
-# COLMAP, for all pairs with many matches.
+# Pairs are verified in groups. Each group has one of these smallest inlier ratios. The last ratio
+# is the default of COLMAP; it is used for all pairs with many matches.
 _INLIER_RATIOS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.32, 0.25)
 
 

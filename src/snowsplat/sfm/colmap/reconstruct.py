@@ -41,7 +41,8 @@ from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
-# The expected time at the end of the next attempt, divided by the time now.
+# The expected time from the start of the job to the end of the next attempt, divided by the time
+# from the start of the job until now.
 _NEXT_ATTEMPT = 3.0
 # Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
 # which the features were detected.
@@ -53,7 +54,7 @@ class Matched:
     """A database with features and matches, and how they were made."""
 
     database: Path
-    effort: Effort  # of the features
+    effort: Effort  # with which the features were detected
     choice: PairChoice
     scale: float  # size of a photo / size at which its features were detected (1 or more)
 

@@ -11,7 +11,7 @@ from snowsplat.sfm.colmap.consistency import CheckedPair, check_pairs, find_part
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
 from snowsplat.sfm.colmap.mapping import MIN_PHOTOS, Mapping
 
-_ROUNDS = 3  # how often photos are registered again
+_ROUNDS = 3  # photos are registered again at most this number of times
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Repaired:
 
     model: pycolmap.Reconstruction
     contradicting: int  # number of photos whose pose contradicted their matches
-    left_out: dict[str, str]  # name -> reason, for contradicting photos without a pose now
+    left_out: dict[str, str]  # name -> reason, for those of these photos that have no pose now
 
     @property
     def description(self) -> str:
@@ -43,7 +43,7 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     photos are registered again. This is repeated until no part contradicts the others, at most
     `_ROUNDS` times. Photos that contradict the others even then are left out.
 
-    A model without contradictions is returned unchanged. ``max_error`` is that of `check_pairs`.
+    A model without contradictions is returned unchanged. ``max_error`` as in `check_pairs`.
     """
     names = {i: image.name for i, image in model.images.items()}
     # The image ids of the pairs with false matches, of all rounds.
@@ -68,9 +68,10 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
 def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> list[set[int]]:
     """The parts of a model that contradict each other, as `find_parts`.
 
-    ``false_pairs`` were found to be false in an earlier model, perhaps by mistake. So they count,
-    too. But they do not count if the model contradicts only them, and no pair of photos that follow
-    each other: then the earlier model was wrong, and this one is not.
+    The matches of ``false_pairs`` were found to be false in an earlier model. This may have been a
+    mistake, so these pairs are used here, too. There is one exception. If all contradictions come
+    from ``false_pairs``, and no pair of photos that follow each other is a tear, then this model is
+    considered correct, and there is only one part.
     """
     parts = find_parts(pairs)
     if len(parts) > 1 and not any(pair.torn and pair.follows for pair in pairs):
@@ -102,8 +103,8 @@ def _false_pairs(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set
 
     These are the pairs that are not tears: the wrong poses agree with their matches. Pairs of
     photos that follow each other are an exception, because they may be the only pairs between two
-    parts whose matches are true. True matches agree with wrong poses, too, if false matches
-    elsewhere have moved both parts in the same way.
+    parts whose matches are true. Even true matches can agree with wrong poses: this happens if
+    other, false matches have moved both photos of the pair in the same way.
     """
     part = _part_of(parts)
     return {

@@ -18,14 +18,15 @@ from PIL import Image
 from snowsplat.sfm.ingest.photo_files import open_image
 from snowsplat.util.machine import memory_bytes
 
-# Parameters of the detection that COLMAP has, too.
+# Parameters of the detection; their values are the defaults of COLMAP.
 _CONTRAST_THRESHOLD = 0.02  # for pixels in [0, 1]; divided by the number of layers in an octave
 _EDGE_THRESHOLD = 10
-_LAYERS = 3  # in an octave, the range in which the scale doubles
+_LAYERS = 3  # in an octave. The scale doubles from one octave to the next
 _NORM = 512  # Euclidean norm of a uint8 descriptor, except for rounding
 
 # Memory for each pixel of the resized photo: all octaves of its pyramid, float32. The first octave
 # has 4 pixels for each pixel of the photo, with 6 levels of blur and 5 differences between them.
+# The other octaves together have a third of the pixels of the first one.
 _BYTES_PER_PIXEL = 4 * 4 * (_LAYERS + 3 + _LAYERS + 2) * 4 // 3
 # The part of the machine's memory that all these pyramids may use.
 _MEMORY_PART = 0.25
@@ -36,8 +37,8 @@ class Features(NamedTuple):
 
     A keypoint has its position x, y in pixels of the photo, where the centre of the first pixel is
     (0.5, 0.5); and a 2 x 2 matrix in row order: its scale in pixels times its rotation. The
-    descriptors are "RootSIFT" (Arandjelović and Zisserman 2012): square roots of histograms of the
-    gradients whose sum is 1, multiplied by 512.
+    descriptors are "RootSIFT" (Arandjelović and Zisserman 2012): histograms of the gradients are
+    divided by their sum; the square roots of these values are multiplied by 512.
     """
 
     keypoints: NDArray[np.float32]  # (N, 6)
@@ -54,9 +55,9 @@ def photos_at_once(image_size: int, threads: int) -> int:
 def detect_sift(photo: Path, mask: Path | None, image_size: int, count: int) -> Features:
     """The ``count`` largest features of a photo, or fewer.
 
-    If the longest side of the photo has more than ``image_size`` pixels, it is resized to this
-    size. Large features are found again in more of the other photos than small ones. Features at
-    black pixels of ``mask`` are left out.
+    If the longest side of the photo has more than ``image_size`` pixels, the photo is resized to
+    this size. The largest features are used because they are found again in more of the other
+    photos. Features at black pixels of ``mask`` are left out.
 
     Raises:
         OSError: a file is missing.

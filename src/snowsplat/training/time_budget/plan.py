@@ -50,7 +50,7 @@ _MIN_SAMPLE_STEPS = 3
 _SAMPLE_PHOTOS = 2
 #: Maximum number of initial points in the sample. It limits the memory.
 _SAMPLE_POINTS = 20_000
-#: Photos with more pixels than this are reduced to half the size.
+#: Photos with more pixels than this are reduced to half the width and height.
 _SAMPLE_PIXELS = 500_000
 #: Time of a step with a trained scene, divided by that with the initial points. It is larger than
 #: 1, because more splats overlap in a trained scene. Measured with fox and fern: 1.5 to 1.9.
@@ -66,7 +66,7 @@ class Plan:
         width, height: of a photo at that resolution, in pixels.
         config: the configuration, with the chosen number of steps and limit of Gaussians.
         time_ratio: seconds of a step on this machine, divided by `Work.seconds`.
-        seconds: mean time of a step.
+        seconds: mean time of a step, in seconds.
     """
 
     resolution: int | None
