@@ -37,7 +37,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
-from snowsplat.sfm.colmap.pairs import following, numbered_series
+from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
@@ -45,10 +45,6 @@ Ints = NDArray[np.integer[Any]]
 # positions (M, 2) of these features in the normalised image plane.
 _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 
-# Pairs with fewer verified matches are ignored: unrelated photos can have about this number of
-# matches by chance.
-_MIN_MATCHES = 50
-_MIN_FOLLOWING_MATCHES = 15  # for photos that follow each other: their matches are rarely false
 # A match is a hit if its two features observe the same point of the model. It is a miss if one of
 # its features observes a point whose projection into the other photo is far from the matched
 # feature. The support of a pair is hits / (hits + misses); in a correct model, it is nearly 1.
@@ -63,12 +59,6 @@ _MIN_AGREEING = 0.5
 # support is at most `_TORN`.
 _CONFIRMED = 0.8
 _TORN = 0.3
-# Two photos follow each other if their positions in a series of names (`numbered_series`) differ by
-# at most `_MAX_STEP`. Such photos were usually taken side by side, so their matches are rarely
-# false, and each match counts as `_FOLLOWING_WEIGHT` matches. In five datasets with correct poses,
-# the model confirms all 692 pairs of this kind.
-_MAX_STEP = 2
-_FOLLOWING_WEIGHT = 20.0
 _MIN_MISS_DISTANCE = 4.0  # of a miss, in units of the ``max_error`` of `check_pairs`
 _MIN_ANGLE = 2.0  # degrees: two rays with a smaller angle between them count as parallel
 # Two parts contradict each other if both of these conditions hold:
@@ -85,24 +75,12 @@ _THRESHOLDS = 10  # number of thresholds that are tried for each eigenvector
 
 
 @dataclass(frozen=True)
-class CheckedPair:
-    """Two registered photos, and how many of their verified matches agree with the model.
+class CheckedPair(VerifiedPair):
+    """Two registered photos, and how many of their verified matches agree with the model."""
 
-    ``first`` and ``second`` are image ids of the database, ``first`` < ``second``.
-    """
-
-    first: int
-    second: int
-    matches: int  # number of verified matches
     hits: int  # number of matches whose two features observe the same point of the model
-    agreeing: float = 0.0  # share of the matches that agree with the poses, if computed
-    miss_share: float = 0.0  # share of the matches that are misses, if computed
-    follows: bool = False  # whether the photos follow each other by name (`_MAX_STEP`)
-
-    @property
-    def weight(self) -> float:
-        """The number of matches; those of photos that follow each other count several times."""
-        return self.matches * (_FOLLOWING_WEIGHT if self.follows else 1.0)
+    agreeing: float = 0.0  # share of the matches that agree with the poses
+    miss_share: float = 0.0  # share of the matches that are misses
 
     @property
     def hit_share(self) -> float:
@@ -118,14 +96,14 @@ class CheckedPair:
         return float(self.agreeing >= _MIN_AGREEING)
 
     @property
-    def counts(self) -> bool:
-        """Whether the pair has enough matches to be considered."""
-        return self.matches >= (_MIN_FOLLOWING_MATCHES if self.follows else _MIN_MATCHES)
+    def contradicted(self) -> bool:
+        """Whether the model contradicts the matches, however few they are."""
+        return self.support <= _TORN
 
     @property
     def torn(self) -> bool:
-        """Whether the pair is a tear: the model contradicts its matches."""
-        return self.counts and self.support <= _TORN
+        """Whether the pair is a tear: the model contradicts its matches, and they are enough."""
+        return self.counts and self.contradicted
 
 
 def check_pairs(
@@ -143,7 +121,7 @@ def check_pairs(
     rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
-        following_pairs = _following_pairs(source)
+        follow = following_pairs(database_names(source))
 
         def rays_of(image_id: int, features: Ints) -> Floats:
             if image_id not in rays:
@@ -159,31 +137,23 @@ def check_pairs(
             rows = source.read_two_view_geometry(first, second).inlier_matches
             of_first, of_second = points[first][rows[:, 0]], points[second][rows[:, 1]]
             is_hit = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
-            follows = (first, second) in following_pairs
+            follows = (first, second) in follow
             pair = CheckedPair(first, second, len(rows), int(is_hit.sum()), follows=follows)
-            if pair.counts:
-                images = model.image(first), model.image(second)
-                focal = np.mean([model.camera(i.camera_id).mean_focal_length() for i in images])
-                pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
-                both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
-                error = max_error / float(focal)
-                sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
-                missed = _misses(positions, sides[0], sides[1], _MIN_MISS_DISTANCE * error)
-                missed |= _misses(positions, sides[1], sides[0], _MIN_MISS_DISTANCE * error)
-                pair = replace(
-                    pair,
-                    agreeing=agreement(pose, *both, error),
-                    miss_share=float(np.mean(missed & ~is_hit)),
-                )
+            images = model.image(first), model.image(second)
+            focal = np.mean([model.camera(i.camera_id).mean_focal_length() for i in images])
+            pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
+            both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
+            error = max_error / float(focal)
+            sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
+            missed = _misses(positions, sides[0], sides[1], _MIN_MISS_DISTANCE * error)
+            missed |= _misses(positions, sides[1], sides[0], _MIN_MISS_DISTANCE * error)
+            pair = replace(
+                pair,
+                agreeing=agreement(pose, *both, error),
+                miss_share=float(np.mean(missed & ~is_hit)),
+            )
             checked.append(pair)
     return checked
-
-
-def _following_pairs(database: pycolmap.Database) -> set[tuple[int, int]]:
-    """The image ids (first < second) of the pairs of photos that follow each other by name."""
-    names = {image.image_id: image.name for image in database.read_all_images()}
-    steps = range(1, _MAX_STEP + 1)
-    return set().union(*(following(series, steps) for series in numbered_series(names)))
 
 
 def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -12,7 +13,10 @@ import pycolmap
 
 from snowsplat.sfm.colmap.database import count_rows
 from snowsplat.sfm.colmap.features import SEED
+from snowsplat.sfm.colmap.incremental import IncrementalMapper
 from snowsplat.sfm.colmap.options import Mapper
+from snowsplat.sfm.colmap.subset import spread_subset
+from snowsplat.sfm.colmap.view_graph import ViewGraph
 from snowsplat.sfm.progress import Report
 
 # A camera that sees fewer points has no reliable pose.
@@ -21,11 +25,14 @@ MIN_PHOTOS = 3
 # At the end, observations with a larger reprojection error are removed. In pixels of the resized
 # photo in which the features were detected.
 _MAX_REPROJECTION_ERROR = 3.0
-# With several threads, the result of COLMAP's mapper depends on their timing. The initial pair and
-# therefore the coordinate frame may differ, and all poses differ a little. With up to this number
-# of photos, several threads are not faster than one. Then one thread is used, and the poses are the
-# same in every run.
-_MANY_PHOTOS = 150
+#: Largest distance of a verified match from its epipolar line. In pixels of the resized photo in
+#: which the features were detected.
+MAX_ERROR = 4.0
+# With more than this number of photos, a part of them (`spread_subset`) is registered first, with
+# bundle adjustment. The other photos are registered without it, which takes a tenth of the time.
+_MANY_PHOTOS = 100
+_SUBSET = 0.4  # share of the photos
+_MAX_MODELS = 20  # also the number of times that a model is started in vain
 # With at least this number of photos, global bundle adjustment runs less often: when the model has
 # grown by 40% (default of COLMAP: 10%). It then runs once (default of COLMAP: up to 5 times), with
 # at most 20 iterations. Local bundle adjustment runs after each new photo, as with fewer photos.
@@ -61,7 +68,7 @@ class Mapping:
         if mapper == "global":
             models = self._map_globally()
         else:
-            models = self._map_incrementally(self._options(relaxed), start=None)
+            models = self._map_incrementally(relaxed)
         return usable_models([self._refine(model) for model in models])
 
     def extend(
@@ -72,13 +79,13 @@ class Mapping:
         Photos of the other models are tried, too, so that separate models may be joined. If no
         photo can be added, ``models`` are returned unchanged. ``relaxed`` as in `run`.
         """
-        grown = self._map_incrementally(self._options(relaxed), start=models[0])
-        if not grown or grown[0].num_reg_images() <= models[0].num_reg_images():
+        before = models[0].num_reg_images()
+        model = copy.deepcopy(models[0])
+        graph = ViewGraph.read(self.database)
+        self._grow(self._mapper(graph, relaxed), model, graph)
+        if model.num_reg_images() <= before or self._refine(model).num_reg_images() <= before:
             return models
-        refined = self._refine(grown[0])
-        if refined.num_reg_images() <= models[0].num_reg_images():
-            return models
-        return usable_models([refined, *models[1:]])
+        return usable_models([model, *models[1:]])
 
     def without(
         self, model: pycolmap.Reconstruction, photos: Iterable[int]
@@ -94,8 +101,9 @@ class Mapping:
 
     def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()
+        # With several threads, the result of COLMAP's mapper depends on their timing.
+        options.num_threads = 1
         photos = count_rows(self.database, "images")
-        options.num_threads = self.threads if photos > _MANY_PHOTOS else 1
         if photos >= _LARGE_MODEL:
             options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
             options.ba_global_max_refinements = 1
@@ -104,7 +112,6 @@ class Mapping:
         options.ba_local_function_tolerance = _LOCAL_TOLERANCE
         options.ba_local_max_refinements = 1
         options.random_seed = SEED
-        options.min_model_size = MIN_PHOTOS
         mapper, triangulation = options.mapper, options.triangulation
         mapper.init_max_error *= self.scale
         mapper.abs_pose_max_error *= self.scale
@@ -120,40 +127,47 @@ class Mapping:
             mapper.max_reg_trials = 6
         return options
 
-    def _map_incrementally(
-        self,
-        options: pycolmap.IncrementalPipelineOptions,
-        start: pycolmap.Reconstruction | None,
-    ) -> list[pycolmap.Reconstruction]:
-        total = count_rows(self.database, "images")
-        registered = 0
+    def _map_incrementally(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
+        """Models of separate photos: each is made of the photos that are in no model before."""
+        graph = ViewGraph.read(self.database)
+        mapper = self._mapper(graph, relaxed)
+        models: list[pycolmap.Reconstruction] = []
+        left = graph
+        for _ in range(_MAX_MODELS):
+            model = mapper.start(self._first(left)) if len(left.names) >= MIN_PHOTOS else None
+            if model is None:
+                break
+            self._grow(mapper, model, left)
+            if model.num_reg_images() >= MIN_PHOTOS:
+                models.append(model)
+                left = left.of_photos(set(left.names) - set(model.reg_image_ids()))
+        return models
 
-        def begin() -> None:
-            nonlocal registered
-            registered = 2 if start is None else start.num_reg_images()
-            self.report(registered, total, "registered photos")
+    def _mapper(self, graph: ViewGraph, relaxed: bool) -> IncrementalMapper:
+        total = len(graph.names)
+        return IncrementalMapper(
+            self.database,
+            graph,
+            self._options(relaxed),
+            MAX_ERROR * self.scale,
+            lambda registered: self.report(registered, total, "registered photos"),
+        )
 
-        def step() -> None:
-            nonlocal registered
-            registered += 1
-            self.report(min(registered, total), total, "registered photos")
+    def _first(self, graph: ViewGraph) -> set[int]:
+        """The photos (image ids) that are registered with bundle adjustment."""
+        count = len(graph.names)
+        if count <= _MANY_PHOTOS:
+            return set(graph.names)
+        return spread_subset(graph, max(_MANY_PHOTOS, round(_SUBSET * count)))
 
-        with self._output() as output:
-            start_path = ""
-            if start is not None:
-                start_path = str(output / "start")
-                (output / "start").mkdir()
-                start.write(start_path)
-            models = pycolmap.incremental_mapping(
-                self.database,
-                self.images,
-                output,
-                options,
-                input_path=start_path,
-                initial_image_pair_callback=begin,
-                next_image_callback=step,
-            )
-        return list(models.values())
+    def _grow(
+        self, mapper: IncrementalMapper, model: pycolmap.Reconstruction, graph: ViewGraph
+    ) -> None:
+        """Register the photos of ``graph`` in ``model``."""
+        first = self._first(graph)
+        mapper.grow(model, first, adjust=True)
+        if len(first) < len(graph.names):
+            mapper.grow(model, graph.names, adjust=False)
 
     def _map_globally(self) -> list[pycolmap.Reconstruction]:
         options = pycolmap.GlobalPipelineOptions()

@@ -101,16 +101,17 @@ def _part_of(parts: Sequence[set[int]]) -> dict[int, int]:
 def _false_pairs(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set[tuple[int, int]]:
     """The pairs of photos in different parts whose matches are false, as image ids.
 
-    These are the pairs that are not tears: the wrong poses agree with their matches. Pairs of
-    photos that follow each other are an exception, because they may be the only pairs between two
-    parts whose matches are true. Even true matches can agree with wrong poses: this happens if
-    other, false matches have moved both photos of the pair in the same way.
+    These are the pairs that the model does not contradict: the wrong poses agree with their
+    matches. Pairs of photos that follow each other are an exception, because they may be the only
+    pairs between two parts whose matches are true. Even true matches can agree with wrong poses:
+    this happens if other, false matches have moved both photos of the pair in the same way.
     """
     part = _part_of(parts)
     return {
         (pair.first, pair.second)
         for pair in pairs
-        if part.get(pair.first, 0) != part.get(pair.second, 0) and not (pair.torn or pair.follows)
+        if part.get(pair.first, 0) != part.get(pair.second, 0)
+        and not (pair.contradicted or pair.follows)
     }
 
 
