@@ -1,0 +1,57 @@
+"""The subset of photos that is registered first."""
+
+import itertools
+
+from snowsplat.sfm.colmap.subset import spread_subset
+from snowsplat.sfm.colmap.view_graph import ViewGraph
+
+COUNT = 40
+
+
+def walk(matches, named=True, weak=()):
+    """Photos along a line: ``matches[d - 1]`` matches at distance d; few across ``weak`` ones."""
+    names = {i: f"{i:03}.jpg" if named else f"{chr(65 + i)}.jpg" for i in range(1, COUNT + 1)}
+    pairs = [
+        (i, i + d, 40 if any(i <= w < i + d for w in weak) else number)
+        for d, number in enumerate(matches, start=1)
+        for i in range(1, COUNT + 1 - d)
+    ]
+    return ViewGraph.of(names, pairs)
+
+
+def test_the_photos_are_spread():
+    subset = sorted(spread_subset(walk([900, 700, 500, 300, 200, 150]), COUNT // 3))
+    assert len(subset) == COUNT // 3
+    steps = [b - a for a, b in itertools.pairwise(subset)]
+    assert max(steps) <= 6
+    assert subset[0] <= 6
+    assert subset[-1] >= COUNT - 5
+
+
+def test_photos_without_numbers_are_spread_by_their_matches():
+    subset = sorted(spread_subset(walk([900, 700, 500, 300, 200, 150], named=False), COUNT // 3))
+    assert len(subset) == COUNT // 3
+    steps = [b - a for a, b in itertools.pairwise(subset)]
+    assert max(steps) <= 6
+
+
+def test_photos_that_connect_the_others_stay():
+    """Pairs at a distance of three photos are weak: never are two photos side by side left out."""
+    subset = sorted(spread_subset(walk([900, 400, 60]), 2))
+    steps = [b - a for a, b in itertools.pairwise(subset)]
+    assert max(steps) == 2
+
+
+def test_the_photos_on_both_sides_of_a_weak_link_stay():
+    """The camera turns fast after photo 20, where even neighbours have few matches."""
+    subset = spread_subset(walk([900, 700, 500, 300, 200, 150], weak=[20]), COUNT // 3)
+    assert {20, 21} <= subset
+
+
+def test_nothing_is_left_out_without_strong_pairs():
+    assert spread_subset(walk([90, 80, 70]), 5) == set(range(1, COUNT + 1))
+
+
+def test_the_same_photos_give_the_same_subset():
+    graph = walk([900, 700, 500, 300])
+    assert spread_subset(graph, 12) == spread_subset(graph, 12)
