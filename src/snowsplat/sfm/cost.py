@@ -9,8 +9,7 @@ The work is a sum of steps. Each step has a cost in seconds of one core of a ref
     features  pixels of the photos in which features are detected; features        all
     pairs     pairs of photos, times the square of the number of features          all
     verified  pairs of photos, times the square root of the number of features     all
-    poses     photos; the time for a photo grows with their number, because of     1
-              bundle adjustment
+    poses     photos; those that are registered with bundle adjustment cost more   1
     load      constant                                                             1
     images    pixels of the copies, from which the lens distortion is removed      up to 4
     report    constant                                                             1
@@ -32,7 +31,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap.options import EFFORTS, EffortName
+from snowsplat.sfm.colmap.options import EFFORTS, EffortName, photos_with_adjustment
 from snowsplat.sfm.colmap.sift import new_detector
 from snowsplat.sfm.survey import Photos
 
@@ -45,12 +44,10 @@ _SIFT_MEGAPIXEL = 0.33
 _SIFT_THOUSAND = 0.06  # for each thousand features
 _MATCHED_PAIR = 0.001  # a pair of photos with 1000 features each
 _VERIFIED_PAIR = 0.015  # a pair of photos with 1000 features each
-_POSE = 0.33
-# With this number of photos, the mean time to register a photo is twice that of the first photos.
-_POSE_GROWTH = 60.0
-# With this number of photos, registering them takes half of the time of the step "poses". The other
-# half is the bundle adjustment at the end, and the check of the poses.
-_POSE_END = 120.0
+# The costs of a photo in the step "poses".
+_REGISTERED = 0.27  # with bundle adjustment (`photos_with_adjustment`)
+_ADDED = 0.1  # registered without bundle adjustment
+_REFINED = 0.15  # final bundle adjustment and check of the poses
 _IMAGE_MEGAPIXEL = 0.24
 _START = 2.5  # loading libraries
 _LOAD = 3.0  # loading more libraries, for the images
@@ -118,7 +115,7 @@ def steps_of(photos: Photos, size: int | None, effort: EffortName) -> dict[str, 
         "photos": Step(reading, _MOST_READERS),
         "features": Step(count * (detecting + _SIFT_THOUSAND * parameters.features / 1000)),
         **steps_of_pairs(expected_pairs(count, effort), parameters.features),
-        "poses": Step(_POSE * _growing(count), 1),
+        "poses": Step(_registration(count, count) + _REFINED * count, 1),
         "load": Step(_LOAD, 1),
         "images": Step(_IMAGE_MEGAPIXEL * copy * count, _MOST_READERS),
         "report": Step(_REPORT, 1),
@@ -136,13 +133,14 @@ def steps_of_pairs(pairs: float, features: float) -> dict[str, Step]:
 
 def share_of_poses(registered: int, photos: int) -> float:
     """The share of the step "poses" that is finished with ``registered`` of ``photos`` photos."""
-    registration = 1 / (1 + photos / _POSE_END)
-    return registration * _growing(registered) / _growing(max(1, photos))
+    done = _registration(registered, photos)
+    return done / (_registration(photos, photos) + _REFINED * photos) if photos else 0.0
 
 
-def _growing(photos: int) -> float:
-    """The work of registering this number of photos; about 1 for one photo."""
-    return photos * (1 + photos / _POSE_GROWTH)
+def _registration(registered: int, photos: int) -> float:
+    """The work of registering ``registered`` of ``photos`` photos."""
+    first = min(registered, photos_with_adjustment(photos))
+    return _REGISTERED * first + _ADDED * (registered - first)
 
 
 def expected_pairs(count: int, effort: EffortName) -> float:

@@ -42,7 +42,7 @@ def test_a_walk_past_look_alikes(mapping, scene, ordered):
 
 def test_a_part_of_the_photos_is_registered_first(mapping, scene, monkeypatch):
     """The other photos are then registered without bundle adjustment."""
-    monkeypatch.setattr(mapping_module, "_MANY_PHOTOS", 8)
+    monkeypatch.setattr(mapping_module, "photos_with_adjustment", lambda count: count // 2)
     calls = []
     grow = mapping_module.IncrementalMapper.grow
 

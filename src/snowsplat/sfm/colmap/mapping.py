@@ -14,7 +14,7 @@ import pycolmap
 from snowsplat.sfm.colmap.database import count_rows
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.incremental import IncrementalMapper
-from snowsplat.sfm.colmap.options import Mapper
+from snowsplat.sfm.colmap.options import Mapper, photos_with_adjustment
 from snowsplat.sfm.colmap.subset import spread_subset
 from snowsplat.sfm.colmap.view_graph import ViewGraph
 from snowsplat.sfm.progress import Report
@@ -28,10 +28,6 @@ _MAX_REPROJECTION_ERROR = 3.0
 #: Largest distance of a verified match from its epipolar line. In pixels of the resized photo in
 #: which the features were detected.
 MAX_ERROR = 4.0
-# With more than this number of photos, a part of them (`spread_subset`) is registered first, with
-# bundle adjustment. The other photos are registered without it, which takes a tenth of the time.
-_MANY_PHOTOS = 100
-_SUBSET = 0.4  # share of the photos
 _MAX_MODELS = 20  # also the number of times that a model is started in vain
 # With at least this number of photos, global bundle adjustment runs less often: when the model has
 # grown by 40% (default of COLMAP: 10%). It then runs once (default of COLMAP: up to 5 times), with
@@ -155,10 +151,7 @@ class Mapping:
 
     def _first(self, graph: ViewGraph) -> set[int]:
         """The photos (image ids) that are registered with bundle adjustment."""
-        count = len(graph.names)
-        if count <= _MANY_PHOTOS:
-            return set(graph.names)
-        return spread_subset(graph, max(_MANY_PHOTOS, round(_SUBSET * count)))
+        return spread_subset(graph, photos_with_adjustment(len(graph.names)))
 
     def _grow(
         self, mapper: IncrementalMapper, model: pycolmap.Reconstruction, graph: ViewGraph
