@@ -3,6 +3,7 @@
     python benchmarks/sfm.py                                  real datasets, scenes of 60 photos
     python benchmarks/sfm.py room twins --photos 60 150       scenes of 60 and of 150 photos
     python benchmarks/sfm.py fern rooms-300 --json sfm.json
+    python benchmarks/sfm.py room-120s                        a video of two minutes
     python benchmarks/sfm.py room --versus ../before/src      compare another build with this one
 
 A workload is a real dataset (a folder of photos or a video; skipped if absent), or a procedural
@@ -29,9 +30,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 from sfm_placed import placed
-from sfm_scenes import CACHE_VARIABLE, KINDS, SIZE, cache_folder, photos_of
+from sfm_scenes import CACHE_VARIABLE, KINDS, SIZE, cache_folder, photos_of, video_of
 from torch import Tensor
 
 from snowsplat.data.colmap import read_model
@@ -88,8 +91,28 @@ def workload(name: str, datasets: Path, cache: Path, size: tuple[int, int]) -> W
         if done == total:
             print(file=sys.stderr)
 
+    if count.endswith("s"):
+        video, truth = video_of(kind, int(count[:-1]), cache, size, report=report)
+        return Workload(name, video, truth.poses)
     folder, truth = photos_of(kind, int(count), cache, size, report=report)
     return Workload(name, folder, truth.poses)
+
+
+def frames_shown(photos: Path, frames: Path) -> dict[str, str]:
+    """The name of each photo -> the name of the frame in the folder ``frames`` that it shows."""
+
+    def thumbnails(folder: Path) -> tuple[list[str], Tensor]:
+        names = sorted(path.name for path in folder.glob("*.jpg"))
+        rows = []
+        for name in names:
+            with Image.open(folder / name) as image:
+                small = image.convert("L").resize((32, 24), Image.Resampling.BOX)
+            rows.append(torch.tensor(np.asarray(small, np.float32)).flatten())
+        return names, torch.stack(rows)
+
+    (names, some), (all_names, every) = thumbnails(photos), thumbnails(frames)
+    nearest = torch.cdist(some, every).argmin(1).tolist()
+    return {name: all_names[i] for name, i in zip(names, nearest, strict=True)}
 
 
 def measure(work: Workload, folder: Path, options: Mapping[str, Any], source: Path) -> dict:
@@ -132,8 +155,13 @@ def measure(work: Workload, folder: Path, options: Mapping[str, Any], source: Pa
             "attempts": result["attempts"],
         }
     if work.true is not None:
-        compared = placed(found, work.true)
-        row |= {"photos": len(work.true), "placed": len(found)}
+        true = work.true
+        frames = work.source.with_name("frames")
+        if work.source.is_file() and frames.is_dir():  # a video of a scene
+            shown = frames_shown(folder / "input", frames)
+            true = {name: true[frame] for name, frame in shown.items()}
+        compared = placed(found, true)
+        row |= {"photos": len(true), "placed": len(found)}
         row |= {"correct": len(compared.correct), "wrong": compared.wrong}
         row |= {"missing": compared.missing}
         if compared.correct:
@@ -206,7 +234,8 @@ def _names(arguments: argparse.Namespace) -> list[str]:
     names = []
     for name in chosen:
         kind, dash, count = name.partition("-")
-        if name in DATASETS or (kind in KINDS and count.isdecimal() and int(count) >= 3):
+        number = count.removesuffix("s")
+        if name in DATASETS or (kind in KINDS and number.isdecimal() and int(number) >= 3):
             names.append(name)
         elif kind in KINDS and not dash:
             names += [f"{kind}-{photos}" for photos in arguments.photos]
@@ -224,7 +253,9 @@ def _size(text: str) -> tuple[int, int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument(
-        "workloads", nargs="*", help="a real dataset, a scene, or SCENE-N for N photos of a scene"
+        "workloads",
+        nargs="*",
+        help="a real dataset, a scene, SCENE-N for N photos, or SCENE-Ns for N seconds of video",
     )
     parser.add_argument(
         "--photos", type=int, nargs="+", default=[60], help="numbers of photos of the scenes (60)"

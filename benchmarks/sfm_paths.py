@@ -12,8 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snowsplat.scene.geometry import look_at
+from snowsplat.scene.geometry import (
+    invert_rigid,
+    look_at,
+    quat_from_rotation,
+    rotation_from_quat,
+)
 from snowsplat.synthetic.photographer import rolled
+from snowsplat.trajectory.spline import Spline
 
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 _PHOTOS_OF_A_LOOP = 20
@@ -47,6 +53,19 @@ def loops(
         positions.append(at)
         targets.append(to)
     return _hand_held(positions, targets, random)
+
+
+def in_between(poses: list[Tensor], count: int) -> list[Tensor]:
+    """``count`` poses on a smooth path through ``poses``, from the first to the last."""
+    views = invert_rigid(torch.stack(poses))
+    quats = quat_from_rotation(views[..., :3])
+    signs = torch.where((quats[1:] * quats[:-1]).sum(1) < 0, -1.0, 1.0).cumprod(0)
+    quats = torch.cat([quats[:1], quats[1:] * signs[:, None].to(quats)])
+    times = torch.arange(len(poses), dtype=torch.float64)
+    path = Spline(times, torch.cat([views[..., 3], quats], 1))
+    at = path(torch.linspace(0, len(poses) - 1, count, dtype=torch.float64))
+    rotations = rotation_from_quat(torch.nn.functional.normalize(at[:, 3:], dim=1))
+    return list(invert_rigid(torch.cat([rotations, at[:, :3, None]], 2)))
 
 
 def looking_down(count: int, seed: int) -> list[Tensor]:

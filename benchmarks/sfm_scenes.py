@@ -20,7 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from sfm_paths import around_two, looking_down, loops, through_two_rooms
+from PIL import Image
+from sfm_paths import around_two, in_between, looking_down, loops, through_two_rooms
 from torch import Tensor
 
 from snowsplat.sfm.progress import Report, silent
@@ -31,11 +32,13 @@ from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
+from snowsplat.trajectory.video import video_writer
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
 VERSION = 2
 CACHE_VARIABLE = "SNOWSPLAT_SFM_SCENES"
 SIZE = (800, 600)
+FRAMES_PER_SECOND = 10
 
 _HEIGHT = 2.6  # metres, of all rooms
 _TEXEL = 0.005  # metres per pixel of a texture
@@ -83,6 +86,32 @@ def photos_of(
     lens = phone_lens(*size)
     poses = chosen.path(count, seed)
     return folder, take_photos(folder, lambda: chosen.build(seed), lens, poses, seed, report)
+
+
+def video_of(
+    kind: str,
+    seconds: int,
+    cache: Path,
+    size: tuple[int, int] = SIZE,
+    seed: int = 0,
+    report: Report = silent,
+) -> tuple[Path, Truth]:
+    """A video of a scene of `KINDS`, as `photos_of`.
+
+    The truth has the poses of the frames ``IMG_0001.jpg`` …, which are in the folder of the video.
+    """
+    chosen = KINDS[kind]
+    folder = cache / f"{kind}-{seconds}s-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
+    poses = in_between(chosen.path(seconds, seed), seconds * FRAMES_PER_SECOND)
+    lens = phone_lens(*size)
+    truth = take_photos(folder / "frames", lambda: chosen.build(seed), lens, poses, seed, report)
+    video = folder / "video.mp4"
+    if not video.exists():
+        with video_writer(video, *size, FRAMES_PER_SECOND) as add:
+            for name in truth.poses:
+                with Image.open(folder / "frames" / name) as frame:
+                    add(np.asarray(frame.convert("RGB")))
+    return video, truth
 
 
 # The scenes
