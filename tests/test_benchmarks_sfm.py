@@ -179,8 +179,9 @@ def test_a_video_moves_smoothly_through_the_poses(sfm_modules):
 
 
 def test_which_frames_the_photos_of_a_video_show(sfm_modules, tmp_path):
-    import sfm
     from PIL import Image
+
+    import sfm
 
     random = np.random.default_rng(0)
     for folder in ("frames", "photos"):
