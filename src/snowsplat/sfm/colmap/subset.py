@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,36 +24,52 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
     of its neighbours in the view graph, and the pair of the photos before and after it by name.
     """
     ids, matches = graph.matrix()
-    row = {photo: index for index, photo in enumerate(ids)}
-    kept = np.ones(len(ids), bool)
-    series_of = {
-        row[photo]: [row[other] for other in series]
-        for series in numbered_series(graph.names)
-        for photo in series
-    }
     strong = matches >= _MIN_MATCHES
+    kept = np.ones(len(ids), bool)
+    row = {photo: index for index, photo in enumerate(ids)}
+    before: dict[int, int | None] = {}  # row of a photo -> row of the kept photo before it by name
+    after: dict[int, int | None] = {}
+    for series in numbered_series(graph.names):
+        for one, other in itertools.pairwise(series):
+            after[row[one]], before[row[other]] = row[other], row[one]
 
     def needed(index: int) -> bool:
-        series = series_of.get(index, [])
-        if series:
-            position = series.index(index)
-            before = [i for i in series[:position] if kept[i]]
-            after = [i for i in series[position + 1 :] if kept[i]]
-            if before and after and not strong[before[-1], after[0]]:
-                return True
-        near = np.flatnonzero(kept & strong[index])
+        one, other = before.get(index), after.get(index)
+        if one is not None and other is not None and not strong[one, other]:
+            return True
+        near = np.flatnonzero(strong[index])
         return len(near) < 2 or not _connected(strong[np.ix_(near, near)])
 
+    # The second strongest pair: a photo with one strong pair only is at the end of a walk.
+    second = _second_largest(matches)
+    is_needed = np.zeros(len(ids), bool)  # is computed again only if a neighbour is left out
     while kept.sum() > count:
-        rows = np.flatnonzero(kept)
-        # The second strongest pair: a photo with one strong pair only is at the end of a walk.
-        second = np.sort(matches[np.ix_(rows, rows)], axis=1)[:, -2]
-        unneeded = (int(i) for i in rows[np.argsort(-second, kind="stable")] if not needed(int(i)))
-        index = next(unneeded, None)
-        if index is None:
+        rows = np.flatnonzero(kept & ~is_needed)
+        for index in rows[np.argsort(-second[rows], kind="stable")].tolist():
+            is_needed[index] = needed(index)
+            if not is_needed[index]:
+                break
+        else:
             break
         kept[index] = False
+        one, other = before.pop(index, None), after.pop(index, None)
+        if one is not None:
+            after[one] = other
+            is_needed[one] = False
+        if other is not None:
+            before[other] = one
+            is_needed[other] = False
+        is_needed[strong[index]] = False
+        strong[index] = strong[:, index] = False
+        near = np.flatnonzero(matches[index])
+        matches[index] = matches[:, index] = 0
+        second[near] = _second_largest(matches[near])
     return {photo for photo, keep in zip(ids, kept, strict=True) if keep}
+
+
+def _second_largest(values: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """The second largest entry of each row of (N, M) values; 0 if M < 2."""
+    return np.partition(values, -2)[:, -2] if values.shape[1] > 1 else np.zeros(len(values))
 
 
 def _connected(linked: NDArray[np.bool_]) -> bool:

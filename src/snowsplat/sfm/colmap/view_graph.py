@@ -83,13 +83,14 @@ class ViewGraph:
     @property
     def pairs(self) -> list[VerifiedPair]:
         """All pairs, sorted by their image ids."""
-        found = {pair for pairs in self.pairs_of.values() for pair in pairs}
+        found = (pair for i, pairs in self.pairs_of.items() for pair in pairs if pair.first == i)
         return sorted(found, key=lambda pair: (pair.first, pair.second))
 
     def of_photos(self, photos: Collection[int]) -> ViewGraph:
         """The graph of only these photos. Photos follow each other if no photo of these or only one
         is between them."""
-        names = {i: self.names[i] for i in self.names if i in set(photos)}
+        chosen = set(photos)
+        names = {i: name for i, name in self.names.items() if i in chosen}
         return ViewGraph.of(names, ((p.first, p.second, p.matches) for p in self.pairs))
 
     def matrix(self) -> tuple[list[int], NDArray[np.floating[Any]]]:
