@@ -96,9 +96,10 @@ def video_of(
     seed: int = 0,
     report: Report = silent,
 ) -> tuple[Path, Truth]:
-    """A video of a scene of `KINDS`, as `photos_of`.
+    """A video of a scene of `KINDS`, and the true poses of its frames.
 
-    The truth has the poses of the frames ``IMG_0001.jpg`` …, which are in the folder of the video.
+    The frames ``IMG_0001.jpg`` … are in the folder ``frames`` beside the video. Frames that are not
+    in ``cache`` are rendered, as in `photos_of`.
     """
     chosen = KINDS[kind]
     folder = cache / f"{kind}-{seconds}s-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"

@@ -1,4 +1,4 @@
-"""Photos are registered along their strongest pairs, and not at places that only look alike."""
+"""Photos are registered in the order of their strongest pairs, and not at look-alike places."""
 
 import numpy as np
 import pycolmap
@@ -98,7 +98,7 @@ def test_equal_runs_give_equal_models(mapping):
 
 @pytest.mark.parametrize("follows", [True, False])
 def test_a_photo_is_not_registered_where_the_photo_before_it_contradicts(mapping, scene, follows):
-    """Most matches of photo 14 are with the look-alikes of what it shows."""
+    """Most matches of photo 14 are false: they are with points that look like those it shows."""
     model = look_alikes.model(scene, folded=False)
     observations = pycolmap.ObservationManager(model)
     for photo in range(10, 17):

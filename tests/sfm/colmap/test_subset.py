@@ -2,6 +2,9 @@
 
 import itertools
 
+import numpy as np
+import pytest
+
 from snowsplat.sfm.colmap.subset import spread_subset
 from snowsplat.sfm.colmap.view_graph import ViewGraph
 
@@ -9,7 +12,10 @@ COUNT = 40
 
 
 def walk(matches, named=True, weak=()):
-    """Photos along a line: ``matches[d - 1]`` matches at distance d; few across ``weak`` ones."""
+    """Photos along a line, with ``matches[d - 1]`` matches between photos at distance d.
+
+    After each photo of ``weak``, the view changes: there are 40 matches between the two sides.
+    """
     names = {i: f"{i:03}.jpg" if named else f"{chr(65 + i)}.jpg" for i in range(1, COUNT + 1)}
     pairs = [
         (i, i + d, 40 if any(i <= w < i + d for w in weak) else number)
@@ -36,7 +42,7 @@ def test_photos_without_numbers_are_spread_by_their_matches():
 
 
 def test_photos_that_connect_the_others_stay():
-    """Pairs at a distance of three photos are weak: never are two photos side by side left out."""
+    """Pairs at a distance of three photos are weak, so no two neighbours are both left out."""
     subset = sorted(spread_subset(walk([900, 400, 60]), 2))
     steps = [b - a for a, b in itertools.pairwise(subset)]
     assert max(steps) == 2
@@ -55,3 +61,24 @@ def test_nothing_is_left_out_without_strong_pairs():
 def test_the_same_photos_give_the_same_subset():
     graph = walk([900, 700, 500, 300])
     assert spread_subset(graph, 12) == spread_subset(graph, 12)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_very_few_photos(count):
+    graph = ViewGraph.of({i: f"{i}.jpg" for i in range(count)}, [])
+    assert spread_subset(graph, count) == set(range(count))
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_photos_left_out_at_once_or_one_by_one_are_the_same(named):
+    """So the values that are kept from one photo to the next are correct."""
+    random = np.random.default_rng(0)
+    numbers = sorted(random.integers(50, 900, 9).tolist(), reverse=True)
+    graph = walk(numbers, named)
+    loops = [(i, i + 15, int(random.integers(20, 400))) for i in range(1, COUNT - 14)]
+    graph = ViewGraph.of(graph.names, [(p.first, p.second, p.matches) for p in graph.pairs] + loops)
+    left = set(graph.names)
+    for _ in range(COUNT):
+        left = spread_subset(graph.of_photos(left), len(left) - 1)
+    assert len(left) < COUNT // 2
+    assert spread_subset(graph, 1) == left

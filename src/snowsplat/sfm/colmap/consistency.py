@@ -102,7 +102,7 @@ class CheckedPair(VerifiedPair):
 
     @property
     def torn(self) -> bool:
-        """Whether the pair is a tear: the model contradicts its matches, and they are enough."""
+        """Whether the pair is a tear: it has enough matches, and the model contradicts them."""
         return self.counts and self.contradicted
 
 

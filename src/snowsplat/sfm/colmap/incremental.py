@@ -1,12 +1,12 @@
 """Registers photos one after the other, in the order of their strongest pairs.
 
-COLMAP registers next the photo that sees the most points of the model. If two places look alike,
-this may be a photo of the other place. Its pose is then wrong, and so are the poses of the photos
-that are registered from it. Here, the next photo is one that follows a registered photo by name, if
+By default, COLMAP next registers a photo that sees many points of the model. If two places look
+alike, this may be a photo of the other place. Its pose is then wrong, and so are the poses of the
+photos that are registered from it. Here, the next photo is one that follows a registered photo by name, if
 there is any; otherwise the photo whose strongest pair with a registered photo has the most matches.
-So the model grows as in Prim's algorithm for the maximum spanning tree of the view graph. A photo
-whose pose contradicts its matches with the registered photos is not registered: the matches that
-agree with this pose are false, and the photo is registered again without them.
+So the model grows as in Prim's algorithm for the maximum spanning tree of the view graph. If the
+pose of a photo contradicts its matches with the registered photos, the pose is removed. The matches
+that agree with this pose are assumed to be false, and registration continues without them.
 
 The estimation of poses and points and the bundle adjustment are those of COLMAP's incremental
 mapper (Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016).
@@ -28,9 +28,10 @@ from snowsplat.sfm.colmap.consistency import agreement
 from snowsplat.sfm.colmap.database import closing_database, copy_for_mapping, remove_database
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, ViewGraph
 
-# The first two photos are the pair with the largest weight whose points have a median triangulation
-# angle of at least the first of these angles; if there is none, of at least the next one. In
-# degrees. Photos that follow each other often have smaller angles than COLMAP requires (16).
+# In degrees. The first two photos are the pair with the largest weight among the pairs whose points
+# have a median triangulation angle of at least the first of these angles. If there is no such pair,
+# the second angle is used. Photos that follow each other often have smaller angles than COLMAP
+# requires (16).
 _INITIAL_ANGLES = (8.0, 4.0)
 _INITIAL_PAIRS = 100  # number of pairs that are tried for each angle
 _MIN_INITIAL_POINTS = 50
@@ -38,7 +39,7 @@ _MIN_INITIAL_POINTS = 50
 # contradicts the pair if less than the share `_CONTRADICTING` agrees.
 _AGREEING = 0.5
 _CONTRADICTING = 0.3
-_TRIALS = 2  # how often a photo is rejected before it is not tried any more
+_TRIALS = 2  # a photo that was rejected this number of times is not tried again
 
 ImagePair = tuple[int, int]
 
@@ -61,7 +62,7 @@ class IncrementalMapper:
     def start(self, photos: Collection[int]) -> pycolmap.Reconstruction | None:
         """A new model of two of ``photos`` (image ids); None if there are no two suitable photos.
 
-        Each call returns a model of two other photos.
+        Each call starts with a pair of photos with which no earlier call started.
         """
         options = self.options.get_mapper()
         with self._mapper(photos) as mapper:
@@ -87,8 +88,8 @@ class IncrementalMapper:
     def grow(self, model: pycolmap.Reconstruction, photos: Collection[int], adjust: bool) -> None:
         """Register as many of ``photos`` (image ids) in ``model`` as possible.
 
-        ``adjust``: also run bundle adjustment. Without it, the poses and points of the model do not
-        change, and a photo takes a few hundredths of a second.
+        ``adjust``: also run bundle adjustment. Without it, the poses that the model already has do
+        not change, and a photo takes about a third of the time.
         """
         matches = _Matches(self.database, self.max_error)
         graph = self.graph.of_photos({*photos, *model.reg_image_ids()})
@@ -135,7 +136,7 @@ class IncrementalMapper:
         options = pycolmap.DatabaseCacheOptions()
         options.min_num_matches = self.options.min_num_matches
         options.image_names = {self.graph.names[photo] for photo in photos}
-        options.load_all_images = True  # a model may contain photos without any true match
+        options.load_all_images = True  # also photos of the model that have no pair left
         database = self.database.with_suffix(".reduced.db") if without else self.database
         try:
             if without:
@@ -206,7 +207,7 @@ class _Growth:
     def register_all(self) -> set[ImagePair]:
         """Register the photos; returns the pairs whose matches are false.
 
-        If there are such pairs, no photo is registered that does not follow a registered one.
+        After such a pair was found, only photos that follow a registered photo are registered.
         """
         while True:
             if self._register_next():

@@ -28,7 +28,7 @@ _MAX_REPROJECTION_ERROR = 3.0
 #: Largest distance of a verified match from its epipolar line. In pixels of the resized photo in
 #: which the features were detected.
 MAX_ERROR = 4.0
-_MAX_MODELS = 20  # also the number of times that a model is started in vain
+_MAX_MODELS = 20  # a model is started at most this number of times
 # With at least this number of photos, global bundle adjustment runs less often: when the model has
 # grown by 40% (default of COLMAP: 10%). It then runs once (default of COLMAP: up to 5 times), with
 # at most 20 iterations. Local bundle adjustment runs after each new photo, as with fewer photos.
@@ -78,7 +78,7 @@ class Mapping:
         before = models[0].num_reg_images()
         model = copy.deepcopy(models[0])
         graph = ViewGraph.read(self.database)
-        self._grow(self._mapper(graph, relaxed), model, graph)
+        self._grow(self._mapper(graph, relaxed), model, graph, self._first(graph))
         if model.num_reg_images() <= before or self._refine(model).num_reg_images() <= before:
             return models
         return usable_models([model, *models[1:]])
@@ -124,19 +124,20 @@ class Mapping:
         return options
 
     def _map_incrementally(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
-        """Models of separate photos: each is made of the photos that are in no model before."""
+        """Make models one after the other, each from the photos that are in no earlier model."""
         graph = ViewGraph.read(self.database)
         mapper = self._mapper(graph, relaxed)
         models: list[pycolmap.Reconstruction] = []
-        left = graph
+        left, first = graph, self._first(graph)
         for _ in range(_MAX_MODELS):
-            model = mapper.start(self._first(left)) if len(left.names) >= MIN_PHOTOS else None
+            model = mapper.start(first) if len(left.names) >= MIN_PHOTOS else None
             if model is None:
                 break
-            self._grow(mapper, model, left)
+            self._grow(mapper, model, left, first)
             if model.num_reg_images() >= MIN_PHOTOS:
                 models.append(model)
                 left = left.of_photos(set(left.names) - set(model.reg_image_ids()))
+                first = self._first(left)
         return models
 
     def _mapper(self, graph: ViewGraph, relaxed: bool) -> IncrementalMapper:
@@ -154,10 +155,13 @@ class Mapping:
         return spread_subset(graph, photos_with_adjustment(len(graph.names)))
 
     def _grow(
-        self, mapper: IncrementalMapper, model: pycolmap.Reconstruction, graph: ViewGraph
+        self,
+        mapper: IncrementalMapper,
+        model: pycolmap.Reconstruction,
+        graph: ViewGraph,
+        first: set[int],
     ) -> None:
-        """Register the photos of ``graph`` in ``model``."""
-        first = self._first(graph)
+        """Register the photos of ``graph`` in ``model``, those of ``first`` before the others."""
         mapper.grow(model, first, adjust=True)
         if len(first) < len(graph.names):
             mapper.grow(model, graph.names, adjust=False)

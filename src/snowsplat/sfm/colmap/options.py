@@ -99,7 +99,7 @@ _SUBSET = 0.4
 
 
 def photos_with_adjustment(count: int) -> int:
-    """How many of ``count`` photos are registered with bundle adjustment; the others follow later.
+    """How many of ``count`` photos are registered with bundle adjustment, before the others.
 
     Without bundle adjustment, a photo takes about a third of the time.
     """

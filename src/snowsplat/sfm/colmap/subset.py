@@ -1,4 +1,4 @@
-"""A subset of the photos that is spread over the scene, from which a model is made first."""
+"""Chooses the photos from which a model is made first: a subset that is spread over the scene."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from snowsplat.sfm.colmap.pairs import numbered_series
 from snowsplat.sfm.colmap.view_graph import ViewGraph
 
-# A photo may be left out if the photos of the subset with which it has at least this number of
-# verified matches stay connected by pairs with as many matches.
-_MIN_MATCHES = 100
+_MIN_MATCHES = 100  # number of verified matches of a strong pair
 
 
 def spread_subset(graph: ViewGraph, count: int) -> set[int]:
-    """``count`` photos (image ids) or a few more, which are connected by strong pairs.
+    """``count`` photos (image ids), or more if fewer photos can be left out.
 
-    Photos are left out one after the other, those with the strongest pairs first. A photo stays in
-    the subset if the pairs between the others would become weak without it (`_MIN_MATCHES`): pairs
-    of its neighbours in the view graph, and the pair of the photos before and after it by name.
+    Photos are left out one after the other: the next one is the photo whose second strongest pair
+    has the most matches. A photo is not left out if one of these conditions holds:
+
+    - It has fewer than two strong pairs (`_MIN_MATCHES`) with the photos of the subset.
+    - Strong pairs would not connect the other photos of these pairs without it.
+    - The photos before and after it by name are no strong pair.
     """
     ids, matches = graph.matrix()
     strong = matches >= _MIN_MATCHES

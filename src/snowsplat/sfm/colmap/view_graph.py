@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
 from snowsplat.sfm.colmap.pairs import following, numbered_series
 
-# Pairs with fewer verified matches are ignored: unrelated photos can have about this number of
-# matches by chance.
+# Poses are not compared with pairs that have fewer verified matches: unrelated photos can have
+# about this number of matches by chance.
 _MIN_MATCHES = 50
-_MIN_FOLLOWING_MATCHES = 15  # instead, for photos that follow each other: they have few of these
+_MIN_FOLLOWING_MATCHES = 15  # for photos that follow each other: their matches are rarely false
 # Two photos follow each other if their positions in a series of names (`numbered_series`) differ by
 # at most `_MAX_STEP`. Such photos were usually taken side by side, so their matches are rarely
 # false, and each match counts as `_FOLLOWING_WEIGHT` matches. In five datasets with correct poses,
@@ -42,7 +42,7 @@ class VerifiedPair:
 
     @property
     def counts(self) -> bool:
-        """Whether the pair has enough matches to be considered."""
+        """Whether the pair has enough matches to be compared with poses."""
         return self.matches >= (_MIN_FOLLOWING_MATCHES if self.follows else _MIN_MATCHES)
 
     def other(self, photo: int) -> int:
@@ -87,14 +87,19 @@ class ViewGraph:
         return sorted(found, key=lambda pair: (pair.first, pair.second))
 
     def of_photos(self, photos: Collection[int]) -> ViewGraph:
-        """The graph of only these photos. Photos follow each other if no photo of these or only one
-        is between them."""
+        """The graph of these photos only.
+
+        Two photos follow each other in it if at most one of these photos is between them.
+        """
         chosen = set(photos)
         names = {i: name for i, name in self.names.items() if i in chosen}
         return ViewGraph.of(names, ((p.first, p.second, p.matches) for p in self.pairs))
 
     def matrix(self) -> tuple[list[int], NDArray[np.floating[Any]]]:
-        """The image ids, ascending, and the (N, N) symmetric numbers of verified matches."""
+        """The image ids in ascending order, and the number of verified matches of each pair.
+
+        The numbers are a symmetric (N, N) matrix; 0: the two photos are no pair.
+        """
         ids = sorted(self.names)
         row = {photo: index for index, photo in enumerate(ids)}
         matches = np.zeros((len(ids), len(ids)))
