@@ -2,11 +2,11 @@
 
 By default, COLMAP next registers a photo that sees many points of the model. If two places look
 alike, this may be a photo of the other place. Its pose is then wrong, and so are the poses of the
-photos that are registered from it. Here, the next photo is one that follows a registered photo by name, if
-there is any; otherwise the photo whose strongest pair with a registered photo has the most matches.
-So the model grows as in Prim's algorithm for the maximum spanning tree of the view graph. If the
-pose of a photo contradicts its matches with the registered photos, the pose is removed. The matches
-that agree with this pose are assumed to be false, and registration continues without them.
+photos that are registered from it. Here, the next photo is one that follows a registered photo by
+name, if there is any; otherwise the photo whose strongest pair with a registered photo has the most
+matches. So the model grows as in Prim's algorithm for the maximum spanning tree of the view graph.
+If the pose of a photo contradicts its matches with the registered photos, the pose is removed. The
+matches that agree with this pose are assumed to be false, and registration continues without them.
 
 The estimation of poses and points and the bundle adjustment are those of COLMAP's incremental
 mapper (Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016).

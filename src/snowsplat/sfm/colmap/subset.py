@@ -31,8 +31,8 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
     before: dict[int, int | None] = {}  # row of a photo -> row of the kept photo before it by name
     after: dict[int, int | None] = {}
     for series in numbered_series(graph.names):
-        for one, other in itertools.pairwise(series):
-            after[row[one]], before[row[other]] = row[other], row[one]
+        for i, j in itertools.pairwise(series):
+            after[row[i]], before[row[j]] = row[j], row[i]
 
     def needed(index: int) -> bool:
         one, other = before.get(index), after.get(index)
