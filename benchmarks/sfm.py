@@ -7,8 +7,9 @@
     python benchmarks/sfm.py room --versus ../before/src      compare another build with this one
 
 A workload is a real dataset (a folder of photos or a video; skipped if absent), or a procedural
-scene of `sfm_scenes.py` with a number of photos. The photos of a scene are rendered once, into the
-folder that --cache or the environment variable SNOWSPLAT_SFM_SCENES names.
+scene of `sfm_scenes.py`: a number of photos, or a video. The photos of a scene and the frames of a
+video are rendered once, into the folder that --cache or the environment variable
+SNOWSPLAT_SFM_SCENES names.
 
 The estimated poses are aligned with the true ones by the similarity transform that agrees with the
 most photos (`sfm_placed.py`). A photo is placed correctly if the error of its rotation is then less
@@ -99,7 +100,10 @@ def workload(name: str, datasets: Path, cache: Path, size: tuple[int, int]) -> W
 
 
 def frames_shown(photos: Path, frames: Path) -> dict[str, str]:
-    """The name of each photo -> the name of the frame in the folder ``frames`` that it shows."""
+    """The name of each photo -> the name of the frame in the folder ``frames`` that it shows.
+
+    Empty if the folder ``photos`` does not exist, because the decoding of the video failed.
+    """
 
     def thumbnails(folder: Path) -> tuple[list[str], Tensor]:
         names = sorted(path.name for path in folder.glob("*.jpg"))
@@ -108,7 +112,7 @@ def frames_shown(photos: Path, frames: Path) -> dict[str, str]:
             with Image.open(folder / name) as image:
                 small = image.convert("L").resize((32, 24), Image.Resampling.BOX)
             rows.append(torch.tensor(np.asarray(small, np.float32)).flatten())
-        return names, torch.stack(rows)
+        return names, torch.stack(rows) if rows else torch.zeros(0, 32 * 24)
 
     (names, some), (all_names, every) = thumbnails(photos), thumbnails(frames)
     nearest = torch.cdist(some, every).argmin(1).tolist()

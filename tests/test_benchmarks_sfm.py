@@ -194,3 +194,4 @@ def test_which_frames_the_photos_of_a_video_show(sfm_modules, tmp_path):
             frame.save(tmp_path / "photos" / f"frame_{i // 2}.jpg", quality=50)
     shown = sfm.frames_shown(tmp_path / "photos", tmp_path / "frames")
     assert shown == {"frame_0.jpg": "IMG_1.jpg", "frame_2.jpg": "IMG_4.jpg"}
+    assert sfm.frames_shown(tmp_path / "absent", tmp_path / "frames") == {}

@@ -41,7 +41,8 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
         near = np.flatnonzero(strong[index])
         return len(near) < 2 or not _connected(strong[np.ix_(near, near)])
 
-    # The second strongest pair: a photo with one strong pair only is at the end of a walk.
+    # The number of matches of the second strongest pair of each photo. It is small for a photo at
+    # the end of a walk, which may have one strong pair only.
     second = _second_largest(matches)
     is_needed = np.zeros(len(ids), bool)  # is computed again only if a neighbour is left out
     while kept.sum() > count:
