@@ -25,9 +25,6 @@ MIN_PHOTOS = 3
 # At the end, observations with a larger reprojection error are removed. In pixels of the resized
 # photo in which the features were detected.
 _MAX_REPROJECTION_ERROR = 3.0
-#: Largest distance of a verified match from its epipolar line. In pixels of the resized photo in
-#: which the features were detected.
-MAX_ERROR = 4.0
 _MAX_MODELS = 20  # a model is started at most this number of times
 # With at least this number of photos, global bundle adjustment runs less often: when the model has
 # grown by 40% (default of COLMAP: 10%). It then runs once (default of COLMAP: up to 5 times), with
@@ -146,7 +143,6 @@ class Mapping:
             self.database,
             graph,
             self._options(relaxed),
-            MAX_ERROR * self.scale,
             lambda registered: self.report(registered, total, "registered photos"),
         )
 

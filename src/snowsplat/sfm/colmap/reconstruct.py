@@ -31,7 +31,7 @@ from snowsplat.sfm.colmap.database import (
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
-from snowsplat.sfm.colmap.mapping import MAX_ERROR, Mapping, usable_models, write_models
+from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.sfm.colmap.pair_matching import match_pairs
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
@@ -44,6 +44,9 @@ _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
 # The expected time from the start of the job to the end of the next attempt, divided by the time
 # from the start of the job until now.
 _NEXT_ATTEMPT = 3.0
+# Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
+# which the features were detected.
+_MAX_ERROR = 4.0
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ class PoseEstimation:
         sizes = [max(photo.width, photo.height) for photo in self.photos]
         scale = max(1.0, float(np.median(sizes)) / effort.image_size)
         match_pairs(
-            database, self.photos, choice.pairs, MAX_ERROR * scale, self.threads, self.progress
+            database, self.photos, choice.pairs, _MAX_ERROR * scale, self.threads, self.progress
         )
         return Matched(database, effort, choice, scale)
 
@@ -176,7 +179,7 @@ class PoseEstimation:
             weak = f", {added} of them with weak matches" if added else ""
         check, left_out = "", dict[str, str]()
         if models:
-            repaired = repair(models[0], mapping, MAX_ERROR * matched.scale)
+            repaired = repair(models[0], mapping, _MAX_ERROR * matched.scale)
             models = usable_models([repaired.model, *models[1:]])
             left_out = repaired.left_out
             check = f"; {repaired.description}" if repaired.description else ""

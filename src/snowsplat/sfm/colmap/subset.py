@@ -12,6 +12,9 @@ from snowsplat.sfm.colmap.pairs import numbered_series
 from snowsplat.sfm.colmap.view_graph import ViewGraph
 
 _MIN_MATCHES = 100  # number of verified matches of a strong pair
+# Two photos of the subset that follow each other by name are at most this number of positions apart
+# in the series of all photos. Even photos of equal rooms can be a strong pair.
+_MAX_GAP = 4
 
 
 def spread_subset(graph: ViewGraph, count: int) -> set[int]:
@@ -22,7 +25,10 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
 
     - It has fewer than two strong pairs (`_MIN_MATCHES`) with the photos of the subset.
     - Strong pairs would not connect the other photos of these pairs without it.
-    - The photos before and after it by name are no strong pair.
+    - It is the first or last photo of a series of names.
+    - The photos before and after it by name are no strong pair, or more than `_MAX_GAP` positions
+      apart. Of four photos of the subset in a row, two photos with one photo between them must be a
+      strong pair, too: a photo is registered from points that two photos before it see.
     """
     ids, matches = graph.matrix()
     strong = matches >= _MIN_MATCHES
@@ -30,14 +36,21 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
     row = {photo: index for index, photo in enumerate(ids)}
     before: dict[int, int | None] = {}  # row of a photo -> row of the kept photo before it by name
     after: dict[int, int | None] = {}
+    position: dict[int, int] = {}  # in the series
     for series in numbered_series(graph.names):
+        position |= {row[photo]: place for place, photo in enumerate(series)}
         for i, j in itertools.pairwise(series):
             after[row[i]], before[row[j]] = row[j], row[i]
 
     def needed(index: int) -> bool:
-        one, other = before.get(index), after.get(index)
-        if one is not None and other is not None and not strong[one, other]:
-            return True
+        if index in position:
+            one, other = before.get(index), after.get(index)
+            if one is None or other is None:
+                return True
+            links = [(one, other), (before.get(one), other), (one, after.get(other))]
+            weak = any(None not in link and not strong[link] for link in links)
+            if weak or position[other] - position[one] > _MAX_GAP:
+                return True
         near = np.flatnonzero(strong[index])
         return len(near) < 2 or not _connected(strong[np.ix_(near, near)])
 
