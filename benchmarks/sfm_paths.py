@@ -24,6 +24,7 @@ from snowsplat.trajectory.spline import Spline
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 _PHOTOS_OF_A_LOOP = 20
 _PHOTOS_OF_A_TURN = 6
+_STEP_BACK = 0.5
 _HEIGHTS = (1.45, 1.75, 1.1)  # of the camera above the floor, in metres; one for each loop in turn
 
 
@@ -165,7 +166,8 @@ def _turn(
 ) -> None:
     """Append photos between two views, each a position and a target.
 
-    The camera turns evenly, in the direction of the smaller angle.
+    The camera turns evenly, in the direction of the smaller angle. Meanwhile it moves back by up to
+    `_STEP_BACK` metres: no points can be computed from photos of a camera that only turns.
     """
     (at, to), (last_at, last_to) = start, end
     azimuths = [math.atan2(*(target - position)[1::-1]) for position, target in (start, end)]
@@ -175,7 +177,9 @@ def _turn(
     for i in range(1, photos + 1):
         share = i / (photos + 1)
         azimuth = azimuths[0] + share * turn
+        back = _STEP_BACK * math.sin(math.pi * share)
         position = at + share * (last_at - at)
+        position[:2] -= back * np.array([math.cos(azimuth), math.sin(azimuth)])
         reach = np.linalg.norm((to - at)[:2])
         drop = (1 - share) * (to - at)[2] + share * (last_to - last_at)[2]
         ahead = np.array([reach * math.cos(azimuth), reach * math.sin(azimuth), drop])

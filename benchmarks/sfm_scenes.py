@@ -35,7 +35,7 @@ from snowsplat.synthetic.still_life import still_life
 from snowsplat.trajectory.video import video_writer
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
-VERSION = 2
+VERSION = 3
 CACHE_VARIABLE = "SNOWSPLAT_SFM_SCENES"
 SIZE = (800, 600)
 FRAMES_PER_SECOND = 10

@@ -150,12 +150,11 @@ class _Growth:
 
     def _register_next(self) -> bool:
         """Register one photo, from points of the model, or else only from its matches."""
-        functions = {
-            False: self.mapper.register_next_image,
-            True: self.mapper.register_next_structure_less_image,
-        }
-        for structure_less, register in functions.items():
-            found = self.mapper.find_next_images(self._mapper_options, structure_less)
+        functions = [self.mapper.register_next_image]
+        if self.adjust:  # takes up to half a minute for a photo with many false matches
+            functions.append(self.mapper.register_next_structure_less_image)
+        for structure_less, register in enumerate(functions):
+            found = self.mapper.find_next_images(self._mapper_options, bool(structure_less))
             for photo in self._in_order(found):
                 if register(self._mapper_options, photo):
                     self.mapper.triangulate_image(self._triangulation, photo)
