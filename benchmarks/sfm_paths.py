@@ -24,7 +24,9 @@ from snowsplat.trajectory.spline import Spline
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 _PHOTOS_OF_A_LOOP = 20
 _PHOTOS_OF_A_TURN = 6
-_STEP_BACK = 0.5
+# The share of the way through the passage that the camera walks. It looks ahead by the rest, so at
+# a corner it turns over several photos.
+_WALKED = 0.8
 _HEIGHTS = (1.45, 1.75, 1.1)  # of the camera above the floor, in metres; one for each loop in turn
 
 
@@ -111,6 +113,9 @@ def through_two_rooms(
 ) -> list[Tensor]:
     """Loops in one room, then the way through the passage, then loops in the other room.
 
+    In the rooms, the camera always looks across the room: a turn between two loops without photos
+    of the turn could not be distinguished from a walk into the other room.
+
     Before the passage, the camera turns gradually from the last view of a loop to the direction of
     the passage. After the passage, it turns gradually to the first view of the next loop.
 
@@ -132,10 +137,9 @@ def through_two_rooms(
             number, share = divmod(i * rounds / photos, 1.0)
             angle = 2 * math.pi * share - math.pi / 2
             at = np.array([1.0 * math.cos(angle), 0.85 * math.sin(angle), 0])
-            to = -1.1 * at if int(number) % 2 == 0 else 2.5 * at
             lift = _HEIGHTS[int(number) % 3]
             positions.append(at + np.array([middle, 0, lift]))
-            targets.append(to + np.array([middle, 0, lift - 0.25]))
+            targets.append(-1.1 * at + np.array([middle, 0, lift - 0.25]))
 
     loop(middles[0], first, positions, targets)
     a, b = middles
@@ -143,8 +147,9 @@ def through_two_rooms(
     corners += [(b + door, -1.3), (b, -0.4), (b, 1.0)]
     way, ahead = [], []
     for i in range(between):
-        way.append(np.array([*_along(corners, (i + 0.5) / between * 0.9), 1.45]))
-        share = min(1.0, (i + 0.5) / between * 0.9 + 0.1)
+        share = (i + 0.5) / between * _WALKED
+        way.append(np.array([*_along(corners, share), 1.45]))
+        share += 1 - _WALKED
         ahead.append(np.array([*_along(corners, share), 1.3]))
     _turn(positions, targets, (positions[-1], targets[-1]), (way[0], ahead[0]), turning)
     positions += way
@@ -166,8 +171,7 @@ def _turn(
 ) -> None:
     """Append photos between two views, each a position and a target.
 
-    The camera turns evenly, in the direction of the smaller angle. Meanwhile it moves back by up to
-    `_STEP_BACK` metres: no points can be computed from photos of a camera that only turns.
+    The camera turns evenly, in the direction of the smaller angle.
     """
     (at, to), (last_at, last_to) = start, end
     azimuths = [math.atan2(*(target - position)[1::-1]) for position, target in (start, end)]
@@ -177,9 +181,7 @@ def _turn(
     for i in range(1, photos + 1):
         share = i / (photos + 1)
         azimuth = azimuths[0] + share * turn
-        back = _STEP_BACK * math.sin(math.pi * share)
         position = at + share * (last_at - at)
-        position[:2] -= back * np.array([math.cos(azimuth), math.sin(azimuth)])
         reach = np.linalg.norm((to - at)[:2])
         drop = (1 - share) * (to - at)[2] + share * (last_to - last_at)[2]
         ahead = np.array([reach * math.cos(azimuth), reach * math.sin(azimuth), drop])
