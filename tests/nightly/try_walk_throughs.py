@@ -62,7 +62,7 @@ def follow(walk: WalkThrough, folder: Path) -> bool:
     environment = {
         **os.environ,
         "PYTHON": sys.executable,
-        "PYTHONPATH": str(folder / "src"),
+        "PYTHONPATH": os.pathsep.join([str(use_copy(folder)), str(folder / "src")]),
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
     }
     for command in walk.commands:
@@ -74,6 +74,23 @@ def follow(walk: WalkThrough, folder: Path) -> bool:
             print("FAILED", flush=True)
             return False
     return True
+
+
+def use_copy(folder: Path) -> Path:
+    """A folder for PYTHONPATH, with which Python imports the copy and not an editable installation.
+
+    Such an installation adds a finder to `sys.meta_path`, which comes before PYTHONPATH.
+    """
+    site = folder / ".site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(
+        '"""Removes the finders of editable installations."""\n\n'
+        "import sys\n\n"
+        "sys.meta_path[:] = [\n"
+        '    f for f in sys.meta_path if not type(f).__module__.startswith("_editable_skbc_")\n'
+        "]\n"
+    )
+    return site
 
 
 def copy_project(folder: Path) -> None:
