@@ -34,12 +34,15 @@ _GROWTH = 1.4
 _ITERATIONS = 20
 # Bundle adjustment ends when an iteration reduces the cost by less than this share. There is one
 # share for local and one for global bundle adjustment in the mapper, and one for the final bundle
-# adjustment of the result. By default, COLMAP goes on until the gradient is small. In the final
-# bundle adjustment, this takes 2.6 times as long and changes no camera of fox_photos by more than
-# 3e-6 of the extent of the scene.
+# adjustment of the result. By default, COLMAP goes on until the gradient is small, which takes
+# several times as long.
 _LOCAL_TOLERANCE = 1e-4
 _GLOBAL_TOLERANCE = 1e-5
-_FINAL_TOLERANCE = 1e-6
+_FINAL_TOLERANCE = 1e-4
+# The bundle adjustment of the result has a Cauchy loss, so false matches that became observations
+# have little effect on the poses. Its scale, in units of the mean reprojection error, is decreased:
+# with the small one alone, a model that is bent may remain bent.
+_FINAL_LOSS_SCALES = (3.0, 1.0)
 _MIN_ANGLE = 1.5  # degrees: smallest triangulation angle of a point
 
 
@@ -187,7 +190,7 @@ class Mapping:
             shutil.rmtree(output, ignore_errors=True)
 
     def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """Twice: remove outliers and cameras with few points, then run bundle adjustment.
+        """For each scale of the loss: remove outliers and cameras with few points, then adjust.
 
         Changes ``model`` and returns it.
         """
@@ -195,8 +198,9 @@ class Mapping:
         options.print_summary = False
         options.ceres.solver_options.num_threads = self.threads
         options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         observations = pycolmap.ObservationManager(model)
-        for _ in range(2):
+        for scale in _FINAL_LOSS_SCALES:
             observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
             for image_id in list(model.reg_image_ids()):
                 image = model.image(image_id)
@@ -204,6 +208,8 @@ class Mapping:
                     observations.deregister_frame(image.frame_id)
             if model.num_reg_images() < MIN_PHOTOS:
                 break
+            model.update_point_3d_errors()
+            options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()
             pycolmap.bundle_adjustment(model, options)
         model.update_point_3d_errors()
         return model

@@ -1,4 +1,4 @@
-"""Removes the poses of photos that are in a wrong place, and registers these photos again."""
+"""Makes a model again, without false matches, if photos of it are in a wrong place."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pycolmap
 
 from snowsplat.sfm.colmap.consistency import CheckedPair, check_pairs, find_parts
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
-from snowsplat.sfm.colmap.mapping import MIN_PHOTOS, Mapping
+from snowsplat.sfm.colmap.mapping import Mapping
 
-_ROUNDS = 3  # photos are registered again at most this number of times
+_ROUNDS = 3  # the model is made again at most this number of times
 
 
 @dataclass(frozen=True)
@@ -37,32 +37,38 @@ class Repaired:
 def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -> Repaired:
     """Find the photos of ``model`` that are in a wrong place, and register them again.
 
-    `find_parts` divides the photos into parts that contradict each other. The photos of all parts
-    except the first lose their poses. These poses are wrong, so matches between photos of different
-    parts are false if they agree with these poses (`_false_pairs`). Without the false matches, the
-    photos are registered again. This is repeated until no part contradicts the others, at most
-    `_ROUNDS` times. Photos that contradict the others even then are left out.
+    `find_parts` divides the photos into parts that contradict each other. The poses of all parts
+    except the first are wrong, so matches between photos of different parts are false if they agree
+    with these poses (`_false_pairs`). A new model is made without the false matches: they have
+    also bent the first part of the model. This is repeated until no part contradicts the others, at
+    most `_ROUNDS` times. Of all models, the one with the most photos is used. Its photos that
+    contradict the others are left out.
 
     A model without contradictions is returned unchanged. ``max_error`` as in `check_pairs`.
     """
     names = {i: image.name for i, image in model.images.items()}
     # The image ids of the pairs with false matches, of all rounds.
     false_pairs: set[tuple[int, int]] = set()
-    wrong: dict[int, str] = {}  # image id -> reason, for all photos that lost their pose
-    for number in range(_ROUNDS + 1):
+    wrong: dict[int, str] = {}  # image id -> reason, for all photos that had a wrong pose
+    found: list[tuple[pycolmap.Reconstruction, set[int]]] = []  # models and their wrong photos
+    while True:
         pairs = check_pairs(model, mapping.database, max_error)
         parts = _parts(pairs, false_pairs)
+        found.append((model, set().union(*parts[1:])))
         if len(parts) < 2:
             break
         wrong |= _reasons(model, pairs, parts)
         false_pairs |= _false_pairs(pairs, parts)
-        model = mapping.without(model, set().union(*parts[1:]))
-        if number == _ROUNDS or model.num_reg_images() < MIN_PHOTOS:
+        models = _made_again(mapping, false_pairs) if len(found) <= _ROUNDS else []
+        if not models:
             break
-        model = _registered_again(model, mapping, false_pairs)
+        model = models[0]
+    model, left_out = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
+    if left_out:
+        model = mapping.without(model, left_out)
     registered = set(model.reg_image_ids())
-    left_out = {i: reason for i, reason in wrong.items() if i not in registered}
-    return Repaired(model, len(wrong), {names[i]: reason for i, reason in left_out.items()})
+    reasons = {names[i]: reason for i, reason in wrong.items() if i not in registered}
+    return Repaired(model, len(wrong), reasons)
 
 
 def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> list[set[int]]:
@@ -81,14 +87,14 @@ def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> l
     return parts
 
 
-def _registered_again(
-    model: pycolmap.Reconstruction, mapping: Mapping, false_pairs: set[tuple[int, int]]
-) -> pycolmap.Reconstruction:
-    """``model`` with poses for more photos, without the matches of the pairs ``false_pairs``."""
+def _made_again(
+    mapping: Mapping, false_pairs: set[tuple[int, int]]
+) -> list[pycolmap.Reconstruction]:
+    """New models, made without the matches of the pairs ``false_pairs``."""
     reduced = mapping.database.with_suffix(".checked.db")
     try:
         copy_for_mapping(mapping.database, reduced, without=false_pairs)
-        return replace(mapping, database=reduced).extend([model], relaxed=False)[0]
+        return replace(mapping, database=reduced).run("incremental")
     finally:
         remove_database(reduced)
 
