@@ -31,12 +31,16 @@ _HEIGHTS = (1.45, 1.75, 1.1)  # of the camera above the floor, in metres; one fo
 
 
 def loops(
-    count: int, seed: int, half: tuple[float, float] = (1.65, 1.2), down: float = 0.0
+    count: int,
+    seed: int,
+    half: tuple[float, float] = (1.65, 1.2),
+    down: float = 0.0,
+    outwards: bool = True,
 ) -> list[Tensor]:
     """Elliptical loops with the semi-axes ``half``, in metres.
 
-    The camera looks across the room in the first, third … loop and outwards in the others. ``down``
-    lowers the point that the camera looks at, in metres.
+    The camera looks across the room. If ``outwards``, it does so in the first, third … loop only,
+    and looks outwards in the others. ``down`` lowers the point that the camera looks at, in metres.
     """
     random = np.random.default_rng([seed, count])
     rounds = max(1, min(6, count // _PHOTOS_OF_A_LOOP))
@@ -47,7 +51,7 @@ def loops(
         size = 1 - 0.12 * (number // 2)
         at = np.array([half[0] * math.cos(angle), half[1] * math.sin(angle), 0]) * size
         at[2] = _HEIGHTS[number % 3]
-        if number % 2:  # outwards, and a little ahead
+        if outwards and number % 2:  # and a little ahead
             ahead = angle + 0.5
             to = at + 1.5 * np.array([math.cos(ahead), math.sin(ahead), 0])
         else:
@@ -74,6 +78,11 @@ def in_between(poses: list[Tensor], count: int) -> list[Tensor]:
 def looking_down(count: int, seed: int) -> list[Tensor]:
     """Loops on which the camera sees mostly the floor."""
     return loops(count, seed, (1.9, 1.4), down=1.5)
+
+
+def looking_across(count: int, seed: int) -> list[Tensor]:
+    """Loops on which the camera never sees only the nearest wall."""
+    return loops(count, seed, outwards=False)
 
 
 def around_two(count: int, seed: int, distance: float = 4.4, radius: float = 1.55) -> list[Tensor]:

@@ -2,7 +2,7 @@
 
     room     a furnished room; the camera path has several loops
     around   the still life of `snowsplat demo`; the camera goes around the table
-    plain    the room with walls of one colour and less furniture
+    plain    the room with walls of one colour and less furniture; all loops look across the room
     carpet   a room whose carpet repeats exactly; the camera looks down
     twins    two identical objects in a hall with pictures; a figure of eight around the objects
     rooms    two identical rooms, and the passage from one to the other
@@ -21,7 +21,14 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from sfm_paths import around_two, in_between, looking_down, loops, through_two_rooms
+from sfm_paths import (
+    around_two,
+    in_between,
+    looking_across,
+    looking_down,
+    loops,
+    through_two_rooms,
+)
 from torch import Tensor
 
 from snowsplat.sfm.progress import Report, silent
@@ -35,7 +42,7 @@ from snowsplat.synthetic.still_life import still_life
 from snowsplat.trajectory.video import video_writer
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
-VERSION = 3
+VERSION = 4
 CACHE_VARIABLE = "SNOWSPLAT_SFM_SCENES"
 SIZE = (800, 600)
 FRAMES_PER_SECOND = 10
@@ -358,7 +365,7 @@ def _through_two_rooms(count: int, seed: int) -> list[Tensor]:
 KINDS = {
     "room": Kind(_room, loops),
     "around": Kind(still_life, walk),
-    "plain": Kind(_plain_room, loops),
+    "plain": Kind(_plain_room, looking_across),
     "carpet": Kind(_carpeted_room, looking_down),
     "twins": Kind(_twins, around_two),
     "rooms": Kind(_two_rooms, _through_two_rooms),
