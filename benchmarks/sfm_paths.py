@@ -76,8 +76,8 @@ def in_between(poses: list[Tensor], count: int) -> list[Tensor]:
 
 
 def looking_down(count: int, seed: int) -> list[Tensor]:
-    """Loops on which the camera sees mostly the floor."""
-    return loops(count, seed, (1.9, 1.4), down=1.5)
+    """Loops on which the floor fills more than half of most photos."""
+    return loops(count, seed, (1.9, 1.4), down=0.9, outwards=False)
 
 
 def looking_across(count: int, seed: int) -> list[Tensor]:

@@ -3,7 +3,7 @@
     room     a furnished room; the camera path has several loops
     around   the still life of `snowsplat demo`; the camera goes around the table
     plain    the room with walls of one colour and less furniture; all loops look across the room
-    carpet   a room whose carpet repeats exactly; the camera looks down
+    carpet   a room whose carpet repeats exactly; the camera looks down at it, across the room
     twins    two identical objects in a hall with pictures; a figure of eight around the objects
     rooms    two identical rooms, and the passage from one to the other
 
@@ -169,9 +169,14 @@ def _carpeted_room(seed: int) -> Scene:
     colours = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
     one = paint.woven(_pixels(tile, tile), 5, colours, random)
     carpet = np.tile(one, (down, across, 1))
-    walls = [_plain((0.78, 0.77, 0.72)), _plain((0.70, 0.74, 0.74))] * 2
+    x, y = across * tile, down * tile
+    colours = [(0.78, 0.77, 0.72), (0.70, 0.74, 0.74)] * 2
+    walls = [
+        _with_pictures(paint.plain(_pixels(side, _HEIGHT), colour, random), 3, random)
+        for side, colour in zip((y, y, x, x), colours, strict=True)
+    ]
     objects = [
-        _shell((across * tile, down * tile), [*walls, carpet, _plain((0.86, 0.86, 0.84))]),
+        _shell((x, y), [*walls, carpet, _plain((0.86, 0.86, 0.84))]),
         *_crates(random, (2.6, 1.9), 0.5),
         *_crates(random, (-2.6, -1.8), 0.5),
     ]

@@ -190,7 +190,7 @@ class Mapping:
             shutil.rmtree(output, ignore_errors=True)
 
     def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """For each scale of the loss: remove outliers and cameras with few points, then adjust.
+        """Remove outliers and run bundle adjustment, for each scale of the loss.
 
         Changes ``model`` and returns it.
         """
@@ -199,20 +199,24 @@ class Mapping:
         options.ceres.solver_options.num_threads = self.threads
         options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        observations = pycolmap.ObservationManager(model)
+        self._remove_outliers(model)
         for scale in _FINAL_LOSS_SCALES:
-            observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
-            for image_id in list(model.reg_image_ids()):
-                image = model.image(image_id)
-                if image.num_points3D < MIN_POINTS:
-                    observations.deregister_frame(image.frame_id)
             if model.num_reg_images() < MIN_PHOTOS:
                 break
-            model.update_point_3d_errors()
             options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()
             pycolmap.bundle_adjustment(model, options)
-        model.update_point_3d_errors()
+            self._remove_outliers(model)
         return model
+
+    def _remove_outliers(self, model: pycolmap.Reconstruction) -> None:
+        """Remove observations with a large error, flat points, and cameras with few points."""
+        observations = pycolmap.ObservationManager(model)
+        observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
+        for image_id in list(model.reg_image_ids()):
+            image = model.image(image_id)
+            if image.num_points3D < MIN_POINTS:
+                observations.deregister_frame(image.frame_id)
+        model.update_point_3d_errors()
 
 
 def usable_models(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
