@@ -36,6 +36,10 @@ _PASSES = 8
 # Pairs are verified in groups. Each group has one of these smallest inlier ratios. The last ratio
 # is the default of COLMAP; it is used for all pairs with many matches.
 _INLIER_RATIOS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.32, 0.25)
+# The maximum number of samples of RANSAC (COLMAP: 10,000). It matters for pairs with many
+# matches of which most are false, such as photos of a carpet that repeats. For 600 pairs of four
+# real datasets, the result is the same as with 10,000.
+_MAX_TRIALS = 3000
 
 
 def match_pairs(
@@ -96,6 +100,7 @@ def _verify(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = _MIN_INLIERS
     verification.ransac.min_inlier_ratio = inlier_ratio
+    verification.ransac.max_num_trials = _MAX_TRIALS
     verification.ransac.max_error = max_error
     verification.ransac.random_seed = SEED
     pairing = pycolmap.ImportedPairingOptions()
