@@ -171,6 +171,18 @@ def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypat
     assert len(repaired.left_out) == len(FAR)
 
 
+def test_a_photo_may_be_in_a_later_model_only(mapping, scene, monkeypatch, tmp_path):
+    first = mapping.without(look_alikes.model(scene, folded=True), [look_alikes.COUNT])
+    first.write(tmp_path)
+    first = pycolmap.Reconstruction(tmp_path)
+    assert look_alikes.COUNT not in first.images
+    folded = look_alikes.model(scene, folded=True)
+    runs = iter([[folded], []])
+    monkeypatch.setattr(Mapping, "run", lambda self, mapper: next(runs))
+    repaired = repair(first, mapping, 4.0)
+    assert f"{look_alikes.COUNT - 1:02}.png" in repaired.left_out
+
+
 def test_the_model_with_the_most_photos_is_used(mapping, scene, monkeypatch):
     """A model made again may have fewer photos than the first one without its wrong photos."""
     few = look_alikes.COUNT - len(FAR) - 1

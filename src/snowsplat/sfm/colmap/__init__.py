@@ -7,7 +7,8 @@ pairs, retrieval   choose the pairs of photos to match
 sift, features       detect features in a photo, in all photos
 matching, pair_matching   match two sets of features; match all pairs, verify the matches
 mapping      estimates poses and points from the matches in the COLMAP `database`
-consistency, repair   find photos in a wrong place after mapping, and register them again
+incremental, view_graph, subset   the order in which photos are registered
+consistency, repair   find photos in a wrong place after mapping, and make the model again
 diagnosis    explains why photos have no pose
 result, check_model   statistics of models; reading models from unknown sources
 """

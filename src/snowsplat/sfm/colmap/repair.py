@@ -46,12 +46,13 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
 
     A model without contradictions is returned unchanged. ``max_error`` as in `check_pairs`.
     """
-    names = {i: image.name for i, image in model.images.items()}
+    names: dict[int, str] = {}  # image id -> file name
     # The image ids of the pairs with false matches, of all rounds.
     false_pairs: set[tuple[int, int]] = set()
     wrong: dict[int, str] = {}  # image id -> reason, for all photos that had a wrong pose
     found: list[tuple[pycolmap.Reconstruction, set[int]]] = []  # models and their wrong photos
     while True:
+        names |= {i: image.name for i, image in model.images.items()}
         pairs = check_pairs(model, mapping.database, max_error)
         parts = _parts(pairs, false_pairs)
         found.append((model, set().union(*parts[1:])))
