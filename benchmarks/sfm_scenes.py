@@ -3,7 +3,7 @@
     room     a furnished room; the camera path has several loops
     around   the still life of `snowsplat demo`; the camera goes around the table
     plain    the room with walls of one colour and less furniture; all loops look across the room
-    carpet   a room whose carpet repeats exactly; the camera looks down at it, across the room
+    carpet   a room with a carpet that repeats exactly; the camera looks down at it, across the room
     twins    two identical objects in a hall with pictures; a figure of eight around the objects
     rooms    two identical rooms, and the passage from one to the other
 
@@ -165,18 +165,20 @@ def _plain_room(seed: int) -> Scene:
 
 def _carpeted_room(seed: int) -> Scene:
     random = np.random.default_rng([seed, 2])
-    across, down, tile = 10, 8, 0.6  # numbers of tiles, and the side of a tile in metres
-    colours = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
-    one = paint.woven(_pixels(tile, tile), 5, colours, random)
-    carpet = np.tile(one, (down, across, 1))
-    x, y = across * tile, down * tile
+    x, y = 6.0, 4.8
+    across, down, tile = 5, 4, 0.6  # numbers of tiles, and the side of a tile in metres
+    shades = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
+    carpet = np.tile(paint.woven(_pixels(tile, tile), 5, shades, random), (down, across, 1))
+    floor = paint.wood(_pixels(x, y), 26, _PINE, random)
+    top, left = ((np.array(floor.shape[:2]) - carpet.shape[:2]) // 2).tolist()
+    floor[top : top + carpet.shape[0], left : left + carpet.shape[1]] = carpet
     colours = [(0.78, 0.77, 0.72), (0.70, 0.74, 0.74)] * 2
     walls = [
         _with_pictures(paint.plain(_pixels(side, _HEIGHT), colour, random), 3, random)
         for side, colour in zip((y, y, x, x), colours, strict=True)
     ]
     objects = [
-        _shell((x, y), [*walls, carpet, _plain((0.86, 0.86, 0.84))]),
+        _shell((x, y), [*walls, floor, _plain((0.86, 0.86, 0.84))]),
         *_crates(random, (2.6, 1.9), 0.5),
         *_crates(random, (-2.6, -1.8), 0.5),
     ]
