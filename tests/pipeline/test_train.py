@@ -116,6 +116,19 @@ def test_photos_that_are_left_out_are_named_also_by_a_resumed_run(dataset, tmp_p
     assert json.loads((tmp_path / "metrics.json").read_text())["left_out"] == list(names)
     assert "probably wrong: view_02.png, view_04.png." in result.report.read_text()
 
+    evaluate(load_trained(tmp_path), split="train")
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["split"], metrics["left_out"]) == ("train", list(names))
+
+
+@pytest.mark.parametrize("damaged", ["", "[1]", '{"left_out": 3}'])
+def test_a_damaged_file_of_metrics_is_replaced(dataset, tmp_path, damaged):
+    train(dataset, tmp_path, options(1, hold_out=8))
+    whole = (tmp_path / "metrics.json").read_text()
+    (tmp_path / "metrics.json").write_text(damaged)
+    evaluate(load_trained(tmp_path))
+    assert (tmp_path / "metrics.json").read_text() == whole
+
 
 def test_without_photos_that_are_left_out_nothing_is_said(dataset, tmp_path):
     recorder = Recorder()

@@ -253,16 +253,20 @@ class OutputFolder:
         iteration: int,
         split: str,
         evaluation: Evaluation,
-        left_out: tuple[str, ...] = (),
+        left_out: tuple[str, ...] | None = None,
     ) -> None:
         """Write `metrics.json`: iteration, split, mean metrics, and the metrics of each view.
 
-        If the training has left photos out, their names are the list "left_out".
+        Args:
+            left_out: names of the photos that the training has left out. If there are any, they are
+                the list "left_out". None: the list of the existing file is kept.
         """
+        path = self.path / "metrics.json"
+        names = _left_out_in(path) if left_out is None else list(left_out)
         head: dict[str, Any] = {"iteration": iteration, "split": split}
-        if left_out:
-            head["left_out"] = list(left_out)
-        write_json(self.path / "metrics.json", head | evaluation.as_json())
+        if names:
+            head["left_out"] = names
+        write_json(path, head | evaluation.as_json())
 
     # Settings
 
@@ -295,6 +299,15 @@ class OutputFolder:
             where = ours if ours.is_file() else theirs
             raise UserError(f"{where}: damaged; it does not name the dataset") from None
         return dataset, (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+
+
+def _left_out_in(metrics: Path) -> list[str]:
+    """The list "left_out" of `metrics.json`; empty if there is none, or the file is damaged."""
+    try:
+        names = read_json(metrics).get("left_out", [])
+    except (OSError, ValueError, AttributeError):
+        return []
+    return names if isinstance(names, list) else []
 
 
 def _namespace(path: Path) -> dict[str, Any]:
