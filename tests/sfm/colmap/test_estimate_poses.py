@@ -81,6 +81,25 @@ def test_poses_are_those_of_the_cameras(done):
     assert abs(camera["params"][0] / scenes.FOCAL - 1) < 0.03
 
 
+def test_points_that_only_two_photos_see_are_on_the_boards(done):
+    dataset, photos, result, _ = done
+    model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
+    truth = np.stack([-pose[:, :3].T @ pose[:, 3] for pose in scenes.arc(COUNT)])
+    to_truth = similarity_from_points(torch.tensor(centres(model, photos)), torch.tensor(truth))
+    points = list(model.points3D.values())
+    found = to_truth.apply(torch.tensor(np.stack([point.xyz for point in points]))).numpy()
+    distances = []
+    for board in scenes.boards():
+        normal = np.cross(board.right, board.down)
+        distances.append(np.abs((found - board.corner) @ normal) / np.linalg.norm(normal))
+    distance = np.min(distances, axis=0)
+    few = np.array([point.track.length() == 2 for point in points])
+    assert few.mean() > 0.1
+    assert np.median(distance[few]) < 0.02
+    errors = np.array([point.error for point in points])
+    assert result.reprojection_error == pytest.approx(errors[~few].mean())
+
+
 def test_result_fits_json(done):
     result = done[2]
     assert SfmResult(**json.loads(json.dumps(dataclasses.asdict(result)))) == result

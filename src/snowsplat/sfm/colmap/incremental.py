@@ -84,6 +84,22 @@ class IncrementalMapper:
             _Growth(mapper, model, graph, self.options, adjust, self.registered).register_all()
             mapper.end_reconstruction(False)
 
+    def triangulate_pairs(self, model: pycolmap.Reconstruction) -> None:
+        """Add points that only two photos of ``model`` see. The poses do not change.
+
+        COLMAP does not use such matches (`ignore_two_view_tracks`), because they contribute little
+        to the poses, and more of them are false. With the final poses, a false match is recognised:
+        most of them are far from the epipolar line.
+        """
+        options = self.options.get_triangulation()
+        options.ignore_two_view_tracks = False
+        photos = sorted(model.reg_image_ids())
+        with self._mapper(photos) as mapper:
+            mapper.begin_reconstruction(model)
+            for photo in photos:
+                mapper.triangulate_image(options, photo)
+            mapper.end_reconstruction(False)
+
     def _initial_pairs(
         self,
         mapper: pycolmap.IncrementalMapper,

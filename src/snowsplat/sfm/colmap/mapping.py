@@ -95,6 +95,12 @@ class Mapping:
             observations.deregister_frame(model.image(image_id).frame_id)
         return self._refine(model)
 
+    def add_points(self, model: pycolmap.Reconstruction) -> None:
+        """Add points that only two photos of ``model`` see, for the training. Changes ``model``."""
+        mapper = self._mapper(ViewGraph.read(self.database), relaxed=False)
+        mapper.triangulate_pairs(model)
+        self._remove_outliers(model)
+
     def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()
         # With several threads, the result of COLMAP's mapper depends on their timing.

@@ -49,7 +49,8 @@ class SfmResult:
     unregistered: dict[str, str]  # name -> the reason, as text for users
     points: int
     observations: int
-    reprojection_error: float  # pixels of the photos in input/, mean over points
+    # Pixels of the photos in input/, mean over the points that at least three photos see.
+    reprojection_error: float
     sub_models: list[int]  # number of photos of each model, largest first
     # For each camera: model, width, height, params, focal_from ("exif" or "guessed") and images,
     # the number of photos.

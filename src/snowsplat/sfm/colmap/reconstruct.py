@@ -105,7 +105,9 @@ class PoseEstimation:
         if not best.models:
             remove_database(second)
             raise failure(evidence)
+        mapping = self._mapping(best.matched)
         for model in best.models:
+            mapping.add_points(model)
             model.extract_colors_for_all_images(self.folders.images, self.threads)
         write_models(best.models, self.folders.sparse)
         reasons = explain(
@@ -167,9 +169,7 @@ class PoseEstimation:
 
     def _try(self, how: str, matched: Matched, mapper: Mapper, relaxed: bool = False) -> None:
         """Make an attempt. ``how`` describes it, as text for users; ``relaxed`` as in `Mapping`."""
-        mapping = Mapping(
-            matched.database, self.folders.images, matched.scale, self.threads, self.progress.report
-        )
+        mapping = self._mapping(matched)
         models = mapping.run(mapper, relaxed)
         weak = ""
         if models and models[0].num_reg_images() < len(self.photos):
@@ -190,6 +190,11 @@ class PoseEstimation:
             f"{how}: {effort.features} features per photo at {effort.image_size} pixels, "
             f"{matched.choice.description}, {mapper} mapping: "
             f"{attempt.registered} of {len(self.photos)} photos registered{weak}{check}"
+        )
+
+    def _mapping(self, matched: Matched) -> Mapping:
+        return Mapping(
+            matched.database, self.folders.images, matched.scale, self.threads, self.progress.report
         )
 
     def _enough(self, evidence: Evidence) -> bool:

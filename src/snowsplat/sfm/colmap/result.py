@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from snowsplat.sfm.colmap.check_model import can_be_read
@@ -43,12 +44,21 @@ def result_of(
         unregistered=unregistered,
         points=model.num_points3D(),
         observations=model.compute_num_observations(),
-        reprojection_error=model.compute_mean_reprojection_error(),
+        reprojection_error=_reprojection_error(model),
         sub_models=[m.num_reg_images() for m in models],
         cameras=cameras,
         pairs=pairs,
         attempts=attempts,
     )
+
+
+def _reprojection_error(model: pycolmap.Reconstruction) -> float:
+    """The mean over the points that at least three photos see, in pixels; 0 without such points.
+
+    The points of two photos have small errors even if a pose is slightly wrong.
+    """
+    errors = [p.error for p in model.points3D.values() if p.track.length() > 2]
+    return float(np.mean(errors)) if errors else 0.0
 
 
 def names_in(model: pycolmap.Reconstruction) -> set[str]:
