@@ -101,8 +101,11 @@ class StepProgress:
 
     def _text(self, progress: trainer.Progress) -> str:
         rate = self._rate or (progress.step - self._start_step) / max(self.seconds, 1e-9)
-        left = (self.total - progress.step) / rate if rate else math.inf
-        remaining = "done in " + duration(self.seconds) if left == 0 else duration(left) + " left"
+        left = progress.seconds_left
+        if progress.step >= self.total:
+            remaining = f"done in {duration(self.seconds)}"
+        else:
+            remaining = "" if left is None else f"{duration(left)} left"
         return (
             f"{rate:.1f} it/s  loss {self._loss:.4f}  {progress.gaussians:,} Gaussians"
             f"{self._psnr}  {resident_bytes() / 1e6:.0f} MB  {remaining}"

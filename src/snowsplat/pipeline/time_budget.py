@@ -97,6 +97,4 @@ class TimeBudget:
         from snowsplat.training.time_budget.pace import Pace
         from snowsplat.training.time_budget.step_cost import Work
 
-        sizes = [view.camera.width * view.camera.height for view in trainer.dataset.train]
-        work = Work(trainer.config, sum(sizes) / len(sizes), len(trainer.dataset.test))
-        return Pace(work, self.left, time_ratio)
+        return Pace(Work.of(trainer.config, trainer.dataset), self.left, time_ratio)

@@ -15,6 +15,8 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.time_budget import TimeBudget
 from snowsplat.training.history import History
+from snowsplat.training.time_budget.step_cost import Work
+from snowsplat.training.time_budget.steps_left import StepsLeft
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import peak_bytes
 
@@ -105,6 +107,7 @@ class TrainingRun:
         self.started = self.last_checkpoint = time.monotonic()
         self.evaluation: tuple[int, Evaluation] | None = None  # the last one and its step
         self.history = History.read(self.out.history, self.first_step)
+        self._left = StepsLeft(Work.of(self.config, self.trainer.dataset))
         self._told = False  # whether the observer knows which photos are left out
 
     def run(self) -> TrainResult:
@@ -156,7 +159,7 @@ class TrainingRun:
     def _after_step(self, progress: Progress) -> None:
         if progress.metrics is not None and progress.metrics.views:
             self._record_evaluation(progress.step, progress.metrics)
-        self.observer.step(progress)
+        self.observer.step(replace(progress, seconds_left=self._seconds_left(progress)))
         if self.trainer.left_out and not self._told:
             self.observer.note(left_out_line(self._left_out()))
             self._told = True
@@ -168,6 +171,7 @@ class TrainingRun:
             paused = self.page.after_step(
                 progress.step, progress.iterations, progress.loss, self.trainer.gaussians
             )
+            self._left.postpone(paused)
             if self.pace is not None and self.budget is not None:
                 self.pace.postpone(paused)
                 self.budget.started += paused
@@ -178,6 +182,11 @@ class TrainingRun:
             )
             if length is not None:
                 schedule.stretch(progress.step, length)
+
+    def _seconds_left(self, progress: Progress) -> float:
+        schedule = self.trainer.schedule
+        left = self._left.after(schedule, progress.step, progress.downscale, progress.gaussians)
+        return left if self.budget is None else max(0.0, self.budget.left)
 
     def _left_out(self) -> tuple[str, ...]:
         return tuple(self.trainer.dataset.train[i].name for i in self.trainer.left_out)

@@ -46,6 +46,7 @@ class Progress:
 
     ``downscale`` is the factor by which the photos of the step were reduced. ``metrics`` is the
     evaluation of the test views, after the steps of ``test_iterations``; None after other steps.
+    ``seconds_left`` is an estimate that `pipeline.training_run` adds.
     """
 
     step: int
@@ -54,6 +55,7 @@ class Progress:
     iterations: int
     downscale: int
     metrics: Evaluation | None = None
+    seconds_left: float | None = None
 
 
 class Trainer:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.step_schedule import Schedule
+
+if TYPE_CHECKING:
+    from snowsplat.data import Dataset
 
 # Seconds of a step on the machine of docs/performance.md. Only their proportions matter: the time
 # on this machine with this scene, divided by these seconds, is measured. It is the `time_ratio`.
@@ -50,6 +54,12 @@ class Work:
     config: TrainConfig
     pixels: float
     held_out: int
+
+    @classmethod
+    def of(cls, config: TrainConfig, dataset: Dataset) -> Work:
+        """The work of training on ``dataset``."""
+        sizes = [view.camera.width * view.camera.height for view in dataset.train]
+        return cls(config, sum(sizes) / len(sizes), len(dataset.test))
 
     def seconds(self, downscale: int, gaussians: float) -> float:
         """Seconds of one step on the machine of docs/performance.md."""
