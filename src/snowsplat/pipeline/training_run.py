@@ -15,8 +15,6 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.time_budget import TimeBudget
 from snowsplat.training.history import History
-from snowsplat.training.time_budget.step_cost import Work
-from snowsplat.training.time_budget.steps_left import StepsLeft
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import peak_bytes
 
@@ -102,6 +100,9 @@ class TrainingRun:
     page: LivePage | None = None
 
     def __post_init__(self) -> None:
+        from snowsplat.training.time_budget.step_cost import Work
+        from snowsplat.training.time_budget.steps_left import StepsLeft
+
         self.config = self.trainer.config
         self.first_step = self.trainer.step
         self.started = self.last_checkpoint = time.monotonic()
