@@ -17,13 +17,14 @@
 
 namespace snow {
 
-constexpr int kTile = 16;           // edge of a tile in pixels
-constexpr int kGroupChannels = 4;   // maximum number of channels of one rasterization pass
-constexpr int kSlotWidth = 16;      // numbers of an instance's gradient: ≤ 4 colours, 6 moments
-constexpr int kPackedHeader = 8;    // columns of Splats2D before the colours
-constexpr int kPackedStride = 16;   // columns of Splats2D with three colours
-constexpr int kPoseSums = 15;       // 9 of the rotation, 3 of the translation, 3 of the position
-constexpr int kMaxNeighbours = 64;  // largest k of `neighbours`
+constexpr int kTile = 16;            // edge of a tile in pixels
+constexpr int kGroupChannels = 4;    // maximum number of channels of one rasterization pass
+constexpr int kSlotWidth = 16;       // numbers of an instance's gradient: ≤ 4 colours, 6 moments
+constexpr int kPackedHeader = 8;     // columns of Splats2D before the colours
+constexpr int kPackedStride = 16;    // columns of Splats2D with three colours
+constexpr int kPoseSums = 15;        // 9 of the rotation, 3 of the translation, 3 of the position
+constexpr int kMaxNeighbours = 64;   // largest k of `neighbours`
+constexpr int kAlignmentRadius = 7;  // of the window of `align_patches`, in pixels
 
 class LayoutHash {
  public:
@@ -71,6 +72,7 @@ constexpr uint64_t layout_of() {
   hash.constant("packed_stride", kPackedStride);
   hash.constant("pose_sums", kPoseSums);
   hash.constant("max_neighbours", kMaxNeighbours);
+  hash.constant("alignment_radius", kAlignmentRadius);
   Params::template describe<Params>(hash);
   return hash.value;
 }

@@ -344,6 +344,20 @@ struct MatchDescriptorsParams {
               column_second)
 };
 
+// ---- align_patches (CPU only) -------------------------------------------------------------------
+
+// For each pair of patches the affine transform of the positions that minimises the weighted squared
+// differences of the grey values in a window, up to a gain and an offset of these values.
+struct AlignPatchesParams {
+  int64_t n;               // pairs
+  int64_t side;            // of a patch in pixels; odd, at least 2 * kAlignmentRadius + 3
+  const uint8_t* patches;  // (m, side, side)
+  const int32_t* pairs;    // (n, 2); the window is at the centre of the first patch of a pair
+  float* transform;    // out, (n, 2, 3), from the window to the second patch; both from the centre
+  float* correlation;  // out, (n,), -1 to 1; -1 and the identity if there is no solution
+  SNOW_FIELDS(n, side, patches, pairs, transform, correlation)
+};
+
 // ---- sizes --------------------------------------------------------------------------------------
 
 // Parameters of the entries that return a size, such as that of a scratch tensor.

@@ -31,6 +31,8 @@ POSE_SUMS = 15
 """Number of sums for the gradient of a pose: 9 for R, 3 for t, 3 for the camera's position."""
 MAX_NEIGHBOURS = 64
 """Largest k of `nearest_neighbours.neighbours`."""
+ALIGNMENT_RADIUS = 7
+"""Radius of the window of `patches.align_patches` in pixels, without its centre."""
 
 _CONSTANTS = {
     "tile": TILE,
@@ -40,6 +42,7 @@ _CONSTANTS = {
     "packed_stride": PACKED_STRIDE,
     "pose_sums": POSE_SUMS,
     "max_neighbours": MAX_NEIGHBOURS,
+    "alignment_radius": ALIGNMENT_RADIUS,
 }
 
 _WORD = 8  # bytes of a field

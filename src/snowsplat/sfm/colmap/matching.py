@@ -6,17 +6,12 @@ process of COLMAP, so it does not import torch.
 
 from __future__ import annotations
 
-import ctypes
-import functools
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.util import native_library
-from snowsplat.util.native_layout import Params, layout_of
+from snowsplat.sfm.colmap import kernels
 from snowsplat.util.native_library import ArrayPointer
 
 #: Number of values of a descriptor.
@@ -33,26 +28,6 @@ class Nearest(NamedTuple):
     which: NDArray[np.int32]  # index of the nearest; the smallest index if several are equally near
     best: NDArray[np.int32]  # dot product of the descriptor and the nearest
     second: NDArray[np.int32]  # dot product with the second nearest; 0 if there is none
-
-
-@dataclass(slots=True, kw_only=True)
-class MatchDescriptorsParams(Params):
-    """The struct of the same name in `native/params.h`."""
-
-    n: int
-    m: int
-    first: ArrayPointer
-    second: ArrayPointer
-    row_index: ArrayPointer
-    row_best: ArrayPointer
-    row_second: ArrayPointer
-    column_index: ArrayPointer
-    column_best: ArrayPointer
-    column_second: ArrayPointer
-
-
-#: The native functions that are called from here. They exist for the CPU only.
-ENTRIES: dict[str, type[Params]] = {"match_descriptors": MatchDescriptorsParams}
 
 
 def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint32]:
@@ -95,7 +70,7 @@ def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Ne
             raise ValueError(f"two_nearest: {name} must be uint8, got {descriptors.dtype}")
     n, m = len(first), len(second)
     rows, columns = (Nearest(*(np.empty(k, np.int32) for _ in range(3))) for k in (n, m))
-    params = MatchDescriptorsParams(
+    params = kernels.MatchDescriptorsParams(
         n=n,
         m=m,
         first=ArrayPointer(np.ascontiguousarray(first)),
@@ -107,19 +82,8 @@ def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Ne
         column_best=ArrayPointer(columns.best),
         column_second=ArrayPointer(columns.second),
     )
-    layout = layout_of(MatchDescriptorsParams)
-    buffer = ctypes.create_string_buffer(layout.size)
-    layout.pack_into(buffer, params)
-    _function()(ctypes.addressof(buffer))
+    kernels.call("match_descriptors", params)
     return rows, columns
-
-
-@functools.cache
-def _function() -> Callable[[int], Any]:
-    native_library.check_layouts(ENTRIES)
-    function = native_library.library()[1].match_descriptors
-    function.restype, function.argtypes = ctypes.c_int64, (ctypes.c_void_p,)
-    return function
 
 
 def _accepted(nearest: Nearest) -> NDArray[np.int32]:

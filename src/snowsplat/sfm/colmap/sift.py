@@ -65,7 +65,7 @@ def detect_sift(photo: Path, mask: Path | None, image_size: int, count: int) -> 
         cv2.error: not enough memory.
     """
     cv2.setNumThreads(1)  # other photos are processed in parallel
-    grey, size = _read_grey(photo, image_size)
+    grey, size = read_grey(photo, image_size)
     allowed = None if mask is None else _read_mask(mask, grey)
     sift = new_detector()
     found = sorted(sift.detect(grey, allowed), key=lambda keypoint: -keypoint.size)[:count]
@@ -88,7 +88,7 @@ def new_detector() -> cv2.SIFT:
     )
 
 
-def _read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
+def read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
     """The grey photo (H, W), resized, and its original width and height."""
     with open_image(photo) as image:
         width, height = image.size

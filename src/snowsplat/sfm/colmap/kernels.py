@@ -1,0 +1,70 @@
+"""Calls the native functions of structure from motion with NumPy arrays.
+
+The child process of COLMAP does not import torch, so it cannot use `snowsplat.ops`. The functions
+exist for the CPU only; `native/params.h` documents their parameters.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from snowsplat.util import native_library
+from snowsplat.util.native_layout import Params, layout_of
+from snowsplat.util.native_library import ArrayPointer
+
+
+@dataclass(slots=True, kw_only=True)
+class MatchDescriptorsParams(Params):
+    """The struct of the same name in `native/params.h`."""
+
+    n: int
+    m: int
+    first: ArrayPointer
+    second: ArrayPointer
+    row_index: ArrayPointer
+    row_best: ArrayPointer
+    row_second: ArrayPointer
+    column_index: ArrayPointer
+    column_best: ArrayPointer
+    column_second: ArrayPointer
+
+
+@dataclass(slots=True, kw_only=True)
+class AlignPatchesParams(Params):
+    """The struct of the same name in `native/params.h`."""
+
+    n: int
+    side: int
+    patches: ArrayPointer
+    pairs: ArrayPointer
+    transform: ArrayPointer
+    correlation: ArrayPointer
+
+
+ENTRIES: dict[str, type[Params]] = {
+    "match_descriptors": MatchDescriptorsParams,
+    "align_patches": AlignPatchesParams,
+}
+
+
+def call(name: str, params: Params) -> None:
+    """Call a function of `ENTRIES`. Its arguments must be valid: C++ does not check them.
+
+    Raises UserError if the native library is missing or outdated.
+    """
+    layout = layout_of(ENTRIES[name])
+    buffer = ctypes.create_string_buffer(layout.size)
+    layout.pack_into(buffer, params)
+    _function(name)(ctypes.addressof(buffer))
+
+
+@functools.cache
+def _function(name: str) -> Callable[[int], Any]:
+    native_library.check_layouts(ENTRIES)
+    function = getattr(native_library.library()[1], name)
+    function.restype, function.argtypes = ctypes.c_int64, (ctypes.c_void_p,)
+    return function
