@@ -47,7 +47,7 @@ _VERIFIED_PAIR = 0.015  # a pair of photos with 1000 features each
 # The costs of a photo in the step "poses".
 _REGISTERED = 0.27  # with bundle adjustment (`photos_with_adjustment`)
 _ADDED = 0.1  # registered without bundle adjustment
-_REFINED = 0.2  # final bundle adjustment and check of the poses
+_REFINED = 0.3  # check of the poses, alignment of features, final bundle adjustment
 _IMAGE_MEGAPIXEL = 0.24
 _START = 2.5  # loading libraries
 _LOAD = 3.0  # loading more libraries, for the images

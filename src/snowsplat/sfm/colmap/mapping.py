@@ -12,6 +12,7 @@ from pathlib import Path
 import pycolmap
 
 from snowsplat.sfm.colmap.database import count_rows
+from snowsplat.sfm.colmap.feature_alignment import align_features
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.incremental import IncrementalMapper
 from snowsplat.sfm.colmap.options import Mapper, photos_with_adjustment
@@ -19,8 +20,10 @@ from snowsplat.sfm.colmap.subset import spread_subset
 from snowsplat.sfm.colmap.view_graph import ViewGraph
 from snowsplat.sfm.progress import Report
 
-# A camera that sees fewer points has no reliable pose.
+# A camera that sees fewer points has no reliable pose. The alignment of features reduces their
+# errors to a third; then fewer points are sufficient.
 MIN_POINTS = 15
+_MIN_POINTS_ALIGNED = 10
 MIN_PHOTOS = 3
 # At the end, observations with a larger reprojection error are removed. In pixels of the resized
 # photo in which the features were detected.
@@ -95,11 +98,19 @@ class Mapping:
             observations.deregister_frame(model.image(image_id).frame_id)
         return self._refine(model)
 
+    def align_features(self, model: pycolmap.Reconstruction, image_size: int) -> None:
+        """Align the features of each point, and run bundle adjustment. Changes ``model``.
+
+        ``image_size``: the longest side of the photos in which the features were detected.
+        """
+        align_features(model, self.database, self.images, image_size, self.threads)
+        self._refine(model, _MIN_POINTS_ALIGNED)
+
     def add_points(self, model: pycolmap.Reconstruction) -> None:
         """Add points that only two photos of ``model`` see, for the training. Changes ``model``."""
         mapper = self._mapper(ViewGraph.read(self.database), relaxed=False)
         mapper.triangulate_pairs(model)
-        self._remove_outliers(model)
+        self._remove_outliers(model, _MIN_POINTS_ALIGNED)
 
     def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()
@@ -195,32 +206,37 @@ class Mapping:
         finally:
             shutil.rmtree(output, ignore_errors=True)
 
-    def _refine(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    def _refine(
+        self, model: pycolmap.Reconstruction, min_points: int = MIN_POINTS
+    ) -> pycolmap.Reconstruction:
         """Remove outliers and run bundle adjustment, for each scale of the loss.
 
-        Changes ``model`` and returns it.
+        Changes ``model`` and returns it. ``min_points`` as in `_remove_outliers`.
         """
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.ceres.solver_options.num_threads = self.threads
         options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        self._remove_outliers(model)
+        self._remove_outliers(model, min_points)
         for scale in _FINAL_LOSS_SCALES:
             if model.num_reg_images() < MIN_PHOTOS:
                 break
             options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()
             pycolmap.bundle_adjustment(model, options)
-            self._remove_outliers(model)
+            self._remove_outliers(model, min_points)
         return model
 
-    def _remove_outliers(self, model: pycolmap.Reconstruction) -> None:
-        """Remove observations with a large error, flat points, and cameras with few points."""
+    def _remove_outliers(self, model: pycolmap.Reconstruction, min_points: int) -> None:
+        """Remove observations with a large error, flat points, and cameras with few points.
+
+        A camera remains if it sees at least ``min_points`` points.
+        """
         observations = pycolmap.ObservationManager(model)
         observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
         for image_id in list(model.reg_image_ids()):
             image = model.image(image_id)
-            if image.num_points3D < MIN_POINTS:
+            if image.num_points3D < min_points:
                 observations.deregister_frame(image.frame_id)
         model.update_point_3d_errors()
 

@@ -107,6 +107,7 @@ class PoseEstimation:
             raise failure(evidence)
         mapping = self._mapping(best.matched)
         for model in best.models:
+            mapping.align_features(model, best.matched.effort.image_size)
             mapping.add_points(model)
             model.extract_colors_for_all_images(self.folders.images, self.threads)
         write_models(best.models, self.folders.sparse)
