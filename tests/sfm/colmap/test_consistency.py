@@ -9,8 +9,10 @@ import pytest
 
 from snowsplat.sfm.colmap.consistency import (
     CheckedPair,
+    _without_bridged_tears,
     agreement,
     find_parts,
+    unconfirmed_photos,
 )
 
 
@@ -137,6 +139,38 @@ def test_look_alikes_in_a_correct_model_cut_nothing():
     pairs = chain(range(1, 31))
     pairs += [CheckedPair(i, j, 300, 0) for i in range(1, 6) for j in range(26, 31)]
     assert find_parts(pairs) == [set(range(1, 31))]
+
+
+def test_tears_that_the_photo_between_bridges_do_not_count_as_photos_in_order():
+    """A floor with a pattern: of the matches of every second photo, most are false."""
+    adjacent = {(i, i + 1) for i in range(1, 30)}
+    true = [CheckedPair(i, i + 1, 500, 450, follows=True) for i in range(1, 30)]
+    true += [CheckedPair(i, i + 2, 400, 350, follows=True) for i in range(1, 14)]
+    false = [CheckedPair(i, i + 2, 600, 10, follows=True) for i in range(14, 29)]
+    false += [CheckedPair(i, i + 3, 500, 0) for i in range(1, 28)]
+    assert [p.follows for p in _without_bridged_tears(true + false, adjacent)] == (
+        [True] * len(true) + [False] * len(false)
+    )
+    assert len(find_parts(_without_bridged_tears(true + false, adjacent))) == 1
+    # Where the walk is torn, all pairs across the tear still count.
+    broken = [replace(p, hits=0) if (p.first, p.second) == (20, 21) else p for p in true + false]
+    unbridged = [p for p in _without_bridged_tears(broken, adjacent) if p.torn and p.follows]
+    assert [(p.first, p.second) for p in unbridged] == [(20, 21), (19, 21), (20, 22)]
+    # A photo between two others that has no pose bridges nothing.
+    missing = [p for p in true + false if 20 not in (p.first, p.second)]
+    left = [p for p in _without_bridged_tears(missing, adjacent) if p.torn and p.follows]
+    assert [(p.first, p.second) for p in left] == [(19, 21)]
+
+
+def test_a_photo_that_no_other_photo_confirms():
+    def pairs(best, tears):
+        of_photo = [CheckedPair(i, 31, 300, 10) for i in range(1, 1 + tears)]
+        return [*chain(range(1, 31)), *of_photo, replace(chain([30, 31])[0], miss_share=best)]
+
+    assert unconfirmed_photos(pairs(best=0.3, tears=3)) == {31}
+    assert unconfirmed_photos(pairs(best=0.3, tears=2)) == set()
+    assert unconfirmed_photos(pairs(best=0.1, tears=3)) == set()
+    assert unconfirmed_photos([]) == set()
 
 
 def test_little_evidence_cuts_nothing():

@@ -27,7 +27,8 @@ and scalable constrained clustering: a generalized spectral method", AISTATS 201
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -121,7 +122,8 @@ def check_pairs(
     rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
-        follow = following_pairs(database_names(source))
+        names = database_names(source)
+        follow = following_pairs(names)
 
         def rays_of(image_id: int, features: Ints) -> Floats:
             if image_id not in rays:
@@ -153,7 +155,47 @@ def check_pairs(
                 miss_share=float(np.mean(missed & ~is_hit)),
             )
             checked.append(pair)
-    return checked
+    return _without_bridged_tears(checked, following_pairs(names, max_step=1))
+
+
+def _without_bridged_tears(
+    pairs: Sequence[CheckedPair], adjacent: Collection[tuple[int, int]]
+) -> list[CheckedPair]:
+    """``pairs``, where bridged tears do not count as photos that follow each other.
+
+    Let three photos i, j, k follow one another directly: (i, j) and (j, k) are in ``adjacent``. If
+    the pair (i, k) is a tear, but (i, j) and (j, k) are not, this tear is *bridged*: the model
+    connects the two photos through the one between them, so the matches of the tear are false. This
+    occurs on a floor with a repeating pattern.
+    """
+    by_ids = {(pair.first, pair.second): pair for pair in pairs}
+    after: dict[int, list[int]] = {}  # photo -> the adjacent ones with a pair that is no tear
+    for one, other in adjacent:
+        link = by_ids.get((one, other))
+        if link is not None and link.counts and not link.torn:
+            after.setdefault(one, []).append(other)
+            after.setdefault(other, []).append(one)
+
+    def is_bridged(pair: CheckedPair) -> bool:
+        between = set(after.get(pair.first, ())).intersection(after.get(pair.second, ()))
+        return pair.torn and bool(between)
+
+    return [replace(p, follows=False) if p.follows and is_bridged(p) else p for p in pairs]
+
+
+def unconfirmed_photos(pairs: Sequence[CheckedPair]) -> set[int]:
+    """The photos (image ids) whose pose is doubtful, although no part contradicts another one.
+
+    Such a photo has at least `_MIN_TEARS` tears, but no pair that the model confirms. In a correct
+    model, every photo is confirmed by others, even if most of its matches are false.
+    """
+    tears: Counter[int] = Counter()
+    confirmed: set[int] = set()
+    for pair in pairs:
+        tears.update({pair.first: int(pair.torn), pair.second: int(pair.torn)})
+        if pair.counts and pair.support >= _CONFIRMED:
+            confirmed |= {pair.first, pair.second}
+    return {photo for photo, count in tears.items() if count >= _MIN_TEARS} - confirmed
 
 
 def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import pycolmap
 
-from snowsplat.sfm.colmap.consistency import CheckedPair, check_pairs, find_parts
+from snowsplat.sfm.colmap.consistency import (
+    CheckedPair,
+    check_pairs,
+    find_parts,
+    unconfirmed_photos,
+)
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
 from snowsplat.sfm.colmap.mapping import Mapping
 
@@ -42,7 +47,7 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     with these poses (`_false_pairs`). A new model is made without the false matches: they have
     also bent the first part of the model. This is repeated until no part contradicts the others, at
     most `_ROUNDS` times. Of all models, the one with the most photos is used. Its photos that
-    contradict the others are left out.
+    contradict the others, or that no other photo confirms, are left out.
 
     A model without contradictions is returned unchanged. ``max_error`` as in `check_pairs`.
     """
@@ -55,10 +60,11 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         names |= {i: image.name for i, image in model.images.items()}
         pairs = check_pairs(model, mapping.database, max_error)
         parts = _parts(pairs, false_pairs)
-        found.append((model, set().union(*parts[1:])))
+        doubtful = unconfirmed_photos(pairs).difference(*parts[1:])
+        found.append((model, doubtful.union(*parts[1:])))
+        wrong |= _doubts(model, pairs, doubtful) | _reasons(model, pairs, parts)
         if len(parts) < 2:
             break
-        wrong |= _reasons(model, pairs, parts)
         false_pairs |= _false_pairs(pairs, parts)
         models = _made_again(mapping, false_pairs) if len(found) <= _ROUNDS else []
         if not models:
@@ -120,6 +126,22 @@ def _false_pairs(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set
         if part.get(pair.first, 0) != part.get(pair.second, 0)
         and not (pair.contradicted or pair.follows)
     }
+
+
+def _doubts(
+    model: pycolmap.Reconstruction, pairs: Sequence[CheckedPair], photos: Collection[int]
+) -> dict[int, str]:
+    """Why ``photos``, those of `unconfirmed_photos`, have a doubtful pose: image id -> text."""
+    reasons = {}
+    for photo in sorted(photos):
+        own = [pair for pair in pairs if pair.counts and photo in (pair.first, pair.second)]
+        best = max(own, key=lambda pair: pair.support)
+        reasons[photo] = (
+            f"no other photo confirms its place: {len(own)} photos have matches with it, and at "
+            f"best {best.support:.0%} of the matches agree with its pose "
+            f"({model.image(best.other(photo)).name})"
+        )
+    return reasons
 
 
 def _reasons(
