@@ -80,7 +80,7 @@ def test_the_first_photos_of_many_take_longer():
     assert each[:120] == pytest.approx([each[0]] * 120)
     assert each[120:] == pytest.approx([each[-1]] * 180)
     assert each[0] > 2 * each[-1]
-    assert 0.4 < shares[-1] < 0.6  # the rest is the final bundle adjustment and the check
+    assert 0.3 < shares[-1] < 0.5  # the rest is the check and the final bundle adjustment
 
 
 @pytest.fixture
