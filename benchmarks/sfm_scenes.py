@@ -3,7 +3,7 @@
     room     a furnished room; the camera path has several loops
     around   the still life of `snowsplat demo`; the camera goes around the table
     plain    the room with walls of one colour and less furniture; all loops look across the room
-    carpet   a room with a carpet that repeats exactly; the camera looks down at it, across the room
+    carpet   a room with a worn carpet that repeats; the camera looks down at it, across the room
     twins    two identical objects in a hall with pictures; a figure of eight around the objects
     rooms    two identical rooms, and the passage from one to the other
 
@@ -42,7 +42,7 @@ from snowsplat.synthetic.still_life import still_life
 from snowsplat.trajectory.video import video_writer
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
-VERSION = 4
+VERSION = 5
 CACHE_VARIABLE = "SNOWSPLAT_SFM_SCENES"
 SIZE = (800, 600)
 FRAMES_PER_SECOND = 10
@@ -169,6 +169,7 @@ def _carpeted_room(seed: int) -> Scene:
     across, down, tile = 5, 4, 0.6  # numbers of tiles, and the side of a tile in metres
     shades = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
     carpet = np.tile(paint.woven(_pixels(tile, tile), 5, shades, random), (down, across, 1))
+    carpet = _worn(carpet, random)
     floor = paint.wood(_pixels(x, y), 26, _PINE, random)
     top, left = ((np.array(floor.shape[:2]) - carpet.shape[:2]) // 2).tolist()
     floor[top : top + carpet.shape[0], left : left + carpet.shape[1]] = carpet
@@ -288,6 +289,13 @@ def _board(
     thin = int(np.argmin(size))
     edge = _plain((0.6, 0.58, 0.52))
     return SceneObject(Box(centre, size), [face if i // 2 == thin else edge for i in range(6)])
+
+
+def _worn(cloth: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """``cloth`` with different shading at each place; the standard deviation is 1/30."""
+    size = (cloth.shape[1], cloth.shape[0])
+    shading = 0.1 * paint.noise(size, (size[0] / 10, size[1] / 10), 4, random)
+    return (cloth * (1 + shading)[..., None]).clip(0, 1).astype(np.float32)
 
 
 def _with_pictures(wall: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
