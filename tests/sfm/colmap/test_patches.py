@@ -122,6 +122,22 @@ def test_patches_without_texture_and_patches_of_different_places():
 
 
 @pytest.mark.isa
+def test_any_patches_give_finite_transforms():
+    """Also patches with few grey values, for which the equations are nearly singular."""
+    random = np.random.default_rng(5)
+    stripes = np.tile(np.where(np.arange(SIDE) % 2, 255, 0).astype(np.uint8), (SIDE, 1))
+    spot = np.zeros((SIDE, SIDE), np.uint8)
+    spot[CENTRE, CENTRE] = 255
+    noise = random.integers(0, 256, (20, SIDE, SIDE), dtype=np.uint8)
+    patches = np.stack([stripes, stripes.T, spot, 255 - spot, *noise, *(noise[:9] // 255 * 255)])
+    pairs = np.stack(np.meshgrid(*2 * [np.arange(len(patches))]), -1).reshape(-1, 2)
+    aligned = align_patches(patches, pairs.astype(np.int32))
+    assert np.isfinite(aligned.transform).all()
+    assert np.abs(aligned.transform[:, :, 2]).max() <= CENTRE
+    assert (np.abs(aligned.correlation) <= 1.00001).all()
+
+
+@pytest.mark.isa
 def test_the_number_of_threads_does_not_change_the_result():
     random = np.random.default_rng(3)
     patches = np.stack([patch_of(surface(random)) for _ in range(20)])

@@ -22,6 +22,7 @@ constexpr int kGain = 6;
 constexpr float kSigma = 0.5f * kRadius;  // of the Gaussian weights in the window
 constexpr int kIterations = 10;
 constexpr float kTolerance = 0.005f;  // pixels; smaller changes of the corners end the iterations
+constexpr float kLargestStretch = 100;
 constexpr float kLeastGain = 0.3f, kLargestGain = 3.0f;
 constexpr double kDamping = 1e-4, kSmallest = 1e-3;  // relative to, and added to, the diagonal
 constexpr int64_t kBlock = 64;                       // pairs of a task
@@ -107,12 +108,12 @@ class Alignment {
       float change[6];
       for (int k = 0; k < 6; k++) change[k] = float(x[k]) / gain;
       compose_with_inverse(affine, change);
+      if (!is_valid(affine)) return affine = Affine(), -1.0f;
       const float* q = change;
       const float moved = std::max(kRadius * (std::abs(q[0]) + std::abs(q[1])) + std::abs(q[2]),
                                    kRadius * (std::abs(q[3]) + std::abs(q[4])) + std::abs(q[5]));
       if (!(moved >= kTolerance)) break;
     }
-    if (!is_inside(affine)) return affine = Affine(), -1.0f;
     sample(affine, values);
     return correlation(values);
   }
@@ -165,10 +166,13 @@ class Alignment {
          t.d * ia + t.e * id, t.d * ib + t.e * ie, t.d * ic + t.e * jf + t.f};
   }
 
-  // Whether the centre of the window is inside of the second patch; false if a value is not finite.
-  bool is_inside(const Affine& t) const {
-    const float sum = t.a + t.b + t.d + t.e;
-    return std::isfinite(sum) && std::max(std::abs(t.c), std::abs(t.f)) <= float(side_ / 2);
+  // Whether the centre of the window is inside of the second patch, and the window is not stretched
+  // very much. False if a number is NaN.
+  bool is_valid(const Affine& t) const {
+    const float half = float(side_ / 2);
+    bool valid = std::abs(t.c) <= half && std::abs(t.f) <= half;
+    for (float x : {t.a, t.b, t.d, t.e}) valid = valid && std::abs(x) <= kLargestStretch;
+    return valid;
   }
 
   float correlation(const float* values) const {
