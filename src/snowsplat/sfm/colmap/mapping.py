@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,8 +44,10 @@ _GLOBAL_TOLERANCE = 1e-5
 _FINAL_TOLERANCE = 1e-4
 # The bundle adjustment of the result has a Cauchy loss, so false matches that became observations
 # have little effect on the poses. Its scale, in units of the mean reprojection error, is decreased:
-# with the small one alone, a model that is bent may remain bent.
+# with the small one alone, a model that is bent may remain bent. Before the check of the poses, the
+# first scale is sufficient.
 _FINAL_LOSS_SCALES = (3.0, 1.0)
+_FIRST_LOSS_SCALES = (3.0,)
 _MIN_ANGLE = 1.5  # degrees: smallest triangulation angle of a point
 
 
@@ -68,7 +70,7 @@ class Mapping:
             models = self._map_globally()
         else:
             models = self._map_incrementally(relaxed)
-        return usable_models([self._refine(model) for model in models])
+        return usable_models([self._refine(m, scales=_FIRST_LOSS_SCALES) for m in models])
 
     def extend(
         self, models: list[pycolmap.Reconstruction], relaxed: bool = True
@@ -207,9 +209,12 @@ class Mapping:
             shutil.rmtree(output, ignore_errors=True)
 
     def _refine(
-        self, model: pycolmap.Reconstruction, min_points: int = MIN_POINTS
+        self,
+        model: pycolmap.Reconstruction,
+        min_points: int = MIN_POINTS,
+        scales: Sequence[float] = _FINAL_LOSS_SCALES,
     ) -> pycolmap.Reconstruction:
-        """Remove outliers and run bundle adjustment, for each scale of the loss.
+        """Remove outliers and run bundle adjustment, for each of ``scales`` of the loss.
 
         Changes ``model`` and returns it. ``min_points`` as in `_remove_outliers`.
         """
@@ -219,7 +224,7 @@ class Mapping:
         options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         self._remove_outliers(model, min_points)
-        for scale in _FINAL_LOSS_SCALES:
+        for scale in scales:
             if model.num_reg_images() < MIN_PHOTOS:
                 break
             options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()

@@ -26,7 +26,7 @@ SIDE = 2 * (ALIGNMENT_RADIUS + _MARGIN) + 1
 # Standard deviation of the feature's Gaussian in pixels of its patch, unless this would enlarge the
 # photo. Large features are sampled at a lower resolution, so the window covers most of them.
 _SCALE_IN_PATCH = 1.5
-_ROWS = 32000 // SIDE  # of patches; `cv2.remap` writes less than 2**15 rows of pixels
+_AT_ONCE = 256  # patches; the positions of their pixels fit into the cache of the processor
 
 
 class Aligned(NamedTuple):
@@ -69,8 +69,8 @@ def cut_patches(grey: NDArray[np.uint8], positions: Floats, axes: Floats) -> NDA
         if level:
             grey = np.asarray(cv2.pyrDown(grey), np.uint8)
         (chosen,) = np.nonzero(levels == level)
-        for start in range(0, len(chosen), _ROWS):
-            rows = chosen[start : start + _ROWS]
+        for start in range(0, len(chosen), _AT_ONCE):
+            rows = chosen[start : start + _AT_ONCE]
             # Pixel i of a reduced photo has its centre at that of pixel 2i of the larger one.
             centres = ((positions[rows] - 0.5) / 2**level).astype(np.float32)
             steps = (axes[rows] / 2**level).astype(np.float32)
