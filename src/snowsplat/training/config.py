@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
+from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import DENSITY_CONTROLS, AdaptiveDensity, DensityConfig
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.step_schedule import Schedule, When
@@ -37,6 +38,7 @@ class TrainConfig:
         initial_scale: the scale of every Gaussian at initialisation, in units of the mean distance
             to its three nearest neighbours.
         learning_rates: see `LearningRates`.
+        decay: see `DecayRates`.
         density: settings of density control, one of `DENSITY_CONTROLS`.
         gaussians_per_pixel: limit of the number of Gaussians relative to the number of pixels of a
             photo, in addition to ``density.max_gaussians``. More Gaussians would not improve the
@@ -68,6 +70,7 @@ class TrainConfig:
     initial_opacity: float = 0.1
     initial_scale: float = 1.0
     learning_rates: LearningRates = field(default_factory=LearningRates)
+    decay: DecayRates = field(default_factory=DecayRates)
     density: DensityConfig = field(default_factory=AdaptiveDensity)
     gaussians_per_pixel: float = 0.0
     visible_only: bool = False
@@ -97,10 +100,23 @@ class TrainConfig:
             ("densify_from", density.densify_from),
             ("densify_until", density.densify_until),
             ("lr_means_steps", rates.means_steps),
+            ("decay_until", self.decay.until),
             ("leave_out_after", self.leave_out_after),
         ):
             if not math.isfinite(when):
                 raise SettingError(name, f"{when} is not a step; use e.g. 500, or a fraction, 0.5")
+        if not 0.0 < rates.anneal < math.inf:
+            raise SettingError("lr_anneal", f"{rates.anneal:g} is not positive; use e.g. 0.1")
+        if not 0.0 <= rates.anneal_from < 1.0:
+            raise SettingError(
+                "lr_anneal_from", f"{rates.anneal_from:g} is not a fraction; use e.g. 0.6"
+            )
+        for name, rate in (
+            ("decay_opacity", self.decay.opacity),
+            ("decay_scale", self.decay.scale),
+        ):
+            if not 0.0 <= rate < math.inf:
+                raise SettingError(name, f"{rate:g} is not valid; use e.g. 0.04, or 0 for none")
         if self.leave_out_after < 0:
             raise SettingError(
                 "leave_out_after", f"{self.leave_out_after} is negative; use 0 for never"
@@ -130,8 +146,9 @@ def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
 
     Args:
         settings: fields of `TrainConfig`; fields of its density control (``grad_threshold=4e-4``);
-            and fields of `LearningRates` with the prefix ``lr_`` (``lr_means=1e-4``). None leaves a
-            setting unchanged. ``max_gaussians`` also disables ``gaussians_per_pixel``.
+            fields of `LearningRates` with the prefix ``lr_`` (``lr_means=1e-4``), and of
+            `DecayRates` with the prefix ``decay_``. None leaves a setting unchanged.
+            ``max_gaussians`` also disables ``gaussians_per_pixel``.
 
     Raises:
         SettingError: the configuration has no such setting, or a value is invalid.
@@ -141,20 +158,17 @@ def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
         given.setdefault("gaussians_per_pixel", 0.0)
     direct = {f.name for f in fields(config)} & given.keys()
     config = replace(config, **{name: given.pop(name) for name in direct})
-    density = {f.name for f in fields(config.density)} & given.keys()
-    rates = {f"lr_{f.name}" for f in fields(config.learning_rates)} & given.keys()
-    for name in given.keys() - density - rates:
+    parts: dict[str, Any] = {}
+    for part, prefix in (("density", ""), ("learning_rates", "lr_"), ("decay", "decay_")):
+        settings_of = getattr(config, part)
+        names = {f.name for f in fields(settings_of) if prefix + f.name in given}
+        parts[part] = replace(settings_of, **{name: given.pop(prefix + name) for name in names})
+    if given:
         raise SettingError(
-            name,
+            next(iter(given)),
             f"not a setting of {type(config.density).__name__}; remove it or use another recipe",
         )
-    return replace(
-        config,
-        density=replace(config.density, **{name: given[name] for name in density}),
-        learning_rates=replace(
-            config.learning_rates, **{name.removeprefix("lr_"): given[name] for name in rates}
-        ),
-    )
+    return replace(config, **parts)
 
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:
@@ -172,8 +186,9 @@ def config_from_json(values: dict[str, Any]) -> TrainConfig:
         values = dict(values)
         density = from_json(DENSITY_CONTROLS[values.pop("density_control")], values.pop("density"))
         rates = from_json(LearningRates, values.pop("learning_rates"))
+        decay = from_json(DecayRates, values.pop("decay", {}))  # not in older files
         config = from_json(TrainConfig, values)
-        return replace(config, density=density, learning_rates=rates)
+        return replace(config, density=density, learning_rates=rates, decay=decay)
     except (KeyError, TypeError, ValueError):
         raise UserError(
             "the configuration: written by another version of snowsplat; resume with that version"

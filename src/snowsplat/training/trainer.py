@@ -17,6 +17,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.training.config import TrainConfig
+from snowsplat.training.decay import Decay
 from snowsplat.training.finite import check_state
 from snowsplat.training.init import initial_gaussians
 from snowsplat.training.losses import view_loss
@@ -137,6 +138,7 @@ class Trainer:
             generator=self._generators["density"],
             device=self.device,
         )
+        self._decay = Decay(config.decay, len(dataset.train), self.schedule)
         self._runner = StepRunner(len(self.gaussians), self.device)
 
     def run(
@@ -178,6 +180,7 @@ class Trainer:
                 self.gaussians = self._density.after_step(
                     self.step, self.gaussians, self._optimizer
                 )
+                self._decay.after_step(self.step, self.gaussians)
             step = self.step + 1
             view, camera, photo = self._next_view(step)
             background = self._next_background()
