@@ -32,6 +32,20 @@ def test_the_means_rate_ends_at_its_own_step_and_stays():
     assert relative.at(2000, Schedule(4000), 1.0)["means"] == pytest.approx(1.6e-6)
 
 
+def test_annealing_begins_at_its_moment_and_ends_at_its_factor():
+    rates, schedule = LearningRates(anneal=0.01, anneal_from=0.5), Schedule(1000)
+    constant = LearningRates().at(500, schedule, 1.0)
+    assert rates.at(1, schedule, 1.0) == LearningRates().at(1, schedule, 1.0)
+    assert rates.at(500, schedule, 1.0) == constant
+    for name, rate in constant.items():
+        if name != "means":  # they have a schedule of their own
+            assert rates.at(750, schedule, 1.0)[name] == pytest.approx(0.1 * rate)
+            assert rates.at(1000, schedule, 1.0)[name] == pytest.approx(0.01 * rate)
+    assert rates.at(1000, schedule, 1.0)["means"] == pytest.approx(
+        LearningRates().at(1000, schedule, 1.0)["means"]
+    )
+
+
 def test_scaled_leaves_the_final_rate_unchanged():
     rates = LearningRates().scaled(3.0)
     assert rates.means == pytest.approx(4.8e-4)
@@ -40,3 +54,4 @@ def test_scaled_leaves_the_final_rate_unchanged():
     assert [rates.sh_dc, rates.sh_rest] == pytest.approx([7.5e-3, 3.75e-4])
     assert rates.means_final == 1.6e-6
     assert rates.means_steps == 30_000
+    assert LearningRates(anneal=0.1).scaled(3.0).anneal == 0.1

@@ -2,6 +2,7 @@
 
 import pytest
 
+from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.recipes import recipe
 from snowsplat.training.step_schedule import Schedule
@@ -24,10 +25,11 @@ def test_the_paper_completes_its_schedule_at_any_length():
         assert (density.grad_threshold, density.prune_opacity) == (2e-4, 0.005)
 
 
-def test_the_default_scales_with_its_length():
-    config = recipe("default", iterations=1000)
+@pytest.mark.parametrize(("name", "until"), [("default", 700), ("classic", 500)])
+def test_the_short_recipes_scale_with_their_length(name, until):
+    config = recipe(name, iterations=1000)
     schedule = Schedule(config.iterations)
-    assert schedule.step_of(config.density.densify_until) == 500
+    assert schedule.step_of(config.density.densify_until) == until
     steps = (1, 150, 151, 400, 401, 1000)
     assert [config.downscale_at(step, schedule) for step in steps] == [4, 4, 2, 2, 1, 1]
     assert config.learning_rates.at(1000, schedule, 1.0)["means"] == pytest.approx(1.6e-5)
@@ -35,9 +37,20 @@ def test_the_default_scales_with_its_length():
     assert config.density.prune_world_size == 0
 
 
+@pytest.mark.parametrize("name", ["classic", "paper", "mcmc"])
+def test_only_the_default_anneals_and_decays(name):
+    config = recipe(name)
+    assert config.learning_rates.anneal == 1.0
+    assert config.decay == DecayRates()
+    default = recipe("default")
+    assert default.learning_rates.anneal < 1.0
+    assert min(default.decay.opacity, default.decay.scale) > 0.0
+
+
 def test_an_unknown_recipe_is_rejected():
     with pytest.raises(
-        SettingError, match="^recipe: 'fast' does not exist; use one of default, paper, mcmc"
+        SettingError,
+        match="^recipe: 'fast' does not exist; use one of default, classic, paper, mcmc",
     ):
         recipe("fast")
 

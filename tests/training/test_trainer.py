@@ -21,6 +21,7 @@ from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
 from snowsplat.training import checkpoint
 from snowsplat.training.config import TrainConfig
+from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.losses import view_loss
 from snowsplat.training.lr_schedule import LearningRates
@@ -66,13 +67,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset(views[1:], views[:1], Points(xyz, rgb), extent=3.5)
 
 
-#: 60 steps with densification, coarse to fine, and increasing SH degrees.
+#: 60 steps with densification, coarse to fine, decay, annealing, and increasing SH degrees.
 BUSY = TrainConfig(
     iterations=60,
     background="random",
     sh_interval=10,
     coarse_to_fine=(0.1, 0.2),
     visible_only=True,
+    learning_rates=LearningRates(anneal=0.1, anneal_from=0.5),
+    decay=DecayRates(opacity=0.05, scale=0.05),
     density=AdaptiveDensity(
         densify_from=10,
         densify_until=50,
@@ -179,7 +182,7 @@ def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
 @every_density_control
 def test_a_stretched_run_completes_its_schedule_and_resumes_bitwise(dataset, config, tmp_path):
     """60 steps become 90 after step 20, and 45 after step 40."""
-    rates = LearningRates(means_steps=1.0)
+    rates = replace(config.learning_rates, means_steps=1.0)
     config = replace(config, coarse_to_fine=(0.2, 0.5), learning_rates=rates)
     reports: list[Progress] = []
     first = Trainer(dataset, config)

@@ -9,7 +9,7 @@ from snowsplat.training.time_budget.step_cost import StepCost, Work
 
 def test_a_densification_adds_a_quarter_until_the_limit():
     """Ten densifications remain after step 0, none after step 1000."""
-    config = recipe("default", iterations=2000, max_gaussians=1_000_000)
+    config = recipe("classic", iterations=2000, max_gaussians=1_000_000)
     work = Work(config, 500_000.0, 6)
     parts = work.parts_ahead(Schedule(2000), 0, 10_000)
     assert parts[-1] == (1, pytest.approx(10_000 * 1.25**10))

@@ -1,0 +1,67 @@
+"""The decay of opacities and scales."""
+
+import math
+
+import pytest
+import torch
+
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.decay import INTERVAL, Decay, DecayRates
+from snowsplat.training.recipes import recipe
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.util.errors import SettingError
+
+
+def scene() -> Gaussians:
+    generator = torch.Generator().manual_seed(5)
+    bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    gaussians = Gaussians.random_in_bounds(bounds, 7, generator)
+    gaussians.opacity_logits = torch.linspace(-30.0, 30.0, 7)
+    return gaussians
+
+
+def test_an_epoch_reduces_opacities_and_scales_by_their_rates():
+    views, epochs = 20, 3
+    decay = Decay(DecayRates(opacity=0.04, scale=0.01), views, Schedule(1000))
+    before, after = scene(), scene()
+    for step in range(1, views * epochs + 1):
+        decay.after_step(step, after)
+    torch.testing.assert_close(
+        after.opacities[1:], math.exp(-0.04 * epochs) * before.opacities[1:], rtol=1e-4, atol=1e-7
+    )
+    torch.testing.assert_close(after.scales, math.exp(-0.01 * epochs) * before.scales)
+    for name in ("means", "quats", "sh_dc", "sh_rest"):
+        assert torch.equal(after.parameters()[name], before.parameters()[name])
+
+
+def test_logits_stay_finite():
+    decay = Decay(DecayRates(opacity=5.0), 1, Schedule(10_000))
+    gaussians = scene()
+    for step in range(1000):
+        decay.after_step(step, gaussians)
+    assert gaussians.opacity_logits.isfinite().all()
+    assert float(gaussians.opacities.max()) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("step", "acts"), [(INTERVAL, True), (INTERVAL + 1, False), (500, True), (510, False)]
+)
+def test_it_acts_in_every_tenth_step_until_its_end(step, acts):
+    gaussians = scene()
+    decay = Decay(DecayRates(opacity=0.1, scale=0.1, until=0.5), 10, Schedule(1000))
+    decay.after_step(step, gaussians)
+    assert torch.equal(gaussians.log_scales, scene().log_scales) != acts
+    assert torch.equal(gaussians.opacity_logits, scene().opacity_logits) != acts
+
+
+def test_without_rates_nothing_changes():
+    gaussians = scene()
+    Decay(DecayRates(), 10, Schedule(1000)).after_step(INTERVAL, gaussians)
+    for name, tensor in scene().parameters().items():
+        assert torch.equal(gaussians.parameters()[name], tensor)
+
+
+@pytest.mark.parametrize("name", ["decay_opacity", "decay_scale"])
+def test_a_negative_rate_is_rejected(name):
+    with pytest.raises(SettingError, match=f"^{name}: -1 is not valid; use e.g. 0.04"):
+        recipe("default", **{name: -1.0})
