@@ -38,7 +38,7 @@ def test_the_short_recipes_scale_with_their_length(name, until):
 
 
 @pytest.mark.parametrize("name", ["classic", "paper", "mcmc"])
-def test_only_the_default_anneals_and_decays(name):
+def test_the_other_recipes_neither_anneal_nor_decay(name):
     config = recipe(name)
     assert config.learning_rates.anneal == 1.0
     assert config.decay == DecayRates()
@@ -50,7 +50,7 @@ def test_only_the_default_anneals_and_decays(name):
 def test_an_unknown_recipe_is_rejected():
     with pytest.raises(
         SettingError,
-        match="^recipe: 'fast' does not exist; use one of default, classic, paper, mcmc",
+        match="^recipe: 'fast' does not exist; use one of default, classic, paper, mcmc, mcmc-short",
     ):
         recipe("fast")
 
@@ -62,3 +62,14 @@ def test_mcmc_has_the_initialisation_of_its_paper_and_a_limit():
     assert (config.initial_opacity, config.initial_scale) == (0.5, 0.1)
     assert config.iterations == 30_000
     assert not config.visible_only
+
+
+def test_mcmc_short_reaches_its_limit_early_and_ends_without_noise():
+    config = recipe("mcmc-short")
+    density, schedule = config.density, Schedule(config.iterations)
+    assert isinstance(density, McmcDensity)
+    assert config.iterations == 3000
+    steps = range(density.densify_from, 1050, density.densify_interval)
+    assert 2_000 * (1 + density.growth) ** len(steps) > density.max_gaussians
+    assert schedule.step_of(density.noise_until) == 2100
+    assert schedule.step_of(config.learning_rates.anneal_from) == 2100

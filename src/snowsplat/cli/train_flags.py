@@ -31,7 +31,8 @@ class JobFlags:
     ] = None
     """Named configuration, which determines the defaults of the other settings. default: 3000
     steps, designed for CPUs; classic: the default recipe of version 0.1; paper: the 30,000 steps of
-    the paper; mcmc: 30,000 steps with a fixed maximum number of Gaussians."""
+    the paper; mcmc: 30,000 steps with a fixed maximum number of Gaussians; mcmc-short: the same in
+    3000 steps."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
     """Finish within this time, including evaluation and saving. The number of steps, the size of
     the photos and the maximum number of Gaussians are chosen for this time, unless flags set them.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from snowsplat.training.checkpoint import Checkpoint
 
 #: Names of `training.recipes.RECIPES`, without importing torch.
-Recipe = Literal["default", "classic", "paper", "mcmc"]
+Recipe = Literal["default", "classic", "paper", "mcmc", "mcmc-short"]
 
 
 @dataclass(frozen=True)

@@ -202,6 +202,15 @@ def test_noise_is_scaled_by_the_learning_rate_of_the_means():
     torch.testing.assert_close(moved[0], moved[1], rtol=1e-3, atol=0.5)
 
 
+@pytest.mark.parametrize(("step", "moves"), [(70, True), (71, False)])
+def test_noise_ends_at_its_moment(step, moves):
+    gaussians = some_gaussians(50, opacity=0.001)
+    before = gaussians.means.clone()
+    control, adam = set_up(gaussians, noise_until=70)
+    control.after_step(step, gaussians, adam)
+    assert torch.equal(gaussians.means, before) != moves
+
+
 def test_gaussians_at_the_opacity_limit_are_dead():
     """If all Gaussians are dead, none can be relocated."""
     gaussians = some_gaussians(10)

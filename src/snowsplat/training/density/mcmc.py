@@ -46,6 +46,7 @@ class McmcDensity:
         growth: fraction by which the number of Gaussians grows at each relocation, up to the limit.
         prune_opacity: Gaussians of this opacity or less are dead; they are relocated.
         noise: scale of the noise on the positions, in units of their learning rate.
+        noise_until: the last step with noise (float: fraction of all steps).
         opacity_regularizer, scale_regularizer: weights of the mean opacity and the mean scale in
             the loss.
     """
@@ -57,6 +58,7 @@ class McmcDensity:
     growth: float = 0.05
     prune_opacity: float = 0.005
     noise: float = 5e5
+    noise_until: When = 1.0
     opacity_regularizer: float = 0.01
     scale_regularizer: float = 0.01
 
@@ -108,8 +110,9 @@ class McmcDensityControl:
         gaussians.log_scales.grad = self.settings.scale_regularizer / scales.numel() * scales
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
-        """Add noise in every step; relocate and add Gaussians if the settings require it."""
-        self._add_noise(gaussians, optimizer.rates_at(step)["means"])
+        """Add noise; relocate and add Gaussians if the settings require it."""
+        if step <= self.schedule.step_of(self.settings.noise_until):
+            self._add_noise(gaussians, optimizer.rates_at(step)["means"])
         if self.first <= step <= self.last and step % self.settings.densify_interval == 0:
             check_parameters(step, gaussians)
             gaussians = self._relocate(gaussians, optimizer)
