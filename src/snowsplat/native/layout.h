@@ -25,6 +25,8 @@ constexpr int kPackedStride = 16;    // columns of Splats2D with three colours
 constexpr int kPoseSums = 15;        // 9 of the rotation, 3 of the translation, 3 of the position
 constexpr int kMaxNeighbours = 64;   // largest k of `neighbours`
 constexpr int kAlignmentRadius = 7;  // of the window of `align_patches`, in pixels
+constexpr int kMaxSweepSources = 8;  // of `plane_sweep`
+constexpr int kMaxSweepRadius = 7;   // of the window of `plane_sweep`, in pixels
 
 class LayoutHash {
  public:
@@ -73,6 +75,8 @@ constexpr uint64_t layout_of() {
   hash.constant("pose_sums", kPoseSums);
   hash.constant("max_neighbours", kMaxNeighbours);
   hash.constant("alignment_radius", kAlignmentRadius);
+  hash.constant("max_sweep_sources", kMaxSweepSources);
+  hash.constant("max_sweep_radius", kMaxSweepRadius);
   Params::template describe<Params>(hash);
   return hash.value;
 }

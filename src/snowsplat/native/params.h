@@ -325,6 +325,27 @@ struct NeighboursParams {
   SNOW_FIELDS(n, points, k, distances)
 };
 
+// ---- plane_sweep --------------------------------------------------------------------------------
+
+// The inverse depth of plane k at a pixel is first + k · step, plus `centre` of this pixel.
+template <class T>
+struct PlaneSweepParams {
+  int64_t n;                            // sources, 1 to kMaxSweepSources
+  int64_t width, height;                // of the reference view, pixels
+  int64_t source_width, source_height;  // pixels, at least 2, with a product below 2^31
+  const T* image;                       // (height, width) luminance; NaN: no value
+  const T* sources;                     // (n, source_height, source_width)
+  const T* source_from_pixel;           // (n, 3, 4)
+  const T* centre;                      // (height, width), or null
+  double first, step;                   // inverse depths
+  int64_t planes;                       // at least 2
+  int64_t radius;                       // of the window, 1 to kMaxSweepRadius
+  T* inverse_depth;                     // out, (height, width); 0: none
+  T* score;                             // out, (height, width), -1 to 1; -1: none
+  SNOW_FIELDS(n, width, height, source_width, source_height, image, sources, source_from_pixel,
+              centre, first, step, planes, radius, inverse_depth, score)
+};
+
 // ---- match_descriptors (CPU only) ---------------------------------------------------------------
 
 // For each row, a descriptor of the first image, the column with the largest dot product, this

@@ -14,6 +14,7 @@ from snowsplat.ops.projection import project
 from snowsplat.ops.rasterizer import count_blended, rasterize
 from snowsplat.ops.splats import Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
+from snowsplat.ops.sweep import plane_sweep
 
 __all__ = [
     "Capacity",
@@ -25,6 +26,7 @@ __all__ = [
     "get_num_threads",
     "neighbours",
     "photometric_loss",
+    "plane_sweep",
     "project",
     "rasterize",
     "resolve_device",

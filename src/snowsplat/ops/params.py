@@ -269,7 +269,7 @@ class BackgroundBackwardParams(Params):
     rows: Tensor
 
 
-# --------------------------------------------------------------------- photometric, neighbours
+# -------------------------------------------------------- photometric, neighbours, plane_sweep
 
 
 @dataclass(slots=True, kw_only=True)
@@ -291,6 +291,25 @@ class NeighboursParams(Params):
     points: Tensor
     k: int
     distances: Tensor
+
+
+@dataclass(slots=True, kw_only=True)
+class PlaneSweepParams(Params):
+    n: int
+    width: int
+    height: int
+    source_width: int
+    source_height: int
+    image: Tensor
+    sources: Tensor
+    source_from_pixel: Tensor
+    centre: Tensor | None
+    first: float
+    step: float
+    planes: int
+    radius: int
+    inverse_depth: Tensor
+    score: Tensor
 
 
 # --------------------------------------------------------------------------------------- sizes
@@ -330,4 +349,5 @@ ENTRIES: dict[str, type[Params]] = {
     "photometric": PhotometricParams,
     "photometric_u8": PhotometricParams,
     "neighbours": NeighboursParams,
+    "plane_sweep": PlaneSweepParams,
 }

@@ -13,6 +13,8 @@ kernels with these functions in float64. From top to bottom, this file describes
     accumulate_screen_statistics                 for density control Kerbl et al. 2023, §5.2
     adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
 
+`plane_sweep` is in `sweep_reference.py`.
+
 [Kerbl et al. 2023]    3D Gaussian Splatting for Real-Time Radiance Field Rendering. ACM TOG 42(4).
 [Zwicker et al. 2001]  EWA Volume Splatting. IEEE Visualization. (The J and Σ' of `_project_rows`.)
 [Zwicker et al. 2002]  EWA Splatting. IEEE TVCG 8(3). (The low-pass filter, here `LOW_PASS`.)
@@ -31,6 +33,7 @@ from torch.nn.functional import conv2d
 
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.splats import Splats2D
+from snowsplat.ops.sweep_reference import plane_sweep as plane_sweep
 from snowsplat.util.native_layout import TILE
 
 LOW_PASS = 0.3  # pixels²: blurs every splat, so that it covers at least one pixel centre

@@ -33,6 +33,10 @@ MAX_NEIGHBOURS = 64
 """Largest k of `nearest_neighbours.neighbours`."""
 ALIGNMENT_RADIUS = 7
 """Radius of the window of `patches.align_patches` in pixels, without its centre."""
+MAX_SWEEP_SOURCES = 8
+"""Largest number of source images of `sweep.plane_sweep`."""
+MAX_SWEEP_RADIUS = 7
+"""Largest radius of the window of `sweep.plane_sweep` in pixels, without its centre."""
 
 _CONSTANTS = {
     "tile": TILE,
@@ -43,6 +47,8 @@ _CONSTANTS = {
     "pose_sums": POSE_SUMS,
     "max_neighbours": MAX_NEIGHBOURS,
     "alignment_radius": ALIGNMENT_RADIUS,
+    "max_sweep_sources": MAX_SWEEP_SOURCES,
+    "max_sweep_radius": MAX_SWEEP_RADIUS,
 }
 
 _WORD = 8  # bytes of a field
