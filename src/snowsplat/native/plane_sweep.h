@@ -40,11 +40,16 @@ SNOW_INLINE Real bilinear(const Real* at, int64_t stride, Real fx, Real fy) {
   return upper + fy * (lower - upper);
 }
 
+template <class Real>
+SNOW_INLINE Real invalid() {  // NaN
+  return sqrt(Real(-1.f));
+}
+
 // 1/σ of a window from the means of a and a², or NaN if its variance is too small.
 template <class Real>
 SNOW_INLINE Real inverse_deviation(Real mean, Real mean_square) {
   const Real variance = mean_square - mean * mean, least(kSweepMinVariance);
-  return select(variance >= least, Real(1.f) / sqrt(variance), Real(__builtin_nan("")));
+  return select(variance >= least, Real(1.f) / sqrt(variance), invalid<Real>());
 }
 
 // The zero-mean normalised cross-correlation of a window of the reference view (a) and one of a

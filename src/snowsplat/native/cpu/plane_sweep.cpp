@@ -10,7 +10,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <memory>
 
 #include "cpu/entry.h"
@@ -107,7 +106,7 @@ class Tile {
       const int column = std::min(int(valid ? x : T(0)), columns - 2);
       const int row = std::min(int(valid ? y : T(0)), rows - 2);
       index[i] = row * columns + column;
-      fx[i] = valid ? x - T(column) : std::numeric_limits<T>::quiet_NaN();
+      fx[i] = valid ? x - T(column) : invalid<T>();
       fy[i] = y - T(row);
     }
     const T* source = p_.sources + s * p_.source_width * p_.source_height;

@@ -21,12 +21,13 @@ from snowsplat.ops.cuda import (
     projection,
     rasterizer,
     sorting,
+    sweep,
     tiling,
 )
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.util.native_layout import Params
 
-_PARTS = (projection, adam, sorting, tiling, rasterizer, photometric, nearest_neighbours)
+_PARTS = (projection, adam, sorting, tiling, rasterizer, photometric, nearest_neighbours, sweep)
 KERNELS: dict[str, Kernel] = {n: k for part in _PARTS for n, k in part.KERNELS.items()}
 SEQUENCES: dict[str, Callable[..., int]] = {
     name: sequence for part in _PARTS for name, sequence in part.SEQUENCES.items()
