@@ -45,6 +45,7 @@ def every_op(
                 with sums_in_order(in_order):
                     _ops_of(scene, device, dtype)
         _neighbours(scene.gaussians.means, device)
+        _plane_sweep(width, height, device)
         if count > 0:
             for in_order in (False, True):
                 say(f"training: {count} Gaussians, {width}x{height}, in order: {in_order}")
@@ -149,6 +150,21 @@ def _neighbours(means: Tensor, device: torch.device) -> None:
     for dtype in (torch.float32, torch.float64):
         for k in (1, 3, 8, 64):
             ops.neighbours(means.to(device, dtype), k)
+
+
+def _plane_sweep(width: int, height: int, device: torch.device) -> None:
+    for dtype in (torch.float32, torch.float64):
+        image = torch.rand(height, width, dtype=dtype).to(device)
+        sources = torch.rand(3, height + 1, width + 2, dtype=dtype).to(device)
+        matrix = torch.eye(3, 4, dtype=dtype).repeat(3, 1, 1)
+        matrix[:, 0, 3] = torch.tensor([3.0, -2.0, 1.0])
+        matrix = matrix.to(device)
+        for radius, centre in ((1, None), (7, torch.zeros_like(image))):
+            _finite(
+                *ops.plane_sweep(
+                    image, sources, matrix, 0.0, 1.0, planes=3, radius=radius, centre=centre
+                )
+            )
 
 
 def _finite(*tensors: Tensor | None) -> None:

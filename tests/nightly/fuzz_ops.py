@@ -23,7 +23,14 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
 #: Cases out of a thousand; the others go to `check_project`.
-SHARES = {"rasterize": 350, "harm": 150, "neighbours": 100, "photometric": 98, "long images": 2}
+SHARES = {
+    "rasterize": 350,
+    "harm": 150,
+    "neighbours": 100,
+    "plane sweep": 50,
+    "photometric": 98,
+    "long images": 2,
+}
 
 
 def main() -> int:

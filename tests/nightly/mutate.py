@@ -43,6 +43,7 @@ _OPS = (
     "fuzz",
     "neighbours",
     "photometric",
+    "plane_sweep",
     "project",
     "rasterize",
     "statistic",
@@ -62,7 +63,7 @@ PARTS = {
     ),
     "scene": Part(("scene/*.py",), ("tests/scene",)),
     "trajectory": Part(("trajectory/*.py",), ("tests/trajectory",)),
-    "reference": Part(("ops/reference.py",), tuple(f"tests/ops/test_{op}.py" for op in _OPS)),
+    "reference": Part(("ops/*reference.py",), tuple(f"tests/ops/test_{op}.py" for op in _OPS)),
     "data": Part(("data/**/*.py",), ("tests/data",)),
     "formats": Part(("formats/*.py",), ("tests/formats",)),
 }

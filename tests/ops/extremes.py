@@ -22,6 +22,7 @@ from torch import Tensor
 from snowsplat.ops import reference
 from snowsplat.ops.splats import Splats2D
 
+from .extreme_sweeps import check_plane_sweep, sweeps
 from .scenes import (
     PARAMETERS,
     Scene,
@@ -544,6 +545,7 @@ CHECKS: dict[str, tuple[tuple[st.SearchStrategy, ...], Callable[..., None]]] = {
         check_harm,
     ),
     "neighbours": ((clouds(),), check_neighbours),
+    "plane sweep": ((sweeps(),), check_plane_sweep),
     "photometric": ((photos(), st.sampled_from((0.2, 0.0, 1.0))), check_photometric),
     "long images": ((photos(LONG), st.sampled_from((0.2, 0.0, 1.0))), check_photometric),
 }

@@ -18,6 +18,7 @@ using U = uint32_t;
 #define ENTRY(NAME, ...) extern "C" int64_t NAME(const __VA_ARGS__&)
 extern "C" int64_t set_num_threads(int64_t);
 ENTRY(neighbours, NeighboursParams<F>);
+ENTRY(plane_sweep, PlaneSweepParams<F>);
 ENTRY(project_cull, ProjectCullParams<F>);
 ENTRY(project_fwd, ProjectForwardParams<F>);
 ENTRY(splat_record_bytes, SizeQueryParams);
@@ -147,12 +148,19 @@ std::vector<F> frame(const Scene& s) {
              nonfinite});
   std::vector<F> near(size_t(3 * kCount));
   neighbours({kCount, s.means.data(), 3, near.data()});
+  // The three channels of the target are the view and two sources.
+  const F from_pixel[24] = {1, 0, 0, 9, 0, 1, 0, 0, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 9, 0, 0, 1, 0};
+  std::vector<F> swept(size_t(2 * pixels));
+  const F* view = s.target.data();
+  plane_sweep({2, kWidth, kHeight, kWidth, kHeight, view, view + pixels, from_pixel, nullptr, 0,
+               0.25, 5, 3, swept.data(), swept.data() + pixels});
 
   std::vector<F> results = grad;
   for (const Tensor* t : {&centres, &scales, &quats, &logits, &dc, &rest})
     results.insert(results.end(), t->value.begin(), t->value.end());
   results.insert(results.end(), image.begin(), image.end());
   results.insert(results.end(), near.begin(), near.end());
+  results.insert(results.end(), swept.begin(), swept.end());
   return results;
 }
 

@@ -127,6 +127,22 @@ def test_neighbours(dtype: torch.dtype) -> None:
     assert_same_bits(results)
 
 
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_plane_sweep(dtype: torch.dtype) -> None:
+    """Several tiles; at some planes, parts of the sources are outside."""
+    g = generator(2)
+    image, sources = uniform(g, 0, 1, HEIGHT, 300), uniform(g, 0, 1, 3, HEIGHT, 300)
+    matrix = torch.eye(3, 4).repeat(3, 1, 1)
+    matrix[:, :2, 3] = 20 * normal(g, 3, 2)
+    tensors = [tensor.to(dtype) for tensor in (image, sources, matrix)]
+    results = []
+    for threads in THREADS:
+        ops.set_num_threads(threads)
+        depth, score = ops.plane_sweep(*tensors, 0.0, 1.0, planes=5)
+        results.append({"inverse depth": depth, "score": score})
+    assert_same_bits(results)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("visible_only", [False, True])

@@ -240,7 +240,7 @@ EXAMPLES = {"native": 25, "emulated": 3, "cuda": 25}
 @pytest.mark.parametrize("name", [name for name in CHECKS if name != "long images"])
 def test_random_extremes(native: Variant, name: str) -> None:
     """Projection with its gradient and Adam, rasterization with its gradient and the statistics,
-    non-finite Gaussians among others, distances, the loss."""
+    non-finite Gaussians among others, distances, plane sweeps, the loss."""
     strategies, holds = CHECKS[name]
 
     @settings(
