@@ -10,6 +10,7 @@ import torch
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
+from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
@@ -30,7 +31,8 @@ def dataset_of(xyz: torch.Tensor | None) -> Dataset:
 
 def initialised(dataset: Dataset, config: TrainConfig = CONFIG, seed: int = 0) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
-    return initial_gaussians(dataset, config, generator, torch.device("cpu"))
+    images = ImageLoader(dataset.train)
+    return initial_gaussians(dataset, config, images, generator, torch.device("cpu"))
 
 
 def corners_of_a_cube() -> torch.Tensor:

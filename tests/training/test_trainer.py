@@ -19,8 +19,8 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
-from snowsplat.training import checkpoint
-from snowsplat.training.config import TrainConfig
+from snowsplat.training import checkpoint, init
+from snowsplat.training.config import TrainConfig, changed
 from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.losses import view_loss
@@ -179,6 +179,20 @@ def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
     assert_identical(second.gaussians, uninterrupted)
 
 
+def test_a_resumed_run_does_not_initialise_again(dataset, monkeypatch):
+    """Depth maps take time, and the Gaussians come from the checkpoint."""
+    config = changed(BUSY, dense_init=0.5, max_gaussians=500)
+    uninterrupted = trained(dataset, config)
+    first = Trainer(dataset, config)
+    first.run(until=30)
+    state = {name: tensor.clone() for name, tensor in first.state_tensors().items()}
+    monkeypatch.setattr(init, "dense_points", None)
+    second = Trainer(dataset, config, state=state)
+    assert second.step == 30
+    second.run()
+    assert_identical(second.gaussians, uninterrupted)
+
+
 @every_density_control
 def test_a_stretched_run_completes_its_schedule_and_resumes_bitwise(dataset, config, tmp_path):
     """60 steps become 90 after step 20, and 45 after step 40."""
@@ -225,7 +239,7 @@ def test_a_checkpoint_of_inconsistent_tensors_is_rejected(dataset):
     trainer = Trainer(dataset, BUSY)
     trainer.run(until=1)
     state = trainer.state_tensors()
-    for name, changed in (
+    for name, value in (
         ("gaussians.means", state["gaussians.means"][:3]),
         ("optimizer.exp_avg.quats", state["optimizer.exp_avg.quats"][:3]),
         ("gaussians.quats", state["gaussians.quats"].to(torch.int32)),
@@ -238,7 +252,7 @@ def test_a_checkpoint_of_inconsistent_tensors_is_rejected(dataset):
     ):
         assert name in state
         with pytest.raises(UserError, match="another dataset or recipe|is damaged"):
-            Trainer(dataset, BUSY).load_state({**state, name: changed})
+            Trainer(dataset, BUSY).load_state({**state, name: value})
     Trainer(dataset, BUSY).load_state(state)
 
 

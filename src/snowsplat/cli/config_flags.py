@@ -43,6 +43,9 @@ class ConfigFlags:
     """Weight of 1 - SSIM in the loss. The mean absolute difference has the weight 1 - F."""
     initial_points: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Number of Gaussians at random positions to start from, if the dataset has no points."""
+    dense_init: Annotated[float | None, flag("F", default=RECIPE)] = None
+    """Compute depth maps from the photos, and start with points on the surfaces in addition to the
+    points of the dataset: F times the maximum number of Gaussians; 0: none."""
     grad_threshold: Annotated[
         float | None, flag("F", "--densify-grad-threshold", default=RECIPE)
     ] = None

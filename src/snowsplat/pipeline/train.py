@@ -215,6 +215,8 @@ class _Job:
                 settings = replace(settings, resolution=plan.resolution)
                 dataset = files.dataset(plan.resolution)
         memory = self._memory(dataset, config)
+        if config.dense_init > 0.0:
+            self.observer.note("computing depth maps for the initialisation")
         trainer = Trainer(dataset, memory.plan.config, device=self.device)
         self.out.begin(dataset, settings, memory.plan.config)
         self.observer.note(_described(dataset))
@@ -239,8 +241,7 @@ class _Job:
         config = _resumed_config(options, start, meta)
         dataset = settings.load()
         memory = self._memory(dataset, config, _gaussians_in(start))
-        trainer = Trainer(dataset, memory.plan.config, schedule, self.device)
-        trainer.load_state(start.tensors)
+        trainer = Trainer(dataset, memory.plan.config, schedule, self.device, start.tensors)
         start.tensors.clear()  # the trainer has a copy, which is the one in the memory plan
         self.out.write_config(settings, memory.plan.config)
         self.observer.note(_described(dataset))

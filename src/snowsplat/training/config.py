@@ -34,6 +34,9 @@ class TrainConfig:
             use ``sh_degree`` from the first step.
         ssim_weight: λ of (1 − λ) · L1 + λ · D-SSIM.
         initial_points: number of random points for a dataset without points.
+        dense_init: number of points that are added to those of the dataset for the initialisation,
+            as a share of the limit of Gaussians. They are computed from the photos; see
+            `dense_init.dense_points`. 0: none.
         initial_opacity: the opacity of every Gaussian at initialisation.
         initial_scale: the scale of every Gaussian at initialisation, in units of the mean distance
             to its three nearest neighbours.
@@ -67,6 +70,7 @@ class TrainConfig:
     sh_interval: int = 1000
     ssim_weight: float = 0.2
     initial_points: int = 100_000
+    dense_init: float = 0.0
     initial_opacity: float = 0.1
     initial_scale: float = 1.0
     learning_rates: LearningRates = field(default_factory=LearningRates)
@@ -117,6 +121,8 @@ class TrainConfig:
         ):
             if not 0.0 <= rate < math.inf:
                 raise SettingError(name, f"{rate:g} is not valid; use e.g. 0.04, or 0 for none")
+        if not 0.0 <= self.dense_init <= 1.0:
+            raise SettingError("dense_init", f"{self.dense_init:g} is not a share; use e.g. 0.4")
         if self.leave_out_after < 0:
             raise SettingError(
                 "leave_out_after", f"{self.leave_out_after} is negative; use 0 for never"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -84,15 +84,18 @@ class Trainer:
         config: TrainConfig,
         schedule: Schedule | None = None,
         device: torch.device | None = None,
+        state: dict[str, Tensor] | None = None,
     ) -> None:
         """
         Args:
             schedule: the schedule of a resumed training run; default: ``config.iterations`` steps.
             device: the device for training; default: the CPU.
+            state: the state of a resumed training run; see `load_state`.
 
         Raises:
             UserError: the dataset has no training views, or some points are so far apart that
-                float32 cannot represent their Gaussians.
+                float32 cannot represent their Gaussians; or the state is not valid, see
+                `load_state`.
         """
         if not dataset.train:
             raise UserError("the dataset has no training views; check its folder and its split")
@@ -119,9 +122,11 @@ class Trainer:
             budget_bytes=config.image_memory or None,
             device=self.device,
         )
+        # The Gaussians of a resumed training run are replaced by those of the state.
+        start = config if state is None else replace(config, dense_init=0.0)
         with single_threaded():
             self.gaussians = initial_gaussians(
-                dataset, config, self._generators["start"], self.device
+                dataset, start, self._images, self._generators["start"], self.device
             )
         self._optimizer = Adam(
             self.gaussians,
@@ -134,12 +139,14 @@ class Trainer:
             len(self.gaussians),
             schedule=self.schedule,
             extent=dataset.extent,
-            random_init=dataset.points is None,
+            random_init=dataset.points is None and config.dense_init == 0.0,
             generator=self._generators["density"],
             device=self.device,
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
         self._runner = StepRunner(len(self.gaussians), self.device)
+        if state is not None:
+            self.load_state(state)
 
     def run(
         self, on_progress: Callable[[Progress], None] | None = None, until: int | None = None

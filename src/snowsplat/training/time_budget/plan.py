@@ -15,6 +15,7 @@ import torch
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.training.config import TrainConfig, changed
+from snowsplat.training.init import initial_count
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.time_budget.step_cost import Work
 from snowsplat.training.trainer import Trainer
@@ -114,8 +115,7 @@ def make_plan(
         height = round(camera.height * width / camera.width)
         sized = _capped(config, width * height, gaussian_factor)
         work = Work(sized, width * height, len(dataset.test))
-        initial = config.initial_points if dataset.points is None else len(dataset.points)
-        initial = min(initial, sized.density.max_gaussians or initial)
+        initial = initial_count(dataset, sized)
         steps, mean = _steps(work, seconds - _SETUP_SECONDS, time_ratio, initial)
         if more_often:
             sized = _densified_in(sized, steps)
@@ -167,6 +167,7 @@ def measure_time_ratio(
         replace(
             config,
             initial_points=min(config.initial_points, _SAMPLE_POINTS),
+            dense_init=0.0,
             iterations=_SAMPLE_STEPS,
             coarse_to_fine=(0, 0) if downscale == 1 else (0, 1.0),
             sh_interval=0,

@@ -1,0 +1,66 @@
+"""`dense_points`: a dense point cloud of a dataset, for the initialisation."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from snowsplat.data.dataset import Dataset, Points
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.training.dense_init.depth_maps import depth_maps, photo_for_map
+from snowsplat.training.dense_init.fusion import consistent, thinned, world_points
+from snowsplat.training.dense_init.source_views import source_views
+
+#: Number of source views of each depth map.
+_SOURCES = 4
+#: Number of points with which the source views are chosen.
+_SAMPLE = 1000
+#: This number of pixels per resulting point is used.
+_PIXELS_PER_POINT = 16
+#: The maximum number of depth maps. Of more views, one in two, in three … is used: the photos of a
+#: large dataset overlap more, and this limits time and memory.
+_MAX_MAPS = 100
+
+
+def dense_points(
+    dataset: Dataset, images: ImageLoader, count: int, generator: torch.Generator
+) -> Points:
+    """At most ``count`` points on the surfaces that several photos show, in the world frame, on the
+    CPU.
+
+    The depth maps of the training views are computed by plane sweep. The map of each view is
+    checked with those of its source views; see `depth_maps` and `fusion`.
+
+    Args:
+        generator: a random generator on the CPU.
+    """
+    views = dataset.train[:: math.ceil(len(dataset.train) / _MAX_MAPS)]
+    samples = _samples(dataset, generator)
+    chosen = torch.randperm(len(samples), generator=generator)[:_SAMPLE]
+    cameras = [view.camera for view in views]
+    sources = source_views(cameras, samples[chosen], _SOURCES)
+    maps = depth_maps(views, sources, images, samples)
+    confirmed = consistent(maps, sources)
+    share = _PIXELS_PER_POINT * count / max(1, sum(int(pixels.sum()) for pixels in confirmed))
+    points, widths = [torch.zeros(0, 3)], [torch.zeros(0)]
+    colors = [torch.zeros(0, 3, dtype=torch.uint8)]
+    for view, depth_map, pixels in zip(views, maps, confirmed, strict=True):
+        if depth_map is None:
+            continue
+        pixels &= torch.rand(pixels.shape, generator=generator) < share
+        points.append(world_points(depth_map, pixels))
+        colors.append(photo_for_map(view, images).rgb[pixels])
+        widths.append(1.0 / (depth_map.inverse_depth[pixels] * depth_map.camera.fx))
+    return thinned(
+        torch.cat(points), torch.cat(colors), torch.cat([torch.zeros(0), *widths]), count
+    )
+
+
+def _samples(dataset: Dataset, generator: torch.Generator) -> Tensor:
+    """The points of the dataset; without points, random ones within its bounds."""
+    if dataset.points is not None:
+        return dataset.points.xyz.cpu()
+    low, high = dataset.bounds
+    return low + (high - low) * torch.rand(4 * _SAMPLE, 3, generator=generator)

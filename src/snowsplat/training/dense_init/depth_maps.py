@@ -1,0 +1,197 @@
+"""Depth maps of the training views, by plane sweep, from coarse to fine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from snowsplat import ops
+from snowsplat.data.dataset import View
+from snowsplat.data.decode import LoadedImage
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import compose_rigid
+
+#: Photos are reduced by 1, 2 or 4, so that their longer side has at most this number of pixels.
+_LONGER_SIDE = 640
+#: Windows have (2 r + 1)² pixels.
+_RADIUS = 3
+#: The coarse sweep has one plane per pixel of displacement in the source view with the longest
+#: baseline, within these limits.
+_PLANES = (32, 128)
+#: The fine sweep has this number of planes around the depth of the coarse sweep, ± this number of
+#: coarse planes.
+_FINE_PLANES, _FINE_RANGE = 8, 1.0
+#: A depth is kept if its mean correlation is at least this.
+_LEAST_SCORE = 0.5
+#: The range of inverse depths is that of the visible points without this share on each side,
+#: extended by this factor.
+_OUTLIERS, _MARGIN = 0.01, 1.2
+#: With fewer visible points, a view has no depth map.
+_FEWEST_POINTS = 8
+
+_LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """The depths of one view; ``camera`` has the size of the map."""
+
+    camera: Camera
+    inverse_depth: Tensor  # (H, W) float32, 1 / world units; 0: unknown
+
+
+def depth_maps(
+    views: Sequence[View], sources: Sequence[Sequence[int]], images: ImageLoader, points: Tensor
+) -> list[DepthMap | None]:
+    """The depth map of each view; None for views without source views or visible points.
+
+    The depth of a pixel is that with the highest mean correlation to the two best source views. A
+    sweep at half the size searches the whole range; a second one refines its result.
+
+    Args:
+        sources: the source views of each view; see `source_views`.
+        points: (P, 3) in the world frame. Those that a view shows determine its range of depths.
+    """
+    return [
+        _depth_map(views[i], [views[j] for j in chosen], images, points)
+        for i, chosen in enumerate(sources)
+    ]
+
+
+def photo_for_map(view: View, images: ImageLoader) -> LoadedImage:
+    """The photo of a view at the size of its depth map, on the CPU."""
+    longer = max(view.camera.width, view.camera.height)
+    factor = next((f for f in (1, 2) if longer <= f * _LONGER_SIDE), 4)
+    return images.get(view, factor).to(torch.device("cpu"))
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A photo at the size of the depth map."""
+
+    camera: Camera
+    luminance: Tensor  # (H, W) float32
+    usable: Tensor | None  # (H, W) bool: False for masked and transparent pixels
+
+    @staticmethod
+    def of(view: View, images: ImageLoader) -> _Picture:
+        photo = photo_for_map(view, images)
+        usable = photo.mask
+        if photo.alpha is not None:
+            opaque = photo.alpha >= 128
+            usable = opaque if usable is None else usable & opaque
+        luminance = photo.rgb.to(torch.float32) @ _LUMINANCE / 255.0
+        height, width = luminance.shape
+        return _Picture(view.camera.scaled(width, height), luminance, usable)
+
+
+def _depth_map(
+    view: View, source_views: list[View], images: ImageLoader, points: Tensor
+) -> DepthMap | None:
+    span = _inverse_depths(view.camera, points)
+    if span is None or not source_views:
+        return None
+    picture = _Picture.of(view, images)
+    sources = [_Picture.of(source, images) for source in source_views]
+    low, high = span
+    coarse, fine = _Level(picture, sources, 2), _Level(picture, sources, 1)
+    shift = round(coarse.displacement(low, high))
+    planes = min(max(shift, _PLANES[0]), _PLANES[1])
+    rough, _ = coarse.sweep(low, high, planes)
+    rough = interpolate(rough[None, None], fine.image.shape, mode="nearest")[0, 0]
+    around = _FINE_RANGE * (high - low) / (planes - 1)
+    inverse, score = fine.sweep(-around, around, _FINE_PLANES, rough)
+    known = (score >= _LEAST_SCORE) & (inverse > 0.0) & (rough > 0.0)
+    if picture.usable is not None:
+        known &= picture.usable
+    return DepthMap(picture.camera, torch.where(known, inverse, 0.0))
+
+
+def _inverse_depths(camera: Camera, points: Tensor) -> tuple[float, float] | None:
+    """The range of inverse depths of the visible points; None if there are too few."""
+    pixel, depth = camera.project(points.to(torch.float64))
+    inside = (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
+    inverse = 1.0 / depth[inside & (depth > 0)]
+    if len(inverse) < _FEWEST_POINTS:
+        return None
+    low, high = inverse.quantile(torch.tensor([_OUTLIERS, 1.0 - _OUTLIERS], dtype=inverse.dtype))
+    return float(low) / _MARGIN, float(high) * _MARGIN
+
+
+class _Level:
+    """A view and its source views, reduced by a factor, as `ops.plane_sweep` needs them."""
+
+    def __init__(self, picture: _Picture, sources: list[_Picture], factor: int) -> None:
+        camera, self.image = _reduced(picture, factor)
+        reduced = [_reduced(source, factor) for source in sources]
+        self.sources = _stacked([image for _, image in reduced])
+        self.source_from_pixel = torch.stack(
+            [_source_from_pixel(camera, source) for source, _ in reduced]
+        )
+
+    def displacement(self, low: float, high: float) -> float:
+        """By how many pixels the image of the central pixel moves between two inverse depths, in
+        the source view in which it moves most.
+        """
+        h, w = self.image.shape
+        middle = torch.tensor([0.5 * w, 0.5 * h, 1.0])
+        lengths = []
+        for matrix in self.source_from_pixel:
+            ends = [matrix[:, :3] @ middle + inverse * matrix[:, 3] for inverse in (low, high)]
+            if all(float(end[2]) > 0.0 for end in ends):
+                a, b = (end[:2] / end[2] for end in ends)
+                lengths.append(float((a - b).norm()))
+        return max(lengths, default=0.0)
+
+    def sweep(
+        self, low: float, high: float, planes: int, centre: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        return ops.plane_sweep(
+            self.image,
+            self.sources,
+            self.source_from_pixel,
+            low,
+            high,
+            planes=planes,
+            radius=_RADIUS,
+            centre=centre,
+        )
+
+
+def _stacked(images: list[Tensor]) -> Tensor:
+    """(S, H, W): smaller images are extended with NaN, which `ops.plane_sweep` does not use."""
+    height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
+    stack = torch.full((len(images), height, width), torch.nan)
+    for row, image in zip(stack, images, strict=True):
+        row[: image.shape[0], : image.shape[1]] = image
+    return stack
+
+
+def _reduced(picture: _Picture, factor: int) -> tuple[Camera, Tensor]:
+    camera = picture.camera.downscaled(factor)
+    size = (camera.height, camera.width)
+    image = picture.luminance
+    if factor > 1:
+        image = interpolate(image[None, None], size, mode="area")[0, 0]
+    return camera, image.contiguous()
+
+
+def _source_from_pixel(camera: Camera, source: Camera) -> Tensor:
+    """(3, 4) [A | b]: pixel (u, v) at inverse depth w is at A (u, v, 1)ᵀ + w b in the source."""
+    source_from_cam = compose_rigid(source.cam_from_world, camera.world_from_cam)
+    matrix = _intrinsics(source) @ source_from_cam.to(torch.float64)
+    matrix[:, :3] = matrix[:, :3] @ torch.linalg.inv(_intrinsics(camera))
+    return matrix.to(torch.float32)
+
+
+def _intrinsics(camera: Camera) -> Tensor:
+    """(3, 3) float64."""
+    return torch.tensor(
+        [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]],
+        dtype=torch.float64,
+    )

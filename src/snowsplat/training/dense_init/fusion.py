@@ -1,0 +1,101 @@
+"""The check of depth maps by one another, and the reduction of their points to a given number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from snowsplat.data.dataset import Points
+from snowsplat.scene.geometry import transform_points
+from snowsplat.training.dense_init.depth_maps import DepthMap
+
+#: Two inverse depths of one point agree if they differ by at most this share.
+_TOLERANCE = 0.02
+#: Number of steps in the search for the voxel size.
+_BISECTIONS = 12
+
+
+def consistent(maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]) -> list[Tensor]:
+    """For each map, (H, W) bool: the pixels whose depth the map of a source view confirms.
+
+    A depth is confirmed if its point, projected into the source view, has the depth of the map
+    there (geometric consistency, Schönberger et al. 2016).
+    """
+    confirmed = []
+    for depth_map, chosen in zip(maps, sources, strict=True):
+        if depth_map is None:
+            confirmed.append(torch.zeros(0, 0, dtype=torch.bool))
+            continue
+        known = depth_map.inverse_depth > 0.0
+        points = world_points(depth_map, known)
+        agrees = torch.zeros(len(points), dtype=torch.bool)
+        for j in chosen:
+            other = maps[j]
+            if other is not None:
+                agrees |= _agrees(points, other)
+        confirmed.append(known.clone().masked_scatter_(known, agrees))
+    return confirmed
+
+
+def _agrees(points: Tensor, depth_map: DepthMap) -> Tensor:
+    """(P,) bool: whether the depth of each point is that of the map at its pixel."""
+    camera = depth_map.camera
+    pixel, depth = camera.project(points)
+    x, y = pixel.nan_to_num(-1.0).clamp(-1.0, 1e6).floor().to(torch.int64).unbind(1)
+    inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    found = depth_map.inverse_depth[y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)]
+    return inside & (found > 0) & ((found * depth - 1.0).abs() <= _TOLERANCE)
+
+
+def world_points(depth_map: DepthMap, chosen: Tensor) -> Tensor:
+    """(P, 3) float32: the points of the chosen pixels, (H, W) bool, in the world frame."""
+    camera = depth_map.camera
+    y, x = chosen.nonzero(as_tuple=True)
+    depth = 1.0 / depth_map.inverse_depth[y, x]
+    right, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
+    cam = torch.stack([right * depth, down * depth, depth], dim=1)
+    return transform_points(camera.world_from_cam.to(torch.float32), cam)
+
+
+def thinned(points: Tensor, colors: Tensor, widths: Tensor, count: int) -> Points:
+    """At most ``count`` points that represent many points.
+
+    Space is divided into voxels, whose side is a power of two near a multiple of the width of a
+    pixel at the depth of the point. Each voxel that contains points becomes one point, with their
+    mean position and colour. The multiple is chosen so that there are at most ``count`` voxels.
+
+    Args:
+        points: (P, 3) float32, in the world frame.
+        colors: (P, 3) uint8.
+        widths: (P,) float32, widths of a pixel at the depths of the points, in world units.
+    """
+    low, high = -2.0, 12.0  # binary logarithms of the multiple
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _voxels(points, widths, middle)[1] > count else (low, middle)
+    voxel, n = _voxels(points, widths, high)
+    return Points(_means(points, voxel, n), _means(colors, voxel, n).round().to(torch.uint8))
+
+
+def _voxels(points: Tensor, widths: Tensor, multiple: float) -> tuple[Tensor, int]:
+    """The voxel of each point, (P,) int64 in 0..n−1, and their number n.
+
+    Args:
+        multiple: binary logarithm of the side of a voxel in units of ``widths``.
+    """
+    level = (widths.log2() + multiple).floor()
+    cell = (points / torch.exp2(level)[:, None]).floor().to(torch.int64)
+    key = level.to(torch.int64)
+    for axis in range(3):  # a hash; voxels that share one are merged, which is rare
+        key = key * 6364136223846793005 + cell[:, axis]
+    unique, voxel = key.unique(return_inverse=True)
+    return voxel, len(unique)
+
+
+def _means(values: Tensor, group: Tensor, n: int) -> Tensor:
+    """(n, C) float32: the means of the rows of each group, summed in the order of the rows."""
+    totals = torch.zeros(n, values.shape[1], dtype=torch.float64)
+    totals.index_add_(0, group, values.to(torch.float64))
+    return (totals / torch.bincount(group, minlength=n)[:, None]).to(torch.float32)
