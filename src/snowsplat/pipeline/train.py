@@ -215,13 +215,13 @@ class _Job:
                 settings = replace(settings, resolution=plan.resolution)
                 dataset = files.dataset(plan.resolution)
         memory = self._memory(dataset, config)
+        self.observer.note(_described(dataset))
+        if budget is not None and plan is not None:
+            self.observer.note(budget.described(plan))
         if config.dense_init > 0.0:
             self.observer.note("computing depth maps for the initialisation")
         trainer = Trainer(dataset, memory.plan.config, device=self.device)
         self.out.begin(dataset, settings, memory.plan.config)
-        self.observer.note(_described(dataset))
-        if budget is not None and plan is not None:
-            self.observer.note(budget.described(plan))
         time_ratio = 1.0 if plan is None else plan.time_ratio
         return self._run(settings, name, trainer, budget, time_ratio, memory)
 

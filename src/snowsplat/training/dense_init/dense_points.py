@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from snowsplat.data.dataset import Dataset, Points
+from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.image_loader import ImageLoader
-from snowsplat.training.dense_init.depth_maps import depth_maps, photo_for_map
+from snowsplat.training.dense_init.depth_maps import depth_maps, map_size, photo_for_map
 from snowsplat.training.dense_init.fusion import consistent, thinned, world_points
 from snowsplat.training.dense_init.source_views import source_views
 
@@ -19,9 +19,11 @@ _SOURCES = 4
 _SAMPLE = 1000
 #: This number of pixels per resulting point is used.
 _PIXELS_PER_POINT = 16
-#: The maximum number of depth maps. Of more views, one in two, in three … is used: the photos of a
-#: large dataset overlap more, and this limits time and memory.
-_MAX_MAPS = 100
+#: The maximum number of pixels of all depth maps. If there are more, one view in two, in three … is
+#: used: the photos of a large dataset overlap more, and this limits time and memory.
+_MAX_PIXELS = 16_000_000
+#: Depth maps may have one pixel per this number of bytes of the memory for photos.
+_BYTES_PER_PIXEL = 10
 
 
 def dense_points(
@@ -36,7 +38,7 @@ def dense_points(
     Args:
         generator: a random generator on the CPU.
     """
-    views = dataset.train[:: math.ceil(len(dataset.train) / _MAX_MAPS)]
+    views = _used_views(dataset, images)
     samples = _samples(dataset, generator)
     chosen = torch.randperm(len(samples), generator=generator)[:_SAMPLE]
     cameras = [view.camera for view in views]
@@ -56,6 +58,12 @@ def dense_points(
     return thinned(
         torch.cat(points), torch.cat(colors), torch.cat([torch.zeros(0), *widths]), count
     )
+
+
+def _used_views(dataset: Dataset, images: ImageLoader) -> list[View]:
+    pixels = sum(math.prod(map_size(view)) for view in dataset.train)
+    limit = min(_MAX_PIXELS, images.budget_bytes // _BYTES_PER_PIXEL)
+    return dataset.train[:: math.ceil(pixels / max(limit, 1))]
 
 
 def _samples(dataset: Dataset, generator: torch.Generator) -> Tensor:

@@ -16,7 +16,7 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
 
-#: Photos are reduced by 1, 2 or 4, so that their longer side has at most this number of pixels.
+#: Photos are reduced so that their longer side has at most this number of pixels.
 _LONGER_SIDE = 640
 #: Windows have (2 r + 1)² pixels.
 _RADIUS = 3
@@ -63,11 +63,26 @@ def depth_maps(
     ]
 
 
+def map_size(view: View) -> tuple[int, int]:
+    """Height and width of the depth map of a view, in pixels."""
+    camera = view.camera
+    scale = min(1.0, _LONGER_SIDE / max(camera.width, camera.height))
+    return max(1, round(scale * camera.height)), max(1, round(scale * camera.width))
+
+
 def photo_for_map(view: View, images: ImageLoader) -> LoadedImage:
     """The photo of a view at the size of its depth map, on the CPU."""
     longer = max(view.camera.width, view.camera.height)
-    factor = next((f for f in (1, 2) if longer <= f * _LONGER_SIDE), 4)
-    return images.get(view, factor).to(torch.device("cpu"))
+    factor = next((f for f in (4, 2) if longer >= f * _LONGER_SIDE), 1)
+    photo = images.get(view, factor).to(torch.device("cpu"))
+    size = map_size(view)
+    if photo.planes.shape[1:] == size:
+        return photo
+    planes = interpolate(photo.planes[None].to(torch.float32), size, mode="area")[0]
+    mask = photo.mask
+    if mask is not None:
+        mask = interpolate(mask[None, None].to(torch.float32), size, mode="area")[0, 0] > 0.5
+    return LoadedImage(planes.round().to(torch.uint8), mask)
 
 
 @dataclass(frozen=True)
