@@ -139,7 +139,7 @@ class Trainer:
             device=self.device,
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
-        self._runner = StepRunner(len(self.gaussians), self.device)
+        self._runner = StepRunner(len(self.gaussians), self.device, config.density.abs_grad)
 
     def run(
         self, on_progress: Callable[[Progress], None] | None = None, until: int | None = None
