@@ -18,6 +18,7 @@ namespace {
 
 constexpr int64_t kBlock = 2048;
 constexpr int64_t kSerialBelow = 8000;  // splats; below this, one part is faster than several
+constexpr uint32_t kPrefetched = 16;    // largest number of slots of a splat that are prefetched
 
 int64_t part_count(int64_t m) { return m < kSerialBelow ? 1 : pool_size(); }
 
@@ -316,8 +317,11 @@ void sum_slots(const SplatsReduceParams<T>& p) {
     const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
     for (int64_t i = begin; i < end; i++) {
       if (i + 8 < end) {
-        const T* next = slots + int64_t(slot_range[2 * (i + 8)]) * kSlotWidth;
-        for (int k = 0; k < 4; k++) prefetch(next + k * kSlotWidth);
+        const uint32_t first = slot_range[2 * (i + 8)], past = slot_range[2 * (i + 8) + 1];
+        const uint32_t last = past - first < kPrefetched ? past : first + kPrefetched;
+        // Most splats have few slots: the first four are prefetched without a branch.
+        for (uint32_t s = first; s < first + 4; s++) prefetch(slots + int64_t(s) * kSlotWidth);
+        for (uint32_t s = first + 4; s < last; s++) prefetch(slots + int64_t(s) * kSlotWidth);
       }
       V sum[kVectors];
       for (int k = 0; k < kVectors; k++) sum[k] = V(0.f);
