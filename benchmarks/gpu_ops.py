@@ -112,11 +112,13 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
     with torch.no_grad():
         splats = ops.project(**params, cam_from_world=pose.detach(), **view, sh_degree=1)
         splats.packed.requires_grad_()
+        splats.abs_grad = torch.zeros(len(splats), 2, device=device, dtype=dtype)
         with torch.enable_grad():
             image, _, _ = ops.rasterize(splats, *size, background.detach())
             ops.photometric_loss(image, (255 * photo).to(torch.uint8)).backward()
         many = [torch.zeros(len(scene.gaussians), device=device, dtype=dtype) for _ in range(3)]
-        ops.accumulate_screen_statistics(splats, *size, *many)
+        for absolute in (False, True):
+            ops.accumulate_screen_statistics(splats, *size, *many, absolute=absolute)
         moments: Any = [{name: torch.zeros_like(p) for name, p in params.items()} for _ in range(2)]
         gradient = splats.packed.grad
         assert gradient is not None
@@ -143,7 +145,7 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
             for p in params.values():
                 p.grad = None
         counts = ops.count_blended(splats, *size)
-    _finite(counts, *many, *params.values())
+    _finite(counts, splats.abs_grad, *many, *params.values())
 
 
 def _neighbours(means: Tensor, device: torch.device) -> None:

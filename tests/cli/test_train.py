@@ -122,6 +122,12 @@ def test_every_setting_is_a_flag_and_a_setting_of_some_recipe():
     assert list(RECIPES) == list(get_args(Recipe))
 
 
+@pytest.mark.parametrize(("value", "expected"), [("on", True), ("off", False)])
+def test_the_flag_of_the_absolute_gradient(value, expected):
+    assert ConfigFlags(abs_grad=value).config_settings() == {"abs_grad": expected}
+    assert ConfigFlags().config_settings() == {}
+
+
 def test_a_setting_of_another_recipe(refused, dataset, tmp_path):
     line = refused(
         "train", dataset, "-o", tmp_path / "out", "--recipe", "mcmc", "--percent-dense", 0.1

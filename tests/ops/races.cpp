@@ -87,7 +87,7 @@ std::vector<F> frame(const Scene& s) {
                                         3};
   std::vector<int32_t> ids(kCount);
   const int64_t m = project_cull({kCount, gaussians, camera, ids.data()});
-  std::vector<F> packed(size_t(m * kStride)), grad(packed.size());
+  std::vector<F> packed(size_t(m * kStride)), grad(packed.size()), abs_grad(size_t(2 * m));
   project_fwd({m, ids.data(), gaussians, camera, packed.data()});
 
   const int64_t columns[4] = {8, 9, 10, -1};
@@ -120,8 +120,9 @@ std::vector<F> frame(const Scene& s) {
       {3, kWidth, kHeight, image.data(), s.target.data(), 0.8, -0.2, d_image.data(), means});
   Aligned<F> slots(16 * n);
   rasterize_bwd({tiles, sorted, 3, slot.data(), image.data(), d_image.data(), alpha.data(), nullptr,
-                 slots.data, nullptr});
-  splats_reduce({m, slots.data, range.data(), packed.data(), kStride, 3, columns, 0, grad.data()});
+                 slots.data, nullptr, nullptr});
+  splats_reduce({m, slots.data, range.data(), packed.data(), kStride, 3, columns, 0, grad.data(),
+                 abs_grad.data()});
 
   Tensor centres(s.means), scales(s.log_scales), quats(s.quats), logits(s.logits), dc(s.dc);
   Tensor rest(s.rest);
@@ -158,6 +159,7 @@ std::vector<F> frame(const Scene& s) {
   std::vector<F> results = grad;
   for (const Tensor* t : {&centres, &scales, &quats, &logits, &dc, &rest})
     results.insert(results.end(), t->value.begin(), t->value.end());
+  results.insert(results.end(), abs_grad.begin(), abs_grad.end());
   results.insert(results.end(), image.begin(), image.end());
   results.insert(results.end(), near.begin(), near.end());
   results.insert(results.end(), swept.begin(), swept.end());

@@ -230,9 +230,15 @@ def random_splats(
     )
 
 
-def leaf_splats(splats: Splats2D, dtype: torch.dtype, requires_grad: bool = True) -> Splats2D:
+def leaf_splats(
+    splats: Splats2D,
+    dtype: torch.dtype,
+    requires_grad: bool = True,
+    with_abs_grad: bool = False,
+) -> Splats2D:
     packed = splats.packed.detach().to(dtype, copy=True).requires_grad_(requires_grad)
-    return Splats2D(packed, splats.ids, splats.channels)
+    abs_grad = torch.zeros(len(splats), 2, dtype=dtype) if with_abs_grad else None
+    return Splats2D(packed, splats.ids, splats.channels, abs_grad)
 
 
 def differentiable_columns(splats: Splats2D) -> Tensor:

@@ -71,17 +71,20 @@ def test_project(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize(("channels", "count"), [(3, 3000), (5, 3000), (3, 12_000)])
 def test_rasterize(dtype: torch.dtype, channels: int, count: int) -> None:
     made = random_splats(2, count, WIDTH, HEIGHT, channels, pixels=1.0)
+    with_abs_grad = channels == 3
     cotangents = [normal(generator(4), HEIGHT, WIDTH, n).to(dtype) for n in (channels, 1, 1)]
     results = []
     for threads in THREADS:
         ops.set_num_threads(threads)
-        splats = leaf_splats(made, dtype)
+        splats = leaf_splats(made, dtype, with_abs_grad=with_abs_grad)
         background = uniform(generator(3), 0, 1, channels).to(dtype).requires_grad_()
         image, alpha, depth = ops.rasterize(splats, WIDTH, HEIGHT, background, with_depth=True)
         outputs = {"image": image, "alpha": alpha, "depth": depth}
         pairs = zip(outputs.values(), cotangents, strict=True)
         torch.autograd.backward(list(outputs.values()), [c.view_as(o) for o, c in pairs])
         grads = {"packed": splats.packed.grad, "background": background.grad}
+        if splats.abs_grad is not None:
+            grads["abs_grad"] = splats.abs_grad
         results.append({**outputs, **grads})
     assert_same_bits(results)
 
@@ -93,11 +96,13 @@ def test_rasterize_with_sums_in_order(native: Variant, channels: int) -> None:
     made = random_splats(2, 400, 60, 45, channels)
     results = []
     for _ in range(3):
-        splats = leaf_splats(made, native.dtype)
+        splats = leaf_splats(made, native.dtype, with_abs_grad=channels == 3)
         background = uniform(generator(3), 0, 1, channels).to(native.dtype).requires_grad_()
         image, alpha, _ = native.ops.rasterize(splats, 60, 45, background)
         (image.square().sum() + alpha.sum()).backward()
         grads = {"packed": splats.packed.grad, "background": background.grad}
+        if splats.abs_grad is not None:
+            grads["abs_grad"] = splats.abs_grad
         results.append({"image": image, "alpha": alpha, **grads})
     for result in results[1:]:
         for name, expected in results[0].items():

@@ -192,7 +192,14 @@ def test_another_constant_is_detected(recording, monkeypatch):
 def reduce_params(slots: torch.Tensor, grad_packed: torch.Tensor) -> SplatsReduceParams:
     same = dict.fromkeys(("slot_range", "packed", "columns"), slots)
     return SplatsReduceParams(
-        n=1, slots=slots, **same, stride=1, channels=1, add=False, grad_packed=grad_packed
+        n=1,
+        slots=slots,
+        **same,
+        stride=1,
+        channels=1,
+        add=False,
+        grad_packed=grad_packed,
+        abs_grad=None,
     )
 
 

@@ -524,6 +524,97 @@ def test_backward_of_alpha_or_depth_alone(native: Variant) -> None:
         assert_close(grads[1], grads[0], native.backward)
 
 
+# Absolute gradients of the means
+
+
+def backward_of(
+    variant: Variant,
+    splats: Splats2D,
+    size: tuple[int, int],
+    cotangents: Tensor,
+    with_depth: bool = False,
+    with_abs_grad: bool = True,
+) -> Splats2D:
+    """Leaf splats with the gradient of Σ cotangents (C or C + 1, H, W) · (image, depth)."""
+    leaf = leaf_splats(splats, variant.dtype, with_abs_grad=with_abs_grad)
+    image, _, depth = variant.ops.rasterize(leaf, *size, with_depth=with_depth)
+    planes = image.permute(2, 0, 1)
+    if depth is not None:
+        planes = torch.cat([planes, depth[None]])
+    (planes * cotangents.to(planes)).sum().backward()
+    return leaf
+
+
+@functools.cache
+def absolute_by_definition(channels: int, with_depth: bool) -> tuple[Splats2D, Tensor, Tensor]:
+    """Splats, cotangents and Σ |∂L/∂mean2d| (M, 2), with one backward pass per tile."""
+    splats = random_splats(channels, 60, 37, 35, channels, pixels=5.0)
+    cotangents = normal(generator(9), channels + with_depth, 35, 37)
+    absolute = torch.zeros(len(splats), 2, dtype=torch.float64)
+    for top in range(0, 35, 16):
+        for left in range(0, 37, 16):
+            of_tile = torch.zeros_like(cotangents)
+            tile = (slice(None), slice(top, top + 16), slice(left, left + 16))
+            of_tile[tile] = cotangents[tile]
+            leaf = backward_of(REFERENCE, splats, (37, 35), of_tile, with_depth, False)
+            assert leaf.packed.grad is not None
+            absolute += leaf.packed.grad[:, :2].abs()
+    return splats, cotangents, absolute
+
+
+def check_abs_grad(variant: Variant, channels: int, with_depth: bool) -> None:
+    splats, cotangents, absolute = absolute_by_definition(channels, with_depth)
+    leaf = backward_of(variant, splats, (37, 35), cotangents, with_depth)
+    assert leaf.abs_grad is not None
+    assert leaf.packed.grad is not None
+    assert_close(leaf.abs_grad, absolute, variant.backward)
+    # Some splats are pulled in opposite directions; others touch one tile only.
+    ratio = leaf.packed.grad[:, :2].abs() / leaf.abs_grad
+    assert (ratio < 0.5).any()
+    assert (ratio > 0.999).any()
+    assert (leaf.packed.grad[:, 8 + channels :] == 0).all()
+
+
+@pytest.mark.parametrize(("channels", "with_depth"), [(1, False), (3, False), (3, True)])
+def test_abs_grad(variant: Variant, channels: int, with_depth: bool) -> None:
+    check_abs_grad(variant, channels, with_depth)
+
+
+@pytest.mark.usefixtures("sums_in_order")
+@pytest.mark.parametrize(("channels", "with_depth"), [(1, False), (3, False), (3, True)])
+def test_abs_grad_with_sums_in_order(native: Variant, channels: int, with_depth: bool) -> None:
+    check_abs_grad(native, channels, with_depth)
+
+
+@pytest.mark.usefixtures("sums_in_order")
+def test_abs_grad_does_not_change_the_gradient(native: Variant) -> None:
+    splats, cotangents, _ = absolute_by_definition(3, False)
+    with_it, without = (
+        backward_of(native, splats, (37, 35), cotangents, with_abs_grad=on).packed.grad
+        for on in (True, False)
+    )
+    assert with_it is not None
+    assert without is not None
+    assert torch.equal(with_it, without)
+
+
+def test_abs_grad_adds_up(variant: Variant) -> None:
+    """Two images of the same splats, as for the gradient; invisible splats stay unchanged."""
+    splats = random_splats(0, 30, 20, 18)
+    splats.packed[::3, 5] = 0.001
+    leaf = leaf_splats(splats, variant.dtype, with_abs_grad=True)
+    assert leaf.abs_grad is not None
+    leaf.abs_grad += 1
+    for expected in (1, 2):
+        image, _, _ = variant.ops.rasterize(leaf, 20, 18)
+        image.square().sum().backward()
+        if expected == 1:
+            once = leaf.abs_grad - 1
+    assert (once[1::3].sum(dim=1) > 0).any()
+    assert_close(leaf.abs_grad, 1 + 2 * once, variant.backward)
+    assert (leaf.abs_grad[::3] == 1).all()
+
+
 def test_two_dimensional_fitting(variant: Variant) -> None:
     """Splats without ids are fitted to an image by gradient descent."""
     target = torch.zeros(16, 16, 3, dtype=variant.dtype)
@@ -555,6 +646,16 @@ WRONG = {
     "background of another dtype": {"background": torch.zeros(3, dtype=torch.float64)},
     "background of integers": {"background": torch.zeros(3, dtype=torch.int32)},
     "background elsewhere": {"background": torch.zeros(3, device="meta")},
+    "abs_grad of another length": {
+        "splats": Splats2D(torch.zeros(2, 16), None, 3, torch.zeros(3, 2))
+    },
+    "abs_grad of another dtype": {
+        "splats": Splats2D(torch.zeros(2, 16), None, 3, torch.zeros(2, 2).double())
+    },
+    "abs_grad with two groups of channels": {
+        "splats": Splats2D(torch.zeros(2, 16), None, 4, torch.zeros(2, 2)),
+        "with_depth": True,
+    },
     "half": {"splats": Splats2D(torch.zeros(2, 16, dtype=torch.float16), None, 3)},
     "integers": {"splats": Splats2D(torch.zeros(2, 16, dtype=torch.int64), None, 3)},
 }

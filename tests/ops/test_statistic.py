@@ -14,10 +14,12 @@ from snowsplat.ops import Splats2D, reference
 from .scenes import Variant, assert_close
 
 
-def splats_of(ids: Tensor, packed: Tensor, grad: Tensor) -> Splats2D:
+def splats_of(
+    ids: Tensor, packed: Tensor, grad: Tensor, abs_grad: Tensor | None = None
+) -> Splats2D:
     packed = packed.clone().requires_grad_()
     packed.grad = grad
-    return Splats2D(packed, ids.to(torch.int32), 3)
+    return Splats2D(packed, ids.to(torch.int32), 3, abs_grad)
 
 
 def test_one_gaussian(variant: Variant) -> None:
@@ -35,6 +37,18 @@ def test_one_gaussian(variant: Variant) -> None:
     assert radii.tolist() == [1.0, 6.0, 9.0]
 
 
+@pytest.mark.parametrize(("absolute", "norm"), [(False, 5.0), (True, 13.0)])
+def test_the_absolute_gradient_is_optional(variant: Variant, absolute: bool, norm: float) -> None:
+    packed, grad = torch.zeros(2, 1, 16, dtype=variant.dtype)
+    grad[0, :2] = torch.tensor([3.0, -4.0])
+    abs_grad = torch.tensor([[5.0, 12.0]], dtype=variant.dtype)
+    splats = splats_of(torch.tensor([0]), packed, grad, abs_grad)
+    norm_sum, views = torch.zeros(2, 1, dtype=variant.dtype)
+    variant.ops.accumulate_screen_statistics(splats, 2, 2, norm_sum, views, absolute=absolute)
+    assert norm_sum.tolist() == [norm]
+    assert views.tolist() == [1.0]
+
+
 def test_only_a_valid_view_is_added(variant: Variant) -> None:
     ones = torch.ones(1, 16, dtype=variant.dtype)
     splats = splats_of(torch.tensor([0]), ones, ones)
@@ -44,17 +58,23 @@ def test_only_a_valid_view_is_added(variant: Variant) -> None:
         assert sums[1:].tolist() == [[views], [views]]
 
 
+@pytest.mark.parametrize("absolute", [False, True])
 @pytest.mark.parametrize("with_radii", [True, False])
-def test_native_agrees_with_the_reference(native: Variant, with_radii: bool) -> None:
+def test_native_agrees_with_the_reference(
+    native: Variant, with_radii: bool, absolute: bool
+) -> None:
     generator = torch.Generator().manual_seed(1)
     ids = torch.randperm(20_000, generator=generator)[:9_000].sort().values
     packed, grad = torch.randn(2, 9_000, 16, generator=generator, dtype=torch.float64)
+    abs_grad = torch.rand(9_000, 2, generator=generator, dtype=torch.float64)
 
     def accumulate(implementation: Variant, dtype: torch.dtype) -> Tensor:
         sums = torch.zeros(3, 20_000, dtype=dtype)
-        splats = splats_of(ids, packed.to(dtype), grad.to(dtype))
+        splats = splats_of(ids, packed.to(dtype), grad.to(dtype), abs_grad.to(dtype))
         radii = sums[2] if with_radii else None
-        implementation.accumulate_screen_statistics(splats, 640, 360, sums[0], sums[1], radii)
+        implementation.accumulate_screen_statistics(
+            splats, 640, 360, sums[0], sums[1], radii, absolute=absolute
+        )
         return sums
 
     expected = accumulate(reference, torch.float64)
@@ -85,6 +105,11 @@ def test_wrong_input() -> None:
         ops.accumulate_screen_statistics(splats, 4, 4, sums, sums[:4])
     with pytest.raises(ValueError, match="max_radii"):
         ops.accumulate_screen_statistics(splats, 4, 4, sums, sums.clone(), sums.double())
+    with pytest.raises(ValueError, match="gradient"):
+        ops.accumulate_screen_statistics(splats, 4, 4, sums, sums.clone(), absolute=True)
+    splats.abs_grad = torch.zeros(3, 2)
+    with pytest.raises(ValueError, match="gradient"):
+        ops.accumulate_screen_statistics(splats, 4, 4, sums, sums.clone(), absolute=True)
     splats.packed.grad = None
     with pytest.raises(ValueError, match="gradient"):
         ops.accumulate_screen_statistics(splats, 4, 4, sums, sums.clone())

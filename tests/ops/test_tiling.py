@@ -460,7 +460,8 @@ def test_tiles_without_slots(native: Variant, size: int) -> None:
 @pytest.mark.parametrize("add", [False, True])
 @pytest.mark.parametrize("channels", [1, 3, 4])
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 100])
-def test_reduce(native: Variant, count: int, channels: int, add: bool) -> None:
+@pytest.mark.parametrize("absolute", [False, True])
+def test_reduce(native: Variant, absolute: bool, count: int, channels: int, add: bool) -> None:
     g = generator(count)
     dtype, suffix = native.dtype, "" if native.dtype == torch.float32 else "_f64"
     packed = random_splats(13, count, 50, 50, channels=20).packed.to(dtype)
@@ -474,6 +475,8 @@ def test_reduce(native: Variant, count: int, channels: int, add: bool) -> None:
     columns = torch.tensor([12, 9, 6, 27])
     grad = torch.full((count + 1, stride), 99.0, dtype=dtype)
     grad[:count] = before if add else math.nan
+    abs_before = uniform(g, 0, 1, count + 1, 2)
+    abs_grad = abs_before.to(dtype, copy=True)
     natives.launch(
         f"splats_reduce{suffix}",
         SplatsReduceParams(
@@ -486,6 +489,7 @@ def test_reduce(native: Variant, count: int, channels: int, add: bool) -> None:
             columns=columns,
             add=add,
             grad_packed=grad,
+            abs_grad=abs_grad if absolute else None,
         ),
     )
     assert (grad[count:] == 99).all()
@@ -493,9 +497,19 @@ def test_reduce(native: Variant, count: int, channels: int, add: bool) -> None:
     first = 3 if channels <= 3 else 4
     splat_of_slot = torch.arange(count).repeat_interleave(lengths)
     total = torch.zeros(count, 16, dtype=torch.float64).index_add(0, splat_of_slot, slots)
-    a, b, c, opacity = packed[:, 2:6].double().unbind(dim=1)
-    q, qx, qy, qxx, qxy, qyy = total[:, first : first + 6].unbind(dim=1)
-    wanted[:, :2] += torch.stack([a * qx + b * qy, b * qx + c * qy], dim=1)
+    opacity = packed[:, 5].double()
+    q, qxx, qxy, qyy = total[:, [first, *range(first + 3, first + 6)]].unbind(dim=1)
+
+    def grad_of_means(conics: Tensor, moments: Tensor) -> Tensor:
+        (a, b, c), (_, qx, qy) = conics.unbind(dim=1), moments.unbind(dim=1)
+        return torch.stack([a * qx + b * qy, b * qx + c * qy], dim=1)
+
+    conics, of_moments = packed[:, 2:5].double(), slice(first, first + 3)
+    wanted[:, :2] += grad_of_means(conics, total[:, of_moments])
     wanted[:, 2:6] += torch.stack([-0.5 * qxx, -qxy, -0.5 * qyy, q / opacity], dim=1)
     wanted[:, columns[:channels]] += total[:, :channels]
     assert_close(grad[:count], wanted, 10 * native.forward if count else 0)
+    if absolute:
+        of_slots = grad_of_means(conics[splat_of_slot], slots[:, of_moments])
+        abs_before.index_add_(0, splat_of_slot, of_slots.abs())
+    assert_close(abs_grad, abs_before, native.forward)

@@ -116,6 +116,13 @@ def test_json_round_trip(name):
     assert config_from_json(json.loads(written)) == config
 
 
+def test_settings_that_an_earlier_version_did_not_have_get_their_default():
+    values = config_to_json(recipe("paper", abs_grad=True))
+    assert config_from_json(values).density.abs_grad
+    del values["density"]["abs_grad"]
+    assert config_from_json(values) == recipe("paper")
+
+
 def test_the_configuration_of_another_version_is_rejected():
     values = config_to_json(TrainConfig())
     with pytest.raises(UserError, match="another version"):

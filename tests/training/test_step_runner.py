@@ -148,6 +148,26 @@ def test_an_invalid_step_changes_neither_statistics_nor_parameters_nor_moments()
         assert bool(adam.exp_avg["opacity_logits"].any()) == changed
 
 
+@pytest.mark.isa
+@pytest.mark.parametrize("abs_grad", [False, True])
+def test_the_absolute_gradient_is_computed_on_request(abs_grad: bool) -> None:
+    runner = StepRunner(4, torch.device("cpu"), abs_grad)
+    splats = splats_with_gradient_one()
+    splats.packed[:, :2] = torch.tensor([3.0, 2.0])
+    with torch.enable_grad():
+        loss = runner.rasterize(splats, CAMERA, torch.zeros(3))[0, 0, 0]
+    gradient = runner.backward(loss, splats, CAMERA, 0)
+    if not abs_grad:
+        assert gradient.splats.abs_grad is None
+        return
+    norm_sum, views = torch.zeros(2, 4)
+    gradient.add_statistics(norm_sum, views, absolute=True)
+    assert gradient.splats.abs_grad is not None
+    assert splats.packed.grad is not None
+    # All pixels are in one tile.
+    assert torch.equal(gradient.splats.abs_grad, splats.packed.grad[:, :2].abs())
+
+
 def test_a_gradient_is_valid_and_counts_nothing_by_default() -> None:
     """The image has 8 x 6 pixels and the gradient is (1, 1) per pixel: |(8/2, 6/2)| = 5."""
     gaussians = GAUSSIANS.clone()

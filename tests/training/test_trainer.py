@@ -85,12 +85,18 @@ BUSY = TrainConfig(
     ),
     test_iterations=(),
 )
+BUSY_ABS_GRAD = replace(BUSY, density=replace(BUSY.density, abs_grad=True))
 BUSY_MCMC = replace(
     BUSY, density=McmcDensity(densify_from=10, densify_interval=10, max_gaussians=50)
 )
 #: Runs a test with every density control. Add a new one here.
 every_density_control = pytest.mark.parametrize(
-    "config", [pytest.param(BUSY, id="adaptive"), pytest.param(BUSY_MCMC, id="mcmc")]
+    "config",
+    [
+        pytest.param(BUSY, id="adaptive"),
+        pytest.param(BUSY_ABS_GRAD, id="abs-grad"),
+        pytest.param(BUSY_MCMC, id="mcmc"),
+    ],
 )
 CALM = TrainConfig(
     iterations=300,
@@ -254,6 +260,19 @@ def test_a_checkpoint_of_inconsistent_tensors_is_rejected(dataset):
         with pytest.raises(UserError, match="another dataset or recipe|is damaged"):
             Trainer(dataset, BUSY).load_state({**state, name: value})
     Trainer(dataset, BUSY).load_state(state)
+
+
+def test_density_control_gets_the_absolute_gradients(dataset):
+    """They are larger if the image has more than one tile; the step itself is the same."""
+    trainers = []
+    for config in (BUSY, BUSY_ABS_GRAD):
+        trainer = Trainer(dataset, replace(config, coarse_to_fine=(0, 0)))
+        trainer.step_once()
+        trainers.append(trainer)
+    signed, absolute = (trainer._density.state_tensors()["grad_sum"] for trainer in trainers)
+    assert (absolute >= 0.999 * signed).all()
+    assert absolute.sum() > 1.05 * signed.sum()
+    assert_identical(*(trainer.gaussians for trainer in trainers))
 
 
 def test_refinement_waits_for_the_next_step(dataset):

@@ -51,6 +51,10 @@ class ConfigFlags:
     ] = None
     """Clone or split Gaussians whose view-space gradient exceeds this threshold. With a larger
     value, fewer Gaussians are added."""
+    abs_grad: Annotated[Literal["on", "off"] | None, flag("{on,off}", default=RECIPE)] = None
+    """Whether --grad-threshold applies to the sum of the absolute gradients of the 16x16 tiles of
+    the image. In this sum, gradients of opposite directions do not cancel, so more Gaussians are
+    cloned or split in detailed regions."""
     densify_interval: Annotated[
         int | None, flag("N", "--densification-interval", default=RECIPE)
     ] = None
@@ -95,4 +99,6 @@ class ConfigFlags:
         given = {field.name: getattr(self, field.name) for field in fields(ConfigFlags)}
         if self.test_iterations is not None:
             given["test_iterations"] = tuple(step for step in self.test_iterations if step > 0)
+        if self.abs_grad is not None:
+            given["abs_grad"] = self.abs_grad == "on"
         return {name: value for name, value in given.items() if value is not None}

@@ -134,14 +134,16 @@ struct ScreenStatisticsParams {
   int64_t n;             // splats
   const int32_t* ids;    // (n,) distinct Gaussians; negative: an empty row
   const T* packed;       // (n, stride)
-  const T* grad_packed;  // (n, stride)
   int64_t stride;        // columns
+  const T* grad_means;   // (n, grad_stride): the first two columns, of the 2D mean, are read
+  int64_t grad_stride;   // columns
   double width, height;  // pixels
   T* norm_sum;           // (N,) the norm of the gradient of the 2D mean is added
   T* views;              // (N,) 1 is added
   T* max_radii;          // (N,), or null: replaced by the radius if that is larger
   const bool* valid;     // (1,), or null; false: nothing is changed
-  SNOW_FIELDS(n, ids, packed, grad_packed, stride, width, height, norm_sum, views, max_radii, valid)
+  SNOW_FIELDS(n, ids, packed, stride, grad_means, grad_stride, width, height, norm_sum, views,
+              max_radii, valid)
 };
 
 // ---- rasterize: splats → tiles ------------------------------------------------------------------
@@ -268,8 +270,9 @@ struct RasterizeBackwardParams {
   T* slots;                       // out, (instances, 16) gradients, which splats_reduce adds;
                                   // null: they are added to grad_packed atomically (CUDA)
   T* grad_packed;                 // (splats, stride)
+  T* abs_grad;                    // as for splats_reduce, if `slots` is null; or null
   SNOW_FIELDS(n, frame, channels, instance_slot, image, grad_image, alpha, grad_alpha, slots,
-              grad_packed)
+              grad_packed, abs_grad)
 };
 
 // splats_reduce: the gradient of a splat as the sum over its instances.
@@ -284,7 +287,8 @@ struct SplatsReduceParams {
   const int64_t* columns;      // (4,) destination columns of the gradients of the channels
   int64_t add;                 // 1: add to grad_packed; 0: write every column
   T* grad_packed;              // (n, stride)
-  SNOW_FIELDS(n, slots, slot_range, packed, stride, channels, columns, add, grad_packed)
+  T* abs_grad;  // (n, 2), or null: |∂L/∂mean2d| of each instance is added, for x and y
+  SNOW_FIELDS(n, slots, slot_range, packed, stride, channels, columns, add, grad_packed, abs_grad)
 };
 
 // background_bwd: the sum of grad_image · (1 − alpha) over each row of pixels.

@@ -29,6 +29,7 @@ namespace snow {
 SNOW_INLINE float select(bool m, float a, float b) { return m ? a : b; }
 SNOW_INLINE float min(float a, float b) { return a < b ? a : b; }
 SNOW_INLINE float max(float a, float b) { return a > b ? a : b; }
+SNOW_INLINE float abs(float a) { return ::fabsf(a); }
 SNOW_INLINE float sqrt(float a) { return ::sqrtf(a); }
 SNOW_INLINE float exp(float a) { return ::expf(a); }
 SNOW_INLINE float log2(float a) { return ::log2f(a); }
@@ -38,6 +39,7 @@ SNOW_INLINE float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
 SNOW_INLINE double select(bool m, double a, double b) { return m ? a : b; }
 SNOW_INLINE double min(double a, double b) { return a < b ? a : b; }
 SNOW_INLINE double max(double a, double b) { return a > b ? a : b; }
+SNOW_INLINE double abs(double a) { return ::fabs(a); }
 SNOW_INLINE double sqrt(double a) { return ::sqrt(a); }
 SNOW_INLINE double exp(double a) { return ::exp(a); }
 SNOW_INLINE double log2(double a) { return ::log2(a); }

@@ -134,11 +134,17 @@ struct BlendMoments {
   Real q, qx, qy, qxx, qxy, qyy;
 };
 
+// ∂L/∂mean, from the sums of q dx and q dy over any set of pixels.
+template <class Real>
+SNOW_INLINE void mean_vjp(const Real* conic, Real qx, Real qy, Real* d_mean) {
+  d_mean[0] = conic[0] * qx + conic[1] * qy;
+  d_mean[1] = conic[1] * qx + conic[2] * qy;
+}
+
 template <class Real>
 SNOW_INLINE void splat_terms_vjp(const Real* conic, Real opacity, const BlendMoments<Real>& m,
                                  Real* d_mean, Real* d_conic, Real& d_opacity) {
-  d_mean[0] = conic[0] * m.qx + conic[1] * m.qy;
-  d_mean[1] = conic[1] * m.qx + conic[2] * m.qy;
+  mean_vjp(conic, m.qx, m.qy, d_mean);
   d_conic[0] = Real(-0.5f) * m.qxx;
   d_conic[1] = -m.qxy;
   d_conic[2] = Real(-0.5f) * m.qyy;

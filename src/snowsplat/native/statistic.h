@@ -12,7 +12,7 @@ SNOW_INLINE void accumulate_splat(const ScreenStatisticsParams<T>& p, int64_t i,
                                   T half_height) {
   const int32_t row = p.ids[i];
   if (row < 0) return;
-  const T* g = p.grad_packed + i * p.stride;
+  const T* g = p.grad_means + i * p.grad_stride;
   const T x = g[0] * half_width, y = g[1] * half_height;
   const T norm = sqrt(x * x + y * y);
   if (!is_finite(norm)) return;

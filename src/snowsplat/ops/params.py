@@ -124,8 +124,9 @@ class ScreenStatisticsParams(Params):
     n: int
     ids: Tensor
     packed: Tensor
-    grad_packed: Tensor
     stride: int
+    grad_means: Tensor
+    grad_stride: int
     width: float
     height: float
     norm_sum: Tensor
@@ -244,6 +245,7 @@ class RasterizeBackwardParams(Params):
     grad_alpha: Tensor | None
     slots: Tensor | None
     grad_packed: Tensor
+    abs_grad: Tensor | None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -257,6 +259,7 @@ class SplatsReduceParams(Params):
     columns: Tensor
     add: bool
     grad_packed: Tensor
+    abs_grad: Tensor | None
 
 
 @dataclass(slots=True, kw_only=True)

@@ -51,22 +51,28 @@ def rasterize(
     where T is the transmittance of the splats in front and α = min(0.99, o exp(−½ dᵀ conic d)).
     Splats with α < 1/255 are skipped. A pixel is finished when the next splat would make T < 1e-4
     (Kerbl et al. 2023, section 6). Gradients flow to `background` and to every column of
-    `splats.packed` except the radii.
+    `splats.packed` except the radii. If `splats.abs_grad` is not None, the backward pass adds to it
+    (see `Splats2D`); the image may then have at most four channels, including the depth.
 
     With `capacity`, the CPU does not wait until a GPU has counted the instances (see `Capacity`).
     On a GPU, gradients are summed with atomic operations, in no fixed order, unless
     `torch.use_deterministic_algorithms` is set.
 
-    Raises ValueError if shapes, dtypes or devices do not match.
+    Raises ValueError if shapes, dtypes or devices do not match, or there are too many channels.
     """
-    packed, channels = splats.packed, splats.channels
+    packed, channels, abs_grad = splats.packed, splats.channels, splats.abs_grad
     check_float("rasterize", "splats", packed)
     check_size("rasterize", width, height)
     if background is None:
         background = packed.new_zeros(channels)
     check_tensor("rasterize", "background", background, (channels,), packed)
+    if abs_grad is not None:
+        check_tensor("rasterize", "abs_grad", abs_grad, (len(packed), 2), packed)
+        if channels + with_depth > GROUP_CHANNELS:
+            # Several passes would each add the absolute values of a part of the gradient.
+            raise ValueError(f"rasterize: abs_grad requires at most {GROUP_CHANNELS} channels")
     planes, alpha = _Rasterize.apply(
-        packed, background, width, height, channels, with_depth, capacity
+        packed, background, width, height, channels, with_depth, capacity, abs_grad
     )
     depth = planes[channels] if with_depth else None
     return planes[:channels].permute(1, 2, 0), alpha, depth
@@ -250,6 +256,7 @@ class _Rasterize(torch.autograd.Function):
         channels: int,
         with_depth: bool,
         capacity: Capacity | None,
+        abs_grad: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         packed = packed.detach().contiguous()
         groups = _channel_groups(channels, with_depth, packed.device)
@@ -273,6 +280,7 @@ class _Rasterize(torch.autograd.Function):
             )
         ctx.save_for_backward(planes, alpha)
         ctx.frame, ctx.groups, ctx.channels = frame, groups, channels
+        ctx.abs_grad = abs_grad
         ctx.set_materialize_grads(False)
         return planes, alpha
 
@@ -286,11 +294,13 @@ class _Rasterize(torch.autograd.Function):
             grad_planes = torch.zeros_like(planes)
         grad_planes = grad_planes.contiguous()
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-        grad_packed = _grad_packed(ctx.frame, ctx.groups, planes, grad_planes, alpha, grad_alpha)
+        grad_packed = _grad_packed(
+            ctx.frame, ctx.groups, planes, grad_planes, alpha, grad_alpha, ctx.abs_grad
+        )
         grad_background = None
         if ctx.needs_input_grad[1]:
             grad_background = _grad_background(grad_planes[: ctx.channels], alpha)
-        return grad_packed, grad_background, None, None, None, None, None
+        return grad_packed, grad_background, None, None, None, None, None, None
 
 
 def _grad_packed(
@@ -300,8 +310,9 @@ def _grad_packed(
     grad_planes: Tensor,
     alpha: Tensor,
     grad_alpha: Tensor | None,
+    abs_grad: Tensor | None,
 ) -> Tensor:
-    """The gradient of the splats, of the shape of `packed`."""
+    """The gradient of the splats, of the shape of `packed`. Also adds to `abs_grad`, if given."""
     packed, stride = frame.params.packed, frame.params.stride
     grad_packed = scratch.empty(tuple(packed.shape), packed.dtype, packed.device)
     slots = None  # the gradients of the instances, if they are summed in a fixed order
@@ -324,6 +335,7 @@ def _grad_packed(
                 grad_alpha=grad_alpha if first == 0 else None,
                 slots=slots,
                 grad_packed=grad_packed,
+                abs_grad=abs_grad,
             ),
         )
         if slots is not None and frame.slot_range is not None:
@@ -339,6 +351,7 @@ def _grad_packed(
                     columns=columns,
                     add=first > 0,
                     grad_packed=grad_packed,
+                    abs_grad=abs_grad,
                 ),
             )
     return grad_packed

@@ -25,7 +25,7 @@ Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -240,9 +240,11 @@ def rasterize(
     (H, W, C) with planar storage, alpha (H, W), and depth (H, W) or None:
     image = Σ T α c + T_end · background, alpha = 1 − T_end, depth = Σ T α z (not divided by alpha),
     where T is the transmittance of the splats in front. Conics must be positive definite.
-    `capacity` is ignored, because the memory always suffices.
+    `capacity` is ignored, because the memory always suffices. If `splats.abs_grad` is not None, the
+    backward pass adds, for each 16×16 tile, the absolute value of the gradient of `means2d` that
+    comes from the pixels of the tile.
     """
-    order = torch.argsort(splats.depths.detach(), stable=True)
+    order, abs_grad = torch.argsort(splats.depths.detach(), stable=True), splats.abs_grad
     splats = Splats2D(splats.packed[order], None, splats.channels)
     means2d, conics, opacities = splats.means2d, splats.conics, splats.opacities
     values = splats.colors
@@ -266,7 +268,10 @@ def rasterize(
             last = torch.tensor([left + w - 0.5, top + h - 0.5]).to(means2d)
             tile = ((high >= first) & (low <= last)).all(dim=1).nonzero()[:, 0]
             pixels = _pixel_centres(left, top, w, h).to(means2d)  # (P, 2)
-            alpha, T, T_end = _blend_weights(pixels, means2d[tile], conics[tile], opacities[tile])
+            means = means2d[tile]
+            if abs_grad is not None and means.requires_grad:
+                means.register_hook(_adds_absolute_values(abs_grad, order[tile]))
+            alpha, T, T_end = _blend_weights(pixels, means, conics[tile], opacities[tile])
             blended = (T * alpha) @ values[tile]  # (P, C or C + 1)
             tiles.append(torch.cat([blended, T_end], dim=1).T.reshape(-1, h, w))
         bands.append(torch.cat(tiles, dim=2))
@@ -276,6 +281,15 @@ def rasterize(
     image = planes[:channels] + T_end * background[:, None, None]
     depth = planes[channels] if with_depth else None
     return image.permute(1, 2, 0), 1 - T_end, depth
+
+
+def _adds_absolute_values(abs_grad: Tensor, rows: Tensor) -> Callable[[Tensor], None]:
+    """A hook that adds |gradient| (K, 2) of some splats to their rows of `abs_grad` (M, 2)."""
+
+    def add(grad: Tensor) -> None:
+        abs_grad.index_add_(0, rows, grad.abs())
+
+    return add
 
 
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
@@ -394,17 +408,21 @@ def accumulate_screen_statistics(
     views: Tensor,
     max_radii: Tensor | None = None,
     valid: Tensor | None = None,
+    *,
+    absolute: bool = False,
 ) -> None:
     """Adds one view to the statistics of the visible Gaussians for density control (section 5.2).
 
     The gradient of the 2D mean, (M, 2), is scaled to a screen that spans [-1, 1] in x and y. Rows
     with a non-finite gradient are skipped. If `valid` (1,) is False, all rows are skipped.
+    absolute: use `splats.abs_grad` instead of the gradient.
     """
     if valid is not None and not valid:
         return
     assert splats.ids is not None
-    assert splats.packed.grad is not None
-    norms = (splats.packed.grad[:, :2] * norm_sum.new_tensor([width / 2, height / 2])).norm(dim=1)
+    grad = splats.abs_grad if absolute else splats.packed.grad
+    assert grad is not None
+    norms = (grad[:, :2] * norm_sum.new_tensor([width / 2, height / 2])).norm(dim=1)
     counts = norms.isfinite()
     rows = splats.ids.long()[counts]
     norm_sum[rows] += norms[counts]

@@ -45,6 +45,12 @@ class Splats2D:
               CPU would have to wait for the number of visible ones. On the CPU no row is empty.
               None: there are no 3D Gaussians (2D Gaussians fitted to an image).
     channels: C, at least 1.
+    abs_grad: (M, 2), or None. The backward pass of `rasterize` adds to it, for x and y separately,
+              Σ |g| over the 16×16 tiles of the image. g is the part of the gradient of `means2d`
+              that comes from the pixels of the tile, so the gradient itself is Σ g. In |Σ g|,
+              tiles that move a splat in opposite directions cancel. The homodirectional gradient of
+              AbsGS (Ye et al. 2024, arXiv:2404.10484) is the same sum over pixels. The sum over
+              tiles is cheap, because the gradients of the tiles are computed anyway.
 
     The properties are views of `packed`; autograd flows through them.
     """
@@ -52,6 +58,7 @@ class Splats2D:
     packed: Tensor
     ids: Tensor | None
     channels: int
+    abs_grad: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.channels < 1:

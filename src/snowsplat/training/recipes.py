@@ -25,7 +25,8 @@ def default() -> TrainConfig:
     It is `classic` with these changes, which docs/performance.md measures: the training starts with
     points on the surfaces, which are found by plane sweep; in the last part of the training, all
     learning rates decrease; opacities and scales decay, so that Gaussians which no photo needs
-    disappear and their places are used again; and densification lasts longer.
+    disappear and their places are used again; and densification lasts longer and uses absolute
+    gradients.
     """
     config = classic()
     return replace(
@@ -34,7 +35,7 @@ def default() -> TrainConfig:
         initial_opacity=0.3,
         learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),
         decay=DecayRates(opacity=0.04, scale=0.02),
-        density=replace(config.density, densify_until=0.7),
+        density=replace(config.density, densify_until=0.7, abs_grad=True),
     )
 
 

@@ -67,12 +67,17 @@ class StepRunner:
     loss = runner.run(optimize, step, gaussians, view, photo)
     """
 
-    def __init__(self, gaussians: int, device: torch.device) -> None:
-        """``gaussians``: their initial number, from which the initial capacity is estimated."""
+    def __init__(self, gaussians: int, device: torch.device, abs_grad: bool = False) -> None:
+        """
+        Args:
+            gaussians: their initial number, from which the initial capacity is estimated.
+            abs_grad: whether the backward pass computes ``abs_grad`` of the splats.
+        """
         # The CPU allocates what a frame requires, and ignores the capacity.
         on_cpu = device.type == "cpu"
         instances = sys.maxsize if on_cpu else INITIAL_INSTANCES_PER_GAUSSIAN * gaussians
         self.capacity = Capacity(instances, torch.zeros(1, dtype=torch.int64, device=device))
+        self._abs_grad = abs_grad
         self._nonfinite_rows = torch.zeros(len(PARAMETERS), dtype=torch.int32, device=device)
         self._readback = Readback(2 + len(PARAMETERS), device)
 
@@ -86,6 +91,8 @@ class StepRunner:
             (H, W, 3) image.
         """
         splats.packed.requires_grad_()
+        if self._abs_grad:
+            splats.abs_grad = splats.packed.new_zeros(len(splats), 2)
         size = camera.width, camera.height
         image, _, _ = ops.rasterize(splats, *size, background, capacity=self.capacity)
         return image

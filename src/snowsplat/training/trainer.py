@@ -144,7 +144,7 @@ class Trainer:
             device=self.device,
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
-        self._runner = StepRunner(len(self.gaussians), self.device)
+        self._runner = StepRunner(len(self.gaussians), self.device, config.density.abs_grad)
         if state is not None:
             self.load_state(state)
 

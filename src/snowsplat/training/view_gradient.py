@@ -22,6 +22,7 @@ class ViewGradient:
 
     Attributes:
         splats: the splats from `scene.render.project`; the gradient is ``splats.packed.grad``.
+            ``splats.abs_grad`` is not None if the density control requires it.
         camera: the camera of the view, at the resolution of the step. It is needed to propagate the
             gradient from the splats to the parameters of the Gaussians.
         sh_degree: degree of the spherical harmonics used by this step.
@@ -36,12 +37,18 @@ class ViewGradient:
     nonfinite_rows: Tensor | None = None
 
     def add_statistics(
-        self, norm_sum: Tensor, views: Tensor, max_radii: Tensor | None = None
+        self,
+        norm_sum: Tensor,
+        views: Tensor,
+        max_radii: Tensor | None = None,
+        *,
+        absolute: bool = False,
     ) -> None:
         """Add this view to statistics of the Gaussians, by `ops.accumulate_screen_statistics`.
 
         For each visible Gaussian: norm_sum (N,) += |∂L/∂mean2d · (width/2, height/2)|,
         views (N,) += 1, and max_radii (N,) = max(max_radii, 3σ radius in pixels) unless it is None.
+        If ``absolute``, ``splats.abs_grad`` replaces ∂L/∂mean2d.
         """
         ops.accumulate_screen_statistics(
             self.splats,
@@ -51,4 +58,5 @@ class ViewGradient:
             views,
             max_radii,
             self.valid,
+            absolute=absolute,
         )

@@ -122,6 +122,23 @@ def test_densification_compares_the_mean_over_views_with_the_threshold():
     assert names(control.after_step(600, gaussians, adam)) == [0, 1, 2, 2]
 
 
+def test_the_absolute_gradient_replaces_the_signed_one():
+    """The gradients of the tiles of Gaussian 0 cancel; Gaussian 1 touches one tile."""
+    gaussians = gaussians_of([0.05, 0.05])
+    signed, absolute = [[0.0, 0.0], [1e-4, -1e-4]], [[4e-4, 3e-4], [1e-4, 1e-4]]
+    for settings, sums in (
+        ({}, [0.0, math.hypot(1e-4, 1e-4)]),
+        ({"abs_grad": True}, [5e-4, math.hypot(1e-4, 1e-4)]),
+    ):
+        control, adam = set_up(gaussians.clone(), **settings)
+        gradient = view([0, 1], signed, size=(2, 2))
+        gradient.splats.abs_grad = torch.tensor(absolute)
+        control.after_backward(1, gaussians, gradient)
+        torch.testing.assert_close(control.grad_sum, torch.tensor(sums))
+        refined = control.after_step(600, gaussians.clone(), adam)
+        assert names(refined) == ([0, 0, 1] if settings else [0, 1])
+
+
 def test_an_unseen_gaussian_has_no_gradient():
     gaussians = gaussians_of([0.05, 0.05])
     control, adam = set_up(gaussians, grad_threshold=0.0)
@@ -133,6 +150,7 @@ def test_the_papers_constants():
     settings = AdaptiveDensity()
     assert SPLIT_SHRINK == PHI
     assert settings.grad_threshold == 2e-4
+    assert not settings.abs_grad
     assert settings.prune_opacity == 0.005
     assert settings.percent_dense == 0.01
     assert (settings.densify_from, settings.densify_until) == (500, 15_000)

@@ -18,6 +18,7 @@ namespace {
 
 constexpr int64_t kBlock = 2048;
 constexpr int64_t kSerialBelow = 8000;  // splats; below this, one part is faster than several
+constexpr uint32_t kPrefetched = 16;    // largest number of slots of a splat that are prefetched
 
 int64_t part_count(int64_t m) { return m < kSerialBelow ? 1 : pool_size(); }
 
@@ -304,8 +305,8 @@ int64_t fill_tiles(const TilesFillParams<T>& p) {
 
 // Sums the slots of each splat in slot order. Writes the sum to the splat's row of the packed
 // gradient; for further groups of channels, adds it to this row.
-template <class V, class T = typename V::Scalar>
-int64_t reduce(const SplatsReduceParams<T>& p) {
+template <class V, bool kAbsGrad, class T = typename V::Scalar>
+void sum_slots(const SplatsReduceParams<T>& p) {
   const int64_t m = p.n, stride = p.stride, channels = p.channels;
   const T* slots = p.slots;
   const uint32_t* slot_range = p.slot_range;
@@ -316,22 +317,33 @@ int64_t reduce(const SplatsReduceParams<T>& p) {
     const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
     for (int64_t i = begin; i < end; i++) {
       if (i + 8 < end) {
-        const T* next = slots + int64_t(slot_range[2 * (i + 8)]) * kSlotWidth;
-        for (int k = 0; k < 4; k++) prefetch(next + k * kSlotWidth);
+        const uint32_t first = slot_range[2 * (i + 8)], past = slot_range[2 * (i + 8) + 1];
+        const uint32_t last = past - first < kPrefetched ? past : first + kPrefetched;
+        // Most splats have few slots: the first four are prefetched without a branch.
+        for (uint32_t s = first; s < first + 4; s++) prefetch(slots + int64_t(s) * kSlotWidth);
+        for (uint32_t s = first + 4; s < last; s++) prefetch(slots + int64_t(s) * kSlotWidth);
       }
       V sum[kVectors];
       for (int k = 0; k < kVectors; k++) sum[k] = V(0.f);
-      for (int64_t s = slot_range[2 * i]; s < slot_range[2 * i + 1]; s++)
-        for (int k = 0; k < kVectors; k++) sum[k] += V::load(slots + s * kSlotWidth + k * W);
+      const T *row = p.packed + i * stride, *conic = row + 2;
+      T d_mean[2], d_conic[3], d_opacity, abs_sum[2] = {T(0), T(0)};
+      for (int64_t s = slot_range[2 * i]; s < slot_range[2 * i + 1]; s++) {
+        const T* slot = slots + s * kSlotWidth;
+        for (int k = 0; k < kVectors; k++) sum[k] += V::load(slot + k * W);
+        if constexpr (kAbsGrad) {
+          mean_vjp(conic, slot[base + 1], slot[base + 2], d_mean);
+          abs_sum[0] += abs(d_mean[0]), abs_sum[1] += abs(d_mean[1]);
+        }
+      }
+      if constexpr (kAbsGrad) p.abs_grad[2 * i] += abs_sum[0], p.abs_grad[2 * i + 1] += abs_sum[1];
       alignas(64) T total[kSlotWidth];
       for (int k = 0; k < kVectors; k++) sum[k].store(total + k * W);
-      const T *row = p.packed + i * stride, *q = total + base;
+      const T* q = total + base;
       T* g = p.grad_packed + i * stride;
       if (!add)
         for (int64_t k = 0; k < stride; k += W) V(0.f).store(g + k);
       if (slot_range[2 * i] == slot_range[2 * i + 1]) continue;
-      T d_mean[2], d_conic[3], d_opacity;
-      splat_terms_vjp<T>(row + 2, row[5], {q[0], q[1], q[2], q[3], q[4], q[5]}, d_mean, d_conic,
+      splat_terms_vjp<T>(conic, row[5], {q[0], q[1], q[2], q[3], q[4], q[5]}, d_mean, d_conic,
                          d_opacity);
       g[0] += d_mean[0], g[1] += d_mean[1];
       g[2] += d_conic[0], g[3] += d_conic[1], g[4] += d_conic[2];
@@ -339,6 +351,14 @@ int64_t reduce(const SplatsReduceParams<T>& p) {
       for (int k = 0; k < channels; k++) g[p.columns[k]] += total[k];
     }
   });
+}
+
+template <class V, class T = typename V::Scalar>
+int64_t reduce(const SplatsReduceParams<T>& p) {
+  if (p.abs_grad)
+    sum_slots<V, true>(p);
+  else
+    sum_slots<V, false>(p);
   return 0;
 }
 

@@ -483,8 +483,11 @@ SNOW_INLINE void add_warps(const RasterizeBackwardParams<T>& p, const SumPositio
     } else {
       sum = gradient_of<C>(sum, position.column - C, memory.batch.mean_conic[i],
                            memory.batch.opacity_color[i]);
-      if (warps && position.packed_column >= 0 && sum != T(0))
+      if (warps && position.packed_column >= 0 && sum != T(0)) {
         atomicAdd(p.grad_packed + target[h] * p.frame.stride + position.packed_column, sum);
+        if (p.abs_grad && position.packed_column < 2)
+          atomicAdd(p.abs_grad + 2 * int64_t(target[h]) + position.packed_column, abs(sum));
+      }
     }
   }
   __syncthreads();

@@ -333,6 +333,16 @@ SNOW_INLINE void reduce(const SplatsReduceParams<T>& p) {
 #pragma unroll
   for (int k = 0; k < 4; k++) color[k] = __shfl_sync(kAllLanes, sum, k, kSlotWidth);
   if (i >= p.n || (add && begin == end)) return;
+  if (p.abs_grad && lane < 2) {  // as in mean_vjp: x in lane 0, y in lane 1
+    const T* moments = p.slots + base;
+    const T a = p.packed[i * p.stride + 2 + lane], b = p.packed[i * p.stride + 3 + lane];
+    T abs_sum(0);
+    for (uint32_t s = begin; s < end; s++) {
+      const T* q = moments + int64_t(s) * kSlotWidth;
+      abs_sum += abs(a * q[1] + b * q[2]);
+    }
+    p.abs_grad[2 * i + lane] += abs_sum;
+  }
 
   T d_mean[2] = {T(0), T(0)}, d_conic[3] = {T(0), T(0), T(0)}, d_opacity(0);
   if (begin < end) {

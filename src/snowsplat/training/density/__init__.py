@@ -66,6 +66,11 @@ class DensityConfig(Protocol):
         ...
 
     @property
+    def abs_grad(self) -> bool:
+        """Whether `DensityControl.after_backward` uses ``gradient.splats.abs_grad``."""
+        ...
+
+    @property
     def densify_from(self) -> When:
         """The first step at which Gaussians may be added (float: fraction of all steps)."""
         ...

@@ -38,6 +38,11 @@ class AdaptiveDensity:
         densify_interval: number of steps between two densifications.
         grad_threshold: τ_pos of the paper: a Gaussian is densified if the norm of its view-space
             position gradient, averaged over the views, is larger than this value.
+        abs_grad: whether this gradient is the sum of the absolute values of the gradients of the
+            tiles (`Splats2D.abs_grad`) instead of their sum. A large Gaussian in a detailed region
+            is pulled in opposite directions by different pixels. In the sum of the paper, these
+            gradients cancel, and the Gaussian is not split; see AbsGS (Ye et al. 2024). Sums over
+            pixels, as in AbsGS, are larger and need a larger threshold; sums over tiles do not.
         percent_dense: Gaussians up to this scale, in units of the scene extent, are cloned; larger
             ones are split.
         prune_opacity: Gaussians with a lower opacity are removed.
@@ -61,6 +66,7 @@ class AdaptiveDensity:
     densify_until: When = 15_000
     densify_interval: int = 100
     grad_threshold: float = 2e-4
+    abs_grad: bool = False
     percent_dense: float = 0.01
     prune_opacity: float = 0.005
     prune_world_size: float = 0.1
@@ -98,7 +104,8 @@ class AdaptiveDensityControl:
 
     Attributes:
         first_reset: whether opacity is also reset at step ``first``.
-        grad_sum: (N,) sum over views of |∂L/∂mean2d|, with the image spanning [-1, 1].
+        grad_sum: (N,) sum over views of |∂L/∂mean2d|, with the image spanning [-1, 1]; if
+            ``settings.abs_grad``, of the norm of the absolute gradients.
         views: (N,) number of views in this sum: those in which the Gaussian was visible.
         max_radii: (N,) largest 3σ radius in these views, in pixels.
     """
@@ -127,7 +134,9 @@ class AdaptiveDensityControl:
         if step > self.last:
             return
         max_radii = self.max_radii if self.settings.prune_screen_size > 0 else None
-        gradient.add_statistics(self.grad_sum, self.views, max_radii)
+        gradient.add_statistics(
+            self.grad_sum, self.views, max_radii, absolute=self.settings.abs_grad
+        )
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         """Densify, prune or reset opacity, if the settings require it at ``step``."""

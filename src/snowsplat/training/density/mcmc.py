@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -50,6 +51,8 @@ class McmcDensity:
         opacity_regularizer, scale_regularizer: weights of the mean opacity and the mean scale in
             the loss.
     """
+
+    abs_grad: ClassVar[bool] = False  # there are no statistics of gradients
 
     densify_from: When = 500
     densify_until: When = 25_000
