@@ -69,6 +69,14 @@ def test_the_time_is_used():
         assert 0.85 * seconds < plan.config.iterations * plan.seconds < seconds
 
 
+def test_depth_maps_need_enough_time():
+    assert planned(10, 552, 986).config.dense_init == 0.0
+    assert planned(120, 552, 986).config.dense_init == recipe("default").dense_init > 0.0
+    without = make_plan(dataset(552, 986), recipe("default", dense_init=0.0), 60, 1.0)
+    steps = without.config.iterations - planned(60, 552, 986).config.iterations
+    assert 0.02 < steps / without.config.iterations < 0.15  # they take some of the time
+
+
 def test_the_number_of_gaussians():
     assert planned(30, 552, 986).config.density.max_gaussians == 120_000
     assert planned(3600, 552, 986).config.density.max_gaussians == 240_000

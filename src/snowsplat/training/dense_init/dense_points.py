@@ -60,8 +60,16 @@ def dense_points(
     )
 
 
+def map_pixels(views: int, width: int, height: int) -> int:
+    """About the number of pixels of all depth maps that `dense_points` computes for this number of
+    views of this size.
+    """
+    return min(_MAX_PIXELS, views * math.prod(map_size(width, height)))
+
+
 def _used_views(dataset: Dataset, images: ImageLoader) -> list[View]:
-    pixels = sum(math.prod(map_size(view)) for view in dataset.train)
+    cameras = [view.camera for view in dataset.train]
+    pixels = sum(math.prod(map_size(camera.width, camera.height)) for camera in cameras)
     limit = min(_MAX_PIXELS, images.budget_bytes // _BYTES_PER_PIXEL)
     return dataset.train[:: math.ceil(pixels / max(limit, 1))]
 

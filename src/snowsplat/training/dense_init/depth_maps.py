@@ -63,19 +63,18 @@ def depth_maps(
     ]
 
 
-def map_size(view: View) -> tuple[int, int]:
-    """Height and width of the depth map of a view, in pixels."""
-    camera = view.camera
-    scale = min(1.0, _LONGER_SIDE / max(camera.width, camera.height))
-    return max(1, round(scale * camera.height)), max(1, round(scale * camera.width))
+def map_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height of the depth map of a view of this size, in pixels."""
+    scale = min(1.0, _LONGER_SIDE / max(width, height))
+    return max(1, round(scale * width)), max(1, round(scale * height))
 
 
 def photo_for_map(view: View, images: ImageLoader) -> LoadedImage:
     """The photo of a view at the size of its depth map, on the CPU."""
-    longer = max(view.camera.width, view.camera.height)
-    factor = next((f for f in (4, 2) if longer >= f * _LONGER_SIDE), 1)
+    width, height = map_size(view.camera.width, view.camera.height)
+    factor = next((f for f in (4, 2) if view.camera.width >= f * width), 1)
     photo = images.get(view, factor).to(torch.device("cpu"))
-    size = map_size(view)
+    size = (height, width)
     if photo.planes.shape[1:] == size:
         return photo
     planes = interpolate(photo.planes[None].to(torch.float32), size, mode="area")[0]

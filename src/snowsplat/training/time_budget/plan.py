@@ -15,6 +15,7 @@ import torch
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.training.config import TrainConfig, changed
+from snowsplat.training.dense_init import map_pixels
 from snowsplat.training.init import initial_count
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.time_budget.step_cost import Work
@@ -39,6 +40,10 @@ _MIN_DENSIFICATIONS = 15
 _MIN_DENSIFY_INTERVAL = 25
 #: Seconds before the first step, for preparation and for decoding the first photos.
 _SETUP_SECONDS = 0.5
+#: Seconds for a million pixels of depth maps, on the machine of docs/performance.md.
+_SECONDS_PER_MAP_MEGAPIXEL = 0.4
+#: If depth maps would need more than this share of the time, there is no dense initialisation.
+_MAX_SHARE_OF_MAPS = 0.25
 
 # The speed of the machine is measured by a short training run, called the sample.
 #: Maximum duration of the sample, in seconds.
@@ -114,13 +119,18 @@ def make_plan(
         width = camera.width if side >= longer else max(1, round(camera.width * side / longer))
         height = round(camera.height * width / camera.width)
         sized = _capped(config, width * height, gaussian_factor)
+        maps = map_pixels(len(dataset.train), width, height) / 1e6
+        maps *= _SECONDS_PER_MAP_MEGAPIXEL * time_ratio
+        if maps > _MAX_SHARE_OF_MAPS * seconds:
+            sized = replace(sized, dense_init=0.0)
+        left = seconds - _SETUP_SECONDS - (maps if sized.dense_init > 0.0 else 0.0)
         work = Work(sized, width * height, len(dataset.test))
         initial = initial_count(dataset, sized)
-        steps, mean = _steps(work, seconds - _SETUP_SECONDS, time_ratio, initial)
+        steps, mean = _steps(work, left, time_ratio, initial)
         if more_often:
             sized = _densified_in(sized, steps)
             work = replace(work, config=sized)
-            steps, mean = _steps(work, seconds - _SETUP_SECONDS, time_ratio, initial)
+            steps, mean = _steps(work, left, time_ratio, initial)
         resolution = None if width == camera.width else width
         return Plan(resolution, width, height, replace(sized, iterations=steps), time_ratio, mean)
 
