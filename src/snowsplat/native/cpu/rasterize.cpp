@@ -311,7 +311,12 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
   uint32_t i = f.tile_start[index];
   RowTerms<V> rows;
   for (; i < end; i++) {
-    if (i + 12 < end) prefetch(&f.records[f.instance_splat[i + 12]]);
+    if (i + 12 < end) {
+      prefetch(&f.records[f.instance_splat[i + 12]]);
+      // Slots are written in random order, and stores complete in program order: one slot that is
+      // not in the cache delays all stores behind it.
+      prefetch_to_write(slots + int64_t(instance_slot[i + 12]) * kSlotWidth);
+    }
     T* slot = slots + int64_t(instance_slot[i]) * kSlotWidth;
     Bits touched = f.instance_blocks[i];
     if (!touched) {
