@@ -315,8 +315,8 @@ int64_t reduce(const SplatsReduceParams<T>& p) {
   parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
     const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
     for (int64_t i = begin; i < end; i++) {
-      if (i + 8 < end) {
-        const T* next = slots + int64_t(slot_range[2 * (i + 8)]) * kSlotWidth;
+      if (i + 20 < end) {
+        const T* next = slots + int64_t(slot_range[2 * (i + 20)]) * kSlotWidth;
         for (int k = 0; k < 4; k++) prefetch(next + k * kSlotWidth);
       }
       V sum[kVectors];
