@@ -246,6 +246,7 @@ __attribute__((noinline)) void scatter_rows(typename V::Scalar* base, int64_t st
 }
 
 SNOW_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
+SNOW_INLINE void prefetch_to_write(void* p) { __builtin_prefetch(p, 1, 3); }
 
 // Denormal numbers make blending 1.7× slower. Every kernel sets the mode that flushes them to zero
 // in each of its threads, and restores the caller's mode at its end.

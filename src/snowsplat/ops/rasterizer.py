@@ -74,8 +74,9 @@ def rasterize(
     planes, alpha = _Rasterize.apply(
         packed, background, width, height, channels, with_depth, capacity, abs_grad
     )
-    depth = planes[channels] if with_depth else None
-    return planes[:channels].permute(1, 2, 0), alpha, depth
+    if not with_depth:  # the gradient of a slice would be a copy
+        return planes.permute(1, 2, 0), alpha, None
+    return planes[:channels].permute(1, 2, 0), alpha, planes[channels]
 
 
 @torch.no_grad()

@@ -51,6 +51,16 @@ struct GaussianGroup {
   }
 };
 
+// The hardware prefetcher does not predict the next visible row, because the gaps between them
+// vary.
+template <class T>
+SNOW_INLINE void prefetch_row(const GaussianTensors<T>& g, int64_t row) {
+  prefetch(g.means + 3 * row), prefetch(g.log_scales + 3 * row), prefetch(g.quats + 4 * row);
+  prefetch(g.opacity_logits + row), prefetch(g.sh_dc + 3 * row);
+  const T* rest = g.sh_rest + 3 * g.sh_rest_rows * row;
+  for (int c = 0; c < sh_columns(int(g.sh_degree)); c += 16) prefetch(rest + c);
+}
+
 template <class V>
 struct GaussianGroupGradient {
   GaussianShape<V> shape;

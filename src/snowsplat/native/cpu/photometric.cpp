@@ -1,9 +1,10 @@
 // photometric: L1 and SSIM between two images and the gradient of their weighted sum, in one pass.
 //
 // Images are planar, (channels, H, W). A task is one channel of a strip of columns and a segment of
-// rows. It processes the rows from top to bottom. Ring buffers contain the last 11 horizontally
-// filtered rows of the window means, and those of the derivatives. Only the images and the gradient
-// are read from or written to main memory. The division into tasks depends only on the image size,
+// rows. It processes the rows from top to bottom, kBatch at a time. Ring buffers contain the last
+// horizontally filtered rows of the window means, and those of the derivatives. They do not fit into
+// the fastest cache, so the vertical filter uses each row that it loads for all rows of a batch. Only
+// the images and the gradient are read from or written to main memory. The division into tasks depends only on the image size,
 // and partial sums are added in order, so the result does not depend on the number of threads.
 #include <cstring>
 #include <utility>
@@ -21,7 +22,10 @@ constexpr int kStrip = 256;  // maximum number of columns of a task
 constexpr int kMargin = 16;  // columns computed on each side for the second filter
 constexpr int kPad = 32;     // columns of buffer on each side
 constexpr int kRow = kStrip + 2 * kPad;
-constexpr int kSegment = 540;  // rows of a task, approximately
+constexpr int kSegment = 540;                   // rows of a task, approximately
+constexpr int kBatch = 4;                       // rows that are processed at once
+constexpr int kReach = kSsimTaps + kBatch - 1;  // rows under the windows of a batch
+constexpr int kRing = 16;                       // rows of a ring buffer, at least kReach
 
 int64_t strip_count(int64_t width) { return (width + kStrip - 1) / kStrip; }
 
@@ -84,11 +88,16 @@ struct Filter {
     ((sum += tap[k] * n.template shifted<k>()), ...);
     return sum;
   }
-  SNOW_INLINE V across(const T* const* rows, int offset) const {
-    V sum(0.f);
-#pragma GCC unroll 11
-    for (int k = 0; k < kSsimTaps; k++) sum += tap[k] * V::load(rows[k] + offset);
-    return sum;
+  // sum[r] is the filtered value of row r of a batch; `rows` are the rows under its windows.
+  SNOW_INLINE void across(const T* const* rows, int offset, V* sum) const {
+    for (int r = 0; r < kBatch; r++) sum[r] = V(0.f);
+#pragma GCC unroll 14
+    for (int k = 0; k < kReach; k++) {
+      const V value = V::load(rows[k] + offset);
+#pragma GCC unroll 4
+      for (int r = 0; r < kBatch; r++)
+        if (k >= r && k - r < kSsimTaps) sum[r] += tap[k - r] * value;
+    }
   }
 };
 
@@ -96,10 +105,13 @@ template <class V>
 struct Scratch {
   using T = typename V::Scalar;
   alignas(64) T a[kRow], b[kRow], squares[kRow], product[kRow];
-  alignas(64) T means[kSsimTaps][4][kRow];  // of a, b, a² + b², ab
-  alignas(64) T derivatives[3][kRow];       // d.mean_a, d.mean_aa, d.mean_ab
-  alignas(64) T filtered[kSsimTaps][3][kRow];
+  alignas(64) T means[kRing][4][kRow];         // of a, b, a² + b², ab
+  alignas(64) T derivatives[kBatch][3][kRow];  // d.mean_a, d.mean_aa, d.mean_ab
+  alignas(64) T filtered[kRing][3][kRow];
 };
+
+// Row y of a ring buffer; y ≥ −kRing.
+SNOW_INLINE size_t ring(int64_t y) { return size_t(y + kRing) % kRing; }
 
 template <class V, class Target>
 struct Photometric {
@@ -123,10 +135,14 @@ struct Photometric {
     const int end = kPad + int(x1 - x0 + kMargin - 1) / kMargin * kMargin;
     const int first = kPad - kMargin, last = end + kMargin;
 
-    for (int64_t y = row_begin - 2 * kSsimRadius; y < row_end + 2 * kSsimRadius; y++) {
-      auto& means = s.means[(y + 2 * kSsimTaps) % kSsimTaps];
-      if (y >= 0 && y < height) {
-        const int64_t row = plane + y * width;
+    for (int64_t y = row_begin - 2 * kSsimRadius; y < row_end + 2 * kSsimRadius; y += kBatch) {
+      for (int64_t yb = y; yb < y + kBatch; yb++) {
+        auto& means = s.means[ring(yb)];
+        if (yb < 0 || yb >= height) {
+          std::memset(means, 0, sizeof means);
+          continue;
+        }
+        const int64_t row = plane + yb * width;
         for (int64_t x = from; x < to; x += W) {
           const int64_t at = x - x0 + kPad;
           const V a = load_pixels<V>(image + row + x, to - x);
@@ -139,66 +155,67 @@ struct Photometric {
           filter.along(s.squares, x).store(means[2] + x);
           filter.along(s.product, x).store(means[3] + x);
         }
-      } else {
-        std::memset(means, 0, sizeof means);
       }
 
-      const int64_t ys = y - kSsimRadius;  // the row whose SSIM is complete now
-      if (ys < row_begin - kSsimRadius) continue;
-      auto& filtered = s.filtered[(ys + 2 * kSsimTaps) % kSsimTaps];
-      if (ys >= 0 && ys < height) {
-        const bool mine = ys >= row_begin && ys < row_end;
-        const T* rows[kSsimTaps];
-        for (int k = 0; k < kSsimTaps; k++)
-          rows[k] = s.means[(ys - kSsimRadius + k + 2 * kSsimTaps) % kSsimTaps][0];
-        V sum(0.f);
-        for (int x = first; x < last; x += W) {
+      // The rows whose SSIM is complete now. The rows of the first batches that are not complete
+      // are not used.
+      const int64_t ys = y - kSsimRadius;
+      if (ys + kBatch <= row_begin - kSsimRadius) continue;
+      const T* rows[kReach];
+      for (int k = 0; k < kReach; k++) rows[k] = s.means[ring(ys - kSsimRadius + k)][0];
+      V similarity[kBatch];
+      for (int r = 0; r < kBatch; r++) similarity[r] = V(0.f);
+      for (int x = first; x < last; x += W) {
+        V means[4][kBatch];
+        for (int k = 0; k < 4; k++) filter.across(rows, k * kRow + x, means[k]);
+        // Windows are centred on pixels of the image only.
+        const V column = V::iota() + V(double(x0 + x - kPad));
+        const auto inside = (column >= V(0.f)) & (V(double(width)) > column);
+        for (int r = 0; r < kBatch; r++) {
           SsimDerivatives<V> d;
-          V value =
-              ssim_pixel(filter.across(rows, x), filter.across(rows, kRow + x),
-                         filter.across(rows, 2 * kRow + x), filter.across(rows, 3 * kRow + x), d);
-          // Windows are centred on pixels of the image only.
-          const int64_t column = x0 + x - kPad;
-          if (column < 0 || column + W > width) {
-            const V c = V::iota() + V(double(column));
-            const auto inside = (c >= V(0.f)) & (V(double(width)) > c);
-            value = zero_unless(inside, value), d.mean_a = zero_unless(inside, d.mean_a);
-            d.mean_aa = zero_unless(inside, d.mean_aa), d.mean_ab = zero_unless(inside, d.mean_ab);
-          }
-          if (mine && x >= kPad && x < end) sum += value;
-          d.mean_a.store(s.derivatives[0] + x), d.mean_aa.store(s.derivatives[1] + x);
-          d.mean_ab.store(s.derivatives[2] + x);
+          const V value = ssim_pixel(means[0][r], means[1][r], means[2][r], means[3][r], d);
+          if (x >= kPad && x < end) similarity[r] += zero_unless(inside, value);
+          zero_unless(inside, d.mean_a).store(s.derivatives[r][0] + x);
+          zero_unless(inside, d.mean_aa).store(s.derivatives[r][1] + x);
+          zero_unless(inside, d.mean_ab).store(s.derivatives[r][2] + x);
         }
-        for (int l = 0; l < W; l++) sums[1] += double(sum.v[l]);
-        if (grad)
+      }
+      for (int r = 0; r < kBatch; r++) {
+        if (ys + r >= row_begin && ys + r < row_end)
+          for (int l = 0; l < W; l++) sums[1] += double(similarity[r].v[l]);
+        auto& filtered = s.filtered[ring(ys + r)];
+        if (ys + r < 0 || ys + r >= height)
+          std::memset(filtered, 0, sizeof filtered);
+        else if (grad)
           for (int x = kPad; x < end; x += W)
-            for (int k = 0; k < 3; k++) filter.along(s.derivatives[k], x).store(filtered[k] + x);
-      } else {
-        std::memset(filtered, 0, sizeof filtered);
+            for (int k = 0; k < 3; k++) filter.along(s.derivatives[r][k], x).store(filtered[k] + x);
       }
 
-      const int64_t yo = ys - kSsimRadius;  // the row whose gradient is complete now
-      if (yo < row_begin) continue;
-      const T* rows[kSsimTaps];
-      for (int k = 0; k < kSsimTaps; k++)
-        rows[k] = s.filtered[(yo - kSsimRadius + k + 2 * kSsimTaps) % kSsimTaps][0];
+      const int64_t yo = ys - kSsimRadius;  // the rows whose gradient is complete now
+      if (yo + kBatch <= row_begin) continue;
+      for (int k = 0; k < kReach; k++) rows[k] = s.filtered[ring(yo - kSsimRadius + k)][0];
       const V up(l1_weight), down(-l1_weight), weight(ssim_weight), zero(0.f);
-      V sum(0.f);
+      V distance[kBatch];
+      for (int r = 0; r < kBatch; r++) distance[r] = V(0.f);
       for (int64_t x = x0; x < x1; x += W) {
-        const int64_t at = plane + yo * width + x;
         const int n = x1 - x < W ? int(x1 - x) : W;
-        const V a = load_pixels<V>(image + at, x1 - x), b = load_pixels<V>(target + at, x1 - x);
-        const V difference = a - b;
-        sum += max(difference, -difference);
-        if (!grad) continue;
-        const int offset = int(x - x0) + kPad;
-        const V sign = select(difference > zero, up, select(zero > difference, down, zero));
-        const V g = sign + weight * (filter.across(rows, offset) +
-                                     V(2.f) * a * filter.across(rows, kRow + offset) +
-                                     b * filter.across(rows, 2 * kRow + offset));
-        g.store_first(grad + at, n);
+        V terms[3][kBatch];
+        if (grad)
+          for (int k = 0; k < 3; k++) filter.across(rows, k * kRow + int(x - x0) + kPad, terms[k]);
+        for (int r = 0; r < kBatch; r++) {
+          if (yo + r < row_begin || yo + r >= row_end) continue;
+          const int64_t at = plane + (yo + r) * width + x;
+          const V a = load_pixels<V>(image + at, x1 - x), b = load_pixels<V>(target + at, x1 - x);
+          const V difference = a - b;
+          distance[r] += max(difference, -difference);
+          if (!grad) continue;
+          const V sign = select(difference > zero, up, select(zero > difference, down, zero));
+          const V g = sign + weight * (terms[0][r] + V(2.f) * a * terms[1][r] + b * terms[2][r]);
+          g.store_first(grad + at, n);
+        }
       }
-      for (int l = 0; l < W; l++) sums[0] += double(sum.v[l]);
+      for (int r = 0; r < kBatch; r++)
+        for (int l = 0; l < W; l++) sums[0] += double(distance[r].v[l]);
     }
   }
 };

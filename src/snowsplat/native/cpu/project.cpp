@@ -79,6 +79,8 @@ int64_t forward(const ProjectForwardParams<T>& p) {
       GaussianGroup<V> g;
       g.rows = RowIndex<W>::of(p.ids, i, end);
       g.load(p.gaussians);
+      for (int64_t next = i + W; next < i + 2 * W && next < end; next++)
+        prefetch_row(p.gaussians, p.ids[next]);
       ProjectedGaussian<V> projected;
       project_gaussian(g.shape, cam, projected);
       V column[kPackedStride], *color = column + kPackedHeader;

@@ -183,16 +183,13 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
   constexpr int B = TileV::kBlocks;
   const TileV tile(index, f.tiles_x, f.width, f.height);
   struct Block {
-    V transmittance, color[C], stopped;  // stopped: the final transmittance of finished lanes
+    V transmittance, color[C], rest;  // rest: the transmittance of each lane when it was finished
   };
   alignas(64) Block block[B];
-  uint32_t open_lanes[B];  // for each block, the bits of the lanes that are not finished
-  Bits open_blocks = 0;    // the bits of the blocks with such lanes
+  Bits open_blocks = 0;  // the bits of the blocks with lanes that are not finished
   for (int b = 0; b < B; b++) {
     const int n = tile.lanes(b);
-    open_lanes[b] = V::bits(V::first(n));
-    block[b].transmittance = zero_unless(V::first(n), V(1.f));
-    block[b].stopped = V(0.f);
+    block[b].transmittance = block[b].rest = zero_unless(V::first(n), V(1.f));
     for (int k = 0; k < C; k++) block[b].color[k] = V(0.f);
     if (n) open_blocks |= Bits(1) << b;
   }
@@ -219,38 +216,34 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
       uint64_t list = lists.list[b];
       if (!list) continue;
       const V X = V::iota() + V(T(b / kTile * V::width));
-      V transmittance = block[b].transmittance, color[C];
+      V transmittance = block[b].transmittance, rest = block[b].rest, color[C];
       for (int k = 0; k < C; k++) color[k] = block[b].color[k];
-      uint32_t lanes_left = open_lanes[b];
       while (list) {
         const int j = first_bit(list);
         list &= list - 1;
         const SplatRecord<T>& r = *splat[j];
         const V power = (V(r.terms.A) * X + V(rows[j].p1[row])) * X + V(rows[j].p0[row]);
         const V a = zero_unless(is_blended(power), capped_alpha(exp2_blend(power)));
-        V weight = a * transmittance, next = transmittance - weight;
+        V weight = a * transmittance;
+        const V next = transmittance - weight;
+        // A lane is finished if this splat would reduce its transmittance below the minimum. The
+        // transmittance of a finished lane decreases further, so the lane stays finished. There is
+        // no branch for single lanes, because it would often be mispredicted.
         const auto open = is_open(next);
-        if (__builtin_expect(V::bits(open) != lanes_left, 0)) {
-          // Lanes in which this splat would reduce the transmittance below the minimum are
-          // finished.
-          const auto stops = V::from_bits(lanes_left & ~V::bits(open));
-          block[b].stopped = select(stops, transmittance, block[b].stopped);
-          lanes_left = V::bits(open);
-          weight = zero_unless(open, weight), next = zero_unless(open, next);
-          if (!lanes_left) {
-            open_blocks &= Bits(~(Bits(1) << b));
-            for (; list; list &= list - 1) blocks_of[first_bit(list)] &= Bits(~(Bits(1) << b));
-          }
-        }
+        weight = zero_unless(open, weight);
+        rest = select(open, next, rest);
         transmittance = next;
+        if (__builtin_expect(!V::bits(open), 0)) {
+          open_blocks &= Bits(~(Bits(1) << b));
+          for (; list; list &= list - 1) blocks_of[first_bit(list)] &= Bits(~(Bits(1) << b));
+        }
         if constexpr (Count)
           color[0] += zero_unless(is_blended(power) & open, V(1.f));
         else
           for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
       }
-      block[b].transmittance = transmittance;
+      block[b].transmittance = transmittance, block[b].rest = rest;
       for (int k = 0; k < C; k++) block[b].color[k] = color[k];
-      open_lanes[b] = lanes_left;
     }
   }
   f.tile_end[index] = i < end ? i : end;
@@ -259,7 +252,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
     const int n = tile.lanes(b);
     if (!n) continue;
     const int64_t at = tile.pixel(b, f.width);
-    const V rest = block[b].transmittance + block[b].stopped;
+    const V rest = block[b].rest;
 #pragma GCC unroll 4
     for (int k = 0; k < C; k++)
       if (k < channels)
@@ -283,11 +276,9 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
     V transmittance, behind, grad[C], grad_alpha;
   };
   alignas(64) Block block[B];
-  uint32_t open_lanes[B];
   for (int b = 0; b < B; b++) {
     const int n = tile.lanes(b);
     const int64_t at = n ? tile.pixel(b, f.width) : 0;
-    open_lanes[b] = V::bits(V::first(n));
     block[b].transmittance = zero_unless(V::first(n), V(1.f));
     V behind(0.f);
 #pragma GCC unroll 4
@@ -311,7 +302,12 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
   uint32_t i = f.tile_start[index];
   RowTerms<V> rows;
   for (; i < end; i++) {
-    if (i + 12 < end) prefetch(&f.records[f.instance_splat[i + 12]]);
+    if (i + 12 < end) {
+      prefetch(&f.records[f.instance_splat[i + 12]]);
+      // Slots are written in random order, and stores complete in program order: one slot that is
+      // not in the cache delays all stores behind it.
+      prefetch_to_write(slots + int64_t(instance_slot[i + 12]) * kSlotWidth);
+    }
     T* slot = slots + int64_t(instance_slot[i]) * kSlotWidth;
     Bits touched = f.instance_blocks[i];
     if (!touched) {
@@ -336,12 +332,10 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
         const V power = (A * X + V(rows.p1[row])) * X + V(rows.p0[row]);
         const V e = exp2_blend(power);
         const V a = zero_unless(is_blended(power), capped_alpha(e));
-        V weight = a * s.transmittance, next = s.transmittance - weight;
+        V weight = a * s.transmittance;
+        const V next = s.transmittance - weight;
         const auto open = is_open(next);
-        if (__builtin_expect(V::bits(open) != open_lanes[b], 0)) {
-          open_lanes[b] = V::bits(open);
-          weight = zero_unless(open, weight), next = zero_unless(open, next);
-        }
+        weight = zero_unless(open, weight);
         s.transmittance = next;
         V grad_dot_color = s.grad_alpha;
         for (int k = 0; k < C; k++) {

@@ -316,8 +316,8 @@ void sum_slots(const SplatsReduceParams<T>& p) {
   parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
     const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
     for (int64_t i = begin; i < end; i++) {
-      if (i + 8 < end) {
-        const uint32_t first = slot_range[2 * (i + 8)], past = slot_range[2 * (i + 8) + 1];
+      if (i + 20 < end) {
+        const uint32_t first = slot_range[2 * (i + 20)], past = slot_range[2 * (i + 20) + 1];
         const uint32_t last = past - first < kPrefetched ? past : first + kPrefetched;
         // Most splats have few slots: the first four are prefetched without a branch.
         for (uint32_t s = first; s < first + 4; s++) prefetch(slots + int64_t(s) * kSlotWidth);
