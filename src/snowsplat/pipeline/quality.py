@@ -31,6 +31,6 @@ class Preset:
 
 PRESETS: dict[Quality, Preset] = {
     "draft": Preset(1600, 640, 1500, 60_000, 50, 120.0),
-    "normal": Preset(2400, 1000, 3000, None, None, 500.0),
+    "normal": Preset(2400, 1000, 2500, None, None, 500.0),
     "best": Preset(3200, 1600, 10_000, 250_000, None, 4000.0),
 }

@@ -25,17 +25,19 @@ def default() -> TrainConfig:
     It is `classic` with these changes, which docs/performance.md measures: the training starts with
     points on the surfaces, which are found by plane sweep; in the last part of the training, all
     learning rates decrease; opacities and scales decay, so that Gaussians which no photo needs
-    disappear and their places are used again; and densification lasts longer and uses absolute
-    gradients.
+    disappear and their places are used again; densification lasts longer and uses absolute
+    gradients; and of the same time, more is used for Gaussians and less for steps.
     """
     config = classic()
     return replace(
         config,
+        iterations=2500,
         dense_init=0.4,
         initial_opacity=0.3,
+        initial_scale=0.6,
         learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),
         decay=DecayRates(opacity=0.04, scale=0.02),
-        density=replace(config.density, densify_until=0.7, abs_grad=True),
+        density=replace(config.density, densify_until=0.7, abs_grad=True, max_gaussians=160_000),
     )
 
 

@@ -55,9 +55,7 @@ def dense_points(
         points.append(world_points(depth_map, pixels))
         colors.append(photo_for_map(view, images).rgb[pixels])
         widths.append(1.0 / (depth_map.inverse_depth[pixels] * depth_map.camera.fx))
-    return thinned(
-        torch.cat(points), torch.cat(colors), torch.cat([torch.zeros(0), *widths]), count
-    )
+    return thinned(torch.cat(points), torch.cat(colors), torch.cat(widths), count)
 
 
 def map_pixels(views: int, width: int, height: int) -> int:
