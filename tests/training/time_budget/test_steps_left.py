@@ -15,7 +15,7 @@ STEPS = 3000
 def estimates(cost, pause=0.0):
     """For each step: the share of the time that is over, and the estimate of the time left divided
     by the true time left."""
-    config = recipe("default", iterations=STEPS)
+    config = recipe("classic", iterations=STEPS)
     schedule, now, gaussians = Schedule(STEPS), 100.0, 10_000
     left = StepsLeft(Work(config, PIXELS, VIEWS), lambda: now)
     times, estimated = [], []

@@ -30,7 +30,7 @@ _MIN_STEPS_PER_PHOTO = 10
 _MIN_SIDE = 400
 _MAX_SIDE = 1600
 #: The limit of the number of Gaussians is raised if there is time for more steps than this.
-_STEPS_FOR_MORE_GAUSSIANS = 4500
+_STEPS_FOR_MORE_GAUSSIANS = 3000
 #: Maximum factor by which this limit is raised.
 _MAX_GAUSSIAN_FACTOR = 2.0
 #: Minimum number of densifications in the first half of a short training run. The minimum interval
