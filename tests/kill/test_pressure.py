@@ -312,7 +312,7 @@ def bars(text: str) -> list[str]:
 def test_a_narrow_terminal(zygote, place, trained, dataset, photos):
     all_commands = commands(place, trained, dataset, photos)
     shutil.copytree(trained, place / "trained")
-    longer = ["train", dataset, "-o", place / "t", "--iterations", 200, *CPU]
+    longer = ["train", dataset, "-o", place / "t", "--iterations", 1000, *CPU]
     for command in (longer, all_commands["sfm"], all_commands["video"], all_commands["evaluate"]):
         ended = zygote.run(command, columns=24)
         assert ended.code == 0, ended.text
@@ -320,7 +320,7 @@ def test_a_narrow_terminal(zygote, place, trained, dataset, photos):
         for bar in bars(ended.text):
             assert len(bar) <= 24, bar
         if command is longer:
-            steps = [re.match(r"(\d+)/200\b", bar) for bar in bars(ended.text)]
+            steps = [re.match(r"(\d+)/1000\b", bar) for bar in bars(ended.text)]
             assert steps, ended.text
             assert all(steps), bars(ended.text)  # numbers are not truncated
             assert ended.text.count("\x1b[?25l") == ended.text.count("\x1b[?25h") == 1  # cursor

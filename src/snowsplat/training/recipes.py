@@ -36,7 +36,7 @@ def default() -> TrainConfig:
         initial_opacity=0.3,
         initial_scale=0.6,
         learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),
-        decay=DecayRates(opacity=0.04, scale=0.02),
+        decay=DecayRates(opacity=0.04, scale=0.02, until=0.7),
         density=replace(config.density, densify_until=0.7, abs_grad=True, max_gaussians=160_000),
     )
 
