@@ -21,7 +21,7 @@ def scene() -> Gaussians:
 
 
 def test_an_epoch_reduces_opacities_and_scales_by_their_rates():
-    views, epochs = 20, 3
+    views, epochs = 50, 3
     decay = Decay(DecayRates(opacity=0.04, scale=0.01), views, Schedule(1000))
     before, after = scene(), scene()
     for step in range(1, views * epochs + 1):
@@ -32,6 +32,18 @@ def test_an_epoch_reduces_opacities_and_scales_by_their_rates():
     torch.testing.assert_close(after.scales, math.exp(-0.01 * epochs) * before.scales)
     for name in ("means", "quats", "sh_dc", "sh_rest"):
         assert torch.equal(after.parameters()[name], before.parameters()[name])
+
+
+@pytest.mark.parametrize(
+    ("views", "factor"), [(200, 1.0), (50, 1.0), (40, 1.25), (20, 2.5), (10, 2.5)]
+)
+def test_the_rate_of_the_opacity_is_larger_with_few_views(views, factor):
+    before, after = scene(), scene()
+    Decay(DecayRates(opacity=0.04, scale=0.01), views, Schedule(1000)).after_step(INTERVAL, after)
+    epochs = INTERVAL / views
+    expected = math.exp(-0.04 * factor * epochs) * before.opacities
+    torch.testing.assert_close(after.opacities[1:], expected[1:], rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(after.scales, math.exp(-0.01 * epochs) * before.scales)
 
 
 def test_logits_stay_finite():

@@ -10,7 +10,8 @@ Splatting with View Consistency for Sparse View Synthesis", NeurIPS 2024.
 
 The rates are per epoch, that is, per as many steps as there are training views. So with fewer
 views, the pressure of a training run of a given length is higher: its photos are repeated more
-often, and it needs more regularisation.
+often, and it needs more regularisation. With fewer than `MANY_VIEWS` views, the rate of the
+opacity is also larger, because fewer photos show each place.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ from snowsplat.training.step_schedule import Schedule, When
 
 #: Number of steps between two reductions.
 INTERVAL = 10
+#: With fewer views, the rate of the opacity is multiplied by `MANY_VIEWS` / views, at most by
+#: `MAX_FACTOR`.
+MANY_VIEWS = 50
+MAX_FACTOR = 2.5
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,8 @@ class DecayRates:
     """The rates of decay; the defaults, 0, disable it.
 
     Attributes:
-        opacity: fraction of its opacity that a Gaussian loses per epoch.
+        opacity: fraction of its opacity that a Gaussian loses per epoch, with at least `MANY_VIEWS`
+            views.
         scale: fraction of its scales that a Gaussian loses per epoch.
         until: the last moment of the decay. Afterwards, the remaining Gaussians regain the opacity
             that the photos require.
@@ -53,14 +59,15 @@ class Decay:
         """
         self.rates = rates
         self._epochs = INTERVAL / views
+        self._opacity = rates.opacity * min(max(1.0, MANY_VIEWS / views), MAX_FACTOR)
         self._schedule = schedule
 
     def after_step(self, step: int, gaussians: Gaussians) -> None:
         """Reduce opacities and scales in place, in every `INTERVAL`-th step."""
         if step % INTERVAL or step > self._schedule.step_of(self.rates.until):
             return
-        if self.rates.opacity > 0.0:
-            factor = math.exp(-self.rates.opacity * self._epochs)
+        if self._opacity > 0.0:
+            factor = math.exp(-self._opacity * self._epochs)
             opacities = factor * gaussians.opacities
             gaussians.opacity_logits.copy_(torch.logit(opacities, eps=1e-7))
         if self.rates.scale > 0.0:
