@@ -122,9 +122,10 @@ def test_every_setting_is_a_flag_and_a_setting_of_some_recipe():
     assert list(RECIPES) == list(get_args(Recipe))
 
 
+@pytest.mark.parametrize("name", ["abs_grad", "stop_overfitting"])
 @pytest.mark.parametrize(("value", "expected"), [("on", True), ("off", False)])
-def test_the_flag_of_the_absolute_gradient(value, expected):
-    assert ConfigFlags(abs_grad=value).config_settings() == {"abs_grad": expected}
+def test_flags_with_the_values_on_and_off(name, value, expected):
+    assert ConfigFlags(**{name: value}).config_settings() == {name: expected}
     assert ConfigFlags().config_settings() == {}
 
 

@@ -35,6 +35,11 @@ class ConfigFlags:
     """After this step, leave out the training photos that the scene does not explain: their camera
     poses are probably wrong. A value with a decimal point (0.15) is a fraction of all steps; 0:
     never."""
+    stop_overfitting: Annotated[Literal["on", "off"] | None, flag("{on,off}", default=RECIPE)] = (
+        None
+    )
+    """Whether the training ends earlier if the views between the photos become worse. This happens
+    in long training runs with few photos. The dataset needs points."""
 
     sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
     """Degree of the spherical harmonics (view-dependent colour). A lower degree needs less
@@ -99,6 +104,7 @@ class ConfigFlags:
         given = {field.name: getattr(self, field.name) for field in fields(ConfigFlags)}
         if self.test_iterations is not None:
             given["test_iterations"] = tuple(step for step in self.test_iterations if step > 0)
-        if self.abs_grad is not None:
-            given["abs_grad"] = self.abs_grad == "on"
+        for name in ("abs_grad", "stop_overfitting"):
+            if given[name] is not None:
+                given[name] = given[name] == "on"
         return {name: value for name, value in given.items() if value is not None}

@@ -26,7 +26,7 @@ class CheckpointMeta:
         recipe: the recipe from which the configuration was derived.
         training: the configuration, see `config_to_json`.
         time: see `TimeBudget.as_json`; None without a time budget.
-        schedule: the schedule, which a time budget may change; None without a time budget.
+        schedule: the schedule, if it has changed: for a time budget, or because the scene overfits.
     """
 
     capture: DatasetSettings

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 #: Largest number of photos that a line for the user names.
 _LISTED = 10
+#: Why a training run ends early.
+_WORSE = "the views between the photos became worse"
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class TrainResult:
         evaluation: the step and the metrics of the last evaluation on held-out photos.
         left_out: names of the training photos that were left out, because the scene does not
             explain them; see ``TrainConfig.leave_out_after``.
+        ended_early: the line about a training run that ends before its last planned step, because
+            the scene overfits; otherwise None. See ``TrainConfig.stop_overfitting``.
         time: the seconds that were used, including earlier runs, and the time budget in seconds;
             None without a time budget.
     """
@@ -58,6 +62,7 @@ class TrainResult:
     reductions: tuple[str, ...]
     evaluation: tuple[int, Evaluation] | None
     left_out: tuple[str, ...]
+    ended_early: str | None
     time: tuple[float, float] | None
 
 
@@ -110,6 +115,7 @@ class TrainingRun:
         self.history = History.read(self.out.history, self.first_step)
         self._left = StepsLeft(Work.of(self.config, self.trainer.dataset))
         self._told = False  # whether the observer knows which photos are left out
+        self._told_end = False  # whether the observer knows that the training ends early
 
     def run(self) -> TrainResult:
         """Run all steps and write the results.
@@ -164,6 +170,9 @@ class TrainingRun:
         if self.trainer.left_out and not self._told:
             self.observer.note(left_out_line(self._left_out()))
             self._told = True
+        if (line := self._ended_early()) is not None and not self._told_end:
+            self.observer.note(line)
+            self._told_end = True
         if self._checkpoint_is_due(progress.step):
             self._save_checkpoint()
         if progress.step in self.save_iterations:
@@ -176,7 +185,8 @@ class TrainingRun:
             if self.pace is not None and self.budget is not None:
                 self.pace.postpone(paused)
                 self.budget.started += paused
-        if self.pace is not None:
+        # If the scene overfits, the trainer has shortened the schedule, and no more time is needed.
+        if self.pace is not None and self.trainer.overfitting is None:
             schedule = self.trainer.schedule
             length = self.pace.iterations_after(
                 schedule, progress.step, progress.downscale, progress.gaussians
@@ -191,6 +201,13 @@ class TrainingRun:
 
     def _left_out(self) -> tuple[str, ...]:
         return tuple(self.trainer.dataset.train[i].name for i in self.trainer.left_out)
+
+    def _ended_early(self) -> str | None:
+        found, iterations = self.trainer.overfitting, self.trainer.schedule.iterations
+        # `resume` with `iterations` may continue a training run that has ended early.
+        if found is None or iterations >= found.planned:
+            return None
+        return f"stopped after {iterations} of {found.planned} steps: {_WORSE}"
 
     def _checkpoint_is_due(self, step: int) -> bool:
         every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
@@ -227,7 +244,9 @@ class TrainingRun:
         self._restore_folder()
         meta = CheckpointMeta(self.settings, self.recipe, config_to_json(self.config))
         if self.budget is not None:
-            meta = replace(meta, time=self.budget.as_json(), schedule=self.trainer.schedule)
+            meta = replace(meta, time=self.budget.as_json())
+        if self.trainer.schedule.since > 0:
+            meta = replace(meta, schedule=self.trainer.schedule)
         # Write the history first: a run that resumes from the checkpoint needs the curves up to it.
         self.history.write(self.out.history)
         path = checkpoint.save(
@@ -279,6 +298,7 @@ class TrainingRun:
             reductions=self.memory.plan.reductions,
             evaluation=self.evaluation,
             left_out=self._left_out(),
+            ended_early=self._ended_early(),
             time=time_used,
         )
         self.observer.trained(result)
@@ -304,6 +324,7 @@ class TrainingRun:
                 history=self.history,
                 evaluation=None if self.evaluation is None else self.evaluation[1],
                 left_out=self._left_out(),
+                ended_early=self._ended_early(),
                 settings={
                     "recipe": self.recipe,
                     "capture": dataset,

@@ -54,6 +54,8 @@ class TrainConfig:
         leave_out_after: the moment after which training views are left out if the scene does not
             explain them, because their camera poses are probably wrong; see `unexplained`. 0:
             never.
+        stop_overfitting: whether the training ends earlier if the views between the photos become
+            worse; see `overfitting`.
         image_memory: bytes for decoded images; 0: half of the available memory.
         test_iterations: steps after which `Trainer.run` evaluates the test views.
         checkpoint_every: number of steps between two checkpoints; 0: none. The caller of
@@ -80,6 +82,7 @@ class TrainConfig:
     visible_only: bool = False
     coarse_to_fine: tuple[When, When] = (0, 0)
     leave_out_after: When = 0
+    stop_overfitting: bool = False
     image_memory: int = 0
     test_iterations: tuple[int, ...] = (7_000, 30_000)
     checkpoint_every: int = 0

@@ -63,11 +63,13 @@ def check_state(own: Mapping[str, Tensor], given: Mapping[str, Tensor], views: i
         for mine, other in ((own[name], given[name]) for name in own)
     )
     # The kernels take one number of rows for all tensors of Gaussians.
-    others = ("random.", "step", "order", "checked", "left_out")
+    others = ("random.", "step", "order", "checked", "left_out", "overfitting.")
     rows = {len(t) for name, t in given.items() if not name.startswith(others) and t.ndim}
     fits = fits and len(rows) == 1
     fits = fits and all(
-        own[name].shape == given[name].shape for name in own if name.startswith("random.")
+        own[name].shape == given[name].shape
+        for name in own
+        if name.startswith(("random.", "overfitting."))
     )
     every = set(range(views))
     if fits and "left_out" in given:

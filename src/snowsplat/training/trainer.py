@@ -22,6 +22,7 @@ from snowsplat.training.finite import check_state
 from snowsplat.training.init import initial_gaussians
 from snowsplat.training.losses import view_loss
 from snowsplat.training.optim import Adam
+from snowsplat.training.overfitting import Overfitting, OverfittingCheck
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.unexplained import unexplained_views
@@ -68,7 +69,8 @@ class Trainer:
 
     Between two steps, `state_tensors` is the complete state. A trainer that loads it produces
     bit-identical results (on a GPU: only with `torch.use_deterministic_algorithms`).
-    Between two steps, `Schedule.stretch` may change the number of steps.
+    Between two steps, `Schedule.stretch` may change the number of steps. The trainer does this
+    itself if the scene overfits.
 
     Attributes:
         gaussians: the scene after ``step`` steps, on ``device``.
@@ -144,9 +146,17 @@ class Trainer:
             device=self.device,
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
+        self._overfitting = OverfittingCheck(
+            dataset, self._images, self.schedule, self._evaluation_background()
+        )
         self._runner = StepRunner(len(self.gaussians), self.device, config.density.abs_grad)
         if state is not None:
             self.load_state(state)
+
+    @property
+    def overfitting(self) -> Overfitting | None:
+        """When the scene began to overfit; see ``TrainConfig.stop_overfitting``."""
+        return self._overfitting.found
 
     def run(
         self, on_progress: Callable[[Progress], None] | None = None, until: int | None = None
@@ -180,6 +190,10 @@ class Trainer:
         self.within_step = True
         with single_threaded():
             self._leave_out_unexplained()
+            if self.config.stop_overfitting:
+                self._overfitting.after_step(
+                    self.step, self.gaussians, self.config.sh_degree_at(self.step), self.left_out
+                )
             # In the paper, a step ends with density control. Here, density control runs at the
             # beginning of the next step, so that a scene is never evaluated or saved directly after
             # a change by density control.
@@ -215,7 +229,7 @@ class Trainer:
 
     def evaluate(self) -> Evaluation:
         """Metrics of the test views in the current state. Black replaces a random background."""
-        background = (0.0, 0.0, 0.0) if self._background is None else self._background.tolist()
+        background = self._evaluation_background().tolist()
         with single_threaded():
             return evaluate_views(self.gaussians, self.dataset.test, background=background)
 
@@ -239,18 +253,22 @@ class Trainer:
         after = self.config.leave_out_after
         if self._checked or not after or self.step < self.schedule.step_of(after):
             return
-        black = torch.zeros(3, device=self.device)
         self.left_out = unexplained_views(
             self.gaussians,
             self.dataset.train,
             self._images,
-            background=black if self._background is None else self._background,
+            background=self._evaluation_background(),
             sh_degree=self.config.sh_degree_at(self.step),
         )
         self._checked = True
         if self.left_out:
             self._order = [i for i in self._order if i not in self.left_out]
         self._prefetch(self._downscale(self.step + 1))
+
+    def _evaluation_background(self) -> Tensor:
+        """(3,) on the device: the background colour; black replaces a random one."""
+        black = torch.zeros(3, device=self.device)
+        return black if self._background is None else self._background
 
     def _next_background(self) -> Tensor:
         """The background colour, (3,) on the device: the fixed colour, or a random one."""
@@ -282,6 +300,9 @@ class Trainer:
         if self.config.leave_out_after:  # otherwise, as in earlier versions of the format
             tensors["checked"] = torch.tensor(self._checked)
             tensors["left_out"] = torch.tensor(self.left_out, dtype=torch.int64)
+        if self.config.stop_overfitting:
+            state = self._overfitting.state_tensors()
+            tensors |= {f"overfitting.{name}": tensor for name, tensor in state.items()}
         return tensors
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -312,5 +333,7 @@ class Trainer:
         if self.config.leave_out_after:
             self._checked = bool(tensors["checked"])
             self.left_out = tuple(tensors["left_out"].tolist())
+        if self.config.stop_overfitting:
+            self._overfitting.load_state(part("overfitting."))
         self._order = tensors["order"].tolist()
         self._prefetch(self._downscale(self.step + 1))

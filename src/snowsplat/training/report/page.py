@@ -53,6 +53,7 @@ class Trained:
             evaluated.
         settings: the settings by name, as JSON values.
         left_out: names of the training views that the training has left out.
+        ended_early: why the training ended before its last planned step; None if it did not.
         peak_bytes: peak memory; 0 if unknown.
     """
 
@@ -65,6 +66,7 @@ class Trained:
     evaluation: Evaluation | None
     settings: dict[str, Any]
     left_out: tuple[str, ...] = ()
+    ended_early: str | None = None
     peak_bytes: int = 0
 
 
@@ -87,6 +89,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
         body = [
             _headline(trained, evaluation, held_out),
             _cards(trained, evaluation, held_out),
+            _ended_early(trained.ended_early),
             _left_out(trained.left_out),
             _curves(trained.history),
             pictures.compared(trained.gaussians, views, evaluation, trained.background),
@@ -124,6 +127,10 @@ def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
         (duration(trained.history.seconds), "of training"),
     ]
     return cards(figures)
+
+
+def _ended_early(why: str | None) -> str:
+    return "" if why is None else f"<p>The training {text(why)}.</p>"
 
 
 def _left_out(names: tuple[str, ...]) -> str:

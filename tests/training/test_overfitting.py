@@ -1,0 +1,266 @@
+"""Overfitting: the unseen views, the estimate, the rule, and the training that ends early."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from snowsplat.data import load_dataset
+from snowsplat.data.dataset import Dataset
+from snowsplat.data.decode import LoadedImage
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training import checkpoint, overfitting
+from snowsplat.training.config import TrainConfig
+from snowsplat.training.overfitting import (
+    Overfitting,
+    OverfittingCheck,
+    UnseenView,
+    beside,
+    estimated_psnr,
+    unseen_views,
+)
+from snowsplat.training.recipes import recipe
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.trainer import Trainer
+from snowsplat.util.errors import UserError
+
+BLACK = torch.zeros(3)
+CONFIG = recipe("default", iterations=120, stop_overfitting=True)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Dataset:
+    folder = tmp_path_factory.mktemp("toy")
+    return load_dataset(write_toy_dataset(folder, "colmap-bin", 24, 64, 48, n_points=800))
+
+
+def views_of(dataset: Dataset, photo=None) -> list[UnseenView]:
+    """The unseen views. ``photo`` changes the photos."""
+    assert dataset.points is not None
+    with ImageLoader(dataset.train) as images:
+        if photo is not None:
+            get = images.get
+            images.get = lambda view: photo(get(view))  # type: ignore[method-assign]
+        return unseen_views(dataset.train, dataset.points.xyz, images, BLACK)
+
+
+def points_of(unseen: list[UnseenView]) -> int:
+    return sum(len(view.pixels) for view in unseen)
+
+
+# The unseen views
+
+
+def test_an_unseen_view_is_beside_a_photo(dataset):
+    first, second = (view.camera for view in dataset.train[:2])
+    moved = beside(first, second, 0.5)
+    expected = 1.5 * first.position - 0.5 * second.position
+    assert torch.allclose(moved.position.double(), expected.double(), atol=1e-5)
+    rotation = moved.cam_from_world[:, :3].double()
+    assert torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-6)
+    assert torch.det(rotation) > 0
+    # The first camera is between the two others, also in its direction.
+    one, middle, other = (c.cam_from_world[2, :3].double() for c in (moved, first, second))
+    assert one @ middle > one @ other
+    assert torch.equal(beside(first, second, 0.0).position.float(), first.position.float())
+
+
+def test_the_colours_of_points_in_unseen_views(dataset):
+    """The toy points are exact, so their colours are those of the surfaces."""
+    unseen = views_of(dataset)
+    assert len(unseen) == 11  # every second one of 21 views, as there are more than 16
+    assert points_of(unseen) > 1000
+    for view in unseen:
+        assert (view.camera.width, view.camera.height) == (64, 48)
+        pixel, _ = view.camera.project(dataset.points.xyz.double())
+        distance, nearest = torch.cdist(view.pixels.double(), pixel).min(1)
+        assert distance.max() < 1e-4
+        error = (view.colors - dataset.points.rgb[nearest] / 255).abs().mean(1)
+        assert error.median() < 0.05
+
+
+def test_points_with_different_colours_in_two_photos_are_not_used(dataset):
+    generator = torch.Generator().manual_seed(1)
+
+    def noisy(photo: LoadedImage) -> LoadedImage:
+        noise = torch.randint(0, 256, photo.planes.shape, generator=generator, dtype=torch.uint8)
+        return replace(photo, planes=noise)
+
+    assert points_of(views_of(dataset, noisy)) < 0.1 * points_of(views_of(dataset))
+
+
+@pytest.mark.parametrize("kind", ["mask", "alpha"])
+def test_masked_and_transparent_pixels_are_not_used(dataset, kind):
+    def halved(photo: LoadedImage) -> LoadedImage:
+        left = torch.zeros(photo.planes.shape[1:], dtype=torch.bool)
+        left[:, : left.shape[1] // 2] = True
+        if kind == "mask":
+            return replace(photo, mask=left)
+        return replace(photo, planes=torch.cat([photo.planes, 255 * left[None].to(torch.uint8)]))
+
+    def nothing(photo: LoadedImage) -> LoadedImage:
+        return replace(photo, mask=torch.zeros(photo.planes.shape[1:], dtype=torch.bool))
+
+    assert 0 < points_of(views_of(dataset, halved)) < 0.7 * points_of(views_of(dataset))
+    assert views_of(dataset, nothing) == []
+
+
+# The estimate
+
+
+def test_a_known_estimate(dataset):
+    """Colours that differ by 0.1 from the rendering: 20 dB; without a difference: 60 dB. Larger
+    differences count as 0.2."""
+    gaussians = Trainer(dataset, CONFIG).gaussians
+    camera = dataset.train[0].camera
+    pixels = torch.tensor([[10.5, 20.5], [30.5, 7.5]])
+    image = overfitting.render(gaussians, camera, BLACK).image.clamp(0, 1)
+    colors = image[pixels[:, 1].long(), pixels[:, 0].long()]
+    exact = UnseenView(camera, pixels, colors)
+    assert estimated_psnr(gaussians, [exact], BLACK, 3) == pytest.approx(60.0, abs=1e-6)
+    other = replace(exact, colors=colors + torch.tensor([0.1, -0.1, 0.1]))
+    assert estimated_psnr(gaussians, [other], BLACK, 3) == pytest.approx(20.0, abs=1e-3)
+    hidden = replace(exact, colors=colors + 0.5)
+    assert estimated_psnr(gaussians, [hidden], BLACK, 3) == pytest.approx(13.979, abs=1e-3)
+    both = [exact, hidden]
+    assert estimated_psnr(gaussians, both, BLACK, 3) == pytest.approx(16.990, abs=1e-3)
+
+
+def test_the_estimate_tells_fog_that_no_photo_shows(dataset):
+    """A Gaussian directly in front of an unseen view, and behind the camera of the photo."""
+    trainer = Trainer(dataset, CONFIG)
+    unseen = views_of(dataset)
+    before = estimated_psnr(trainer.gaussians, unseen, BLACK, 0)
+    fog = {name: p[:1].clone() for name, p in trainer.gaussians.parameters().items()}
+    world_from_cam = unseen[0].camera.world_from_cam.float()
+    fog["means"] = (world_from_cam[:, 3] + 0.3 * world_from_cam[:, 2])[None]
+    fog["log_scales"] = torch.full((1, 3), -2.5)
+    fog["opacity_logits"] = torch.tensor([2.0])
+    fog["sh_dc"] = torch.full((1, 1, 3), -1.5)
+    own = trainer.gaussians.parameters()
+    foggy = Gaussians(**{name: torch.cat([own[name], fog[name]]) for name in own})
+    assert estimated_psnr(foggy, unseen, BLACK, 0) < before - 0.1
+
+
+# The rule
+
+
+def check_with(monkeypatch, estimates: list[float], iterations: int = 1000) -> OverfittingCheck:
+    """Run all steps of a schedule with given estimates."""
+    given = iter(estimates)
+    monkeypatch.setattr(overfitting, "unseen_views", lambda *args: [None])
+    monkeypatch.setattr(overfitting, "estimated_psnr", lambda *args: next(given))
+    schedule = Schedule(iterations)
+    check = OverfittingCheck(Dataset([], [], None, 1.0), None, schedule, BLACK)  # type: ignore[arg-type]
+    step = 0
+    while step < schedule.iterations:
+        check.after_step(step, None, 0, ())  # type: ignore[arg-type]
+        step += 1
+    return check
+
+
+@pytest.mark.parametrize(
+    ("estimates", "step"),
+    [
+        ([20.0, 19.9, 19.8, 19.7], 600),
+        ([20.0, 19.9, 19.9, 19.9], 600),
+        ([20.0, 20.5, 20.4, 20.3, 20.2], 650),
+        ([20.0, 19.5, 20.0, 19.5, 19.5, 19.95, 19.8, 19.7, 19.6], 850),
+    ],
+)
+def test_three_lower_estimates_in_a_row_end_the_training(monkeypatch, estimates, step):
+    check = check_with(monkeypatch, estimates)
+    assert check.found == Overfitting(step, 1000)
+    # The rest of the schedule is completed in a quarter of the steps.
+    assert check._schedule.iterations == step + -(-(1000 - step) // 4)
+    assert check._schedule.share(check._schedule.iterations) == 1.0
+    assert check._schedule.share(step) == pytest.approx(step / 1000)
+
+
+@pytest.mark.parametrize(
+    "estimates",
+    [
+        [24.68, 24.66, 24.64, 24.71, 24.70, 24.75, 24.81, 24.85, 24.84],  # fern
+        [25.56, 25.65, 25.66, 25.70, 25.56, 25.62, 25.78, 25.75, 25.79],  # fox at 270×480
+        [20.0, 19.8, 19.8, 20.0, 19.8, 19.8, 20.0, 19.8, 19.8],
+        [20.0 + 0.1 * i for i in range(9)],
+    ],
+)
+def test_other_estimates_do_not_end_the_training(monkeypatch, estimates):
+    check = check_with(monkeypatch, estimates)
+    assert check.found is None
+    assert check._estimates == len(estimates) == 9
+    assert check._schedule == Schedule(1000)
+
+
+def test_without_points_nothing_is_estimated(dataset, monkeypatch):
+    monkeypatch.setattr(overfitting, "estimated_psnr", None)
+    with ImageLoader(dataset.train) as images:
+        check = OverfittingCheck(replace(dataset, points=None), images, Schedule(100), BLACK)
+        check.after_step(50, None, 0, ())  # type: ignore[arg-type]
+    assert check.found is None
+
+
+# The training
+
+
+def run(dataset: Dataset, config: TrainConfig) -> Trainer:
+    trainer = Trainer(dataset, config)
+    trainer.run()
+    return trainer
+
+
+def assert_identical(a: Gaussians, b: Gaussians) -> None:
+    for name, parameter in a.parameters().items():
+        assert torch.equal(parameter, b.parameters()[name]), name
+
+
+@pytest.mark.slow
+def test_the_check_changes_no_bit_if_the_scene_does_not_overfit(dataset):
+    checked, unchecked = (
+        run(dataset, replace(CONFIG, stop_overfitting=on)) for on in (True, False)
+    )
+    assert checked.overfitting is None
+    assert checked._overfitting._estimates == 9
+    assert checked._overfitting._best > 15.0
+    assert_identical(checked.gaussians, unchecked.gaussians)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [60, 65, 66, 67, 75])
+def test_a_resumed_run_ends_at_the_same_step_with_the_same_scene(
+    dataset, tmp_path, monkeypatch, stop
+):
+    monkeypatch.setattr(overfitting, "_DIFFERENCE", -100.0)  # every estimate is worse
+    uninterrupted = run(dataset, CONFIG)
+    assert uninterrupted.overfitting == Overfitting(66, 120)
+    assert uninterrupted.step == 66 + 14
+    first = Trainer(dataset, CONFIG)
+    first.run(until=stop)
+    path = checkpoint.save(tmp_path, stop, first.state_tensors(), {})
+    state = checkpoint.load(path).tensors
+    second = Trainer(dataset, CONFIG, replace(first.schedule), state=state)
+    second.run()
+    assert (second.step, second.overfitting) == (80, Overfitting(66, 120))
+    assert_identical(second.gaussians, uninterrupted.gaussians)
+
+
+def test_a_checkpoint_without_the_setting_is_as_before(dataset):
+    state = Trainer(dataset, replace(CONFIG, stop_overfitting=False)).state_tensors()
+    assert not any(name.startswith("overfitting") for name in state)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("counts", torch.zeros(3, dtype=torch.int64)), ("counts", torch.zeros(4)), ("best", None)],
+)
+def test_a_damaged_state_is_rejected(dataset, name, value):
+    trainer = Trainer(dataset, CONFIG)
+    state = trainer.state_tensors()
+    state.pop(f"overfitting.{name}")
+    if value is not None:
+        state[f"overfitting.{name}"] = value
+    with pytest.raises(UserError, match="another dataset or recipe"):
+        trainer.load_state(state)
