@@ -159,25 +159,25 @@ def test_the_line_about_photos_that_are_left_out(count, expected):
 
 def test_a_training_that_ends_early_says_so_also_when_resumed(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(overfitting, "_DIFFERENCE", -100.0)  # every estimate is worse
-    settings = {"iterations": 40, "stop_overfitting": True}
-    line = "stopped after 27 of 40 steps: the views between the photos became worse"
+    settings = {"iterations": 200, "stop_overfitting": True}
+    line = "stopped after 133 of 200 steps: the views between the photos became worse"
     whole = train(dataset, tmp_path / "whole", TrainOptions(settings=settings))
 
-    recorder = Recorder(interrupt_at=25)
+    recorder = Recorder(interrupt_at=120)
     with pytest.raises(TrainingStopped):
         train(dataset, tmp_path / "out", TrainOptions(settings=settings), observer=recorder)
     assert recorder.notes.count(line) == 1
-    assert recorder.events.index("note", 3) == recorder.events.index("step 23") + 1
+    assert recorder.events.index("note", 3) == recorder.events.index("step 111") + 1
 
     recorder = Recorder()
     result = resume(tmp_path / "out", observer=recorder)
     assert recorder.notes.count(line) == 1
-    assert (result.step, result.ended_early) == (27, line)
+    assert (result.step, result.ended_early) == (133, line)
     assert f"<p>The training {line}.</p>" in result.report.read_text()
     assert result.scene.read_bytes() == whole.scene.read_bytes()
 
-    longer = resume(tmp_path / "out", TrainOptions(settings={"iterations": 45}))
-    assert (longer.step, longer.ended_early) == (45, None)
+    longer = resume(tmp_path / "out", TrainOptions(settings={"iterations": 205}))
+    assert (longer.step, longer.ended_early) == (205, None)
     assert "became worse" not in longer.report.read_text()
 
 

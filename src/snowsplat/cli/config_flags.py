@@ -35,9 +35,7 @@ class ConfigFlags:
     """After this step, leave out the training photos that the scene does not explain: their camera
     poses are probably wrong. A value with a decimal point (0.15) is a fraction of all steps; 0:
     never."""
-    stop_overfitting: Annotated[Literal["on", "off"] | None, flag("{on,off}", default=RECIPE)] = (
-        None
-    )
+    stop_overfitting: Annotated[Literal["on", "off"] | None, flag("{on,off}", default="off")] = None
     """Whether the training ends earlier if the views between the photos become worse. This happens
     in long training runs with few photos. The dataset needs points."""
 

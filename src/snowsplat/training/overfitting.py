@@ -15,10 +15,11 @@ where I_v is the rendering of the unseen view v, u_vp the pixel of the point p i
 mean of the colours of p in the two photos. Some points are hidden in the unseen view. Because
 errors are limited to 0.2, these points lower the estimate by about the same amount each time.
 
-The estimate is computed at regular moments. The rule is early stopping with patience (Prechelt,
-"Early Stopping – But When?", 1998): the scene overfits if several estimates in a row are below the
-best one. The rest of the schedule is then completed in a quarter of its steps, so that the learning
-rates still decrease to their final values.
+The estimate is computed at regular moments, if there is at least one epoch between two of them:
+otherwise, the photos are not repeated often enough to overfit. The rule is early stopping with
+patience (Prechelt, "Early Stopping – But When?", 1998): the scene overfits if several estimates in
+a row are below the best one. The rest of the schedule is then completed in a quarter of its steps,
+so that the learning rates still decrease to their final values.
 """
 
 from __future__ import annotations
@@ -46,12 +47,12 @@ from snowsplat.training.step_schedule import Schedule
 _FIRST, _LAST, _EVERY = 45, 85, 5
 #: The scene overfits if this number of estimates in a row are below the best one by at least this
 #: difference in dB. In training runs without overfitting, one or two in a row can be that low.
-_PATIENCE, _DIFFERENCE = 3, 0.1
+_PATIENCE, _DIFFERENCE = 3, 0.2
 #: The rest of the schedule is divided by this number.
 _SHORTENING = 4
 
 #: Largest number of unseen views. An estimate takes as long as a few steps.
-_VIEWS = 16
+_VIEWS = 12
 #: An unseen view is this share of the distance between the two cameras beside the first of them.
 _BESIDE = 0.5
 #: The colours of a point in two photos may differ by this much in each channel, in units of white.
@@ -124,6 +125,8 @@ class OverfittingCheck:
         moment = self._schedule.step_of(percent / 100.0)
         if self.found is not None or percent > _LAST or step < moment:
             return
+        if self._schedule.iterations * _EVERY < 100 * len(self._dataset.train):
+            return
         self._estimates += 1
         if self._unseen is None:
             views = [v for i, v in enumerate(self._dataset.train) if i not in left_out]
@@ -162,7 +165,7 @@ class OverfittingCheck:
 def unseen_views(
     views: Sequence[View], points: Tensor, images: ImageLoader, background: Tensor
 ) -> list[UnseenView]:
-    """At most 16 unseen views with their points.
+    """At most 12 unseen views with their points.
 
     Args:
         views: views with photos.
