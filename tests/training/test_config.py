@@ -134,18 +134,28 @@ def test_the_configuration_of_another_version_is_rejected():
 def test_the_limit_follows_the_size_of_the_photos():
     config = recipe("default")
     assert config.gaussians_per_pixel > 0
-    small = config.capped(1000).density.max_gaussians
-    assert small == round(1000 * config.gaussians_per_pixel)
-    assert config.capped(10**9) == config
+    small = config.capped(1000, 40)
+    assert small.density.max_gaussians == round(1000 * config.gaussians_per_pixel)
+    assert small.capped(2000, 400) == small  # it is final
+    assert config.capped(10**9, 40).density == config.density
     # A limit that is set explicitly takes precedence.
-    assert recipe("default", max_gaussians=200_000).capped(1000).density.max_gaussians == 200_000
-    assert recipe("paper").capped(1000).density.max_gaussians == 0
-    assert recipe("default").capped(1).density.max_gaussians == 1
-    assert replace(recipe("paper"), gaussians_per_pixel=0.5).capped(99).density.max_gaussians == 50
+    explicit = recipe("default", max_gaussians=200_000)
+    assert explicit.capped(1000, 400).density.max_gaussians == 200_000
+    assert recipe("paper").capped(1000, 40).density.max_gaussians == 0
+    assert recipe("default").capped(1, 40).density.max_gaussians == 1
+    per_pixel = replace(recipe("paper"), gaussians_per_pixel=0.5)
+    assert per_pixel.capped(99, 400).density.max_gaussians == 50
+
+
+def test_the_limit_grows_with_the_number_of_views():
+    config = recipe("default")
+    few, many = (config.capped(1000, n).density.max_gaussians for n in (50, 200))
+    assert many == 2 * few == 2 * config.capped(1000, 3).density.max_gaussians
+    assert recipe("classic").capped(1000, 200) == recipe("classic").capped(1000, 50)
 
 
 @pytest.mark.parametrize(("limit", "expected"), [(1, 1), (249, 249), (250, 250), (251, 250)])
 def test_the_smaller_limit_counts(limit, expected):
     config = recipe("paper", max_gaussians=limit, gaussians_per_pixel=0.25)
     assert config.gaussians_per_pixel == 0.25
-    assert config.capped(1000).density.max_gaussians == expected
+    assert config.capped(1000, 40).density.max_gaussians == expected

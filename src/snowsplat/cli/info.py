@@ -22,7 +22,7 @@ class Info:
       snowsplat info out/garden
       snowsplat info walk_scene
       snowsplat info garden.spz
-      snowsplat info out/garden/point_cloud/iteration_2500/point_cloud.ply
+      snowsplat info out/garden/point_cloud/iteration_2000/point_cloud.ply
       snowsplat info garden
 
     Notes:

@@ -20,7 +20,7 @@ class Train(TrainFlags):
     """Train a scene from photos with known camera poses (COLMAP or transforms.json).
 
     Examples:
-      snowsplat train garden -o out                  2500 steps; takes a few minutes
+      snowsplat train garden -o out                  2000 steps; takes a few minutes
       snowsplat train garden -o out --eval           hold out every 8th photo
       snowsplat train garden -o out -r 4             faster: 1/4 of the width
       snowsplat train garden -o out --minutes 5      finish within 5 minutes

@@ -29,7 +29,7 @@ class JobFlags:
     recipe: Annotated[
         Recipe | None, flag(f"{{{','.join(get_args(Recipe))}}}", default="default")
     ] = None
-    """Named configuration, which determines the defaults of the other settings. default: 2500
+    """Named configuration, which determines the defaults of the other settings. default: 2000
     steps, designed for CPUs; classic: the default recipe of version 0.1; paper: the 30,000 steps of
     the paper; mcmc: 30,000 steps with a fixed maximum number of Gaussians; mcmc-short: the same in
     3000 steps."""

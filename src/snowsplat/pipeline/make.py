@@ -32,7 +32,13 @@ STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
 RECORD = "make.json"
 HOLD_OUT = 8
 # The fields of a preset that affect the training.
-_TRAINING_FIELDS = ("side", "iterations", "max_gaussians", "densify_interval")
+_TRAINING_FIELDS = (
+    "side",
+    "iterations",
+    "max_gaussians",
+    "densify_interval",
+    "stop_overfitting",
+)
 # Photos that the scene does not explain after this fraction of the steps are left out of the
 # training: see docs/cameras.md.
 _LEAVE_OUT_AFTER = 0.2
@@ -339,8 +345,7 @@ class _Job:
             settings: dict[str, Any] = {"leave_out_after": _LEAVE_OUT_AFTER}
             return replace(options, hold_out=HOLD_OUT, minutes=minutes, settings=settings)
         preset = PRESETS[self.plan.quality]
-        names = ("iterations", "max_gaussians", "densify_interval")
-        settings = {name: getattr(preset, name) for name in names}
+        settings = {name: getattr(preset, name) for name in _TRAINING_FIELDS if name != "side"}
         return replace(
             options,
             hold_out=HOLD_OUT,

@@ -42,10 +42,14 @@ class TrainConfig:
             to its three nearest neighbours.
         learning_rates: see `LearningRates`.
         decay: see `DecayRates`.
+        relative_scale: largest scale of a Gaussian, in units of its distance to the nearest camera
+            of a training view; see `scale_limit`. 0: no limit.
         density: settings of density control, one of `DENSITY_CONTROLS`.
         gaussians_per_pixel: limit of the number of Gaussians relative to the number of pixels of a
             photo, in addition to ``density.max_gaussians``. More Gaussians would not improve the
-            scene. 0: no limit.
+            scene. 0: no limit, and ``limit_views`` has no effect.
+        limit_views: with more training views than this, the limit of Gaussians grows with the
+            square root of their number, because they show a larger scene. 0: it does not grow.
         visible_only: whether the optimiser skips Gaussians that are not visible in the view of the
             step. In the paper, their momentum continues to change them. Skipping them is faster,
             without a measurable loss of quality.
@@ -77,8 +81,10 @@ class TrainConfig:
     initial_scale: float = 1.0
     learning_rates: LearningRates = field(default_factory=LearningRates)
     decay: DecayRates = field(default_factory=DecayRates)
+    relative_scale: float = 0.0
     density: DensityConfig = field(default_factory=AdaptiveDensity)
     gaussians_per_pixel: float = 0.0
+    limit_views: int = 0
     visible_only: bool = False
     coarse_to_fine: tuple[When, When] = (0, 0)
     leave_out_after: When = 0
@@ -124,6 +130,11 @@ class TrainConfig:
         ):
             if not 0.0 <= rate < math.inf:
                 raise SettingError(name, f"{rate:g} is not valid; use e.g. 0.04, or 0 for none")
+        if not 0.0 <= self.relative_scale < math.inf:
+            raise SettingError(
+                "relative_scale",
+                f"{self.relative_scale:g} is not valid; use e.g. 0.5, or 0 for none",
+            )
         if not 0.0 <= self.dense_init <= 1.0:
             raise SettingError("dense_init", f"{self.dense_init:g} is not a share; use e.g. 0.4")
         if self.leave_out_after < 0:
@@ -131,14 +142,24 @@ class TrainConfig:
                 "leave_out_after", f"{self.leave_out_after} is negative; use 0 for never"
             )
 
-    def capped(self, pixels: int) -> TrainConfig:
-        """This configuration with the limit of Gaussians for photos of ``pixels`` pixels."""
+    def capped(self, pixels: int, views: int) -> TrainConfig:
+        """This configuration with the limit of Gaussians for a dataset.
+
+        The result has no ``gaussians_per_pixel``, so another call does not change it.
+
+        Args:
+            pixels: number of pixels of a photo.
+            views: number of training views.
+        """
         if self.gaussians_per_pixel <= 0:
             return self
-        cap = max(1, round(self.gaussians_per_pixel * pixels))
+        cap = self.gaussians_per_pixel * pixels
         if self.density.max_gaussians > 0:
             cap = min(cap, self.density.max_gaussians)
-        return replace(self, density=replace(self.density, max_gaussians=cap))
+        if self.limit_views > 0:
+            cap *= max(1.0, math.sqrt(views / self.limit_views))
+        density = replace(self.density, max_gaussians=max(1, round(cap)))
+        return replace(self, density=density, gaussians_per_pixel=0.0)
 
     def downscale_at(self, step: int, schedule: Schedule) -> int:
         """The factor by which images are reduced at this step: 1, 2 or 4."""

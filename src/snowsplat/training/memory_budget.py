@@ -146,7 +146,7 @@ def plan_memory(
     """
     sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
     largest, median = sizes[-1], sizes[len(sizes) // 2]
-    config = config.capped(median)
+    config = config.capped(median, len(dataset.train))
     cost = GPU if device.type == "cuda" else CPU
     starts_random = dataset.points is None and not present
     scene = _SceneCost(

@@ -25,19 +25,30 @@ def default() -> TrainConfig:
     It is `classic` with these changes, which docs/performance.md measures: the training starts with
     points on the surfaces, which are found by plane sweep; in the last part of the training, all
     learning rates decrease; opacities and scales decay, so that Gaussians which no photo needs
-    disappear and their places are used again; densification lasts longer and uses absolute
-    gradients; and of the same time, more is used for Gaussians and less for steps.
+    become transparent; Gaussians with an opacity below 0.1 are removed, and their places are used
+    again; densification lasts longer, uses absolute gradients, and always reaches the maximum
+    number; and of the same time, more is used for Gaussians and less for steps.
     """
     config = classic()
     return replace(
         config,
-        iterations=2500,
+        iterations=2000,
         dense_init=0.4,
         initial_opacity=0.3,
         initial_scale=0.6,
         learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),
         decay=DecayRates(opacity=0.04, scale=0.02, until=0.7),
-        density=replace(config.density, densify_until=0.7, abs_grad=True, max_gaussians=160_000),
+        relative_scale=0.5,
+        density=replace(
+            config.density,
+            densify_until=0.7,
+            grad_threshold=1e-4,
+            abs_grad=True,
+            prune_opacity=0.1,
+            max_gaussians=200_000,
+        ),
+        gaussians_per_pixel=0.6,
+        limit_views=50,
     )
 
 

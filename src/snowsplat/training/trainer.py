@@ -23,6 +23,7 @@ from snowsplat.training.init import initial_gaussians
 from snowsplat.training.losses import view_loss
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
+from snowsplat.training.scale_limit import ScaleLimit
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.unexplained import unexplained_views
@@ -103,7 +104,7 @@ class Trainer:
             raise UserError("the dataset has no training views; check its folder and its split")
         self.dataset = dataset
         sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
-        self.config = config = config.capped(sizes[len(sizes) // 2])
+        self.config = config = config.capped(sizes[len(sizes) // 2], len(sizes))
         self.schedule = schedule or Schedule(config.iterations)
         self.step = 0
         self.within_step = False
@@ -146,6 +147,7 @@ class Trainer:
             device=self.device,
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
+        self._scale_limit = ScaleLimit(config.relative_scale, self._cameras)
         self._overfitting = OverfittingCheck(
             dataset, self._images, self.schedule, self._evaluation_background()
         )
@@ -202,6 +204,7 @@ class Trainer:
                     self.step, self.gaussians, self._optimizer
                 )
                 self._decay.after_step(self.step, self.gaussians)
+                self._scale_limit.after_step(self.step, self.gaussians)
             step = self.step + 1
             view, camera, photo = self._next_view(step)
             background = self._next_background()

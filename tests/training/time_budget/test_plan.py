@@ -78,9 +78,9 @@ def test_depth_maps_need_enough_time():
 
 
 def test_the_number_of_gaussians():
-    assert planned(30, 552, 986).config.density.max_gaussians == 160_000
-    assert planned(3600, 552, 986).config.density.max_gaussians == 272_136
-    assert planned(3600, 270, 480).config.density.max_gaussians == 64_800  # one for two pixels
+    assert planned(30, 552, 986).config.density.max_gaussians == 200_000
+    assert planned(3600, 552, 986).config.density.max_gaussians == 326_563
+    assert planned(3600, 270, 480).config.density.max_gaussians == 77_760  # 0.6 per pixel
     named = changed(recipe("default"), max_gaussians=50_000)
     plan = make_plan(dataset(552, 986), named, 3600, 1.0, more_gaussians=False)
     assert plan.config.density.max_gaussians == 50_000
@@ -110,7 +110,7 @@ def test_other_recipes():
 
 def test_plans_as_text():
     plan = replace(planned(60, 552, 986), config=recipe("default", iterations=8964))
-    assert str(plan) == "552x986, at most 160,000 Gaussians, about 9,000 steps"
+    assert str(plan) == "552x986, at most 200,000 Gaussians, about 9,000 steps"
 
 
 @pytest.mark.slow

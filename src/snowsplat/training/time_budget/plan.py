@@ -224,7 +224,7 @@ def _capped(config: TrainConfig, pixels: int, gaussian_factor: float) -> TrainCo
         config = replace(
             config, density=changed(config, max_gaussians=round(gaussian_factor * cap)).density
         )
-    return config.capped(pixels)
+    return config.capped(pixels, views=0)  # the limit follows the time, not the views
 
 
 def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:

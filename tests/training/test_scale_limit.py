@@ -1,0 +1,75 @@
+"""The limit of scales by the distance to the cameras."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import look_at
+from snowsplat.training import scale_limit
+from snowsplat.training.recipes import recipe
+from snowsplat.training.scale_limit import INTERVAL, ScaleLimit
+from snowsplat.util.errors import SettingError
+
+
+def camera(x: float) -> Camera:
+    up, target = torch.tensor([0.0, -1.0, 0.0]), torch.tensor([x, 0.0, 9.0])
+    pose = look_at(torch.tensor([x, 0.0, 0.0]).double(), target.double(), up.double())
+    return Camera(40, 30, 30.0, 30.0, 20.0, 15.0, pose)
+
+
+CAMERAS = [camera(0.0), camera(100.0)]
+
+
+def scene() -> Gaussians:
+    """Means at the distances 2, 8, 5 and 0 from the nearest camera; scales 0.5, 1.5 and 3."""
+    bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    gaussians = Gaussians.random_in_bounds(bounds, 4, torch.Generator().manual_seed(5))
+    gaussians.means = torch.tensor(
+        [[2.0, 0.0, 0.0], [0.0, 0.0, 8.0], [103.0, 4.0, 0.0], [0.0, 0.0, 0.0]]
+    )
+    gaussians.log_scales = torch.tensor([0.5, 1.5, 3.0]).log().repeat(4, 1)
+    return gaussians
+
+
+def test_scales_are_at_most_the_share_of_the_distance_to_the_nearest_camera(monkeypatch):
+    monkeypatch.setattr(scale_limit, "_ROWS", 3)  # several parts
+    before, after = scene(), scene()
+    ScaleLimit(0.5, CAMERAS).after_step(INTERVAL, after)
+    limits = torch.tensor([1.0, 4.0, 2.5])
+    torch.testing.assert_close(after.scales[:3], torch.minimum(before.scales[:3], limits[:, None]))
+    assert after.log_scales.isfinite().all()
+    assert float(after.scales[3].max()) < 1e-30
+    for name in ("means", "quats", "opacity_logits", "sh_dc", "sh_rest"):
+        assert torch.equal(after.parameters()[name], before.parameters()[name])
+
+
+@pytest.mark.parametrize(("ratio", "step"), [(0.0, INTERVAL), (0.5, INTERVAL + 1)])
+def test_nothing_changes_without_a_limit_and_between_its_steps(ratio, step):
+    before, after = scene(), scene()
+    ScaleLimit(ratio, CAMERAS).after_step(step, after)
+    assert torch.equal(after.log_scales, before.log_scales)
+
+
+def test_many_cameras_are_sampled():
+    many = [camera(0.01 * i) for i in range(1000)]
+    limit = ScaleLimit(0.5, many)
+    assert len(limit._centres) <= 64
+    gaussians = scene()
+    limit.after_step(INTERVAL, gaussians)
+    assert math.isclose(float(gaussians.scales[1].max()), 3.0, rel_tol=1e-6)  # below the limit, 4
+
+
+def test_recipes():
+    assert recipe("default").relative_scale == 0.5
+    for name in ("classic", "paper", "mcmc", "mcmc-short"):
+        assert recipe(name).relative_scale == 0.0
+
+
+@pytest.mark.parametrize("ratio", [-0.1, math.inf, math.nan])
+def test_invalid_ratios(ratio):
+    with pytest.raises(SettingError, match="relative_scale"):
+        replace(recipe("default"), relative_scale=ratio)
