@@ -64,7 +64,7 @@ def test_many_cameras_are_sampled():
 
 
 def test_recipes():
-    assert recipe("default").relative_scale == 0.5
+    assert recipe("default").relative_scale == 0.3
     for name in ("classic", "paper", "mcmc", "mcmc-short"):
         assert recipe(name).relative_scale == 0.0
 

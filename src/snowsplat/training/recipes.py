@@ -38,7 +38,7 @@ def default() -> TrainConfig:
         initial_scale=0.6,
         learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),
         decay=DecayRates(opacity=0.04, scale=0.02, until=0.7),
-        relative_scale=0.5,
+        relative_scale=0.3,
         density=replace(
             config.density,
             densify_until=0.7,
