@@ -300,7 +300,7 @@ def test_minutes(run, dataset, tmp_path):
     result = run("train", dataset, "-o", out, *flags)
     assert result.code == 0, result.err
     lines = result.out.splitlines()
-    assert re.fullmatch(r"1.8 s on this machine: 48x36, at most 864 Gaussians, .*steps", lines[1])
+    assert re.fullmatch(r"1.8 s on this machine: 48x36, at most 1,037 Gaussians, .*steps", lines[1])
     assert re.fullmatch(r"\S+ s in total, of 1.8 s", lines[-1])
     step = json.loads((out / "metrics.json").read_text())["iteration"]
     assert len(scene(out, step)) > 1000
