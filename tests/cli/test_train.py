@@ -306,7 +306,7 @@ def test_minutes(run, dataset, tmp_path):
     assert len(scene(out, step)) > 1000
     training = json.loads((out / "config.json").read_text())["training"]
     assert training["iterations"] == step > 1
-    assert training["density"]["max_gaussians"] == 864
+    assert training["density"]["max_gaussians"] == 1037
 
     # The training run is finished; --iterations adds steps to it.
     assert run("train", "-o", out, "--resume", "--iterations", step + 50).code == 0
