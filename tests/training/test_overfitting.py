@@ -17,7 +17,6 @@ from snowsplat.training.overfitting import (
     Overfitting,
     OverfittingCheck,
     UnseenView,
-    beside,
     estimated_psnr,
     unseen_views,
 )
@@ -51,20 +50,6 @@ def points_of(unseen: list[UnseenView]) -> int:
 
 
 # The unseen views
-
-
-def test_an_unseen_view_is_beside_a_photo(dataset):
-    first, second = (view.camera for view in dataset.train[:2])
-    moved = beside(first, second, 0.5)
-    expected = 1.5 * first.position - 0.5 * second.position
-    assert torch.allclose(moved.position.double(), expected.double(), atol=1e-5)
-    rotation = moved.cam_from_world[:, :3].double()
-    assert torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-6)
-    assert torch.det(rotation) > 0
-    # The first camera is between the two others, also in its direction.
-    one, middle, other = (c.cam_from_world[2, :3].double() for c in (moved, first, second))
-    assert one @ middle > one @ other
-    assert torch.equal(beside(first, second, 0.0).position.float(), first.position.float())
 
 
 def test_the_colours_of_points_in_unseen_views(dataset):

@@ -44,6 +44,8 @@ class TrainConfig:
         decay: see `DecayRates`.
         relative_scale: largest scale of a Gaussian, in units of its distance to the nearest camera
             of a training view; see `scale_limit`. 0: no limit.
+        near_limit: smallest depth of a Gaussian in a view, in units of that of the nearest points
+            of the dataset; see `near_limit`. 0: no limit.
         density: settings of density control, one of `DENSITY_CONTROLS`.
         gaussians_per_pixel: limit of the number of Gaussians relative to the number of pixels of a
             photo, in addition to ``density.max_gaussians``. More Gaussians would not improve the
@@ -82,6 +84,7 @@ class TrainConfig:
     learning_rates: LearningRates = field(default_factory=LearningRates)
     decay: DecayRates = field(default_factory=DecayRates)
     relative_scale: float = 0.0
+    near_limit: float = 0.0
     density: DensityConfig = field(default_factory=AdaptiveDensity)
     gaussians_per_pixel: float = 0.0
     limit_views: int = 0
@@ -130,11 +133,12 @@ class TrainConfig:
         ):
             if not 0.0 <= rate < math.inf:
                 raise SettingError(name, f"{rate:g} is not valid; use e.g. 0.04, or 0 for none")
-        if not 0.0 <= self.relative_scale < math.inf:
-            raise SettingError(
-                "relative_scale",
-                f"{self.relative_scale:g} is not valid; use e.g. 0.5, or 0 for none",
-            )
+        for name, limit in (
+            ("relative_scale", self.relative_scale),
+            ("near_limit", self.near_limit),
+        ):
+            if not 0.0 <= limit < math.inf:
+                raise SettingError(name, f"{limit:g} is not valid; use e.g. 0.5, or 0 for none")
         if not 0.0 <= self.dense_init <= 1.0:
             raise SettingError("dense_init", f"{self.dense_init:g} is not a share; use e.g. 0.4")
         if self.leave_out_after < 0:

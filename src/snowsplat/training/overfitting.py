@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -36,10 +36,10 @@ from snowsplat.data.dataset import Dataset, View
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import invert_rigid
 from snowsplat.scene.render import render
 from snowsplat.training.dense_init.source_views import source_views
 from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.unseen_cameras import beside
 
 #: The first and the last moment of an estimate, and the distance between two, in percent of the
 #: schedule. Before the first one, the recipes use small photos. After the last one, few steps could
@@ -194,20 +194,6 @@ def unseen_views(
         chosen = known & also_known & inside & same
         unseen.append(UnseenView(camera, pixels[chosen], 0.5 * (first + other)[chosen]))
     return unseen if sum(len(view.pixels) for view in unseen) >= _FEWEST_POINTS else []
-
-
-def beside(first: Camera, second: Camera, share: float) -> Camera:
-    """The first camera, moved and rotated away from the second one by a share of their difference.
-
-    The rotation is the nearest one to (1 + share) R₁ − share R₂.
-    """
-    a, b = (camera.world_from_cam.to(torch.float64) for camera in (first, second))
-    moved = (1.0 + share) * a - share * b
-    u, _, vt = torch.linalg.svd(moved[:, :3])
-    if torch.det(u @ vt) < 0.0:  # the two directions are almost opposite
-        vt[2] = -vt[2]
-    world_from_cam = torch.cat([u @ vt, moved[:, 3:]], dim=1)
-    return replace(first, cam_from_world=invert_rigid(world_from_cam))
 
 
 @torch.no_grad()

@@ -26,8 +26,9 @@ def default() -> TrainConfig:
     points on the surfaces, which are found by plane sweep; in the last part of the training, all
     learning rates decrease; opacities and scales decay, so that Gaussians which no photo needs
     become transparent; Gaussians with an opacity below 0.1 are removed, and their places are used
-    again; densification lasts longer, uses absolute gradients, and always reaches the maximum
-    number; and of the same time, more is used for Gaussians and less for steps.
+    again; no Gaussian is much nearer to a camera than the points that it sees; densification lasts
+    longer, uses absolute gradients, and always reaches the maximum number; and of the same time,
+    more is used for Gaussians and less for steps.
     """
     config = classic()
     return replace(
@@ -39,6 +40,7 @@ def default() -> TrainConfig:
         learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),
         decay=DecayRates(opacity=0.04, scale=0.02, until=0.7),
         relative_scale=0.3,
+        near_limit=0.6,
         density=replace(
             config.density,
             densify_until=0.7,

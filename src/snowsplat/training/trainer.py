@@ -21,6 +21,7 @@ from snowsplat.training.decay import Decay
 from snowsplat.training.finite import check_state
 from snowsplat.training.init import initial_gaussians
 from snowsplat.training.losses import view_loss
+from snowsplat.training.near_limit import NearLimit
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
 from snowsplat.training.scale_limit import ScaleLimit
@@ -148,6 +149,8 @@ class Trainer:
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
         self._scale_limit = ScaleLimit(config.relative_scale, self._cameras)
+        points = None if dataset.points is None else dataset.points.xyz
+        self._near_limit = NearLimit(config.near_limit, self._cameras, points)
         self._overfitting = OverfittingCheck(
             dataset, self._images, self.schedule, self._evaluation_background()
         )
@@ -200,6 +203,7 @@ class Trainer:
             # beginning of the next step, so that a scene is never evaluated or saved directly after
             # a change by density control.
             if self.step > 0:
+                self._near_limit.after_step(self.step, self.gaussians)
                 self.gaussians = self._density.after_step(
                     self.step, self.gaussians, self._optimizer
                 )

@@ -1,0 +1,117 @@
+"""The limit of Gaussians near the cameras."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat.data import load_dataset
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import look_at
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training.near_limit import INTERVAL, NearLimit, nearest_depth, unseen_cameras
+from snowsplat.training.recipes import recipe
+from snowsplat.training.trainer import Trainer
+from snowsplat.util.errors import SettingError
+
+
+def camera(x: float) -> Camera:
+    """At (x, 0, 0), looking along z, with a field of view of 90° in both directions."""
+    position = torch.tensor([x, 0.0, 0.0]).double()
+    forward, up = torch.tensor([0.0, 0.0, 9.0]).double(), torch.tensor([0.0, -1.0, 0.0]).double()
+    return Camera(40, 40, 20.0, 20.0, 20.0, 20.0, look_at(position, position + forward, up))
+
+
+def wall(depth: float = 10.0) -> Tensor:
+    """(400, 3) points on the plane z = depth; all cameras between x = −3 and 3 see most of them."""
+    grid = torch.linspace(-8.0, 8.0, 20)
+    x, y = torch.meshgrid(grid, grid, indexing="ij")
+    return torch.stack([x, y, torch.full_like(x, depth)], dim=2).reshape(-1, 3)
+
+
+def removed(cameras: list[Camera], points: Tensor | None, means: list[list[float]]) -> list[bool]:
+    """Which Gaussians at ``means`` a limit of 0.5 removes."""
+    bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    gaussians = Gaussians.random_in_bounds(bounds, len(means), torch.Generator().manual_seed(5))
+    gaussians.means = torch.tensor(means)
+    before = gaussians.clone()
+    NearLimit(0.5, cameras, points).after_step(INTERVAL, gaussians)
+    for name, tensor in gaussians.parameters().items():
+        if name != "opacity_logits":
+            assert torch.equal(tensor, before.parameters()[name])
+    changed = gaussians.opacity_logits != before.opacity_logits
+    assert float(gaussians.opacities[changed].sum()) < len(means) / 255
+    return changed.tolist()
+
+
+def test_gaussians_in_front_of_the_points_are_removed():
+    near = [[0.0, 0.0, 4.9], [0.0, 0.0, 0.1], [4.8, -4.8, 4.9]]
+    kept = [[0.0, 0.0, 5.1], [0.0, 0.0, -1.0], [9.0, 0.0, 4.9], [0.0, 0.0, 10.0]]
+    assert removed([camera(0.0)], wall(), near + kept) == [True] * 3 + [False] * 4
+
+
+def test_also_in_views_that_nobody_photographed():
+    """A Gaussian between the fields of view of two cameras, and one beside the first of them."""
+    first, second = camera(-3.0), camera(3.0)
+    between, beside, outside = [0.0, 0.0, 0.5], [-5.5, 0.0, 1.2], [-5.5, 0.0, 0.3]
+    assert removed([first], wall(), [between, beside, outside]) == [False] * 3
+    assert removed([first, second], wall(), [between, beside, outside]) == [True, True, False]
+    positions = sorted(float(c.position[0]) for c in unseen_cameras([first, second], wall()))
+    assert positions == pytest.approx([-4.5, 0.0, 0.0, 4.5], abs=1e-6)
+
+
+def test_a_few_wrong_points_do_not_matter():
+    wrong = torch.tensor([[0.0, 0.0, 0.5]] * 4)
+    assert nearest_depth(camera(0.0), torch.cat([wall(), wrong])) == pytest.approx(10.0)
+    assert removed([camera(0.0)], torch.cat([wall(), wrong]), [[0.0, 0.0, 4.0]]) == [True]
+
+
+def test_views_with_few_points_have_no_limit():
+    assert nearest_depth(camera(0.0), wall()[::10]) == 0.0
+    assert removed([camera(0.0)], wall()[::10], [[0.0, 0.0, 4.0]]) == [False]
+
+
+def test_nothing_is_removed_without_points_or_without_a_limit():
+    assert removed([camera(0.0)], None, [[0.0, 0.0, 4.0]]) == [False]
+    gaussians = Gaussians.random_in_bounds(
+        torch.tensor([[-1.0, -1.0, 1.0], [1.0, 1.0, 2.0]]), 9, torch.Generator().manual_seed(5)
+    )
+    before = gaussians.clone()
+    NearLimit(0.0, [camera(0.0)], wall()).after_step(INTERVAL, gaussians)
+    NearLimit(0.5, [camera(0.0)], wall()).after_step(INTERVAL + 1, gaussians)
+    assert torch.equal(gaussians.opacity_logits, before.opacity_logits)
+
+
+def test_many_cameras_are_sampled():
+    limit = NearLimit(0.5, [camera(0.001 * i) for i in range(500)], wall())
+    assert limit._views is not None
+    assert len(limit._views) <= 64 * 5
+
+
+def test_a_training_run_without_a_floater(tmp_path):
+    """An opaque Gaussian in front of a camera is removed by density control."""
+    dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 8, 48, 36, n_points=400))
+    trainer = Trainer(dataset, recipe("default", iterations=300, dense_init=0.0))
+    trainer.run(until=INTERVAL)
+    viewer = dataset.train[0].camera.world_from_cam
+    floater = (viewer[:, 3] + 0.1 * viewer[:, 2]).to(torch.float32)
+    trainer.gaussians.means[0] = floater
+    trainer.gaussians.opacity_logits[0] = 6.0
+    trainer.run(until=INTERVAL + 1)
+    distances = (trainer.gaussians.means - floater).norm(dim=1)
+    assert float(distances.min()) > 0.05
+
+
+def test_recipes():
+    assert recipe("default").near_limit == 0.6
+    for name in ("classic", "paper", "mcmc", "mcmc-short"):
+        assert recipe(name).near_limit == 0.0
+
+
+@pytest.mark.parametrize("share", [-0.1, math.inf, math.nan])
+def test_invalid_shares(share):
+    with pytest.raises(SettingError, match="near_limit"):
+        replace(recipe("default"), near_limit=share)
