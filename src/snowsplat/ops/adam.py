@@ -45,20 +45,23 @@ def adam_step(
     The gradients of the parameters are never written to memory. This halves the time of this part
     of a training step. The camera arguments and `sh_degree` must be those passed to `project`.
 
-    params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of `project`,
-        contiguous. If `.grad` is not None (from a regulariser), it is added to the gradient.
-    exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
-    ids, packed_grad: `splats.ids` (M,), ascending, and `splats.packed.grad` (M, 16). On a GPU, rows
-        with id -1 may be present or removed.
-    lr: the learning rate of each parameter.
-    step: the number of this step, from 1 on (for the bias correction).
-    visible_only: whether rows that are not in `ids` keep their values and moments. If False, their
-        gradient is 0 (plus `.grad`), and their moments decay.
-    valid: (1,) bool on the device; False skips the step. The CPU does not wait for the value.
-        None means True.
-    nonfinite_rows: (6,) int32 counts, in the order of the parameters; None disables counting. If
-        the step would make a value infinite or NaN, the value and its moments stay unchanged, and
-        its row is counted. So a non-finite gradient does not change the parameters.
+    Args:
+        params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of
+            `project`, contiguous. If `.grad` is not None (from a regulariser), it is added to the
+            gradient.
+        exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
+        ids, packed_grad: `splats.ids` (M,), ascending, and `splats.packed.grad` (M, 16). On a GPU,
+            rows with id -1 may be present or removed.
+        lr: the learning rate of each parameter.
+        step: the number of this step, from 1 on (for the bias correction).
+        visible_only: whether rows that are not in `ids` keep their values and moments. If False,
+            their gradient is 0 (plus `.grad`), and their moments decay.
+        valid: (1,) bool on the device; False skips the step. The CPU does not wait for the value.
+            None means True.
+        nonfinite_rows: (6,) int32 counts, in the order of the parameters; None disables counting.
+            If the step would make a value infinite or NaN, the value and its moments stay
+            unchanged, and its row is counted. So a non-finite gradient does not change the
+            parameters.
 
     Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
     p −= lr · m̂ / √(v̂ + eps²) (Kingma & Ba 2015, but with ε inside the root).

@@ -50,15 +50,17 @@ def project(
     On a GPU all rows are returned, because the CPU would have to wait in order to remove rows. The
     rows of invisible Gaussians are empty (zeros) and have the id -1.
 
-    means: (N, 3) in world units.
-    log_scales: (N, 3).
-    quats: (N, 4) wxyz, not necessarily normalised; zero means no rotation.
-    opacity_logits: (N,).
-    sh_dc: (N, 1, 3).
-    sh_rest: (N, K, 3); the first (sh_degree + 1)² − 1 rows of each Gaussian are used.
-    cam_from_world: (3, 4), with the axes of OpenCV.
-    fx, fy, cx, cy: in pixels.
-    near: > 0, in world units.
+    Args:
+        means: (N, 3) in world units.
+        log_scales: (N, 3).
+        quats: (N, 4) wxyz, not necessarily normalised; zero means no rotation.
+        opacity_logits: (N,).
+        sh_dc: (N, 1, 3).
+        sh_rest: (N, K, 3); the first (sh_degree + 1)² − 1 rows of each Gaussian are used.
+        cam_from_world: (3, 4), with the axes of OpenCV.
+        fx, fy, cx, cy: in pixels.
+        near: > 0, in world units.
+
     All tensors are float32, or all are float64.
 
     The 2D covariance is Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (Kerbl et al. 2023, eq. 5); the colour is

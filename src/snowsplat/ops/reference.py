@@ -414,8 +414,8 @@ def accumulate_screen_statistics(
     """Adds one view to the statistics of the visible Gaussians for density control (section 5.2).
 
     The gradient of the 2D mean, (M, 2), is scaled to a screen that spans [-1, 1] in x and y. Rows
-    with a non-finite gradient are skipped. If `valid` (1,) is False, all rows are skipped.
-    absolute: use `splats.abs_grad` instead of the gradient.
+    with a non-finite gradient are skipped. If `valid` (1,) is False, all rows are skipped. If
+    `absolute`, `splats.abs_grad` is used instead of the gradient.
     """
     if valid is not None and not valid:
         return
@@ -460,17 +460,18 @@ def adam_step(
 ) -> None:
     """Propagates the gradient of the splats through `project` and takes one Adam step, in place.
 
-    params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of `project`.
-        If `.grad` is not None (from a regulariser), it is added to the gradient.
-    exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
-    ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns).
-    lr: the learning rate of each parameter.
-    step: the number of this step, from 1 on.
-    visible_only: whether rows that are not in `ids` keep their values and moments. If False, their
-        gradient is 0 (plus `.grad`), and their moments decay.
-    valid: (1,) bool; False: nothing is changed.
-    nonfinite_rows: (6,) int32 counts, one per parameter. If the step would make a value infinite or
-        NaN, the value and its moments stay unchanged, and its row is counted.
+    Args:
+        params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of
+            `project`. If `.grad` is not None (from a regulariser), it is added to the gradient.
+        exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
+        ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns).
+        lr: the learning rate of each parameter.
+        step: the number of this step, from 1 on.
+        visible_only: whether rows that are not in `ids` keep their values and moments. If False,
+            their gradient is 0 (plus `.grad`), and their moments decay.
+        valid: (1,) bool; False: nothing is changed.
+        nonfinite_rows: (6,) int32 counts, one per parameter. If the step would make a value
+            infinite or NaN, the value and its moments stay unchanged, and its row is counted.
 
     Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
     p −= lr · m̂ / √(v̂ + eps²); the paper has the denominator √v̂ + eps. The steps with

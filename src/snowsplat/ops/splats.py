@@ -33,26 +33,30 @@ def packed_width(channels: int) -> int:
 class Splats2D:
     """2D Gaussians on the image plane, in pixels. Pixel (i, j) is centred at (i + 0.5, j + 0.5).
 
-    packed:   (M, 16·ceil((8 + C) / 16)), one row per splat:
-              0:2 `means2d`   x, y
-              2:5 `conics`    a, b, c of the inverse covariance [[a, b], [b, c]]
-              5   `opacities` in [0, 1]
-              6   `depths`    camera z; splats are ordered by it, nearest first, then by row
-              7   `radii`     3 σ of the major axis (information only, without gradient)
-              8:8+C `colors`; the rest is padding (zero)
-    ids:      (M,) int32: the index of the Gaussian of each row, ascending. −1 marks an empty row,
-              which is not drawn. On a GPU, `project` returns a row for every Gaussian, because the
-              CPU would have to wait for the number of visible ones. On the CPU no row is empty.
-              None: there are no 3D Gaussians (2D Gaussians fitted to an image).
-    channels: C, at least 1.
-    abs_grad: (M, 2), or None. The backward pass of `rasterize` adds to it, for x and y separately,
-              Σ |g| over the 16×16 tiles of the image. g is the part of the gradient of `means2d`
-              that comes from the pixels of the tile, so the gradient itself is Σ g. In |Σ g|,
-              tiles that move a splat in opposite directions cancel. The homodirectional gradient of
-              AbsGS (Ye et al. 2024, arXiv:2404.10484) is the same sum over pixels. The sum over
-              tiles is cheap, because the gradients of the tiles are computed anyway.
+    The columns of a row of `packed`:
+
+        0:2   means2d    x, y
+        2:5   conics     a, b, c of the inverse covariance [[a, b], [b, c]]
+        5     opacities  in [0, 1]
+        6     depths     camera z; splats are ordered by it, nearest first, then by row
+        7     radii      3 σ of the major axis (information only, without gradient)
+        8:8+C colors     the rest is padding (zero)
 
     The properties are views of `packed`; autograd flows through them.
+
+    Attributes:
+        packed: (M, 16·ceil((8 + C) / 16)), one row per splat.
+        ids: (M,) int32: the index of the Gaussian of each row, ascending. −1 marks an empty row,
+            which is not drawn. On a GPU, `project` returns a row for every Gaussian, because the
+            CPU would have to wait for the number of visible ones. On the CPU no row is empty.
+            None: there are no 3D Gaussians (2D Gaussians fitted to an image).
+        channels: C, at least 1.
+        abs_grad: (M, 2), or None. The backward pass of `rasterize` adds to it, for x and y
+            separately, Σ |g| over the 16×16 tiles of the image. g is the part of the gradient of
+            `means2d` that comes from the pixels of the tile, so the gradient itself is Σ g. In
+            |Σ g|, tiles that move a splat in opposite directions cancel. The homodirectional
+            gradient of AbsGS (Ye et al. 2024, arXiv:2404.10484) is the same sum over pixels. The
+            sum over tiles is cheap, because the gradients of the tiles are computed anyway.
     """
 
     packed: Tensor
