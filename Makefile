@@ -2,6 +2,7 @@
 # make quick    checks of format, lint, types and layers, and the fast tests: under a minute once built
 # make test     the same checks and all tests: on every instruction set, with the GPU kernels on the CPU
 # make dev      creates the development environment for the other targets
+# make docs     builds the documentation site in build/docs; warnings are errors
 # make format   formats the sources
 # make native   builds the native libraries
 #
@@ -31,7 +32,7 @@ BUILD := build/native
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo quick test dev format native compiler lint types layers clean
+.PHONY: demo quick test dev docs format native compiler lint types layers clean
 .PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized
 
 demo: native
@@ -52,7 +53,7 @@ dev: native
 	@$(BOOTSTRAP) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(NO_VENV)" >&2; exit 1; }
 	$(BOOTSTRAP) -m venv .venv
 	.venv/bin/python -m pip install --quiet --upgrade pip
-	.venv/bin/python -m pip install --editable '.[dev]' \
+	.venv/bin/python -m pip install --editable '.[dev,docs]' \
 	    --config-settings=wheel.cmake=false --config-settings=editable.mode=inplace
 	@touch $@
 
@@ -69,6 +70,11 @@ native: $(ENVIRONMENT) | compiler
 	        -DPython3_EXECUTABLE="$(abspath $(shell command -v $(PYTHON)))" >/dev/null; \
 	    cmake --build $(BUILD) -- --quiet; \
 	    cmake --install $(BUILD) --prefix src >/dev/null'
+
+# Always all pages: otherwise, the warnings about unchanged pages would be missing.
+docs: $(ENVIRONMENT)
+	$(PYTHON) -m sphinx --builder html --doctree-dir build/doctrees --fresh-env --fail-on-warning --keep-going \
+	    --quiet docs build/docs
 
 format: $(ENVIRONMENT)
 	ruff format .
