@@ -38,7 +38,7 @@ pygments_style = "tango"
 
 # API
 autoclass_content = "both"
-autodoc_default_options = {"member-order": "bysource", "show-inheritance": False}
+autodoc_default_options = {"member-order": "bysource"}
 autodoc_preserve_defaults = True
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
