@@ -31,9 +31,9 @@ html_theme = "furo"
 html_title = f"snowsplat {release}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_show_copyright = False
 html_show_sphinx = False
 html_copy_source = False
-html_last_updated_fmt = None
 pygments_style = "tango"
 
 # API

@@ -1,4 +1,4 @@
-"""Adapts docstrings, which are plain text with sections in Google style, to reStructuredText.
+"""Adapts docstrings, which are plain text with sections in Google style, to Sphinx.
 
 - In the docstrings of snowsplat, an indented block after a paragraph is an example or a table. In
   reStructuredText, it would be a quotation; after "::" it is shown as it is. The blocks of sections
@@ -6,11 +6,16 @@
 - Bars and asterisks have no special meaning.
 - The first line of the docstring of a property is not "type: description".
 - "a, b: text" describes two parameters or attributes; ":param a, b:" would be b of type a.
+- In a signature, the default of a field that a factory makes is "...", because "<factory>" is not
+  valid Python.
+- The label of the attributes of a class is "Attributes", and dashes are not two hyphens.
 """
 
 import re
 from typing import Any
 
+from docutils import nodes
+from sphinx.addnodes import literal_strong
 from sphinx.application import Sphinx
 
 _SECTION = re.compile(r"(Args|Attributes|Examples?|Notes?|Raises|Returns|Yields):$")
@@ -56,7 +61,28 @@ def _after_napoleon(
     lines[:] = [_FIELD.sub(lambda match: match[0].replace(", ", ","), line) for line in lines]
 
 
+def _signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str | None, result: str
+) -> tuple[str | None, str]:
+    return (signature or "").replace("<factory>", "...") or None, result
+
+
+def _fields(app: Sphinx, doctree: nodes.document) -> None:
+    for field in doctree.findall(nodes.field):
+        for text in list(field.findall(nodes.Text)):
+            strong = isinstance(text.parent, literal_strong)
+            if strong and "," in text:
+                text.parent.replace(text, nodes.Text(text.replace(",", ", ")))
+            elif text in _TEXTS and not strong:
+                text.parent.replace(text, nodes.Text(_TEXTS[text]))
+
+
+_TEXTS = {" -- ": " – ", "Variables": "Attributes"}
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("autodoc-process-docstring", _before_napoleon, priority=400)
     app.connect("autodoc-process-docstring", _after_napoleon, priority=600)
+    app.connect("autodoc-process-signature", _signature)
+    app.connect("doctree-read", _fields)
     return {"parallel_read_safe": True}
