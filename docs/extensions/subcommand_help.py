@@ -1,6 +1,6 @@
-"""The directive `subcommand`: describes a subcommand, from the output of its `--help`.
+"""The directive `subcommands`: describes all subcommands, from the output of their `--help`.
 
-```{subcommand} train
+```{subcommands}
 ```
 """
 
@@ -76,17 +76,14 @@ def markdown(name: str) -> str:
     return "\n".join(lines)
 
 
-class Subcommand(SphinxDirective):
-    """`{subcommand} NAME`"""
-
-    required_arguments = 1
+class Subcommands(SphinxDirective):
+    """One section for each subcommand."""
 
     def run(self) -> list[nodes.Node]:
-        for folder in ("cli", "pipeline"):
-            self.env.note_dependency(f"../src/snowsplat/{folder}")
-        return self.parse_text_to_nodes(markdown(self.arguments[0]))
+        sections = (f"## {name}\n\n{markdown(name)}" for name in main.SUBCOMMANDS)
+        return self.parse_text_to_nodes("\n".join(sections), allow_section_headings=True)
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    app.add_directive("subcommand", Subcommand)
+    app.add_directive("subcommands", Subcommands)
     return {"parallel_read_safe": True}
