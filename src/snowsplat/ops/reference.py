@@ -15,9 +15,9 @@ kernels with these functions in float64. From top to bottom, this file describes
 
 `plane_sweep` is in `sweep_reference.py`.
 
-[Kerbl et al. 2023]    3D Gaussian Splatting for Real-Time Radiance Field Rendering. ACM TOG 42(4).
-[Zwicker et al. 2001]  EWA Volume Splatting. IEEE Visualization. (The J and Σ' of `_project_rows`.)
-[Zwicker et al. 2002]  EWA Splatting. IEEE TVCG 8(3). (The low-pass filter, here `LOW_PASS`.)
+- [Kerbl et al. 2023] 3D Gaussian Splatting for Real-Time Radiance Field Rendering. ACM TOG 42(4).
+- [Zwicker et al. 2001] EWA Volume Splatting. IEEE Visualization. (The J and Σ' of `_project_rows`.)
+- [Zwicker et al. 2002] EWA Splatting. IEEE TVCG 8(3). (The low-pass filter, here `LOW_PASS`.)
 
 Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) has its centre at
 (i + 0.5, j + 0.5).

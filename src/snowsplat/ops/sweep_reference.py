@@ -1,7 +1,7 @@
 """The reference of `plane_sweep`: see `reference.py`.
 
-[Collins 1996]        A Space-Sweep Approach to True Multi-Image Matching. CVPR.
-[Gallup et al. 2007]  Real-Time Plane-Sweeping Stereo with Multiple Sweeping Directions. CVPR.
+- [Collins 1996] A Space-Sweep Approach to True Multi-Image Matching. CVPR.
+- [Gallup et al. 2007] Real-Time Plane-Sweeping Stereo with Multiple Sweeping Directions. CVPR.
 """
 
 from __future__ import annotations
