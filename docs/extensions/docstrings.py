@@ -19,7 +19,7 @@ from sphinx.addnodes import literal_strong
 from sphinx.application import Sphinx
 
 _SECTION = re.compile(r"(Args|Attributes|Examples?|Notes?|Raises|Returns|Yields):$")
-_LIST_ITEM = re.compile(r"([-*]|\d+\.) |\.\. ")
+_LIST_ITEM = re.compile(r"(-|\d+\.) |\.\. ")
 _CODE = re.compile(r"(`+[^`]*`+)")
 _MARKUP = re.compile(r"[|*]")
 _FIELD = re.compile(r":(param|ivar|keyword) ([^:]+):")
