@@ -1,7 +1,7 @@
 """Adapts docstrings, which are plain text with sections in Google style, to Sphinx.
 
 - In the docstrings of snowsplat, an indented block after a paragraph is an example or a table. In
-  reStructuredText, it would be a quotation; after "::" it is shown as it is. The blocks of sections
+  reStructuredText, it would be a quotation, so a directive is inserted. The blocks of sections
   ("Args:") and lists are not changed.
 - Bars and asterisks have no special meaning.
 - The first line of the docstring of a property is not "type: description".
@@ -11,7 +11,10 @@
 - The label of the attributes of a class is "Attributes", and dashes are not two hyphens.
 """
 
+import ast
 import re
+import textwrap
+from itertools import takewhile
 from typing import Any
 
 from docutils import nodes
@@ -31,6 +34,16 @@ def _plain(line: str) -> str:
     return "".join(p if p.startswith("`") else _MARKUP.sub(r"\\\g<0>", p) for p in parts)
 
 
+def _language(lines: list[str]) -> str:
+    """python or text: the language of the indented block at the beginning of ``lines``."""
+    block = takewhile(lambda line: not line or line.startswith(" "), lines)
+    try:
+        ast.parse(textwrap.dedent("\n".join(block)))
+    except SyntaxError:
+        return "text"
+    return "python"
+
+
 def as_rest(lines: list[str]) -> list[str]:
     """A docstring with its examples marked and other characters escaped."""
     found: list[str] = []
@@ -43,7 +56,7 @@ def as_rest(lines: list[str]) -> list[str]:
         elif indented and not in_code and i and not lines[i - 1]:
             in_code = not (_SECTION.match(start) or _LIST_ITEM.match(start))
             if in_code and not start.endswith("::"):
-                found += ["::", ""]
+                found += [f".. code-block:: {_language(lines[i:])}", ""]
         found.append(line if in_code and indented else _plain(line))
     return found
 
