@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
+import sys
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,6 +27,7 @@ from snowsplat.util.native_layout import Params, layout_of
 ISAS = ("baseline", "avx2", "avx512")
 
 _LIBRARIES = Path(__file__).resolve().parent.parent / "_lib"
+_SUFFIX = ".dll" if sys.platform == "win32" else ".so"  # on macOS, too
 _lock = threading.RLock()
 
 
@@ -43,9 +45,13 @@ class ArrayPointer:
         return int(self.array.ctypes.data)
 
 
+def _path(isa: str) -> Path:
+    return _LIBRARIES / f"libsnowsplat_{isa}{_SUFFIX}"
+
+
 def _open(isa: str) -> ctypes.CDLL:
     """The library of one instruction set. Its calls release the interpreter lock."""
-    path = _LIBRARIES / f"libsnowsplat_{isa}.so"
+    path = _path(isa)
     if not path.exists():
         raise UserError(
             f"the native library {path.name} is missing; in a checkout `make native` builds it, "
@@ -63,7 +69,7 @@ def _open(isa: str) -> ctypes.CDLL:
 def available_isas() -> tuple[str, ...]:
     """The instruction sets that are built and that this machine supports, worst first."""
     best = _open("baseline").best_isa()
-    built = (isa for isa in ISAS if (_LIBRARIES / f"libsnowsplat_{isa}.so").exists())
+    built = (isa for isa in ISAS if _path(isa).exists())
     return tuple(isa for isa in built if ISAS.index(isa) <= best)
 
 

@@ -8,7 +8,11 @@
 
 #include "params.h"
 
+#if defined(_WIN32)
+#define SNOW_EXPORT extern "C" __declspec(dllexport)
+#else
 #define SNOW_EXPORT extern "C" __attribute__((visibility("default")))
+#endif
 
 #define SNOW_ENTRY(NAME, ...)                                   \
   SNOW_EXPORT uint64_t NAME##_layout() {                        \

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "cpu/entry.h"
+#include "cpu/isa.h"
 #include "cpu/pool.h"
 
 #if defined(__x86_64__)
@@ -248,7 +249,7 @@ using namespace snow;
 
 SNOW_ENTRY(match_descriptors, MatchDescriptorsParams) {
 #if defined(SNOWSPLAT_ISA_AVX512)
-  if (__builtin_cpu_supports("avx512vnni")) return Matcher<Quads>(p).run(), 0;
+  if (has_avx512_vnni()) return Matcher<Quads>(p).run(), 0;
 #endif
   Matcher<Pairs>(p).run();
   return 0;

@@ -1,7 +1,9 @@
 // The thread pool: see pool.h for its guarantees.
 #include "cpu/pool.h"
 
+#if !defined(_WIN32)
 #include <pthread.h>
+#endif
 
 #include <atomic>
 #include <condition_variable>
@@ -105,12 +107,14 @@ std::mutex pool_mutex;
 Pool* pool = nullptr;
 int wanted = 1;
 
+#if !defined(_WIN32)
 // A forked process does not have the threads of its parent. So the pool is discarded, and a new one
 // is created when it is needed.
 void after_fork_in_child() {
   new (&pool_mutex) std::mutex;
   pool = nullptr;
 }
+#endif
 
 }  // namespace
 
@@ -125,8 +129,10 @@ void pool_run(int64_t tasks, void (*body)(void*, int64_t), void* context) {
   }
   {
     std::lock_guard<std::mutex> lock(pool_mutex);
+#if !defined(_WIN32)  // which has no fork
     static const int registered = pthread_atfork(nullptr, nullptr, after_fork_in_child);
     (void)registered;
+#endif
     if (!pool) pool = new Pool(wanted);
   }
   pool->run(tasks, body, context);
