@@ -98,7 +98,7 @@ class Make:
         except KeyboardInterrupt:
             print("stopped")
             return self._stopped()
-        _print_summary(result)
+        print_summary(result)
         if page is not None:
             self._watch(result, page)
         return 0
@@ -124,7 +124,8 @@ class Make:
             )
 
 
-def _print_summary(made: MakeResult) -> None:
+def print_summary(made: MakeResult) -> None:
+    """Print the files of a finished scene, and its quality."""
     print(
         f"\nThe scene, for any viewer:  {made.scene}\n"
         f"Report on camera poses:     {made.dataset_report}\n"

@@ -13,6 +13,10 @@ def described(stage: str, result: dict[str, Any]) -> list[str]:
     return _LINES[stage](result)
 
 
+def _demo(taken: dict[str, Any]) -> list[str]:
+    return [f"{taken['photos']} photos of a synthetic scene"]
+
+
 def _photos(gathered: dict[str, Any]) -> list[str]:
     photos, skipped = gathered["photos"], gathered["skipped"]
     line = f"{len(photos)} photos"
@@ -73,6 +77,7 @@ def _listed(lines: list[str]) -> list[str]:
 
 
 _LINES: dict[str, Callable[[dict[str, Any]], list[str]]] = {
+    "demo": _demo,
     "photos": _photos,
     "poses": _poses,
     "images": _images,

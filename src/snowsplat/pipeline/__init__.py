@@ -1,6 +1,7 @@
 """Python functions that do the work of the subcommands.
 
     make.py      makes a scene from photos or a video
+    demo.py      makes a scene from photos of a synthetic scene
     train.py     trains a scene from a dataset; resumes after an interruption
     render.py    renders images of a scene
     videos.py    renders a video of a scene

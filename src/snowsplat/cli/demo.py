@@ -1,0 +1,88 @@
+"""`snowsplat demo`: the complete pipeline on photos of a synthetic scene."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from snowsplat.cli.flags import flag, switch, with_flags
+from snowsplat.cli.make import print_summary
+from snowsplat.cli.observer import TerminalObserver
+from snowsplat.pipeline.demo import MAX_DEGREES, MAX_SHARE, demo
+from snowsplat.pipeline.training_run import TrainingStopped
+
+if TYPE_CHECKING:
+    from snowsplat.synthetic.compare_poses import PoseErrors
+
+
+@dataclass
+class Demo:
+    """Make a scene from photos of a synthetic scene, to try snowsplat without own photos.
+
+    Examples:
+      snowsplat demo
+      snowsplat demo -o out/demo --open
+
+    Notes:
+      The photos are ray traced, with lens distortion and noise. The scene is
+      made from the photos alone, as by snowsplat make. At the end, the estimated
+      camera poses are compared with the true ones; the exit code is 1 if the
+      difference is large. This takes about three minutes. If the command is
+      interrupted, run it again to resume.
+    """
+
+    output: Annotated[Path, flag("OUT", "-o", default="./snowsplat_demo")] = Path("snowsplat_demo")
+    """Output folder. It is created if it does not exist."""
+    open: Annotated[bool, switch()] = False
+    """Show the finished scene in the browser until Ctrl-C, as snowsplat view does."""
+
+    def run(self) -> int:
+        """Returns the exit code: 0; 1 if the poses are wrong; 130 after Ctrl-C."""
+        try:
+            with TerminalObserver() as observer:
+                result = demo(self.output, observer=observer)
+        except TrainingStopped as stopped:
+            print(with_flags(str(stopped)))
+            return self._stopped()
+        except KeyboardInterrupt:
+            print("stopped")
+            return self._stopped()
+        print_summary(result.made)
+        _print_errors(result.errors)
+        if not result.accurate:
+            print(
+                "snowsplat: the camera poses are wrong; repeat the demo in a new folder while no "
+                "other programs run",
+                file=sys.stderr,
+            )
+            return 1
+        scene = result.made.folder.path.parent
+        if not self.open:
+            look = shlex.join(["snowsplat", "view", str(scene)])
+            print(f"\nTo see the scene: {look}; with your own photos: snowsplat make PHOTOS")
+            return 0
+        from snowsplat.cli.view import View
+
+        return View(scene).run()
+
+    def _stopped(self) -> int:
+        words = ["snowsplat", "demo", "-o", str(self.output)] + ["--open"] * self.open
+        print(f"resume with: {shlex.join(words)}")
+        return 130
+
+
+def _print_errors(errors: PoseErrors) -> None:
+    degrees, shares = errors.rotations, errors.centres
+    found, total = len(errors.names), len(errors.names) + len(errors.missing)
+    print(
+        f"\nEstimated poses compared with the true ones ({found} of {total} photos)\n"
+        f"                            median     worst      limit\n"
+        f"  rotation                  {degrees.median():.3f}°     {degrees.max():.3f}°     "
+        f"{MAX_DEGREES}°\n"
+        f"  position, of the extent   {shares.median():.3%}     {shares.max():.3%}     "
+        f"{MAX_SHARE:.1%}",
+        flush=True,
+    )

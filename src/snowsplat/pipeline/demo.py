@@ -1,0 +1,107 @@
+"""`demo`: photos of a synthetic scene become a scene again, and its poses are checked."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.make import MakeOptions, MakeResult, make
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.synthetic import Truth
+    from snowsplat.synthetic.compare_poses import PoseErrors
+
+PHOTOS, TRUTH, MADE = "photos", "truth", "made"
+MAX_DEGREES = 0.1  # largest accepted rotation error of a photo
+MAX_SHARE = (
+    0.002  # largest accepted position error of a photo, relative to the extent of the cameras
+)
+_OPTIONS = MakeOptions(quality="normal", minutes=2.2)
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """A finished demo.
+
+    Attributes:
+        photos: the folder of the photos.
+        truth: the folder of the true poses: a COLMAP text model.
+        made: the scene.
+        errors: the estimated poses, compared with the true ones.
+    """
+
+    photos: Path
+    truth: Path
+    made: MakeResult
+    errors: PoseErrors
+
+    @property
+    def accurate(self) -> bool:
+        """Whether every photo has a pose, and the errors of all poses are small."""
+        return is_accurate(self.errors)
+
+
+def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
+    """Ray trace photos of a synthetic scene, run `make` on the photos alone, and check the poses.
+
+    The same call resumes after an interruption.
+
+    Args:
+        output: the output folder. It contains photos/, truth/ (the true poses) and made/ (the
+            output folder of `make`).
+
+    Raises:
+        UserError: ``output`` is a file or contains other files; see also `make`.
+        TrainingStopped, KeyboardInterrupt: Ctrl-C. Finished photos and stages are kept.
+    """
+    out = Path(output)
+    _check_free(out)
+    truth = _take_photos(out / PHOTOS, observer)
+    truth.write(out / TRUTH)
+    made = make(out / PHOTOS, out / MADE, _OPTIONS, observer=observer)
+    errors = compare_with_truth(made.dataset_report.parent, truth)
+    return DemoResult(out / PHOTOS, out / TRUTH, made, errors)
+
+
+def _check_free(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{out}: is a file; use a folder for the output")
+    if out.is_dir() and not {path.name for path in out.iterdir()} <= {PHOTOS, TRUTH, MADE}:
+        raise UserError(f"{out}: contains other files; use a new or an empty folder")
+
+
+def _take_photos(folder: Path, observer: Observer) -> Truth:
+    from snowsplat.synthetic import write_synthetic_photos
+    from snowsplat.util.stages import Outcome
+
+    before = len(list(folder.glob("*.jpg")))
+    started = time.monotonic()
+    truth = write_synthetic_photos(folder, report=observer.begin("demo"))
+    total = len(truth.poses)
+    outcome = Outcome({"photos": total}, time.monotonic() - started, before == total)
+    observer.end("demo", outcome)
+    return truth
+
+
+def compare_with_truth(dataset: Path, truth: Truth) -> PoseErrors:
+    """The errors of the poses of a dataset.
+
+    Raises:
+        ValueError: fewer than three photos have poses.
+    """
+    from snowsplat.data.colmap import posed_camera, read_model
+    from snowsplat.synthetic.compare_poses import compare_poses
+
+    model = read_model(dataset / "sparse" / "0")
+    found = {image.name: posed_camera(model, image).cam_from_world for image in model.images}
+    return compare_poses(found, truth.poses)
+
+
+def is_accurate(errors: PoseErrors) -> bool:
+    """Whether no photo is missing, and all errors are at most `MAX_DEGREES` and `MAX_SHARE`."""
+    degrees, shares = float(errors.rotations.max()), float(errors.centres.max())
+    return degrees <= MAX_DEGREES and shares <= MAX_SHARE and not errors.missing
