@@ -1,10 +1,11 @@
-# make demo     renders photos of a small synthetic scene and reconstructs it with `snowsplat make`
+# make demo     renders photos of a small synthetic scene and reconstructs it: `snowsplat demo`
 # make quick    checks of format, lint, types and layers, and the fast tests: under a minute once built
 # make test     the same checks and all tests: on every instruction set, with the GPU kernels on the CPU
 # make dev      creates the development environment for the other targets
 # make docs     builds the documentation site in build/docs; warnings are errors
 # make format   formats the sources
 # make native   builds the native libraries
+# make wheel    builds wheels for Linux on x86-64 and aarch64, for every version of Python, into dist/
 #
 # Each target works on a fresh clone and needs Python >= 3.10 and a C++ compiler. Everything is installed
 # into .venv, created by BOOTSTRAP (python3); PYTHON=path/to/python uses an existing environment instead.
@@ -32,11 +33,11 @@ BUILD := build/native
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo quick test dev docs format native compiler lint types layers clean
-.PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized
+.PHONY: demo quick test dev docs format native wheel compiler lint types layers clean
+.PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized neon
 
 demo: native
-	$(PYTHON) examples/demo.py out/demo
+	$(PYTHON) -m snowsplat demo -o out/demo
 
 quick: lint
 	@$(MAKE) --no-print-directory -j2 types layers pytest-quick
@@ -76,6 +77,9 @@ docs: $(ENVIRONMENT)
 	$(PYTHON) -m sphinx --builder html --doctree-dir build/doctrees --fresh-env --fail-on-warning --keep-going \
 	    --quiet docs build/docs
 
+wheel: $(ENVIRONMENT)
+	@$(PYTHON) tools/make_wheels.py
+
 format: $(ENVIRONMENT)
 	ruff format .
 	ruff check --fix .
@@ -109,8 +113,8 @@ pytest-quick: native
 	$(PYTEST) -m '$(QUICK)'
 
 # All tests on the best instruction set. Some of them wait for browsers and servers. Therefore, at the same
-# time, with half as many processes and a lower priority: on each other instruction set, the tests that
-# depend on it; and the GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not
+# time, with half as many processes and a lower priority: on each other instruction set and in an emulator
+# of Arm, the tests that depend on it; and the GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not
 # repeated without them.
 pytest: native
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
@@ -118,10 +122,20 @@ pytest: native
 pytest-best:
 	$(PYTEST) $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
+# The kernels for Arm (NEON), in an emulator.
+NEON_TOOLS := aarch64-linux-gnu-g++ qemu-aarch64
+NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py
+NEON_FOUND = $(shell command -v $(NEON_TOOLS) 2>/dev/null | wc -l)
+
+neon: native
+	@$(if $(filter 2,$(NEON_FOUND)),echo "neon: $(PYTEST) -m '$(ISA)' $(NEON_TESTS)"; \
+	    SNOWSPLAT_NEON=run $(PYTEST) -m '$(ISA)' $(NEON_TESTS), \
+	    echo "neon: skipped; it needs a compiler and an emulator (Debian/Ubuntu: apt install g++-aarch64-linux-gnu qemu-user)")
+
 # Prints everything if a test fails, otherwise only the numbers of tests.
 pytest-repeated:
-	@if nice -n 5 $(MAKE) --no-print-directory pytest-isas sanitized JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
-	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|[0-9]+ passed)' $(REPEATED); \
+	@if nice -n 5 $(MAKE) --no-print-directory pytest-isas sanitized neon JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
+	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
 pytest-isas:

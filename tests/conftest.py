@@ -4,6 +4,8 @@
 describes them.
 """
 
+from __future__ import annotations
+
 import gc
 import logging
 import os
@@ -55,6 +57,17 @@ def pytest_collection_finish() -> None:
     for name, logger in logging.root.manager.loggerDict.items():
         if name.split(".")[0] == "torch" and isinstance(logger, logging.Logger):
             logger.propagate = True
+
+
+def pytest_sessionstart() -> None:
+    """With SNOWSPLAT_NEON, the kernels for Arm replace those of this machine: `make neon`."""
+    if os.environ.get("SNOWSPLAT_NEON"):
+        from snowsplat.ops.native import LAUNCHERS
+        from snowsplat.sfm.colmap import kernels
+
+        from .ops import neon
+
+        LAUNCHERS["cpu"] = kernels.call = neon.launch
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

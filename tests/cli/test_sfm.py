@@ -13,6 +13,7 @@ from PIL import Image
 
 from snowsplat.cli.main import main
 from snowsplat.data import load_dataset
+from snowsplat.sfm import dataset_folder
 
 from ..sfm.colmap import scenes
 
@@ -188,3 +189,9 @@ def test_after_a_kill_in_any_stage_the_same_command_resumes(stage, photos, run, 
     dataset = load_dataset(out)
     assert len(dataset.train) + len(dataset.test) == 6
     assert not (out / ".new").exists()
+
+
+def test_without_pycolmap_the_remedy_is_named(refused, photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(dataset_folder, "find_spec", lambda name: None)
+    assert "pycolmap is not installed" in refused("sfm", photos, "-o", tmp_path / "new")
+    assert not (tmp_path / "new").exists()

@@ -21,6 +21,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -97,11 +98,16 @@ def make_dataset(
         `SfmResult` for "poses", an `Undistorted` for "images", the file name for "report".
 
     Raises:
-        UserError: the photos cannot be used, ``folder`` contains other files, or no poses were
-            found. In these cases, the files that this run created are removed. This error is also
-            raised if the disk is full; in this case, the files remain.
+        UserError: the photos cannot be used, ``folder`` contains other files, no poses were found,
+            or pycolmap is missing. In these cases, the files that this run created are removed.
+            This error is also raised if the disk is full; in this case, the files remain.
         OSError: a file cannot be read or written.
     """
+    if find_spec("pycolmap") is None:
+        raise UserError(
+            "pycolmap is not installed, and PyPI may have no package for this computer; build it "
+            "from the sources of COLMAP 4.2, or make the dataset on another computer"
+        )
     sources = find_inputs(inputs)
     in_place = any(path.resolve() == (folder / "input").resolve() for path in inputs)
     _check_free(folder, in_place, inputs, options, overwrite)
