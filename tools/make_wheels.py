@@ -21,10 +21,12 @@ def main() -> int:
     if missing:
         print(f"snowsplat: {missing[0]} is missing; run: pip install '.[wheel]'", file=sys.stderr)
         return 1
-    built = []
+    built: list[Path] = []
+    cubins = ""  # of the first wheel: GPU kernels do not depend on the processor
     for machine in MACHINES:
         if shutil.which(f"{machine}-linux-gnu-g++"):
-            built.append(build(machine))
+            built.append(build(machine, cubins))
+            cubins = cubins or f"{folder_of(machine)}/cmake/cuda"
         else:
             package = f"g++-{machine.replace('_', '-')}-linux-gnu"
             print(f"snowsplat: no wheel for {machine}; it needs {package} (apt install {package})")
@@ -33,14 +35,19 @@ def main() -> int:
     return 0 if built else 1
 
 
-def build(machine: str) -> Path:
-    """The wheel for a processor."""
-    work = ROOT / "build" / f"wheel-{machine}"
+def folder_of(machine: str) -> Path:
+    return ROOT / "build" / f"wheel-{machine}"
+
+
+def build(machine: str, cubins: str) -> Path:
+    """The wheel for a processor. Compiles the GPU kernels if there are no ``cubins``."""
+    work = folder_of(machine)
     shutil.rmtree(work / "wheel", ignore_errors=True)
     settings = {
         "build-dir": f"{work}/cmake",
         "cmake.define.CMAKE_TOOLCHAIN_FILE": f"{ROOT}/cmake/manylinux.cmake",
         "cmake.define.SNOWSPLAT_MACHINE": machine,
+        "cmake.define.SNOWSPLAT_CUBINS": cubins,
     }
     command = ["pip", "wheel", str(ROOT), "--quiet", "--no-deps", "--no-index"]
     command += ["--no-build-isolation", "--wheel-dir", str(work / "wheel")]
