@@ -29,6 +29,6 @@ def test_wrong_or_missing_poses_fail(tmp_path, moved, count, near):
     camera = ColmapCamera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
     nothing = np.zeros((0, 3))
     write_model(tmp_path / "sparse" / "0", {1: camera}, images, nothing, nothing.astype(np.uint8))
-    errors = compare_with_truth(tmp_path, TRUTH)
+    errors = compare_with_truth(tmp_path, TRUTH.poses)
     assert is_accurate(errors) is near
     assert len(errors.missing) == 20 - count
