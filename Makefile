@@ -123,12 +123,11 @@ pytest-best:
 	$(PYTEST) $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
 # The kernels for Arm (NEON), in an emulator.
-NEON_TOOLS := aarch64-linux-gnu-g++ qemu-aarch64
 NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py
-NEON_FOUND = $(shell command -v $(NEON_TOOLS) 2>/dev/null | wc -l)
+NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
 neon: native
-	@$(if $(filter 2,$(NEON_FOUND)),echo "neon: $(PYTEST) -m '$(ISA)' $(NEON_TESTS)"; \
+	@$(if $(NEON_FOUND),echo "neon: $(PYTEST) -m '$(ISA)' $(NEON_TESTS)"; \
 	    SNOWSPLAT_NEON=run $(PYTEST) -m '$(ISA)' $(NEON_TESTS), \
 	    echo "neon: skipped; it needs a compiler and an emulator (Debian/Ubuntu: apt install g++-aarch64-linux-gnu qemu-user)")
 
