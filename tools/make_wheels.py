@@ -1,10 +1,11 @@
 """Builds wheels that run on every Linux with glibc 2.28 or later, into dist/: `make wheel`.
 
 One wheel for each processor whose compiler is installed: see cmake/manylinux.cmake. auditwheel
-checks the versions of the symbols that the libraries need.
+finds the version of glibc that the libraries need, and names the wheel after it.
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -56,11 +57,11 @@ def build(machine: str, cubins: str) -> Path:
     (wheel,) = (work / "wheel").glob("*.whl")
     check_contents(wheel, machine)
 
-    platform = f"manylinux_2_28_{machine}"
-    run(
-        ["auditwheel", "repair", "--plat", platform, "--wheel-dir", str(work / "wheel"), str(wheel)]
-    )
+    run(["auditwheel", "repair", "--plat=auto", f"--wheel-dir={work}/wheel", str(wheel)])
     (repaired,) = (work / "wheel").glob("*manylinux*.whl")
+    oldest = min(map(int, re.findall(r"manylinux_2_(\d+)_", repaired.name)))
+    if oldest > 28:
+        sys.exit(f"snowsplat: {repaired.name} needs glibc 2.{oldest}; see cmake/manylinux.cmake")
     (ROOT / "dist").mkdir(exist_ok=True)
     return Path(shutil.copy(repaired, ROOT / "dist"))
 
