@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Demo:
-    """Make a scene from photos of a synthetic scene, to try snowsplat without own photos.
+    """Try snowsplat: make a scene from rendered photos of a synthetic scene.
 
     Examples:
       snowsplat demo

@@ -26,7 +26,7 @@ from snowsplat.util.safe_json import printable
 #: The subcommands with the first line of their docstrings. The subcommand ``train`` is the
 #: dataclass ``Train`` in the module ``snowsplat.cli.train``, which is imported when it is called.
 SUBCOMMANDS = {
-    "demo": "Make a scene from photos of a synthetic scene, to try snowsplat without own photos.",
+    "demo": "Try snowsplat: make a scene from rendered photos of a synthetic scene.",
     "make": "Make a scene from photos or a video: sfm, train and render in one command.",
     "sfm": "Estimate the camera poses of photos or a video, and create a dataset.",
     "train": "Train a scene from photos with known camera poses (COLMAP or transforms.json).",
@@ -43,7 +43,7 @@ _FORMER_NAMES = {"capture": "sfm"}
 
 DESCRIPTION = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
 
-  snowsplat demo                          try it: photos of a synthetic scene -> a scene
+  snowsplat demo                          try it, without own photos
   snowsplat make PHOTOS                   photos or a video -> a scene
   snowsplat sfm PHOTOS -o DATASET         photos or a video -> a dataset
   snowsplat train DATASET -o OUT --eval   a dataset -> a scene in OUT
