@@ -102,25 +102,26 @@ def _packed(*numbers: int) -> bytes:
 def _server() -> subprocess.Popen[bytes]:
     """The program in the emulator. It ends with this process, which closes its stdin."""
     own = os.environ["SNOWSPLAT_NEON"]
-    program, library = _built()
+    program, library = _BUILD / "server", _BUILD / "libsnowsplat_baseline.so"
+    _BUILD.mkdir(parents=True, exist_ok=True)
+    with (_BUILD / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if own == "run":
+            _build_library()
+        _run(COMPILER, "-std=c++17", "-O1", "-Wall", "-Wextra", _HERE / "server.cpp", "-o", program)
     command = [EMULATOR, "-L", _SYSTEM, program, library if own == "run" else own]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
 
-def _built() -> tuple[Path, Path]:
-    """The program and the library. CMake compiles only changed files."""
-    _BUILD.mkdir(parents=True, exist_ok=True)
-    program, library = _BUILD / "server", _BUILD / "libsnowsplat_baseline.so"
-    with (_BUILD / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        configure = ["cmake", "-G", "Ninja", "-S", _ROOT, "-B", _BUILD, "--log-level=ERROR"]
-        configure += ["-DCMAKE_SYSTEM_NAME=Linux", "-DCMAKE_SYSTEM_PROCESSOR=aarch64"]
-        configure += [f"-DCMAKE_CXX_COMPILER={shutil.which(COMPILER)}"]
-        configure += ["-DCMAKE_DISABLE_FIND_PACKAGE_Python3=ON"]  # without GPU kernels
-        source = _HERE / "server.cpp"
-        commands: list[list[Any]] = [configure, ["cmake", "--build", _BUILD, "--", "--quiet"]]
-        commands.append([COMPILER, "-std=c++17", "-O1", "-Wall", "-Wextra", source, "-o", program])
-        for command in commands:
-            made = subprocess.run(command, capture_output=True, text=True)
-            assert made.returncode == 0, f"{command[0]} failed:\n{made.stdout}{made.stderr}"
-    return program, library
+def _build_library() -> None:
+    """CMake compiles only changed files."""
+    configure = ["cmake", "-G", "Ninja", "-S", _ROOT, "-B", _BUILD, "--log-level=ERROR"]
+    configure += ["-DCMAKE_SYSTEM_NAME=Linux", "-DCMAKE_SYSTEM_PROCESSOR=aarch64"]
+    configure += [f"-DCMAKE_CXX_COMPILER={shutil.which(COMPILER)}"]
+    _run(*configure, "-DCMAKE_DISABLE_FIND_PACKAGE_Python3=ON")  # without GPU kernels
+    _run("cmake", "--build", _BUILD, "--", "--quiet")
+
+
+def _run(*command: str | Path) -> None:
+    made = subprocess.run(command, capture_output=True, text=True)
+    assert made.returncode == 0, f"{command[0]} failed:\n{made.stdout}{made.stderr}"
