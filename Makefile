@@ -122,8 +122,10 @@ pytest: native
 pytest-best:
 	$(PYTEST) $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
-# The kernels for Arm (NEON), in an emulator.
-NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py
+# The kernels for Arm (NEON), in an emulator. The loader of the library, which test_native.py tests, is not
+# used for them.
+NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py \
+    --ignore tests/ops/test_native.py
 NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
 neon: native
