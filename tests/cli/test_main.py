@@ -133,7 +133,7 @@ def test_info_describes_each_kind_of_file_and_folder_without_torch(tmp_path):
 def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):
     assert "trian: unknown subcommand; did you mean train?" in refused("trian")
     assert "did you mean sfm?" in refused("captur")  # a former name, still accepted
-    assert "choose from make, sfm, train" in refused("xyz")
+    assert "choose from demo, make, sfm, train" in refused("xyz")
 
 
 def test_a_misplaced_flag_is_found_in_its_subcommand(run):
