@@ -1,0 +1,105 @@
+"""Makes the pictures of the README and of the documentation from the results of the demo.
+
+    snowsplat demo -o out/demo
+    python docs/pictures.py out/demo
+
+Needs Chromium. Writes to docs/pictures: scene.webp (a moving picture: the camera moves around the
+scene), web.webp and live.webp (the two viewers) and report.webp (the report of the training).
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import av
+from PIL import Image
+
+import snowsplat
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tests.browser import Browser, Page  # noqa: E402
+from tests.ports import unused_port  # noqa: E402
+
+PICTURES = Path(__file__).with_name("pictures")
+WIDTH, HEIGHT = 1280, 800
+#: The moving picture: a size and rate that make it small enough for a page that is often opened.
+FILM = snowsplat.VideoOptions(path="ellipse", seconds=6.0, fps=12.0, size="640x400")
+FILM_QUALITY = 50
+
+
+def film(scene: Path, target: Path) -> None:
+    """An animated WebP file of a camera that moves around the scene."""
+    with TemporaryDirectory() as folder:
+        video = Path(folder) / "film.mp4"
+        snowsplat.render_video(scene, FILM, target=video)
+        with av.open(str(video)) as container:
+            first, *rest = [frame.to_image() for frame in container.decode(video=0)]
+    first.save(
+        target,
+        save_all=True,
+        append_images=rest,
+        duration=round(1000 / FILM.fps),
+        loop=0,
+        quality=FILM_QUALITY,
+        method=6,
+    )
+
+
+def click(page: Page, selector: str) -> None:
+    """Click an element, and wait until it has disappeared."""
+    found = f"document.querySelector('{selector}')"
+    page.evaluate(f"{found}.click()")
+    page.wait_for(f"!{found}?.offsetParent")
+
+
+def shoot(page: Page, target: Path) -> None:
+    """Save what a tab shows."""
+    Image.fromarray(page.screenshot()).save(target, quality=85, method=6)
+
+
+@contextmanager
+def training(dataset: Path) -> Iterator[str]:
+    """The address of the page of a training run, which ends with the context."""
+    port = unused_port()
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "table"  # the page shows this name
+        command = [sys.executable, "-m", "snowsplat", "train", str(dataset), "-o", str(out)]
+        command += ["--eval", "--view", "--port", str(port)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            for line in process.stdout:  # until the page is ready
+                if line.startswith("step"):
+                    break
+            yield f"http://127.0.0.1:{port}"
+            process.terminate()
+
+
+def main(demo: Path) -> None:
+    made = demo / "made"
+    PICTURES.mkdir(exist_ok=True)
+    film(made, PICTURES / "scene.webp")
+    with Browser(WIDTH, HEIGHT, frames=5.0) as browser, TemporaryDirectory() as folder:
+        shoot(browser.open((made / "scene" / "report.html").as_uri()), PICTURES / "report.webp")
+        html = Path(folder) / "scene.html"
+        snowsplat.convert(made, html)
+        page = browser.open(f"{html.as_uri()}?webgl")
+        page.wait_for("!!window.app", 120)
+        click(page, ".sse-controlsHintClose")  # the list of keys
+        shoot(page, PICTURES / "web.webp")
+        page.close()
+        with training(made / "capture") as url:
+            page = browser.open(url)
+            page.wait_for("/Step 1,[5-9]/.test(document.body.innerText)", 600)
+            click(page, ".mantine-Notification-closeButton")  # the browser has no GPU
+            shoot(page, PICTURES / "live.webp")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
