@@ -19,14 +19,19 @@ extensions = [
     "sphinx_copybutton",
     "api_names",
     "docstrings",
+    "drawings",
+    "local_mathjax",
     "repository_links",
     "subcommand_help",
 ]
-exclude_patterns = ["extensions", "static"]
+exclude_patterns = ["extensions", "static", "learn/figures"]
 
 # Pages
+mathjax_path = "mathjax/tex-svg.js"
+mathjax3_config = {"svg": {"fontCache": "global"}, "options": {"enableMenu": False}}
 smartquotes = False  # would change the hyphens of flags
 myst_heading_anchors = 4
+myst_enable_extensions = ["dollarmath"]
 html_theme = "furo"
 html_title = f"snowsplat {release}"
 html_static_path = ["static"]

@@ -38,10 +38,10 @@ def build(folder: Path) -> None:
 @pytest.fixture(scope="module")
 def site() -> Path:
     included = [ROOT / name for name in ("pyproject.toml", "CONTRIBUTING.md", "CHANGELOG.md")]
-    sources = [*ROOT.glob("*/README.md"), *included]
+    sources = [*ROOT.glob("*/README.md"), *ROOT.glob("third_party/mathjax-*"), *included]
     for folder in ("docs", "src"):
         files = (ROOT / folder).rglob("*")
-        sources += [file for file in files if file.suffix in (".css", ".md", ".py")]
+        sources += [file for file in files if file.suffix in (".css", ".md", ".py", ".svg")]
     return cached("docs-site", sources, build) / "html"
 
 

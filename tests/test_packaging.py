@@ -138,7 +138,7 @@ def test_wheel_contains_the_viewer_and_its_licence(wheel):
         files = {name: archive.read(f"snowsplat/_viewer/{name}") for name in VIEWER_FILES}
         assert sum("_viewer/" in name for name in archive.namelist()) == len(files)
         assert not any("third_party" in name for name in archive.namelist())
-    with tarfile.open(next(THIRD_PARTY.glob("*.tar.xz"))) as vendored:
+    with tarfile.open(next(THIRD_PARTY.glob("supersplat-*.tar.xz"))) as vendored:
         for member in vendored.getmembers():
             if member.isfile():
                 content = vendored.extractfile(member)
@@ -148,7 +148,7 @@ def test_wheel_contains_the_viewer_and_its_licence(wheel):
 
 
 def test_the_vendored_archive_is_pinned_and_documented():
-    (archive,) = THIRD_PARTY.glob("*.tar.xz")
+    (archive,) = THIRD_PARTY.glob("supersplat-*.tar.xz")
     assert archive.stat().st_size < 1.5e6
     assert hashlib.sha256(archive.read_bytes()).hexdigest() in (
         REPOSITORY / "CMakeLists.txt"
@@ -165,7 +165,7 @@ def test_a_modified_archive_is_rejected(tmp_path):
     copy = tmp_path / "checkout"
     shutil.copytree(THIRD_PARTY, copy / "third_party")
     shutil.copy(REPOSITORY / "CMakeLists.txt", copy)
-    with open(next((copy / "third_party").glob("*.tar.xz")), "ab") as file:
+    with open(next((copy / "third_party").glob("supersplat-*.tar.xz")), "ab") as file:
         file.write(b"more")
     cmake = shutil.which("cmake", path=f"{Path(sys.executable).parent}{os.pathsep}/usr/bin")
     if cmake is None:
