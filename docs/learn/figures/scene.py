@@ -1,0 +1,58 @@
+"""The real scene of the figures: that of `snowsplat demo`, trained with the recipe `default`.
+
+The photos, the dataset and the trained scene are stored in build/learn, and made if they are missing
+(some minutes).
+"""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from snowsplat import Camera, Gaussians, read_gaussians, write_gaussians
+from snowsplat.data.dataset import Dataset
+from snowsplat.data.load import load_dataset
+from snowsplat.pipeline.demo import demo
+from snowsplat.scene.render import render
+from snowsplat.training.recipes import recipe
+from snowsplat.training.trainer import Trainer
+
+BUILD = Path(__file__).resolve().parents[3] / "build" / "learn"
+VIEW = "IMG_0013.jpg"  # the photo that the figures show
+
+
+@functools.cache
+def dataset() -> Dataset:
+    """The photos with the poses that structure from motion has found; every 8th is held out."""
+    return load_dataset(demo(BUILD / "demo").made.dataset_report.parent)
+
+
+@functools.cache
+def trained() -> Gaussians:
+    path = BUILD / "scene.ply"
+    if not path.exists():
+        trainer = Trainer(dataset(), recipe("default"))
+        trainer.run()
+        write_gaussians(path, trainer.gaussians)
+    return read_gaussians(path)
+
+
+def camera(width: int = 480, name: str = VIEW) -> Camera:
+    """The camera of a photo, for a rendering of this width in pixels."""
+    (found,) = (v.camera for v in [*dataset().train, *dataset().test] if v.name == name)
+    return found.scaled(width, round(width * found.height / found.width))
+
+
+def pixels(image: Tensor) -> np.ndarray:
+    """(H, W, 3) uint8 of a rendering."""
+    return np.rint(255 * image.detach().clamp(0, 1).numpy()).astype(np.uint8)
+
+
+def rendering(gaussians: Gaussians, view: Camera) -> np.ndarray:
+    """(H, W, 3) uint8: the scene from a camera."""
+    return pixels(render(gaussians, view).image)
+
+
+if __name__ == "__main__":
+    print(len(trained()), "Gaussians")
