@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -38,7 +39,7 @@ from snowsplat.training.recipes import recipe
 
 DOWNSCALE = 4
 NEAR = 0.2
-RATES = (0.003, 0.01, 0.03, 0.1)
+RATES = (0.01, 0.03, 0.1, 0.3)
 
 
 @dataclass(frozen=True)
@@ -195,6 +196,8 @@ def train(
         optimizer.step()
         schedule.step()
 
+    if not all(bool(parameter.isfinite().all()) for parameter in learned):
+        return Result(name, rate, seed, -math.inf, math.inf)  # the training has diverged
     with torch.no_grad():
         values = []
         for view in dataset.test:

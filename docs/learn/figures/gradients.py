@@ -1,0 +1,114 @@
+"""Figures of the page "Gradients"."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from drawing import Drawing
+
+from snowsplat.ops import reference
+
+
+def chain() -> None:
+    panel = Drawing(340, 430, x=(0, 10), y=(12.2, 0), margins=(4, 4, 4, 4))
+
+    def box(x: float, y: float, words: str, width: float = 2.6, colour: str = "soft") -> None:
+        panel.rectangle((x - width / 2, y - 0.42), (x + width / 2, y + 0.42), colour, fill=colour,
+                        fill_opacity=0.12, width=1.4)
+        panel.text((x, y), words, dy=5, size=13)
+
+    def link(x0: float, y0: float, x1: float, y1: float) -> None:
+        panel.arrow((x0, y0 + 0.46), (x1, y1 - 0.5), "soft", 1.4)
+
+    box(1.4, 0.8, "quats q", colour="blue")
+    box(4.4, 0.8, "log scales ℓ", colour="blue")
+    box(7.0, 0.8, "means μ", 2.0, colour="blue")
+    box(9.0, 0.8, "SH h", 1.6, colour="blue")
+    box(2.9, 2.6, "M = R S")
+    box(6.0, 2.6, "p = Wμ + t")
+    box(8.8, 2.6, "v", 1.2)
+    box(4.4, 4.3, "U = J W M", 2.8)
+    box(4.4, 5.9, "Σ′ = U Uᵀ + 0.3 I", 3.8)
+    box(4.4, 7.5, "K = Σ′⁻¹", 2.6)
+    box(7.5, 7.2, "m = π(p)", 2.1)
+    box(1.3, 7.5, "o", 1.4, colour="blue")
+    box(9.0, 8.4, "c", 1.2)
+    box(4.4, 9.2, "α = o exp(−½ dᵀ K d)", 5.0)
+    box(6.4, 10.8, "C = Σ T α c   →   loss L", 5.4, colour="orange")
+    for a in ((1.4, 0.8, 2.5, 2.6), (4.4, 0.8, 3.3, 2.6), (7.0, 0.8, 6.2, 2.6), (7.2, 0.8, 8.6, 2.6),
+              (2.9, 2.6, 4.0, 4.3), (5.6, 2.6, 4.8, 4.3), (4.4, 4.3, 4.4, 5.9), (4.4, 5.9, 4.4, 7.5),
+              (6.4, 2.6, 7.4, 7.2), (4.4, 7.5, 4.4, 9.2), (7.5, 7.2, 6.0, 9.2), (1.3, 7.5, 3.2, 9.2),
+              (8.8, 2.6, 8.9, 8.4), (9.5, 0.8, 9.4, 8.4), (4.4, 9.2, 5.6, 10.8), (9.0, 8.4, 7.6, 10.8)):
+        link(*a)
+    panel.save("gradients-chain", "Boxes of the intermediate results, connected by arrows")
+
+
+def scene(dtype: torch.dtype) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    random = torch.Generator().manual_seed(3)
+    n = 6
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=random, dtype=torch.float64)
+
+    means = normal(n, 3) * 0.4 + torch.tensor([0.0, 0.0, 4.0])
+    parameters = {
+        "means": means,
+        "log_scales": normal(n, 3) * 0.3 - 1.0,
+        "quats": normal(n, 4),
+        "opacity_logits": normal(n),
+        "sh_dc": normal(n, 1, 3),
+        "sh_rest": normal(n, 3, 3) * 0.2,
+    }
+    view = {"width": 24, "height": 20, "fx": 26.0, "fy": 26.0, "cx": 12.0, "cy": 10.0, "sh_degree": 1}
+    return {k: v.to(dtype) for k, v in parameters.items()}, view
+
+
+def differences() -> None:
+    steps = 10.0 ** np.arange(-10, -0.4, 0.25)
+    panel = Drawing(340, 250, x=(-10, -0.5), y=(-11, 1), margins=(44, 26, 10, 40))
+    panel.axes("step h", "relative difference",
+               x_ticks=[(e, f"1e{e}") for e in (-10, -8, -6, -4, -2)],
+               y_ticks=[(e, f"1e{e}" if e else "1") for e in (-9, -6, -3, 0)])
+    for dtype, colour, words in ((torch.float64, "blue", "double"), (torch.float32, "orange", "single")):
+        parameters, view = scene(dtype)
+        pose = torch.eye(3, 4, dtype=dtype)
+        target = torch.linspace(0, 1, 20 * 24 * 3, dtype=dtype).reshape(20, 24, 3)
+
+        def loss(values: dict[str, torch.Tensor]) -> torch.Tensor:
+            splats = reference.project(**values, cam_from_world=pose, **view)
+            image = reference.rasterize(splats, view["width"], view["height"])[0]
+            return (image - target).square().sum()
+
+        x = parameters["means"].clone().requires_grad_()
+        (grad,) = torch.autograd.grad(loss({**parameters, "means": x}), x)
+        found = []
+        for h in steps:
+            values = []
+            counts = []
+            for sign in (1, -1):
+                moved = parameters["means"].clone()
+                moved[2, 0] += sign * h
+                values.append(float(loss({**parameters, "means": moved})))
+                splats = reference.project(
+                    **{**parameters, "means": moved}, cam_from_world=pose, **view
+                )
+                counts.append(reference.count_blended(splats, view["width"], view["height"]))
+            if dtype == torch.float64 and h > 1e-3:
+                print(f"h = {h:.4f}: {int((counts[0] != counts[1]).sum())} pixels differ in α ≥ 1/255")
+            estimate = (values[0] - values[1]) / (2 * h)
+            error = abs(estimate / float(grad[2, 0]) - 1)
+            found.append((np.log10(h), np.log10(max(error, 1e-12))))
+        panel.line([p for p in found if p[1] < 0.9], colour, 2)
+        best = min(found, key=lambda p: p[1])
+        print(words, best)
+        panel.text((-0.5, 1), words, colour, anchor="end", dx=-4, dy=14 if colour == "blue" else 32)
+    panel.save("gradients-differences", "Two V-shaped curves of the error over the step size")
+
+
+def main() -> None:
+    chain()
+    differences()
+
+
+if __name__ == "__main__":
+    main()
