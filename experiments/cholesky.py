@@ -39,7 +39,7 @@ from snowsplat.training.recipes import recipe
 
 DOWNSCALE = 4
 NEAR = 0.2
-RATES = (0.01, 0.03, 0.1, 0.3)
+RATES = (0.03, 0.1, 0.3)
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("build/learn/demo"))
     parser.add_argument("--gaussians", type=int, default=4000)
-    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--output", type=Path, default=Path("build/learn/cholesky.json"))
     options = parser.parse_args()

@@ -1,0 +1,146 @@
+"""The formulas of docs/learn/covariance.md, and the code of experiments/cholesky.py."""
+
+import importlib.util
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat import Camera
+from snowsplat.ops import reference
+from snowsplat.ops.reference import LOW_PASS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def rotation(q: Tensor) -> Tensor:
+    """The matrix of the page for a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row) for row in rows])
+
+
+def test_quaternion_product_and_matrix():
+    """q v q̄ = (w² − rᵀr) v + 2 (rᵀv) r + 2w (r × v), and its matrix is that of the code."""
+    q, v = normal(4, seed=1), normal(3, seed=2)
+    q = q / q.norm()
+    w, r = q[0], q[1:]
+    turned = (w * w - r @ r) * v + 2 * (r @ v) * r + 2 * w * torch.linalg.cross(r, v)
+    R = rotation(q)
+    assert torch.allclose(R @ v, turned, atol=1e-14)
+    assert torch.allclose(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-14)
+    assert torch.linalg.det(R) == pytest.approx(1)
+    found = reference._rotation_matrices(torch.stack([q, -q, 5 * q]))
+    for matrix in found:
+        assert torch.allclose(matrix, R, atol=1e-14)
+
+
+def test_the_zero_quaternion_is_the_identity():
+    zero = torch.zeros(1, 4, dtype=torch.float64)
+    assert torch.equal(reference._rotation_matrices(zero)[0], torch.eye(3, dtype=torch.float64))
+
+
+def test_eigendecomposition_and_determinants():
+    R, s = rotation(torch.nn.functional.normalize(normal(4), dim=0)), normal(3, seed=3).exp()
+    sigma = R @ torch.diag(s) @ torch.diag(s) @ R.T
+    values, vectors = torch.linalg.eigh(sigma)
+    assert torch.allclose(values, s.sort().values ** 2)
+    for i in range(3):  # the eigenvectors are the columns of R, up to their signs
+        assert ((R.T @ vectors[:, i]).abs().max()) == pytest.approx(1)
+    L = torch.linalg.cholesky(sigma)
+    assert torch.allclose(L @ L.T, sigma)
+    assert sigma.det().sqrt() == pytest.approx(float(s.prod()))
+    assert L.diagonal().prod() == pytest.approx(float(s.prod()))
+
+
+def test_the_gradient_of_the_quaternion_is_perpendicular_to_it():
+    q = normal(5, 4).requires_grad_()
+    (reference._rotation_matrices(q) * normal(5, 3, 3, seed=4)).sum().backward()
+    assert (q.grad * q).sum(dim=1).abs().max() < 1e-14
+
+
+def test_the_determinant_by_lagrange():
+    u0, u1 = normal(3, seed=5), normal(3, seed=6)
+    sigma = torch.stack([u0, u1]) @ torch.stack([u0, u1]).T + LOW_PASS * torch.eye(2).double()
+    cross = torch.linalg.cross(u0, u1)
+    found = cross @ cross + LOW_PASS * (u0 @ u0 + u1 @ u1) + LOW_PASS**2
+    assert found == pytest.approx(float(sigma.det()))
+
+
+def test_exercises():
+    q = torch.tensor([1.0, 0, 0, 1], dtype=torch.float64)
+    RS = reference._rotation_matrices(q[None])[0] * torch.tensor([2.0, 1, 1])
+    assert torch.allclose(RS @ RS.T, torch.diag(torch.tensor([1.0, 4, 1]).double()), atol=1e-14)
+    sigma = torch.tensor([[4.0, 2], [2, 5]])
+    L = torch.linalg.cholesky(sigma)
+    assert torch.allclose(L, torch.tensor([[2.0, 0], [1, 2]]))
+    assert L[:, 0].norm() == pytest.approx(2.24, abs=5e-3)
+    deviations = torch.linalg.eigvalsh(sigma).sqrt().tolist()
+    expected = sorted(math.sqrt((9 + sign * math.sqrt(17)) / 2) for sign in (1, -1))
+    assert deviations == pytest.approx(expected)
+    assert expected == pytest.approx([1.56, 2.56], abs=5e-3)
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    spec = importlib.util.spec_from_file_location("cholesky", ROOT / "experiments" / "cholesky.py")
+    module = importlib.util.module_from_spec(spec)
+    import sys
+
+    sys.modules["cholesky"] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["cholesky"]
+
+
+def test_the_shapes_of_the_experiment_start_equal(experiment):
+    """Each parameterisation begins with the same isotropic Gaussians."""
+    log_scales = normal(4, 1)
+    for shape in experiment.SHAPES.values():
+        M = shape.factor(shape.parameters(log_scales))
+        expected = (2 * log_scales).exp()[:, :, None] * torch.eye(3).double()
+        assert torch.allclose(M @ M.transpose(1, 2), expected)
+
+
+def test_triangular_factors_of_the_experiment(experiment):
+    """Both Cholesky factors are lower triangular, and every entry has its own parameter."""
+    p = [normal(2, 3), normal(2, 3, seed=1)]
+    below = torch.tensor([[1, 0], [2, 0], [2, 1]])
+    for name in ("Cholesky", "Cholesky, scaled rows"):
+        M = experiment.SHAPES[name].factor(p)
+        assert torch.equal(M, M.tril())
+        assert torch.allclose(M.diagonal(dim1=1, dim2=2), p[0].exp())
+        entries = M[:, below[:, 0], below[:, 1]]
+        scale = p[0].exp()[:, below[:, 0]] if "scaled" in name else 1.0
+        assert torch.allclose(entries, p[1] * scale)
+
+
+def test_the_projection_of_the_experiment_is_that_of_the_operation(experiment):
+    n = 12
+    means = normal(n, 3) * 0.7 + torch.tensor([0.0, 0.0, 4.0])
+    log_scales, quats = normal(n, 3, seed=1) * 0.3 - 2, normal(n, 4, seed=2)
+    logits, colors = normal(n, seed=3) + 1, normal(n, 3, seed=4).sigmoid()
+    pose = torch.eye(3, 4, dtype=torch.float64)
+    view = {"width": 40, "height": 30, "fx": 30.0, "fy": 32.0, "cx": 20.0, "cy": 14.0}
+    dc = (colors - 0.5)[:, None] / reference.C0
+    rest = torch.zeros(n, 0, 3, dtype=torch.float64)
+    expected = reference.project(
+        means, log_scales, quats, logits, dc, rest, pose, **view, sh_degree=0
+    )
+    M = experiment.rotation_and_scales([log_scales, quats])
+    camera = Camera(**view, cam_from_world=pose)
+    found = experiment.project(means, M, logits.sigmoid(), colors, camera)
+    rows = expected.ids.long()
+    assert len(rows) > 5
+    assert len(found) == n  # all are in front of the camera
+    assert torch.allclose(found.packed[rows], expected.packed, atol=1e-12)
