@@ -150,9 +150,7 @@ def rotated(dataset: Dataset, seed: int) -> Dataset:
     return replace(dataset, train=moved(dataset.train), test=moved(dataset.test), points=points)
 
 
-def train(
-    dataset: Dataset, name: str, rate: float, seed: int, count: int, steps: int
-) -> Result:
+def train(dataset: Dataset, name: str, rate: float, seed: int, count: int, steps: int) -> Result:
     """Train `count` Gaussians for `steps` steps; the PSNR is the mean of the test views."""
     shape = SHAPES[name]
     random = torch.Generator().manual_seed(seed)

@@ -83,7 +83,7 @@ def test_the_profile_of_a_cloud():
 
 def test_exercises():
     weights = np.array([0.5, 0.25, 0.125])
-    image, alpha, _ = reference.rasterize(
+    image, _, _ = reference.rasterize(
         splats_with(np.full(3, 0.5), np.eye(3)), 1, 1, torch.ones(3).double()
     )
     assert image[0, 0].numpy() == pytest.approx(weights + 0.125)

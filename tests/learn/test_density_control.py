@@ -47,18 +47,18 @@ def refined(scene: Gaussians, grads: list[float], seed: int = 0) -> Gaussians:
 
 def test_the_measure():
     """τ is the norm of the gradient in a screen that spans [-1, 1]."""
+    pose = torch.eye(3, 4, dtype=torch.float64)
+    pose[2, 3] = 3.0
     splats = reference.project(
         *gaussians([-2.0], [0.5]).map(torch.Tensor.double).parameters().values(),
-        torch.eye(3, 4, dtype=torch.float64) + torch.tensor([[0.0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 3]]),
+        pose,
         width=32, height=24, fx=30, fy=30, cx=16, cy=12, sh_degree=0,
     )  # fmt: skip
     packed = splats.packed.detach().requires_grad_()
     packed.grad = torch.zeros_like(packed)
     packed.grad[0, :2] = torch.tensor([0.3, -0.4])
     norm_sum, views = torch.zeros(1).double(), torch.zeros(1).double()
-    reference.accumulate_screen_statistics(
-        Splats2D(packed, splats.ids, 3), 32, 24, norm_sum, views
-    )
+    reference.accumulate_screen_statistics(Splats2D(packed, splats.ids, 3), 32, 24, norm_sum, views)
     assert float(norm_sum) == pytest.approx(math.hypot(0.3 * 16, 0.4 * 12))
     assert float(views) == 1
 
@@ -72,7 +72,7 @@ def test_clone_split_prune():
     largest = after.scales.amax(dim=1)
     assert sorted(largest.tolist()) == pytest.approx([0.005] * 3 + [0.1 / SPLIT_SHRINK] * 2)
     assert SPLIT_SHRINK == 1.6
-    assert SPLIT_SHRINK**-3 == pytest.approx(0.24, abs=5e-3)
+    assert pytest.approx(0.24, abs=5e-3) == SPLIT_SHRINK**-3
 
 
 def test_the_children_have_the_distribution_of_the_parent():
@@ -118,5 +118,5 @@ def test_the_opacity_of_mcmc():
             shared = 1 - (1 - o) ** (1 / n)
             assert 1 - (1 - shared) ** n == pytest.approx(o)
     # Exercise 1.
-    assert 1 - 0.2**2 == pytest.approx(0.96)
+    assert pytest.approx(0.96) == 1 - 0.2**2
     assert 1 - math.sqrt(0.2) == pytest.approx(0.553, abs=5e-4)

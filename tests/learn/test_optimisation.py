@@ -14,7 +14,9 @@ from snowsplat.training.step_schedule import Schedule
 def test_the_table_of_parameters():
     """Numbers of parameters, initial values and rates of the page."""
     random = torch.Generator().manual_seed(0)
-    points = Points(torch.randn(20, 3, generator=random), torch.full((20, 3), 51, dtype=torch.uint8))
+    points = Points(
+        torch.randn(20, 3, generator=random), torch.full((20, 3), 51, dtype=torch.uint8)
+    )
     gaussians = Gaussians.from_points(points)
     sizes = {name: p[0].numel() for name, p in gaussians.parameters().items()}
     assert sizes == {
@@ -81,7 +83,8 @@ def test_the_step_does_not_depend_on_the_size_of_the_gradient():
     steps = []
     for size in (1e-6, 1.0, 1e6):
         m = v = 0.0
-        for t in range(1, 20):
+        t = 19
+        for _ in range(t):
             m, v = 0.9 * m + 0.1 * size, 0.999 * v + 0.001 * size**2
         steps.append((m / (1 - 0.9**t)) / math.sqrt(v / (1 - 0.999**t)))
     assert steps == pytest.approx([1, 1, 1])

@@ -67,7 +67,9 @@ def test_the_maximum_over_a_tile():
         def exponent(x, y, a=a, b=b, c=c):
             return -0.5 * (a * x * x + c * y * y) - b * x * y
 
-        grid = np.stack(np.meshgrid(*(np.linspace(u, v, 301) for u, v in zip(low, high, strict=True))))
+        grid = np.stack(
+            np.meshgrid(*(np.linspace(u, v, 301) for u, v in zip(low, high, strict=True)))
+        )
         sampled = exponent(*grid).max()
         y = np.clip(0, low[1], high[1])
         x = np.clip(0, low[0], high[0])

@@ -21,8 +21,12 @@ def directions(n: int) -> torch.Tensor:
 def sphere_mean(function) -> torch.Tensor:
     """The mean over the sphere of polynomials up to degree 6: exact by Gauss-Legendre in z."""
     # The nodes and weights of order 4 in z, and 8 equal angles.
-    z = torch.tensor([-0.8611363115940526, -0.3399810435848563, 0.3399810435848563, 0.8611363115940526])
-    w = torch.tensor([0.3478548451374538, 0.6521451548625461, 0.6521451548625461, 0.3478548451374538])
+    z = torch.tensor(
+        [-0.8611363115940526, -0.3399810435848563, 0.3399810435848563, 0.8611363115940526]
+    )
+    w = torch.tensor(
+        [0.3478548451374538, 0.6521451548625461, 0.6521451548625461, 0.3478548451374538]
+    )
     z, w = z.double(), w.double() / 2
     angle = torch.arange(8, dtype=torch.float64) * math.pi / 4
     r = (1 - z * z).sqrt()
@@ -56,8 +60,11 @@ def test_the_functions_are_orthonormal():
 
 def test_the_table_is_that_of_the_code():
     """Every row: function, factor as a root, and factor as a number."""
-    rows = re.findall(r"^\| (\d+) \| (\d), (\S+) \| \$(.+?)\$ \| \$\\sqrt\{(.+?)\}\$ \| ([\d.]+) \|",
-                      PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| (\d+) \| (\d), (\S+) \| \$(.+?)\$ \| \$\\sqrt\{(.+?)\}\$ \| ([\d.]+) \|",
+        PAGE.read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
     assert [int(row[0]) for row in rows] == list(range(16))
     v = directions(7)
     basis = reference.sh_basis(v, 3)
@@ -108,4 +115,5 @@ def test_rotation_of_coefficients():
 
 
 def test_exercise_1():
-    assert 0.5 / reference.C0 == pytest.approx(1.7725, abs=5e-5)
+    red = 0.5 / reference.C0
+    assert red == pytest.approx(1.7725, abs=5e-5)

@@ -1,10 +1,12 @@
 """Figures of the page "Blending"."""
 
+from itertools import pairwise
+
 import numpy as np
-import scene
 import torch
 from drawing import Drawing
 
+import scene
 from snowsplat import ops
 from snowsplat.ops import reference
 from snowsplat.ops.splats import Splats2D
@@ -22,12 +24,14 @@ def ray() -> None:
     T = np.exp(-np.concatenate([[0], np.cumsum((tau[1:] + tau[:-1]) / 2 * step)]))
     panel = Drawing(330, 240, x=(0, 6), y=(0, 2.8), margins=(32, 26, 8, 40))
     panel.axes("distance s", counts=(7, 4))
-    panel.line([(0, 0), *zip(s, tau, strict=True), (6, 0)], "soft", 1, fill="soft",
-               fill_opacity=0.22)
+    panel.line(
+        [(0, 0), *zip(s, tau, strict=True), (6, 0)], "soft", 1, fill="soft", fill_opacity=0.22
+    )
     panel.line(zip(s, T, strict=True), "blue", 2.2)
     panel.line(zip(s, T * tau, strict=True), "orange", 2.2)
-    for i, (words, colour) in enumerate((("density τ", "soft"), ("transmittance T", "blue"),
-                                         ("weight T τ", "orange"))):
+    for i, (words, colour) in enumerate(
+        (("density τ", "soft"), ("transmittance T", "blue"), ("weight T τ", "orange"))
+    ):
         panel.text((0, 2.8), words, colour, anchor="start", dx=8, dy=14 + 17 * i)
     panel.save("blending-density", "A density with two peaks, and the falling transmittance")
 
@@ -35,7 +39,7 @@ def ray() -> None:
     panel = Drawing(330, 240, x=(0, 6), y=(0, 1.05), margins=(32, 26, 8, 40))
     panel.axes("distance s", counts=(7, 5))
     before = 1.0
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         inside = np.linspace(low, high, 101)
         alpha = 1 - np.exp(-density(inside).mean() * (high - low))
         weight = before * alpha
@@ -43,8 +47,9 @@ def ray() -> None:
         panel.rectangle((low + 0.05, 0), (high - 0.05, weight), fill="orange")
         panel.line([(low, before), (high, before)], "blue", 2.4)
         before *= 1 - alpha
-    for i, (words, colour) in enumerate((("α of each layer", "soft"), ("transmittance T", "blue"),
-                                         ("weight T α", "orange"))):
+    for i, (words, colour) in enumerate(
+        (("α of each layer", "soft"), ("transmittance T", "blue"), ("weight T α", "orange"))
+    ):
         panel.text((6, 1.05), words, colour, anchor="end", dx=-2, dy=14 + 17 * i)
     panel.save("blending-weights", "Bars of the opacity and the weight of twelve layers")
 
@@ -88,7 +93,7 @@ def real() -> None:
     pixel = torch.tensor([[x, y]])
     means, conics, opacities = (v[order] for v in (splats.means2d, splats.conics, splats.opacities))
     near = ((means - pixel).norm(dim=1) < 200).nonzero()[:, 0]
-    alpha, T, T_end = reference._blend_weights(pixel, means[near], conics[near], opacities[near])
+    alpha, T, _ = reference._blend_weights(pixel, means[near], conics[near], opacities[near])
     blended = alpha[0] > 0
     weights, before = (alpha * T)[0, blended].numpy(), T[0, blended].numpy()
     n = len(weights)

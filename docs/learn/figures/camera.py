@@ -1,8 +1,9 @@
 """Figures of the page "Cameras"."""
 
 import numpy as np
-import scene
 from drawing import Drawing
+
+import scene
 
 
 def pinhole() -> None:
@@ -62,8 +63,13 @@ def top_view() -> None:
 def pixel_grid() -> None:
     for name, factor in (("pixels", 1), ("half", 2)):
         w, h = 6 // factor, 4 // factor
-        panel = Drawing(300, 222, x=(-0.4 / factor, w + 0.4 / factor),
-                        y=(h + 0.5 / factor, -0.5 / factor), margins=(4, 4, 4, 4))
+        panel = Drawing(
+            300,
+            222,
+            x=(-0.4 / factor, w + 0.4 / factor),
+            y=(h + 0.5 / factor, -0.5 / factor),
+            margins=(4, 4, 4, 4),
+        )
         for i in range(w + 1):
             panel.line([(i, 0), (i, h)], "line", 1.4)
         for j in range(h + 1):

@@ -40,8 +40,7 @@ def factors() -> None:
         for i, colour in enumerate(("orange", "green")):
             panel.arrow((0, 0), factor[:, i], colour, 2.4)
             side = 1 if factor[0, i] > 1 else -1
-            panel.text(factor[:, i], f"column {i + 1}", colour, dx=10 * side,
-                       dy=-9, bold=True)
+            panel.text(factor[:, i], f"column {i + 1}", colour, dx=10 * side, dy=-9, bold=True)
         panel.title(words)
         panel.save(f"covariance-{name}", f"An ellipse and the two columns of {words}")
 

@@ -1,11 +1,11 @@
 """Figures of the pages "Density control" and "Optimisation"."""
 
 import numpy as np
-import scene
 import torch
 from drawing import Drawing
 from training_run import STEPS, record, snapshot
 
+import scene
 from snowsplat.scene.render import project, render
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.recipes import recipe
@@ -16,15 +16,34 @@ def clone_and_split() -> None:
     t = np.linspace(0, 1, 60)
     curve = np.stack([-2.2 + 4.4 * t, 0.9 * np.sin(2.6 * t + 0.3) - 0.35], axis=1)
     for name, old, new in (
-        ("clone", [((-0.9, 0.36), (0.5, 0.22), 30)], [((-0.9, 0.36), (0.5, 0.22), 30), ((0.2, 0.55), (0.5, 0.22), 0)]),
-        ("split", [((0.0, 0.25), (1.9, 0.75), 3)], [((-0.85, 0.25), (1.19, 0.47), 18), ((1.0, 0.3), (1.19, 0.47), -18)]),
+        (
+            "clone",
+            [((-0.9, 0.36), (0.5, 0.22), 30)],
+            [((-0.9, 0.36), (0.5, 0.22), 30), ((0.2, 0.55), (0.5, 0.22), 0)],
+        ),
+        (
+            "split",
+            [((0.0, 0.25), (1.9, 0.75), 3)],
+            [((-0.85, 0.25), (1.19, 0.47), 18), ((1.0, 0.3), (1.19, 0.47), -18)],
+        ),
     ):
         panel = Drawing(330, 190, x=(-2.6, 2.6), y=(-1.3, 1.6), equal=True, margins=(4, 26, 4, 4))
         panel.line(curve, "line", 12)
         for mean, (a, b), degrees in old:
-            panel.ellipse(mean, shape(a, b, degrees), 1, "soft", 1.6, dash="5 4", fill="soft", fill_opacity=0.1)
+            panel.ellipse(
+                mean,
+                shape(a, b, degrees),
+                1,
+                "soft",
+                1.6,
+                dash="5 4",
+                fill="soft",
+                fill_opacity=0.1,
+            )
         for (mean, (a, b), degrees), colour in zip(new, ("blue", "orange"), strict=True):
-            panel.ellipse(mean, shape(a, b, degrees), 1, colour, 2.2, fill=colour, fill_opacity=0.15)
+            panel.ellipse(
+                mean, shape(a, b, degrees), 1, colour, 2.2, fill=colour, fill_opacity=0.15
+            )
             panel.dot(mean, colour)
         panel.title(name)
         panel.save(f"density-{name}", f"{name}: a grey ellipse becomes two coloured ones")
@@ -43,7 +62,9 @@ def histogram() -> None:
     counts, _ = np.histogram(np.log10(grads), edges)
     top = counts.max() * 1.1
     panel = Drawing(340, 220, x=(-7, -2.5), y=(0, float(top)), margins=(44, 26, 10, 40))
-    panel.axes("τ", "Gaussians", x_ticks=[(e, f"1e{e}") for e in (-7, -6, -5, -4, -3)], counts=(5, 4))
+    panel.axes(
+        "τ", "Gaussians", x_ticks=[(e, f"1e{e}") for e in (-7, -6, -5, -4, -3)], counts=(5, 4)
+    )
     threshold = np.log10(2e-4)
     for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True):
         colour = "orange" if low >= threshold - 1e-9 else "blue"
@@ -57,7 +78,9 @@ def histogram() -> None:
 def curves() -> None:
     data = record()
     count = np.array(data["count"])
-    panel = Drawing(340, 230, x=(0, STEPS), y=(0, float(count.max()) * 1.1), margins=(44, 26, 10, 40))
+    panel = Drawing(
+        340, 230, x=(0, STEPS), y=(0, float(count.max()) * 1.1), margins=(44, 26, 10, 40)
+    )
     panel.axes("step", "Gaussians", counts=(5, 5))
     panel.line(zip(range(1, STEPS + 1, 10), count[::10], strict=False), "blue", 2.4)
     for step in (1000, 2000):
@@ -77,11 +100,19 @@ def curves() -> None:
         panel.rectangle((bar[0], 0), (bar[1], e["clones"]), fill="blue")
         panel.rectangle((bar[0], e["clones"]), (bar[1], e["clones"] + e["splits"]), fill="orange")
         panel.rectangle((bar[0], 0), (bar[1], -e["prunes"]), fill="red")
-    for i, (words, colour) in enumerate((("cloned", "blue"), ("split", "orange"), ("pruned", "red"))):
+    for i, (words, colour) in enumerate(
+        (("cloned", "blue"), ("split", "orange"), ("pruned", "red"))
+    ):
         panel.text((2600, panel.y[1]), words, colour, anchor="end", dx=-4, dy=14 + 17 * i)
     panel.save("density-events", "Bars of cloned, split and pruned Gaussians")
-    print("counts", count[0], count.max(), count[-1], {s: data["events"][s]["clones"] for s in (500, 1000)},
-          {s: {k: e[k] for k in ("clones", "splits", "prunes")} for s, e in events.items()})
+    print(
+        "counts",
+        count[0],
+        count.max(),
+        count[-1],
+        {s: data["events"][s]["clones"] for s in (500, 1000)},
+        {s: {k: e[k] for k in ("clones", "splits", "prunes")} for s, e in events.items()},
+    )
 
     loss = np.array(data["loss"])
     window = np.ones(50) / 50
@@ -93,8 +124,14 @@ def curves() -> None:
     scale = 30 / smooth.max()
     panel.line(zip(range(25, STEPS, 20), scale * smooth[::20], strict=False), "orange", 1.8)
     panel.text((STEPS, 32), "PSNR", "blue", anchor="end", dx=-4, dy=16)
-    panel.text((STEPS, 32), f"loss (from {smooth[0]:.2f} to {smooth[-1]:.3f})", "orange", anchor="end",
-               dx=-4, dy=200 - 60)
+    panel.text(
+        (STEPS, 32),
+        f"loss (from {smooth[0]:.2f} to {smooth[-1]:.3f})",
+        "orange",
+        anchor="end",
+        dx=-4,
+        dy=200 - 60,
+    )
     print("psnr", psnr[0], psnr[-1], max(psnr, key=lambda p: p[1]), "loss", smooth[0], smooth[-1])
     panel.save("optimisation-loss", "PSNR rises, the loss falls; both jump at opacity resets")
 
@@ -106,7 +143,9 @@ def pictures() -> None:
         panel.title("start" if step == 0 else f"step {step}")
         panel.picture(scene.rendering(snapshot(step), view), (0, 0), (1, 1), quality=75)
         panel.save(f"optimisation-{name}", f"The scene after {step} steps")
-    for i, (step, words) in enumerate(((1000, "step 1000"), (1010, "step 1010"), (1500, "step 1500")), 1):
+    for i, (step, words) in enumerate(
+        ((1000, "step 1000"), (1010, "step 1010"), (1500, "step 1500")), 1
+    ):
         panel = Drawing(222, 189, margins=(0, 24, 0, 0))
         panel.title(words)
         panel.picture(scene.rendering(snapshot(step), view), (0, 0), (1, 1), quality=75)
@@ -146,18 +185,32 @@ def activations() -> None:
 
 def rates() -> None:
     panel = Drawing(340, 230, x=(0, 1), y=(-2.2, 0.2), margins=(44, 26, 10, 40))
-    panel.axes("share of the steps", "rate / first rate", counts=(5, 3),
-               y_ticks=[(-2, "1%"), (-1, "10%"), (0, "100%")])
-    for config, colour, words in ((recipe("paper"), "blue", "paper"), (recipe("default"), "orange", "default")):
+    panel.axes(
+        "share of the steps",
+        "rate / first rate",
+        counts=(5, 3),
+        y_ticks=[(-2, "1%"), (-1, "10%"), (0, "100%")],
+    )
+    for config, colour, words in (
+        (recipe("paper"), "blue", "paper"),
+        (recipe("default"), "orange", "default"),
+    ):
         rates_: LearningRates = config.learning_rates
         schedule = Schedule(config.iterations)
         for name, dash in (("means", ""), ("log_scales", "5 4")):
             steps = np.linspace(1, config.iterations, 60).astype(int)
             values = [rates_.at(int(s), schedule, 1.0)[name] for s in steps]
-            points = [(s / config.iterations, np.log10(v / values[0])) for s, v in zip(steps, values, strict=True)]
+            points = [
+                (s / config.iterations, np.log10(v / values[0]))
+                for s, v in zip(steps, values, strict=True)
+            ]
             panel.line(points, colour, 2.2, dash=dash)
-        panel.text((0, -2.2), words, colour, anchor="start", dx=8, dy=-10 if colour == "blue" else -27)
-    panel.text((0, -2.2), "solid: positions; dashed: others", "soft", anchor="start", dx=8, dy=-46, size=12)
+        panel.text(
+            (0, -2.2), words, colour, anchor="start", dx=8, dy=-10 if colour == "blue" else -27
+        )
+    panel.text(
+        (0, -2.2), "solid: positions; dashed: others", "soft", anchor="start", dx=8, dy=-46, size=12
+    )
     panel.save("optimisation-rates", "Falling curves of the learning rates")
 
 

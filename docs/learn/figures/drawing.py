@@ -2,7 +2,8 @@
 
 The figures are elements of the pages (`docs/extensions/drawings.py`), and docs/static/site.css
 changes their colours with the theme. A drawing library would write fixed colours, so this module
-writes the SVG itself: each colour is a class, and an attribute for programs that show only the file.
+writes the SVG itself: each colour is a class, and an attribute for programs that show only the
+file.
 
 Panels are at most 340 units wide. So they are shown at their full size on a phone, too.
 """
@@ -169,7 +170,9 @@ class Drawing:
             style += f' stroke-width="{width:g}"'
         self._add(f"<rect {box} {style}/>")
 
-    def polygon_rgb(self, points: Iterable[Point], rgb: Sequence[float], opacity: float = 1) -> None:
+    def polygon_rgb(
+        self, points: Iterable[Point], rgb: Sequence[float], opacity: float = 1
+    ) -> None:
         """A polygon in a fixed colour (0..1), for surfaces."""
         path = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in map(self.at, points)) + "Z"
         colour = _hex(rgb)
@@ -187,7 +190,7 @@ class Drawing:
         quality: int = 82,
         pixelated: bool = False,
     ) -> None:
-        """An image (H, W, 3) in 0..1 or uint8, between two opposite corners; row 0 is at the top."""
+        """An image (H, W, 3) in 0..1 or uint8, between two opposite corners, upright."""
         if image.dtype != np.uint8:
             image = np.rint(255 * image.clip(0, 1)).astype(np.uint8)
         data = io.BytesIO()
@@ -212,7 +215,7 @@ class Drawing:
         x_ticks: Sequence[tuple[float, str]] | None = None,
         y_ticks: Sequence[tuple[float, str]] | None = None,
     ) -> None:
-        """Grid lines with tick labels. The labels are at the end of the x axis and above the y axis.
+        """Grid lines with tick labels. The names are at the end of the x axis and above the y axis.
 
         The margins of the drawing must leave space: about 44 on the left, 38 below, 22 above.
         """

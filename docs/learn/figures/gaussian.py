@@ -48,8 +48,15 @@ def affine() -> None:
     matrix, shift = np.array([[1.5, 0.7], [-0.3, 0.9]]), np.array([1.0, 0.4])
     centre = np.array([-1.6, -0.7])
     panel.ellipse(centre, np.eye(2), 1, "soft", 1.6, dash="5 4")
-    panel.ellipse(matrix @ centre + shift + [2.6, 0.6], matrix @ matrix.T, 1, "blue", 2.2,
-                  fill="blue", fill_opacity=0.13)
+    panel.ellipse(
+        matrix @ centre + shift + [2.6, 0.6],
+        matrix @ matrix.T,
+        1,
+        "blue",
+        2.2,
+        fill="blue",
+        fill_opacity=0.13,
+    )
     for angle in np.linspace(0, 2 * np.pi, 9)[:-1]:
         unit = np.array([np.cos(angle), np.sin(angle)])
         start = centre + unit

@@ -13,8 +13,14 @@ def chain() -> None:
     panel = Drawing(340, 430, x=(0, 10), y=(12.2, 0), margins=(4, 4, 4, 4))
 
     def box(x: float, y: float, words: str, width: float = 2.6, colour: str = "soft") -> None:
-        panel.rectangle((x - width / 2, y - 0.42), (x + width / 2, y + 0.42), colour, fill=colour,
-                        fill_opacity=0.12, width=1.4)
+        panel.rectangle(
+            (x - width / 2, y - 0.42),
+            (x + width / 2, y + 0.42),
+            colour,
+            fill=colour,
+            fill_opacity=0.12,
+            width=1.4,
+        )
         panel.text((x, y), words, dy=5, size=13)
 
     def link(x0: float, y0: float, x1: float, y1: float) -> None:
@@ -35,10 +41,24 @@ def chain() -> None:
     box(9.0, 8.4, "c", 1.2)
     box(4.4, 9.2, "α = o exp(−½ dᵀ K d)", 5.0)
     box(6.4, 10.8, "C = Σ T α c   →   loss L", 5.4, colour="orange")
-    for a in ((1.4, 0.8, 2.5, 2.6), (4.4, 0.8, 3.3, 2.6), (7.0, 0.8, 6.2, 2.6), (7.2, 0.8, 8.6, 2.6),
-              (2.9, 2.6, 4.0, 4.3), (5.6, 2.6, 4.8, 4.3), (4.4, 4.3, 4.4, 5.9), (4.4, 5.9, 4.4, 7.5),
-              (6.4, 2.6, 7.4, 7.2), (4.4, 7.5, 4.4, 9.2), (7.5, 7.2, 6.0, 9.2), (1.3, 7.5, 3.2, 9.2),
-              (8.8, 2.6, 8.9, 8.4), (9.5, 0.8, 9.4, 8.4), (4.4, 9.2, 5.6, 10.8), (9.0, 8.4, 7.6, 10.8)):
+    for a in (
+        (1.4, 0.8, 2.5, 2.6),
+        (4.4, 0.8, 3.3, 2.6),
+        (7.0, 0.8, 6.2, 2.6),
+        (7.2, 0.8, 8.6, 2.6),
+        (2.9, 2.6, 4.0, 4.3),
+        (5.6, 2.6, 4.8, 4.3),
+        (4.4, 4.3, 4.4, 5.9),
+        (4.4, 5.9, 4.4, 7.5),
+        (6.4, 2.6, 7.4, 7.2),
+        (4.4, 7.5, 4.4, 9.2),
+        (7.5, 7.2, 6.0, 9.2),
+        (1.3, 7.5, 3.2, 9.2),
+        (8.8, 2.6, 8.9, 8.4),
+        (9.5, 0.8, 9.4, 8.4),
+        (4.4, 9.2, 5.6, 10.8),
+        (9.0, 8.4, 7.6, 10.8),
+    ):
         link(*a)
     panel.save("gradients-chain", "Boxes of the intermediate results, connected by arrows")
 
@@ -59,49 +79,64 @@ def scene(dtype: torch.dtype) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         "sh_dc": normal(n, 1, 3),
         "sh_rest": normal(n, 3, 3) * 0.2,
     }
-    view = {"width": 24, "height": 20, "fx": 26.0, "fy": 26.0, "cx": 12.0, "cy": 10.0, "sh_degree": 1}
+    view = {
+        "width": 24,
+        "height": 20,
+        "fx": 26.0,
+        "fy": 26.0,
+        "cx": 12.0,
+        "cy": 10.0,
+        "sh_degree": 1,
+    }
     return {k: v.to(dtype) for k, v in parameters.items()}, view
 
 
+def images(
+    parameters: dict[str, torch.Tensor], view: dict[str, Any]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The image of the small scene, and the number of blended splats per pixel."""
+    width, height, pose = view["width"], view["height"], torch.eye(3, 4)
+    splats = reference.project(**parameters, cam_from_world=pose, **view)
+    image = reference.rasterize(splats, width, height)[0]
+    return image, reference.count_blended(splats, width, height)
+
+
 def differences() -> None:
-    steps = 10.0 ** np.arange(-10, -0.4, 0.25)
     panel = Drawing(340, 250, x=(-10, -0.5), y=(-11, 1), margins=(44, 26, 10, 40))
-    panel.axes("step h", "relative difference",
-               x_ticks=[(e, f"1e{e}") for e in (-10, -8, -6, -4, -2)],
-               y_ticks=[(e, f"1e{e}" if e else "1") for e in (-9, -6, -3, 0)])
-    for dtype, colour, words in ((torch.float64, "blue", "double"), (torch.float32, "orange", "single")):
+    panel.axes(
+        "step h",
+        "relative difference",
+        x_ticks=[(e, f"1e{e}") for e in (-10, -8, -6, -4, -2)],
+        y_ticks=[(e, f"1e{e}" if e else "1") for e in (-9, -6, -3, 0)],
+    )
+    for dtype, colour, words in (
+        (torch.float64, "blue", "double"),
+        (torch.float32, "orange", "single"),
+    ):
         parameters, view = scene(dtype)
-        pose = torch.eye(3, 4, dtype=dtype)
         target = torch.linspace(0, 1, 20 * 24 * 3, dtype=dtype).reshape(20, 24, 3)
-
-        def loss(values: dict[str, torch.Tensor]) -> torch.Tensor:
-            splats = reference.project(**values, cam_from_world=pose, **view)
-            image = reference.rasterize(splats, view["width"], view["height"])[0]
-            return (image - target).square().sum()
-
-        x = parameters["means"].clone().requires_grad_()
-        (grad,) = torch.autograd.grad(loss({**parameters, "means": x}), x)
+        means = parameters["means"].clone().requires_grad_()
+        loss = (images({**parameters, "means": means}, view)[0] - target).square().sum()
+        (grad,) = torch.autograd.grad(loss, means)
         found = []
-        for h in steps:
-            values = []
-            counts = []
+        for h in 10.0 ** np.arange(-10, -0.4, 0.25):
+            values, counts = [], []
             for sign in (1, -1):
                 moved = parameters["means"].clone()
                 moved[2, 0] += sign * h
-                values.append(float(loss({**parameters, "means": moved})))
-                splats = reference.project(
-                    **{**parameters, "means": moved}, cam_from_world=pose, **view
-                )
-                counts.append(reference.count_blended(splats, view["width"], view["height"]))
-            if dtype == torch.float64 and h > 1e-3:
-                print(f"h = {h:.4f}: {int((counts[0] != counts[1]).sum())} pixels differ in α ≥ 1/255")
+                image, count = images({**parameters, "means": moved}, view)
+                values.append(float((image - target).square().sum()))
+                counts.append(count)
+            if dtype == torch.float64 and 1e-3 < h < 0.02:
+                pixels = int((counts[0] != counts[1]).sum())
+                print(f"h = {h:.4f}: the splats with α ≥ 1/255 differ at {pixels} pixels")
             estimate = (values[0] - values[1]) / (2 * h)
             error = abs(estimate / float(grad[2, 0]) - 1)
             found.append((np.log10(h), np.log10(max(error, 1e-12))))
         panel.line([p for p in found if p[1] < 0.9], colour, 2)
-        best = min(found, key=lambda p: p[1])
-        print(words, best)
-        panel.text((-0.5, 1), words, colour, anchor="end", dx=-4, dy=14 if colour == "blue" else 32)
+        print(words, "smallest difference:", min(found, key=lambda p: p[1]))
+        y = 14 if colour == "blue" else 32
+        panel.text((-7, 1), words, colour, anchor="end", dx=-4, dy=y + 16)
     panel.save("gradients-differences", "Two V-shaped curves of the error over the step size")
 
 

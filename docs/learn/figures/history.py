@@ -3,12 +3,36 @@
 from drawing import Drawing
 
 LINES = (
-    ("points and splats", "blue", ((1985, "points [1]"), (1990, "footprints [4]"), (2000, "surfels [6]"),
-                                   (2001.6, "EWA [8, 9]"))),
-    ("volume rendering", "green", ((1984, "densities [3]"), (1995, "models [5]"), (2020, "NeRF [14]"),
-                                   (2021.8, "Plenoxels [15]"))),
-    ("photos to points", "violet", ((2004, "SIFT [11]"), (2006, "Photo Tourism [12]"), (2016, "COLMAP [13]"))),
-    ("learned points", "orange", ((2019, "surface splats [18]"), (2020.5, "Pulsar [21]"), (2021.5, "per view [22]"))),
+    (
+        "points and splats",
+        "blue",
+        (
+            (1985, "points [1]"),
+            (1990, "footprints [4]"),
+            (2000, "surfels [6]"),
+            (2001.6, "EWA [8, 9]"),
+        ),
+    ),
+    (
+        "volume rendering",
+        "green",
+        (
+            (1984, "densities [3]"),
+            (1995, "models [5]"),
+            (2020, "NeRF [14]"),
+            (2021.8, "Plenoxels [15]"),
+        ),
+    ),
+    (
+        "photos to points",
+        "violet",
+        ((2004, "SIFT [11]"), (2006, "Photo Tourism [12]"), (2016, "COLMAP [13]")),
+    ),
+    (
+        "learned points",
+        "orange",
+        ((2019, "surface splats [18]"), (2020.5, "Pulsar [21]"), (2021.5, "per view [22]")),
+    ),
 )
 
 

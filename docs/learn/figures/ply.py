@@ -1,12 +1,21 @@
 """Figures of the page "The PLY file"."""
 
 import numpy as np
-import scene
 from drawing import Drawing
 
-FIELDS = (("x y z", 3, "blue"), ("normals", 3, "soft"), ("f_dc", 3, "orange"), ("f_rest: red", 15, "red"),
-          ("f_rest: green", 15, "green"), ("f_rest: blue", 15, "blue"), ("opacity", 1, "ink"),
-          ("scale", 3, "violet"), ("rot", 4, "orange"))
+import scene
+
+FIELDS = (
+    ("x y z", 3, "blue"),
+    ("normals", 3, "soft"),
+    ("f_dc", 3, "orange"),
+    ("f_rest: red", 15, "red"),
+    ("f_rest: green", 15, "green"),
+    ("f_rest: blue", 15, "blue"),
+    ("opacity", 1, "ink"),
+    ("scale", 3, "violet"),
+    ("rot", 4, "orange"),
+)
 
 
 def row() -> None:
@@ -18,7 +27,9 @@ def row() -> None:
         for _ in range(count):
             line, column = divmod(position, 31)
             y = 1.4 + 4.2 * line
-            panel.rectangle((column + 0.06, y), (column + 0.94, y + 1.2), colour, fill=colour, fill_opacity=0.25)
+            panel.rectangle(
+                (column + 0.06, y), (column + 0.94, y + 1.2), colour, fill=colour, fill_opacity=0.25
+            )
             position += 1
         line, column = divmod(start, 31)
         if words == "f_rest: blue" or line == (position - 1) // 31:

@@ -29,8 +29,14 @@ def outlines() -> None:
         p = np.array([np.sin(np.radians(degrees)), 0, np.cos(np.radians(degrees))])
         centre = p[:2] / p[2]
         half = 0.56
-        panel = Drawing(300, 230, x=(centre[0] - half, centre[0] + half), y=(-0.4, 0.4), equal=True,
-                        margins=(4, 26, 4, 4))
+        panel = Drawing(
+            300,
+            230,
+            x=(centre[0] - half, centre[0] + half),
+            y=(-0.4, 0.4),
+            equal=True,
+            margins=(4, 26, 4, 4),
+        )
         J = jacobian(p)
         curve = outline(p, radius)
         panel.ellipse(centre, radius**2 * J @ J.T, 1, "blue", 2.2, fill="blue", fill_opacity=0.13)
@@ -67,14 +73,26 @@ def error_curves() -> None:
         ("angle", angles, [errors(0.05, a, samples) for a in angles], "angle from the axis (°)"),
     ):
         values = 100 * np.array(at)
-        panel = Drawing(320, 230, x=(0, float(xs[-1])), y=(0, float(values.max()) * 1.1),
-                        margins=(38, 26, 10, 40))
+        panel = Drawing(
+            320,
+            230,
+            x=(0, float(xs[-1])),
+            y=(0, float(values.max()) * 1.1),
+            margins=(38, 26, 10, 40),
+        )
         panel.axes(label, "% of the standard deviation", counts=(5, 5))
-        for i, (words, colour) in enumerate((("shift of the mean", "orange"), ("error of σ", "blue"))):
+        for i, (words, colour) in enumerate(
+            (("shift of the mean", "orange"), ("error of σ", "blue"))
+        ):
             panel.line(zip(xs, values[:, i], strict=True), colour, 2.2)
             panel.text((0, panel.y[1]), words, colour, anchor="start", dx=10, dy=18 + 18 * i)
         panel.save(f"projection-error-{name}", "Two rising curves of the error")
-        print(name, [(round(float(x), 3), v.round(2).tolist()) for x, v in zip(xs, values, strict=True)][::5])
+        print(
+            name,
+            [(round(float(x), 3), v.round(2).tolist()) for x, v in zip(xs, values, strict=True)][
+                ::5
+            ],
+        )
 
 
 def filters() -> None:
@@ -86,8 +104,14 @@ def filters() -> None:
             for j in range(-4, 4):
                 d = np.array([i + 0.5, j + 0.5]) - (0.1, 0.15)
                 value = np.exp(-0.5 * d @ inverse @ d)
-                panel.rectangle((i, j), (i + 1, j + 1), "line", fill="blue",
-                                fill_opacity=round(0.85 * value, 3), width=0.8)
+                panel.rectangle(
+                    (i, j),
+                    (i + 1, j + 1),
+                    "line",
+                    fill="blue",
+                    fill_opacity=round(0.85 * value, 3),
+                    width=0.8,
+                )
         for k in (1, 2):
             panel.ellipse((0.1, 0.15), covariance + dilation * np.eye(2), k, "orange", 1.6)
         panel.title("without the filter" if dilation == 0 else "with the filter")

@@ -1,10 +1,10 @@
 """Figures of the page "The tile rasterizer"."""
 
 import numpy as np
-import scene
 import torch
 from drawing import Drawing
 
+import scene
 from snowsplat.ops import reference
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.render import project
@@ -21,31 +21,35 @@ def covariances(splats: Splats2D) -> np.ndarray:
 
 
 def largest_alpha(d0: np.ndarray, d1: np.ndarray, conic: np.ndarray, opacity: float) -> float:
-    """The maximum of α over the pixel centres' rectangle [d0, d1] relative to the mean, by samples."""
+    """The maximum of α over the rectangle [d0, d1], relative to the mean, by samples."""
     x = np.linspace(d0[0], d1[0], 61)
     y = np.linspace(d0[1], d1[1], 61)
-    X, Y = np.meshgrid(np.append(x, np.clip(0, d0[0], d1[0])), np.append(y, np.clip(0, d0[1], d1[1])))
+    X, Y = np.meshgrid(
+        np.append(x, np.clip(0, d0[0], d1[0])), np.append(y, np.clip(0, d0[1], d1[1]))
+    )
     a, b, c = conic
     return float((opacity * np.exp(-0.5 * (a * X * X + c * Y * Y) - b * X * Y)).max())
 
 
 def one_splat() -> None:
     covariance = np.array([[310.0, 235.0], [235.0, 200.0]])
-    mean, opacity = np.array([70.0, 54.0]), 0.7
+    mean, opacity = np.array([97.0, 71.0]), 0.7
     inverse = np.linalg.inv(covariance)
     conic = np.array([inverse[0, 0], inverse[0, 1], inverse[1, 1]])
     k = np.sqrt(2 * np.log(255 * opacity))
     half = k * np.sqrt(covariance.diagonal())
     radius = 3 * np.sqrt(np.linalg.eigvalsh(covariance)[1])
     for name, extent in (("tiles", half), ("tiles-square", np.array([radius, radius]))):
-        panel = Drawing(320, 252, x=(0, 144), y=(112, 0), equal=True, margins=(4, 4, 4, 4))
+        panel = Drawing(328, 248, x=(0, 192), y=(144, 0), margins=(4, 4, 4, 4))
         boxed = exact = 0
-        for row in range(7):
-            for column in range(9):
+        for row in range(9):
+            for column in range(12):
                 low = TILE * np.array([column, row])
                 first, last = low + 0.5, low + TILE - 0.5
                 inside = bool(((mean + extent >= first) & (mean - extent <= last)).all())
-                touched = inside and largest_alpha(first - mean, last - mean, conic, opacity) >= 1 / 255
+                touched = (
+                    inside and largest_alpha(first - mean, last - mean, conic, opacity) >= 1 / 255
+                )
                 boxed, exact = boxed + inside, exact + touched
                 if name == "tiles":
                     opaque = 0.5 if touched else 0.16 if inside else 0.0
@@ -53,8 +57,13 @@ def one_splat() -> None:
                     opaque = 0.3 if inside else 0.0
                 panel.rectangle(low, low + TILE, "line", fill="blue", fill_opacity=opaque)
         panel.ellipse(mean, covariance, k, "orange", 2.4)
-        panel.line([mean - extent, mean + extent * [1, -1], mean + extent, mean + extent * [-1, 1]],
-                   "ink", 1.2, dash="5 4", closed=True)
+        panel.line(
+            [mean - extent, mean + extent * [1, -1], mean + extent, mean + extent * [-1, 1]],
+            "ink",
+            1.2,
+            dash="5 4",
+            closed=True,
+        )
         panel.dot(mean, "orange")
         print(name, "box", boxed, "exact", exact)
         panel.save(f"rasterizer-{name}", "An ellipse over a grid, with marked squares")
@@ -69,12 +78,14 @@ def keys() -> None:
     ordered = sorted(instances, key=lambda i: (i[1], depths[i[0]]))
 
     def chip(x: float, y: float, splat: str, tile: int) -> None:
-        panel.rectangle((x, y), (x + 150, y + 26), colours[splat], fill=colours[splat], fill_opacity=0.16)
+        panel.rectangle(
+            (x, y), (x + 150, y + 26), colours[splat], fill=colours[splat], fill_opacity=0.16
+        )
         panel.text((x, y), f"{splat}   tile {tile} | depth {depths[splat]}", dx=75, dy=18, size=14)
 
     panel.text((95, 24), "instances", size=16, bold=True)
     panel.text((365, 24), "sorted by key", size=16, bold=True)
-    panel.text((590, 24), "ranges", size=16, bold=True)
+    panel.text((528, 24), "ranges", size=16, bold=True)
     y0, step = 38, 31
     for i, (splat, tile) in enumerate(instances):
         chip(20, y0 + i * step, splat, tile)
@@ -85,8 +96,13 @@ def keys() -> None:
         rows = [j for j, instance in enumerate(ordered) if instance[1] == tile]
         top, bottom = y0 + rows[0] * step, y0 + rows[-1] * step + 26
         panel.line([(448, top), (460, top), (460, bottom), (448, bottom)], "ink", 1.6)
-        panel.text((470, (top + bottom) / 2), f"tile {tile}: {rows[0]} to {rows[-1]}", anchor="start",
-                   dy=5, size=15)
+        panel.text(
+            (470, (top + bottom) / 2),
+            f"tile {tile}: {rows[0]} to {rows[-1]}",
+            anchor="start",
+            dy=5,
+            size=15,
+        )
     panel.save("rasterizer-keys", "A list of nine instances, connected with the sorted list")
 
 
@@ -102,18 +118,12 @@ def real() -> None:
     panel.picture(full, (0, 0), (1, 1))
     panel.save("rasterizer-image", "The scene")
 
-    panel = Drawing(320, 240, x=(0, view.width), y=(view.height, 0), margins=(0, 1, 0, 1))
-    order = splats.depths.argsort().numpy()
-    colors = splats.colors.clamp(0, 1).numpy()
-    chosen = np.random.default_rng(0).permutation(order)[:1500]
-    chosen = sorted(chosen, key=lambda i: -float(splats.depths[i]))
-    for i in chosen:
-        values, vectors = np.linalg.eigh(covariance[i])
-        angle = np.linspace(0, 2 * np.pi, 13)[:-1]
-        axes = vectors * np.sqrt(values)
-        ring = means[i] + np.stack([np.cos(angle), np.sin(angle)], 1) @ axes.T
-        panel.polygon_rgb(ring, colors[i], 0.9)
-    panel.save("rasterizer-ellipses", "1500 ellipses of the scene, at one standard deviation")
+    solid = gaussians.clone()
+    solid.log_scales -= np.log(2)
+    solid.opacity_logits[:] = 6.0
+    panel = Drawing(320, 240, margins=(0, 1, 0, 1))
+    panel.picture(scene.rendering(solid, view), (0, 0), (1, 1))
+    panel.save("rasterizer-ellipses", "The Gaussians of the scene as solid ellipsoids")
 
     # Instances: the bounding box of {α ≥ 1/255}, and the exact test of the kernels by samples.
     k = np.sqrt(2 * np.log(255 * opacity))
@@ -129,12 +139,17 @@ def real() -> None:
         counts[y1 + 1, x0] -= 1
         counts[y1 + 1, x1 + 1] += 1
     counts = counts.cumsum(axis=0).cumsum(axis=1)[:rows, :columns]
-    print(f"{len(gaussians)} Gaussians, {len(splats)} visible; {columns} x {rows} tiles; "
-          f"{counts.sum()} instances of bounding boxes; per tile {counts.mean():.0f}, max {counts.max()}")
+    print(
+        f"{len(gaussians)} Gaussians, {len(splats)} visible; {columns} x {rows} tiles; "
+        f"{counts.sum()} instances of bounding boxes; "
+        f"per tile {counts.mean():.0f}, max {counts.max()}"
+    )
     panel = Drawing(400, 300, x=(0, columns), y=(rows, 0), margins=(0, 0, 0, 0))
     share = (counts / counts.max()) ** 0.8
     stops = np.array([[20, 24, 60], [60, 60, 140], [180, 70, 110], [240, 150, 60], [250, 230, 120]])
-    heat = np.stack([np.interp(share, np.linspace(0, 1, 5), stops[:, c]) for c in range(3)], axis=-1)
+    heat = np.stack(
+        [np.interp(share, np.linspace(0, 1, 5), stops[:, c]) for c in range(3)], axis=-1
+    )
     panel.picture(heat.astype(np.uint8), (0, 0), (columns, rows), pixelated=True)
     panel.rectangle(CLOSE_UP, (CLOSE_UP[0] + 1, CLOSE_UP[1] + 1), "page", width=2)
     panel.save("rasterizer-map", "A map of the tiles, coloured by the number of splats")

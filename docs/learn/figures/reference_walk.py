@@ -3,8 +3,9 @@
 import re
 
 import numpy as np
-import scene
 from drawing import FOLDER, Drawing
+
+import scene
 
 
 def main() -> None:
@@ -19,8 +20,11 @@ def main() -> None:
     for name, words, image in (
         ("image", "image", scene.pixels(names["image"])),
         ("alpha", "opacity", np.rint(255 * alpha).astype(np.uint8)[..., None].repeat(3, axis=2)),
-        ("depth", "depth 2.9 to 4.2", np.rint(255 * shade.clip(0, 1)).astype(np.uint8)[..., None]
-         .repeat(3, axis=2)),
+        (
+            "depth",
+            "depth 2.9 to 4.2",
+            np.rint(255 * shade.clip(0, 1)).astype(np.uint8)[..., None].repeat(3, axis=2),
+        ),
     ):
         panel = Drawing(222, 209, margins=(0, 24, 0, 0))
         panel.title(words)

@@ -1,7 +1,7 @@
 """The real scene of the figures: that of `snowsplat demo`, trained with the recipe `default`.
 
-The photos, the dataset and the trained scene are stored in build/learn, and made if they are missing
-(some minutes).
+The photos, the dataset and the trained scene are stored in build/learn, and made if they are
+missing (some minutes).
 """
 
 import functools

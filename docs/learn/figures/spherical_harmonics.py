@@ -1,10 +1,10 @@
 """Figures of the page "Spherical harmonics"."""
 
 import numpy as np
-import scene
 import torch
 from drawing import Drawing
 
+import scene
 from snowsplat import Camera, Gaussians
 from snowsplat.ops import reference
 from snowsplat.scene.geometry import look_at
@@ -81,8 +81,11 @@ def fit(sharpness: float, degree: int) -> torch.Tensor:
 
 def curves() -> None:
     panel = Drawing(330, 240, x=(-180, 180), y=(0, 1), margins=(38, 26, 10, 40))
-    panel.axes("angle from the highlight (°)", "colour",
-               x_ticks=[(a, f"{a}") for a in (-180, -90, 0, 90, 180)])
+    panel.axes(
+        "angle from the highlight (°)",
+        "colour",
+        x_ticks=[(a, f"{a}") for a in (-180, -90, 0, 90, 180)],
+    )
     a = torch.linspace(-np.pi, np.pi, 241, dtype=torch.float64)
     v = torch.stack([a.cos(), a.sin(), 0 * a], dim=1)
     degrees = np.degrees(a.numpy())

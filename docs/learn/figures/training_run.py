@@ -9,9 +9,9 @@ import functools
 from dataclasses import replace
 from typing import Any
 
-import scene
 import torch
 
+import scene
 from snowsplat import Gaussians
 from snowsplat.data.load import load_dataset
 from snowsplat.pipeline.demo import demo
@@ -40,7 +40,7 @@ def _trainer() -> Trainer:
 
 @functools.cache
 def record() -> dict[str, Any]:
-    """loss, counts, psnr per step; clones, splits, prunes per densification; snapshots (parameters)."""
+    """loss, count and psnr by step; events by densification; scenes: parameters by step."""
     path = scene.BUILD / "run.pt"
     if not path.exists():
         trainer = _trainer()
@@ -83,4 +83,4 @@ def snapshot(step: int) -> Gaussians:
 
 
 if __name__ == "__main__":
-    print({step: event for step, event in record()["events"].items()})
+    print(record()["events"])

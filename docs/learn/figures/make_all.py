@@ -1,0 +1,31 @@
+"""Makes all figures of the course again."""
+
+import blending
+import camera
+import covariance
+import density_control
+import gaussian
+import gradients
+import history
+import ply
+import projection
+import rasterizer
+import reference_walk
+import spherical_harmonics
+
+for module in (
+    gaussian,
+    covariance,
+    camera,
+    projection,
+    spherical_harmonics,
+    blending,
+    gradients,
+    rasterizer,
+    reference_walk,
+    density_control,
+    ply,
+    history,
+):
+    print(module.__name__, flush=True)
+    module.main()
