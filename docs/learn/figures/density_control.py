@@ -58,14 +58,14 @@ def shape(a: float, b: float, degrees: float) -> np.ndarray:
 def histogram() -> None:
     grads = record()["events"][600]["grads"].double().numpy()
     grads = grads[grads > 0]
-    edges = np.linspace(-7, -2.5, 46)
+    threshold = np.log10(2e-4)
+    edges = threshold + 0.1 * np.arange(-33, 13)  # the threshold is between two bars
     counts, _ = np.histogram(np.log10(grads), edges)
     top = counts.max() * 1.1
     panel = Drawing(340, 220, x=(-7, -2.5), y=(0, float(top)), margins=(44, 26, 10, 40))
     panel.axes(
         "τ", "Gaussians", x_ticks=[(e, f"1e{e}") for e in (-7, -6, -5, -4, -3)], counts=(5, 4)
     )
-    threshold = np.log10(2e-4)
     for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True):
         colour = "orange" if low >= threshold - 1e-9 else "blue"
         panel.rectangle((low, 0), (high - 0.01, count), fill=colour, fill_opacity=0.75)
@@ -130,7 +130,7 @@ def curves() -> None:
         "orange",
         anchor="end",
         dx=-4,
-        dy=200 - 60,
+        dy=150,
     )
     print("psnr", psnr[0], psnr[-1], max(psnr, key=lambda p: p[1]), "loss", smooth[0], smooth[-1])
     panel.save("optimisation-loss", "PSNR rises, the loss falls; both jump at opacity resets")
@@ -152,9 +152,9 @@ def pictures() -> None:
         panel.save(f"density-reset-{i}", f"The scene at {words}")
     for step in (0, 600, 4000):
         gaussians = snapshot(step)
-        # Every Gaussian as a small opaque ellipsoid, at half of its size.
+        # Every Gaussian as a small opaque ellipsoid, at a quarter of its size.
         with torch.no_grad():
-            gaussians.log_scales -= np.log(2)
+            gaussians.log_scales -= np.log(4)
             gaussians.opacity_logits[:] = 6.0
         panel = Drawing(222, 189, margins=(0, 24, 0, 0))
         panel.title(f"{len(gaussians):,}")

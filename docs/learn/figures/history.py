@@ -37,26 +37,27 @@ LINES = (
 
 
 def main() -> None:
-    # Time runs down, so that the figure is narrow enough for a phone.
-    panel = Drawing(680, 560, x=(0, 4.4), y=(2025, 1982), margins=(46, 34, 8, 10))
-    for year in range(1985, 2026, 5):
-        panel.line([(0, year), (4.4, year)], "line", 1)
-        panel.text((0, year), str(year), "soft", anchor="end", size=14, dx=-8, dy=5)
-    for i, (title, colour, events) in enumerate(LINES):
-        x = 0.12 + 1.1 * i
-        panel.text((x, 1982), title, colour, anchor="start", size=16, dx=-4, dy=-12, bold=True)
-        first = events[0][0]
-        panel.line([(x, first), (x, 2023)], colour, 2.4)
-        last = -1e9
-        for year, words in events:
-            shown = max(year, last + 1.25)
-            panel.dot((x, year), colour, 5)
-            panel.text((x, shown), words, anchor="start", size=15, dx=11, dy=5)
-            last = shown
-    panel.line([(0.12, 2023), (0.12 + 3.3, 2023)], "red", 3)
-    panel.dot((1.77, 2023), "red", 7)
-    panel.text((1.77, 2023), "3D Gaussian Splatting [25]", "red", dy=24, size=17, bold=True)
-    panel.save("history-timeline", "Four vertical lines of events that meet in 2023")
+    # Time runs down, so that the panels are narrow enough for a phone.
+    for number, pair in enumerate(((0, 3), (1, 2)), 1):
+        panel = Drawing(330, 500, x=(0, 2), y=(2027, 1982), margins=(40, 34, 4, 4))
+        for year in range(1985, 2026, 5):
+            panel.line([(0, year), (2, year)], "line", 1)
+            panel.text((0, year), str(year), "soft", anchor="end", size=12, dx=-6, dy=4)
+        for i, index in enumerate(pair):
+            title, colour, events = LINES[index]
+            x = 0.1 + 0.98 * i
+            panel.text((x, 1982), title, colour, anchor="start", dx=-4, dy=-12, bold=True)
+            panel.line([(x, events[0][0]), (x, 2023)], colour, 2.4)
+            last = -1e9
+            for year, words in events:
+                shown = max(year, last + 1.45)
+                panel.dot((x, year), colour, 4.5)
+                panel.text((x, shown), words, anchor="start", dx=10, dy=4)
+                last = shown
+        panel.line([(0.1, 2023), (1.08, 2023)], "red", 3)
+        panel.dot((0.59, 2023), "red", 6)
+        panel.text((0.75, 2023), "3D Gaussian Splatting [25]", "red", dy=22, bold=True)
+        panel.save(f"history-timeline-{number}", "Two lines of events that meet in 2023")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ FIELDS = (
 
 def row() -> None:
     # Two lines of 31 numbers, so that the squares are large enough on a phone.
-    panel = Drawing(700, 190, x=(0, 31), y=(8.4, 0), margins=(4, 4, 4, 4))
+    panel = Drawing(340, 150, x=(0, 31), y=(8.4, 0), margins=(2, 4, 2, 4))
     position = 0
     for words, count, colour in FIELDS:
         start = position
@@ -35,10 +35,10 @@ def row() -> None:
         if words == "f_rest: blue" or line == (position - 1) // 31:
             middle = (start + position) / 2 - 31 * line
             below = words in ("normals", "opacity", "rot")
-            y = 1.4 + 4.2 * line + (2.35 if below else -0.45)
-            panel.text((min(middle, 30.9), y), words, colour, size=15)
+            y = 1.4 + 4.2 * line + (2.15 if below else -0.4)
+            panel.text((min(middle, 30.0), y), words, colour, size=12)
         else:
-            panel.text((column + (31 - column) / 2, 1.4 - 0.45), words, colour, size=15)
+            panel.text((column + (31 - column) / 2, 1.4 - 0.45), words, colour, size=12)
     panel.save("ply-row", "A row of 62 squares in the colours of the fields")
 
 

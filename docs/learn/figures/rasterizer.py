@@ -70,7 +70,7 @@ def one_splat() -> None:
 
 
 def keys() -> None:
-    panel = Drawing(680, 330, x=(0, 680), y=(330, 0), margins=(0, 0, 0, 0))
+    panel = Drawing(340, 270, x=(0, 340), y=(270, 0), margins=(0, 0, 0, 0))
     depths = {"A": 1.5, "B": 3.0, "C": 2.0, "D": 4.0}
     tiles = {"A": [0, 1], "B": [0, 1, 2, 3], "C": [3], "D": [1, 3]}
     colours = {"A": "blue", "B": "orange", "C": "green", "D": "violet"}
@@ -78,31 +78,26 @@ def keys() -> None:
     ordered = sorted(instances, key=lambda i: (i[1], depths[i[0]]))
 
     def chip(x: float, y: float, splat: str, tile: int) -> None:
-        panel.rectangle(
-            (x, y), (x + 150, y + 26), colours[splat], fill=colours[splat], fill_opacity=0.16
-        )
-        panel.text((x, y), f"{splat}   tile {tile} | depth {depths[splat]}", dx=75, dy=18, size=14)
+        colour = colours[splat]
+        panel.rectangle((x, y), (x + 92, y + 21), colour, fill=colour, fill_opacity=0.16)
+        panel.text((x, y), f"{splat}:  {tile} | {depths[splat]}", dx=46, dy=15)
 
-    panel.text((95, 24), "instances", size=16, bold=True)
-    panel.text((365, 24), "sorted by key", size=16, bold=True)
-    panel.text((528, 24), "ranges", size=16, bold=True)
-    y0, step = 38, 31
+    panel.text((47, 14), "splat: tile | depth", size=12)
+    panel.text((201, 14), "sorted", size=12)
+    panel.text((300, 14), "ranges", size=12)
+    top, step = 24, 27
     for i, (splat, tile) in enumerate(instances):
-        chip(20, y0 + i * step, splat, tile)
+        chip(1, top + i * step, splat, tile)
         j = ordered.index((splat, tile))
-        panel.line([(172, y0 + i * step + 13), (288, y0 + j * step + 13)], colours[splat], 1.2)
-        chip(290, y0 + j * step, splat, tile)
+        ends = [(95, top + i * step + 10.5), (153, top + j * step + 10.5)]
+        panel.line(ends, colours[splat], 1.2)
+        chip(155, top + j * step, splat, tile)
     for tile in range(4):
         rows = [j for j, instance in enumerate(ordered) if instance[1] == tile]
-        top, bottom = y0 + rows[0] * step, y0 + rows[-1] * step + 26
-        panel.line([(448, top), (460, top), (460, bottom), (448, bottom)], "ink", 1.6)
-        panel.text(
-            (470, (top + bottom) / 2),
-            f"tile {tile}: {rows[0]} to {rows[-1]}",
-            anchor="start",
-            dy=5,
-            size=15,
-        )
+        low, high = top + rows[0] * step, top + rows[-1] * step + 21
+        panel.line([(251, low), (258, low), (258, high), (251, high)], "ink", 1.4)
+        words = f"tile {tile}: {rows[0]} to {rows[-1]}"
+        panel.text((263, (low + high) / 2), words, anchor="start", dy=4, size=12)
     panel.save("rasterizer-keys", "A list of nine instances, connected with the sorted list")
 
 
