@@ -213,7 +213,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=4000)
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--output", type=Path, default=Path("build/learn/cholesky.json"))
+    parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     made = demo(options.data).made
@@ -237,8 +237,10 @@ def main() -> None:
         psnr = [result.psnr for result in chosen]
         spread = statistics.stdev(psnr) if len(psnr) > 1 else 0.0
         print(f"{name}: rate {best.rate:g}, {statistics.mean(psnr):.2f} ± {spread:.2f} dB\n")
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps([vars(result) for result in results], indent=1))
+    rows = [vars(result) for result in results]
+    for row in rows:  # JSON has no infinity: null if the training has diverged
+        row.update({k: None for k in ("psnr", "axis_ratio") if not math.isfinite(row[k])})
+    options.output.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

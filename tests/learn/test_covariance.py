@@ -1,7 +1,11 @@
 """The formulas of docs/learn/covariance.md, and the code of experiments/cholesky.py."""
 
 import importlib.util
+import json
 import math
+import re
+import statistics
+import sys
 from pathlib import Path
 
 import pytest
@@ -95,8 +99,6 @@ def test_exercises():
 def experiment():
     spec = importlib.util.spec_from_file_location("cholesky", ROOT / "experiments" / "cholesky.py")
     module = importlib.util.module_from_spec(spec)
-    import sys
-
     sys.modules["cholesky"] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     yield module
@@ -144,3 +146,35 @@ def test_the_projection_of_the_experiment_is_that_of_the_operation(experiment):
     assert len(rows) > 5
     assert len(found) == n  # all are in front of the camera
     assert torch.allclose(found.packed[rows], expected.packed, atol=1e-12)
+
+
+def test_the_table_of_the_experiment():
+    """The table of the page has the values of experiments/cholesky.json."""
+    rows = json.loads((ROOT / "experiments" / "cholesky.json").read_text("utf-8"))
+    page = (ROOT / "docs" / "learn" / "covariance.md").read_text("utf-8")
+    table = re.findall(
+        r"^\| (.+?) \| ([\d.]+) \| ([\d.]+) ± ([\d.]+) \| (?:(−[\d.]+) ± ([\d.]+))? ?\| ([\d.]+) \|$",
+        page,
+        re.MULTILINE,
+    )
+    assert len(table) == 3
+    first: list[float] = []
+    for shape, rate, mean, deviation, difference, difference_deviation, ratio in table:
+        own = [row for row in rows if row["shape"] == shape]
+        selecting = [row for row in own if row["seed"] == 5]  # the seed that selects the rate
+        best = max(selecting, key=lambda row: row["psnr"] or 0)
+        assert best["rate"] == float(rate)
+        runs = sorted((r for r in own if r["seed"] < 5), key=lambda r: r["seed"])
+        psnr = [run["psnr"] for run in runs]
+        assert len(psnr) == 5
+        assert statistics.mean(psnr) == pytest.approx(float(mean), abs=6e-3)
+        assert statistics.stdev(psnr) == pytest.approx(float(deviation), abs=6e-3)
+        assert statistics.mean(r["axis_ratio"] for r in runs) == pytest.approx(
+            float(ratio), abs=0.06
+        )
+        first = first or psnr
+        if difference:
+            pairs = [a - b for a, b in zip(psnr, first, strict=True)]
+            value = float(difference.replace("−", "-"))
+            assert statistics.mean(pairs) == pytest.approx(value, abs=6e-3)
+            assert statistics.stdev(pairs) == pytest.approx(float(difference_deviation), abs=6e-3)

@@ -1,7 +1,9 @@
 """Figures of the page "Covariance"."""
 
+import json
+
 import numpy as np
-from drawing import Drawing
+from drawing import FOLDER, Drawing
 
 ANGLE = np.radians(35)
 R = np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
@@ -45,9 +47,49 @@ def factors() -> None:
         panel.save(f"covariance-{name}", f"An ellipse and the two columns of {words}")
 
 
+def experiment() -> None:
+    """The results of experiments/cholesky.py."""
+    path = FOLDER.parents[2] / "experiments" / "cholesky.json"
+    rows = [row for row in json.loads(path.read_text()) if row["psnr"] is not None]
+    shapes = list(dict.fromkeys(row["shape"] for row in rows))
+    colours = dict(zip(shapes, ("blue", "orange", "green"), strict=True))
+    chosen = max(row["seed"] for row in rows)  # the seed that selects the rates
+
+    panel = Drawing(330, 240, x=(-1.65, -0.85), y=(24.0, 25.0), margins=(44, 26, 10, 40))
+    ticks = [(np.log10(rate), f"{rate:g}") for rate in (0.03, 0.1)]
+    panel.axes("learning rate", "PSNR (dB)", x_ticks=ticks, counts=(2, 5))
+    for i, shape in enumerate(shapes):
+        line = [
+            (np.log10(r["rate"]), r["psnr"])
+            for r in rows
+            if r["shape"] == shape and r["seed"] == chosen
+        ]
+        panel.line(line, colours[shape], 2)
+        for point in line:
+            panel.dot(point, colours[shape], 4)
+        panel.text((-1.65, 25.0), shape, colours[shape], anchor="start", dx=8, dy=14 + 17 * i)
+    panel.save("covariance-rates", "PSNR of three parameterisations at two learning rates")
+
+    panel = Drawing(330, 240, x=(-0.5, 2.5), y=(24.0, 24.8), margins=(44, 26, 10, 40))
+    names = ("R S", "Cholesky", "scaled")
+    panel.axes("", "PSNR (dB)", x_ticks=list(enumerate(names)), counts=(2, 5))
+    values = [
+        [r["psnr"] for r in rows if r["shape"] == shape and r["seed"] != chosen] for shape in shapes
+    ]
+    for seed in range(len(values[0])):  # the same seed in each column
+        panel.line([(i, column[seed]) for i, column in enumerate(values)], "line", 1)
+    for i, (shape, column) in enumerate(zip(shapes, values, strict=True)):
+        mean = float(np.mean(column))
+        panel.line([(i - 0.2, mean), (i + 0.2, mean)], colours[shape], 2.6)
+        for value in column:
+            panel.dot((i, value), colours[shape], 3.4)
+    panel.save("covariance-seeds", "PSNR of five seeds for three parameterisations")
+
+
 def main() -> None:
     stages()
     factors()
+    experiment()
 
 
 if __name__ == "__main__":

@@ -123,14 +123,14 @@ def curves() -> None:
     panel.line(psnr, "blue", 2.2)
     scale = 30 / smooth.max()
     panel.line(zip(range(25, STEPS, 20), scale * smooth[::20], strict=False), "orange", 1.8)
-    panel.text((STEPS, 32), "PSNR", "blue", anchor="end", dx=-4, dy=16)
+    panel.text((STEPS, 32), "PSNR", "blue", anchor="end", dx=-4, dy=30)
     panel.text(
         (STEPS, 32),
         f"loss (from {smooth[0]:.2f} to {smooth[-1]:.3f})",
         "orange",
         anchor="end",
         dx=-4,
-        dy=150,
+        dy=128,
     )
     print("psnr", psnr[0], psnr[-1], max(psnr, key=lambda p: p[1]), "loss", smooth[0], smooth[-1])
     panel.save("optimisation-loss", "PSNR rises, the loss falls; both jump at opacity resets")
