@@ -153,7 +153,8 @@ def test_the_table_of_the_experiment():
     rows = json.loads((ROOT / "experiments" / "cholesky.json").read_text("utf-8"))
     page = (ROOT / "docs" / "learn" / "covariance.md").read_text("utf-8")
     table = re.findall(
-        r"^\| (.+?) \| ([\d.]+) \| ([\d.]+) ± ([\d.]+) \| (?:(−[\d.]+) ± ([\d.]+))? ?\| ([\d.]+) \|$",
+        r"^\| (.+?) \| ([\d.]+) \| ([\d.]+) ± ([\d.]+)"
+        r" \| (?:(−[\d.]+) ± ([\d.]+))? ?\| ([\d.]+) \|$",
         page,
         re.MULTILINE,
     )
