@@ -110,7 +110,8 @@ std::vector<F> frame(const Scene& s) {
 
   Aligned<char> blocks(n * rasterize_block_bytes({0, 0, 0}));
   const FrameParams<F> sorted = {kWidth,  kHeight,      packed.data(), kStride,      columns,
-                                 records, start.data(), end.data(),    splat.data(), blocks.data};
+                                 records, start.data(), end.data(),    splat.data(), blocks.data,
+                                 0};
   const int64_t pixels = kWidth * kHeight;
   std::vector<F> image(size_t(3 * pixels)), alpha(image.size() / 3), d_image(image.size());
   const F background[4] = {0, 0, 0, 0};

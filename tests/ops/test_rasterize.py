@@ -265,9 +265,10 @@ def compare(
     *,
     with_background: bool = True,
     with_depth: bool = True,
+    additive: bool = False,
 ) -> None:
     """Values, and gradients of every column and the background, by random cotangents."""
-    view = (width, height, with_background, with_depth)
+    view = (width, height, with_background, with_depth, additive)
     key = (splats.packed.numpy().tobytes(), splats.channels, *view)
     if key not in _EXPECTED:
         _EXPECTED[key] = outputs_and_gradients(REFERENCE, splats, *view)
@@ -291,6 +292,7 @@ def outputs_and_gradients(
     height: int,
     with_background: bool,
     with_depth: bool,
+    additive: bool,
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     g = generator(9)
     leaf, background = leaf_splats(splats, variant.dtype), None
@@ -298,7 +300,7 @@ def outputs_and_gradients(
         background = uniform(g, 0, 1, splats.channels).to(variant.dtype).requires_grad_()
     cotangents = [normal(g, height, width, splats.channels), *normal(g, 2, height, width)]
     image, alpha, depth = variant.ops.rasterize(
-        leaf, width, height, background, with_depth=with_depth
+        leaf, width, height, background, with_depth=with_depth, additive=additive
     )
     assert (depth is not None) == with_depth
     outputs = {"image": image, "alpha": alpha}
@@ -728,3 +730,79 @@ def test_counts_match_the_reference(native: Variant) -> None:
     # α next to 1/255 is rounded in float32.
     allowed = 0.01 if native.dtype == torch.float32 else 0.0
     assert float((counts.double() != exact).double().mean()) <= allowed
+
+
+# Additive blending
+
+
+def test_additive_definition(variant: Variant) -> None:
+    """Each pixel is the background plus the sum of weight · colour; alpha is 0."""
+    width, height = 21, 18
+    splats = random_splats(2, 50, width, height, opacity=(0.3, 1.0))
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    image = BACKGROUND.expand(height, width, 3).clone()
+    depth = torch.zeros(height, width, dtype=torch.float64)
+    for mean, conic, o, z, color in zip(
+        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.colors, strict=True
+    ):
+        dx, dy = x + 0.5 - mean[0], y + 0.5 - mean[1]
+        a, b, c = conic
+        weight = o * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+        weight[weight < 1 / 255] = 0
+        image += weight[:, :, None] * color
+        depth += weight * z
+    got = variant.ops.rasterize(
+        leaf_splats(splats, variant.dtype),
+        *(width, height, BACKGROUND.to(variant.dtype)),
+        with_depth=True,
+        additive=True,
+    )
+    assert (got[1] == 0).all()
+    assert got[2] is not None
+    assert_close(got[0], image, max(variant.forward, 1e-7))
+    assert_close(got[2], depth, max(variant.forward, 1e-7))
+
+
+def test_additive_splats_are_not_limited(variant: Variant) -> None:
+    """Opaque splats are added completely, also behind others, and have gradients."""
+    splats = leaf_splats(flat_stack([1.0] * 5), variant.dtype)
+    image, _, _ = variant.ops.rasterize(splats, 3, 2, additive=True)
+    assert_close(image, torch.ones(2, 3, 5), 1e-5)
+    image.sum().backward()
+    assert splats.packed.grad is not None
+    assert_close(splats.packed.grad[:, 5], torch.full((5,), 6.0), 1e-5)
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_additive_finite_differences(double: Variant, with_depth: bool) -> None:
+    with torch.no_grad():
+        splats = smooth_scene().project(reference)
+    background = uniform(generator(4), 0, 1, 3).requires_grad_()
+    columns = differentiable_columns(splats).requires_grad_()
+
+    def outputs(columns: Tensor, background: Tensor) -> tuple[Tensor, ...]:
+        made = Splats2D.pack(
+            columns[:, 0:2], columns[:, 2:5], columns[:, 5], columns[:, 6], columns[:, 7:]
+        )
+        image, _, depth = double.ops.rasterize(
+            made, 5, 4, background, with_depth=with_depth, additive=True
+        )
+        return (image,) if depth is None else (image, depth)
+
+    check_gradients(double, outputs, (columns, background))
+
+
+@pytest.mark.parametrize(
+    ("channels", "width", "height", "count"),
+    [(1, 17, 16, 30), (3, 23, 17, 60), (4, 64, 1, 20), (9, 35, 34, 150), (3, 16, 16, 1000)],
+)
+def test_additive_native_agrees_with_the_reference(
+    native: Variant, channels: int, width: int, height: int, count: int
+) -> None:
+    splats = random_splats(channels, count, width, height, channels)
+    compare(native, splats, width, height, additive=True)
+
+
+@pytest.mark.usefixtures("sums_in_order")
+def test_additive_native_agrees_with_the_reference_with_sums_in_order(native: Variant) -> None:
+    compare(native, random_splats(3, 150, 35, 34), 35, 34, additive=True)

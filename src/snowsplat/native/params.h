@@ -233,8 +233,9 @@ struct FrameParams {
   uint32_t* tile_end;              // (tiles,) end of the instances that the forward pass visited
   const uint32_t* instance_splat;  // (instances,)
   void* instance_blocks;           // (instances,) bits of the pixel blocks that a splat touches
+  int64_t additive;                // 1: splats are added; 0: they are composited front to back
   SNOW_FIELDS(width, height, packed, stride, columns, records, tile_start, tile_end, instance_splat,
-              instance_blocks)
+              instance_blocks, additive)
 };
 
 template <class T>

@@ -102,6 +102,11 @@ constexpr double kCullSlack = 1e-3;
 // The weight of a splat is α T; a splat with α < 1/255 is skipped. A pixel is finished when the
 // next splat would make T < 1e-4.
 
+//
+// In the additive mode, the weight of a splat is o exp(−½ dᵀ K d), without a limit, and T stays 1. A
+// splat with a weight below 1/255 is skipped. The order of the splats has no effect, and ∂L/∂(log α)
+// is the weight times the dot product of ∂L/∂C and the colour.
+
 template <class Real>
 SNOW_INLINE auto is_blended(Real log2_alpha) {
   return log2_alpha >= Real(kLog2MinAlpha);

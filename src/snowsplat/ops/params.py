@@ -214,6 +214,7 @@ class FrameParams(Params):
     tile_end: Tensor
     instance_splat: Tensor
     instance_blocks: Tensor
+    additive: bool
 
 
 @dataclass(slots=True, kw_only=True)

@@ -41,6 +41,7 @@ def rasterize(
     background: Tensor | None = None,
     *,
     with_depth: bool = False,
+    additive: bool = False,
     capacity: Capacity | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Composites splats over `background` (C,), which is black by default.
@@ -53,6 +54,10 @@ def rasterize(
     (Kerbl et al. 2023, section 6). Gradients flow to `background` and to every column of
     `splats.packed` except the radii. If `splats.abs_grad` is not None, the backward pass adds to it
     (see `Splats2D`); the image may then have at most four channels, including the depth.
+
+    With `additive`, splats are added instead, in any order, as for the fitting of images by Zhang
+    et al. 2024 (GaussianImage, arXiv:2403.08551): image = background + Σ w c, alpha = 0, depth =
+    Σ w z, where w = o exp(−½ dᵀ conic d), not limited to 0.99. Splats with w < 1/255 are skipped.
 
     With `capacity`, the CPU does not wait until a GPU has counted the instances (see `Capacity`).
     On a GPU, gradients are summed with atomic operations, in no fixed order, unless
@@ -72,7 +77,7 @@ def rasterize(
             # Several passes would each add the absolute values of a part of the gradient.
             raise ValueError(f"rasterize: abs_grad requires at most {GROUP_CHANNELS} channels")
     planes, alpha = _Rasterize.apply(
-        packed, background, width, height, channels, with_depth, capacity, abs_grad
+        packed, background, width, height, channels, with_depth, additive, capacity, abs_grad
     )
     if not with_depth:  # the gradient of a slice would be a copy
         return planes.permute(1, 2, 0), alpha, None
@@ -92,7 +97,7 @@ def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
     check_size("count_blended", width, height)
     packed = splats.packed.detach().contiguous()
     columns = _channel_groups(1, False, packed.device)[0][1]
-    frame = _bin_splats(packed, width, height, columns, None)
+    frame = _bin_splats(packed, width, height, columns, False, None)
     counts = scratch.empty((height, width), packed.dtype, packed.device)
     launch(
         variant("rasterize_count", packed),
@@ -116,7 +121,12 @@ class _Frame:
 
 
 def _bin_splats(
-    packed: Tensor, width: int, height: int, columns: Tensor, capacity: Capacity | None
+    packed: Tensor,
+    width: int,
+    height: int,
+    columns: Tensor,
+    additive: bool,
+    capacity: Capacity | None,
 ) -> _Frame:
     """Sorts splats by depth, counts the tiles that each splat touches, and lists splats by tile.
 
@@ -184,6 +194,7 @@ def _bin_splats(
         tile_end=empty(tiles),
         instance_splat=instance_splat,
         instance_blocks=empty(instances * block_bytes, torch.uint8),
+        additive=additive,
     )
     return _Frame(params, tiles, instances, sums_in_order, instance_slot, slot_range)
 
@@ -256,6 +267,7 @@ class _Rasterize(torch.autograd.Function):
         height: int,
         channels: int,
         with_depth: bool,
+        additive: bool,
         capacity: Capacity | None,
         abs_grad: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
@@ -266,7 +278,7 @@ class _Rasterize(torch.autograd.Function):
         background = torch.cat([background.detach(), packed.new_zeros(1)])
         planes = scratch.empty((count, height, width), packed.dtype, packed.device)
         alpha = scratch.empty((height, width), packed.dtype, packed.device)
-        frame = _bin_splats(packed, width, height, groups[0][1], capacity)
+        frame = _bin_splats(packed, width, height, groups[0][1], additive, capacity)
         for first, columns in groups:
             launch(
                 variant("rasterize_fwd", packed),
@@ -294,6 +306,8 @@ class _Rasterize(torch.autograd.Function):
         if grad_planes is None:
             grad_planes = torch.zeros_like(planes)
         grad_planes = grad_planes.contiguous()
+        if ctx.frame.params.additive:
+            grad_alpha = None  # alpha is always 0
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
         grad_packed = _grad_packed(
             ctx.frame, ctx.groups, planes, grad_planes, alpha, grad_alpha, ctx.abs_grad
@@ -301,7 +315,7 @@ class _Rasterize(torch.autograd.Function):
         grad_background = None
         if ctx.needs_input_grad[1]:
             grad_background = _grad_background(grad_planes[: ctx.channels], alpha)
-        return grad_packed, grad_background, None, None, None, None, None, None
+        return grad_packed, grad_background, None, None, None, None, None, None, None
 
 
 def _grad_packed(

@@ -232,6 +232,7 @@ def rasterize(
     background: Tensor | None = None,
     *,
     with_depth: bool = False,
+    additive: bool = False,
     capacity: Capacity | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Composites splats over `background` (C,), which is black by default.
@@ -239,7 +240,8 @@ def rasterize(
     The nearest splat is first; splats of equal depth are in the order of their rows. Returns image
     (H, W, C) with planar storage, alpha (H, W), and depth (H, W) or None:
     image = Σ T α c + T_end · background, alpha = 1 − T_end, depth = Σ T α z (not divided by alpha),
-    where T is the transmittance of the splats in front. Conics must be positive definite.
+    where T is the transmittance of the splats in front. Conics must be positive definite. If
+    `additive`, α is not limited to 0.99, T stays 1, and so alpha is 0 (Zhang et al. 2024).
     `capacity` is ignored, because the memory always suffices. If `splats.abs_grad` is not None, the
     backward pass adds, for each 16×16 tile, the absolute value of the gradient of `means2d` that
     comes from the pixels of the tile.
@@ -271,7 +273,8 @@ def rasterize(
             means = means2d[tile]
             if abs_grad is not None and means.requires_grad:
                 means.register_hook(_adds_absolute_values(abs_grad, order[tile]))
-            alpha, T, T_end = _blend_weights(pixels, means, conics[tile], opacities[tile])
+            geometry = (pixels, means, conics[tile], opacities[tile])
+            alpha, T, T_end = (_additive_weights if additive else _blend_weights)(*geometry)
             blended = (T * alpha) @ values[tile]  # (P, C or C + 1)
             tiles.append(torch.cat([blended, T_end], dim=1).T.reshape(-1, h, w))
         bands.append(torch.cat(tiles, dim=2))
@@ -319,10 +322,7 @@ def _blend_weights(
 
     α is 0 if a splat is not blended.
     """
-    dx, dy = (pixels[:, None, :] - means2d).unbind(dim=2)  # (P, M) each
-    a, b, c = conics.unbind(dim=1)
-    alpha = opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    alpha = torch.where(alpha < ALPHA_MIN, 0, alpha.clamp(max=ALPHA_MAX))
+    alpha = _falloffs(pixels, means2d, conics, opacities).clamp(max=ALPHA_MAX)
     # T decreases. The first splat that would make T too small, and all splats behind it, are not
     # blended.
     unfinished = torch.cumprod(1 - alpha, dim=1) >= TRANSMITTANCE_MIN
@@ -330,6 +330,22 @@ def _blend_weights(
     ones = alpha.new_ones(len(pixels), 1)
     T = torch.cat([ones, torch.cumprod(1 - alpha, dim=1)], dim=1)  # (P, M + 1)
     return alpha, T[:, :-1], T[:, -1:]
+
+
+def _additive_weights(
+    pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same for additive blending: the weights (P, M), and T = 1 everywhere."""
+    weights = _falloffs(pixels, means2d, conics, opacities)
+    return weights, torch.ones_like(weights), weights.new_ones(len(pixels), 1)
+
+
+def _falloffs(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
+    """(P, M): o exp(−½ dᵀ conic d), or 0 where this is less than 1/255."""
+    dx, dy = (pixels[:, None, :] - means2d).unbind(dim=2)  # (P, M) each
+    a, b, c = conics.unbind(dim=1)
+    alpha = opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    return torch.where(alpha < ALPHA_MIN, 0, alpha)
 
 
 # ----------------------------------------------------------------------------------- photometric

@@ -174,8 +174,10 @@ struct Frame {
         instance_blocks(static_cast<typename Tile<V>::Bits*>(p.instance_blocks)) {}
 };
 
-// With `Count`, the value of a pixel is the number of blended splats.
-template <class V, int C, bool Count = false, class T = typename V::Scalar>
+// kCount: the value of a pixel is the number of splats that are composited.
+enum class Blend { kFrontToBack, kAdditive, kCount };
+
+template <class V, int C, Blend kBlend, class T = typename V::Scalar>
 void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* background, T* image,
                   T* alpha) {
   using TileV = Tile<V>;
@@ -223,6 +225,11 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
         list &= list - 1;
         const SplatRecord<T>& r = *splat[j];
         const V power = (V(r.terms.A) * X + V(rows[j].p1[row])) * X + V(rows[j].p0[row]);
+        if constexpr (kBlend == Blend::kAdditive) {
+          const V weight = zero_unless(is_blended(power), exp2_blend(power));
+          for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
+          continue;
+        }
         const V a = zero_unless(is_blended(power), capped_alpha(exp2_blend(power)));
         V weight = a * transmittance;
         const V next = transmittance - weight;
@@ -237,7 +244,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
           open_blocks &= Bits(~(Bits(1) << b));
           for (; list; list &= list - 1) blocks_of[first_bit(list)] &= Bits(~(Bits(1) << b));
         }
-        if constexpr (Count)
+        if constexpr (kBlend == Blend::kCount)
           color[0] += zero_unless(is_blended(power) & open, V(1.f));
         else
           for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
@@ -263,7 +270,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
 
 // grad_alpha may be null. image and grad_image contain only the channels of this pass (at most
 // kGroupChannels).
-template <class V, int C, class T = typename V::Scalar>
+template <class V, int C, Blend kBlend, class T = typename V::Scalar>
 void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_t* instance_slot,
                    const T* image, const T* grad_image, const T* alpha, const T* grad_alpha,
                    T* slots) {
@@ -331,21 +338,23 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
         Block& s = block[b];
         const V power = (A * X + V(rows.p1[row])) * X + V(rows.p0[row]);
         const V e = exp2_blend(power);
-        const V a = zero_unless(is_blended(power), capped_alpha(e));
-        V weight = a * s.transmittance;
-        const V next = s.transmittance - weight;
-        const auto open = is_open(next);
-        weight = zero_unless(open, weight);
-        s.transmittance = next;
-        V grad_dot_color = s.grad_alpha;
-        for (int k = 0; k < C; k++) {
-          grad_dot_color += color[k] * s.grad[k];
-          sums[k] += weight * s.grad[k];
+        V weight, q, grad_dot_color = s.grad_alpha;
+        for (int k = 0; k < C; k++) grad_dot_color += color[k] * s.grad[k];
+        if constexpr (kBlend == Blend::kAdditive) {
+          weight = zero_unless(is_blended(power), e);
+          q = weight * grad_dot_color;
+        } else {
+          const V a = zero_unless(is_blended(power), capped_alpha(e));
+          weight = a * s.transmittance;
+          const V next = s.transmittance - weight;
+          const auto open = is_open(next);
+          weight = zero_unless(open, weight);
+          s.transmittance = next;
+          const V weighted_dot = weight * grad_dot_color, behind = s.behind - weighted_dot;
+          s.behind = behind;
+          q = zero_unless(open & (e < max_alpha), log_alpha_gradient(weighted_dot, a, behind));
         }
-        const V weighted_dot = weight * grad_dot_color, behind = s.behind - weighted_dot;
-        s.behind = behind;
-        const V q =
-            zero_unless(open & (e < max_alpha), log_alpha_gradient(weighted_dot, a, behind));
+        for (int k = 0; k < C; k++) sums[k] += weight * s.grad[k];
         const V dy(rows.dy[row]);
         q0 += q;
         qy += q * dy;
@@ -390,12 +399,11 @@ void for_tiles(int64_t tiles, F&& body) {
 template <class V, class T = typename V::Scalar>
 int64_t forward(const RasterizeForwardParams<T>& p) {
   const Frame<V> f(p.frame);
-  for_tiles(p.n, [&](int64_t t) {
-    if (p.channels <= 3)
-      forward_tile<V, 3>(f, t, int(p.channels), p.background, p.image, p.alpha);
-    else
-      forward_tile<V, 4>(f, t, int(p.channels), p.background, p.image, p.alpha);
-  });
+  auto* const tile = p.frame.additive ? (p.channels <= 3 ? forward_tile<V, 3, Blend::kAdditive>
+                                                         : forward_tile<V, 4, Blend::kAdditive>)
+                                      : (p.channels <= 3 ? forward_tile<V, 3, Blend::kFrontToBack>
+                                                         : forward_tile<V, 4, Blend::kFrontToBack>);
+  for_tiles(p.n, [&](int64_t t) { tile(f, t, int(p.channels), p.background, p.image, p.alpha); });
   return 0;
 }
 
@@ -404,7 +412,7 @@ int64_t count(const RasterizeCountParams<T>& p) {
   const Frame<V> f(p.frame);
   const T nothing_behind = 0;
   for_tiles(p.n, [&](int64_t t) {
-    forward_tile<V, 1, true, T>(f, t, 1, &nothing_behind, p.counts, nullptr);
+    forward_tile<V, 1, Blend::kCount, T>(f, t, 1, &nothing_behind, p.counts, nullptr);
   });
   return 0;
 }
@@ -412,13 +420,14 @@ int64_t count(const RasterizeCountParams<T>& p) {
 template <class V, class T = typename V::Scalar>
 int64_t backward(const RasterizeBackwardParams<T>& p) {
   const Frame<V> f(p.frame);
+  auto* const tile = p.frame.additive
+                         ? (p.channels <= 3 ? backward_tile<V, 3, Blend::kAdditive>
+                                            : backward_tile<V, 4, Blend::kAdditive>)
+                         : (p.channels <= 3 ? backward_tile<V, 3, Blend::kFrontToBack>
+                                            : backward_tile<V, 4, Blend::kFrontToBack>);
   for_tiles(p.n, [&](int64_t t) {
-    if (p.channels <= 3)
-      backward_tile<V, 3>(f, t, int(p.channels), p.instance_slot, p.image, p.grad_image, p.alpha,
-                          p.grad_alpha, p.slots);
-    else
-      backward_tile<V, 4>(f, t, int(p.channels), p.instance_slot, p.image, p.grad_image, p.alpha,
-                          p.grad_alpha, p.slots);
+    tile(f, t, int(p.channels), p.instance_slot, p.image, p.grad_image, p.alpha, p.grad_alpha,
+         p.slots);
   });
   return 0;
 }

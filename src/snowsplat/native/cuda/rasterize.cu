@@ -138,13 +138,19 @@ struct Pixel {
   // Composites a splat and returns whether it contributes. Sets `weight` (0 if it does not
   // contribute), and α before (`uncapped`) and after (`alpha`) the limit 0.99. Both passes must
   // make the same decisions, so every rounding is explicit (fma). In a finished pixel, `next` is
-  // negative, so no further splat is composited.
+  // negative, so no further splat is composited. In the additive mode, the weight is the uncapped α.
+  template <bool kAdditive>
   SNOW_INLINE bool blend(const Four<T>& mean_conic, const Four<T>& opacity_color, T& uncapped,
                          T& alpha, T& weight) {
     const T dx = x - mean_conic.x, dy = y - mean_conic.y;
     const T power = fma(fma(mean_conic.z, dx, mean_conic.w * dy), dx,
                         fma(opacity_color.x * dy, dy, opacity_color.y));
     uncapped = exp2_blend(power), alpha = capped_alpha(uncapped);
+    if constexpr (kAdditive) {
+      const bool added = is_blended(power) && unfinished();  // false outside of the image
+      weight = added ? uncapped : T(0);
+      return added;
+    }
     const T next = fma(-alpha, signed_transmittance, signed_transmittance);
     const bool visible = is_blended(power), open = is_open(next);
     const bool blended = visible && open;
@@ -165,8 +171,10 @@ struct ForwardMemory {
   uint32_t ends[kWarps];
 };
 
-// With `kCount`, the value of a pixel is the number of composited splats.
-template <int C, bool kCount, class T>
+// kCount: the value of a pixel is the number of splats that are composited.
+enum class Blend { kFrontToBack, kAdditive, kCount };
+
+template <int C, Blend kBlend, class T>
 SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* background, T* image,
                          T* alpha, ForwardMemory<T>& memory) {
   uint8_t* const instance_blocks = static_cast<uint8_t*>(f.instance_blocks);
@@ -208,9 +216,9 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
         const int i = memory.list[warp][j];
         const Four<T> opacity_color = memory.batch.opacity_color[i];
         T uncapped, a, weight;
-        const bool blended =
-            pixel.blend(memory.batch.mean_conic[i], opacity_color, uncapped, a, weight);
-        if constexpr (kCount) {
+        const bool blended = pixel.template blend<kBlend == Blend::kAdditive>(
+            memory.batch.mean_conic[i], opacity_color, uncapped, a, weight);
+        if constexpr (kBlend == Blend::kCount) {
           color[0] += blended ? T(1) : T(0);
         } else {
           const Two<T> color_23 = memory.batch.color_23[i];
@@ -244,8 +252,17 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
   for (int k = 0; k < C; k++)
     if (k < channels)
       image[k * position.pixel_count + position.index] =
-          kCount ? color[k] : color[k] + transmittance * background[k];
+          kBlend == Blend::kCount ? color[k] : color[k] + transmittance * background[k];
   if (alpha) alpha[position.index] = T(1) - transmittance;
+}
+
+template <Blend kBlend, class T>
+SNOW_INLINE void forward_of_channels(const RasterizeForwardParams<T>& p, ForwardMemory<T>& memory) {
+  const int channels = int(p.channels);
+  if (channels <= 3)
+    forward<3, kBlend>(p.frame, channels, p.background, p.image, p.alpha, memory);
+  else
+    forward<4, kBlend>(p.frame, channels, p.background, p.image, p.alpha, memory);
 }
 
 constexpr int kGroup = kWarp / kRectHeight;  // splats that a warp processes at a time
@@ -392,15 +409,18 @@ struct PixelGradient {
   }
 
   // Step 1: composites a splat of the batch; returns w and q.
+  template <bool kAdditive>
   SNOW_INLINE Two<T> add(const Batch<T, kBackwardBatch>& batch, int i) {
     const Four<T> opacity_color = batch.opacity_color[i];
     const Two<T> color_23 = batch.color_23[i];
     T uncapped, alpha, weight, grad_dot_color = grad_alpha;
-    const bool blended = pixel.blend(batch.mean_conic[i], opacity_color, uncapped, alpha, weight);
+    const bool blended = pixel.template blend<kAdditive>(batch.mean_conic[i], opacity_color,
+                                                         uncapped, alpha, weight);
     const T splat[kGroupChannels] = {opacity_color.z, opacity_color.w, color_23.x, color_23.y};
 #pragma unroll
     for (int k = 0; k < C; k++) grad_dot_color += splat[k] * grad[k];
     const T weighted_dot = weight * grad_dot_color;
+    if constexpr (kAdditive) return {weight, weighted_dot};
     behind -= weighted_dot;
     const T q = log_alpha_gradient(weighted_dot, alpha, behind);
     return {weight, blended && uncapped < T(kMaxAlpha) ? q : T(0)};
@@ -409,7 +429,7 @@ struct PixelGradient {
 
 // Steps 1 and 2 for the 32 instances from index `first` of the batch on. Composites the instances
 // that touch the rectangle of the warp, and stores the sums over its pixels in the warp's scratch.
-template <int C, class T>
+template <int C, bool kAdditive, class T>
 SNOW_INLINE void sum_over_pixels(const PixelPosition& position, PixelGradient<C, T>& gradient,
                                  int count, int first, BackwardMemory<T>& memory) {
   const int warp = warp_id(), lane = lane_id();
@@ -429,7 +449,7 @@ SNOW_INLINE void sum_over_pixels(const PixelPosition& position, PixelGradient<C,
     const int group = listed - done < kGroup ? listed - done : kGroup;
     Two<T>* pair = scratch.pairs + lane;
     for (int j = 0; j < group; j++, pair += kPairStride)
-      *pair = gradient.add(memory.batch, list[done + j]);
+      *pair = gradient.template add<kAdditive>(memory.batch, list[done + j]);
     __syncwarp();
     Sums<C, T> rows;
     if (slot < group) {
@@ -493,7 +513,7 @@ SNOW_INLINE void add_warps(const RasterizeBackwardParams<T>& p, const SumPositio
   __syncthreads();
 }
 
-template <int C, class T>
+template <int C, bool kAdditive, class T>
 SNOW_INLINE void backward(const RasterizeBackwardParams<T>& p, BackwardMemory<T>& memory) {
   const FrameParams<T>& f = p.frame;
   const uint8_t* const instance_blocks = static_cast<const uint8_t*>(f.instance_blocks);
@@ -511,7 +531,7 @@ SNOW_INLINE void backward(const RasterizeBackwardParams<T>& p, BackwardMemory<T>
     }
     __syncthreads();
     for (int first = 0; first < count; first += kWarp) {
-      sum_over_pixels<C>(position, gradient, count, first, memory);
+      sum_over_pixels<C, kAdditive>(position, gradient, count, first, memory);
       add_warps<C>(p, sum_position, base, count, first, memory);
     }
   }
@@ -520,6 +540,15 @@ SNOW_INLINE void backward(const RasterizeBackwardParams<T>& p, BackwardMemory<T>
   const uint32_t last = f.tile_start[blockIdx.x + 1];
   for (uint32_t i = end + uint32_t(thread / kSlotWidth); i < last; i += kBlock / kSlotWidth)
     p.slots[int64_t(p.instance_slot[i]) * kSlotWidth + thread % kSlotWidth] = T(0);
+}
+
+template <bool kAdditive, class T>
+SNOW_INLINE void backward_of_channels(const RasterizeBackwardParams<T>& p,
+                                      BackwardMemory<T>& memory) {
+  if (p.channels <= 3)
+    backward<3, kAdditive>(p, memory);
+  else
+    backward<4, kAdditive>(p, memory);
 }
 
 // The gradient of the background: the sum over pixels of grad_image · (1 − alpha). One block per
@@ -558,22 +587,21 @@ using namespace snow;
 #define SNOW_RASTERIZE_KERNELS(SUFFIX, T, FORWARD_BLOCKS, BACKWARD_BLOCKS)                     \
   SNOW_KERNEL_OF(rasterize_fwd##SUFFIX, kBlock, FORWARD_BLOCKS, RasterizeForwardParams<T>) {   \
     SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                  \
-    const int channels = int(p.channels);                                                      \
-    if (channels <= 3)                                                                         \
-      forward<3, false>(p.frame, channels, p.background, p.image, p.alpha, *memory);           \
+    if (p.frame.additive)                                                                      \
+      forward_of_channels<Blend::kAdditive>(p, *memory);                                       \
     else                                                                                       \
-      forward<4, false>(p.frame, channels, p.background, p.image, p.alpha, *memory);           \
+      forward_of_channels<Blend::kFrontToBack>(p, *memory);                                    \
   }                                                                                            \
   SNOW_KERNEL(rasterize_count##SUFFIX, kBlock, RasterizeCountParams<T>) {                      \
     SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                  \
-    forward<1, true, T>(p.frame, 1, nullptr, p.counts, nullptr, *memory);                      \
+    forward<1, Blend::kCount, T>(p.frame, 1, nullptr, p.counts, nullptr, *memory);             \
   }                                                                                            \
   SNOW_KERNEL_OF(rasterize_bwd##SUFFIX, kBlock, BACKWARD_BLOCKS, RasterizeBackwardParams<T>) { \
     SNOW_SHARED(BackwardMemory<T>, memory, 1);                                                 \
-    if (p.channels <= 3)                                                                       \
-      backward<3>(p, *memory);                                                                 \
+    if (p.frame.additive)                                                                      \
+      backward_of_channels<true>(p, *memory);                                                  \
     else                                                                                       \
-      backward<4>(p, *memory);                                                                 \
+      backward_of_channels<false>(p, *memory);                                                 \
   }                                                                                            \
   SNOW_KERNEL(background_bwd##SUFFIX, 128, BackgroundBackwardParams<T>) { background_row(p); }
 
