@@ -1,12 +1,12 @@
 """Rectangles and triangles with soft edges, fitted to an image by gradient descent in PyTorch.
 
-The image is background + Σ w c, as for additive Gaussians. The weight w of a shape is the product of
-one logistic function per edge, w = Π σ(d / s): d is the distance of the pixel from the edge in
-pixels, positive inside, and s, the softness of the shape, is learnt. Liu et al. 2019 (Soft Rasterizer,
-arXiv:1904.01786) use the logistic function of a distance in the same way.
+The image is background + Σ w c, as for additive Gaussians. The weight w of a shape is the product
+of one logistic function per edge, w = Π σ(d / s): d is the distance of the pixel from the edge in
+pixels, positive inside, and s is the softness of the shape, which is learnt. Liu et al. 2019 (Soft
+Rasterizer, arXiv:1904.01786) use the logistic function of a distance in the same way.
 
-A pixel is composited only with the shapes near its tile. The lists of these shapes are renewed every
-`_RENEWED` steps.
+A pixel is composited only with the shapes near its tile. The lists of these shapes are renewed
+every `_RENEWED` steps.
 """
 
 from __future__ import annotations

@@ -17,15 +17,13 @@ from snowsplat.image.model import (
     COLORS,
     LOG_SIGMAS,
     MEANS,
+    MOST_GAUSSIANS,
     OPACITY_LOGIT,
     Blending,
     ImageGaussians,
     column_count,
 )
 from snowsplat.util.errors import SettingError
-
-#: The largest number of Gaussians of an image.
-MOST_GAUSSIANS = 4_000_000
 
 # The values below were chosen by measuring the PSNR of 1000 Gaussians after the same number of
 # steps; docs/guides/image.md has the figures.
@@ -39,11 +37,11 @@ _SMALLEST_SIGMA = 0.25  # pixels; a smaller Gaussian could lie between the centr
 _FIRST_SHARE = 0.15  # of the Gaussians: those of the first step
 _ROUNDS = 10  # number of times that others are added
 _LAST_ROUND = 0.4  # of the steps
-# The first Gaussians are sampled with a probability that is proportional to the image gradient, plus
-# this share of a uniform distribution.
+# The density of the first Gaussians is proportional to the gradient of the image, plus this share
+# of a uniform density.
 _UNIFORM_SHARE = 0.3
 _FIRST_SIGMAS = (0.7, 30.0)  # pixels; limits of the first Gaussians
-# New Gaussians are sampled with a probability proportional to |error|³.
+# The density of new Gaussians is proportional to (error²)^1.5.
 _ERROR_POWER = 1.5
 _NEW_SIGMA = 0.4  # times the mean distance of the Gaussians
 _NEW_OPACITY = 0.12  # of front-to-back Gaussians
@@ -146,6 +144,8 @@ class Fitter:
         self._row_adam.step(self._rows, grads[0], rate)
         self._background_adam.step(self._background, grads[1], rate)
         self._rows[:, LOG_SIGMAS].clamp_(min=math.log(_SMALLEST_SIGMA))
+        if self.options.blending == "front-to-back":
+            self._rows[:, COLORS].clamp_(0, 1)
         self.mse = float(error.square().mean())
         self.steps_done += 1
         if self._counts.get(self.steps_done, 0) > len(self._rows):
@@ -170,8 +170,8 @@ class Fitter:
     def _add(self, count: int, error: Tensor) -> None:
         """Add Gaussians at random positions, more of them where the error (3, H, W) is large.
 
-        Additive Gaussians begin with a part of the missing colour. Others are put in front, with the
-        colour of the photo and a low opacity.
+        Additive Gaussians begin with a part of the missing colour. Others are put in front, with
+        the colour of the photo and a low opacity.
         """
         squared = error.square().sum(0) ** _ERROR_POWER
         x, y = self._sample(_mean_of_3x3(squared), count)

@@ -16,6 +16,9 @@ from snowsplat.ops.splats import Splats2D
 #: composited, the first one in front, as splats are in 3D Gaussian Splatting.
 Blending = Literal["additive", "front-to-back"]
 
+#: The largest number of Gaussians of an image.
+MOST_GAUSSIANS = 4_000_000
+
 # Columns of `ImageGaussians.rows`.
 MEANS = slice(0, 2)
 LOG_SIGMAS = slice(2, 4)
@@ -38,7 +41,7 @@ class ImageGaussians:
         0:2   x, y of the centre
         2:4   log σ along the two axes
         4     angle between the x axis of the image and the first axis, in radians
-        5:8   red, green, blue; 1 is white, and any value is allowed
+        5:8   red, green, blue; 1 is white. Colours of additive Gaussians may be negative
         8     logit of the opacity; only for front-to-back blending
 
     Attributes:

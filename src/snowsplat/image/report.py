@@ -22,7 +22,7 @@ from snowsplat.util.machine import processor_name, system_name
 # rendered at a larger size, and the photo is enlarged.
 _LEAST_SIDE = 512
 # In the picture of the Gaussians, σ is multiplied by this factor, so that most do not overlap.
-_SHRUNK = 0.3
+_SHRUNK = 0.5
 
 _STYLE = (
     charts.STYLE
@@ -114,12 +114,13 @@ def _pictures(fitted: Fitted) -> str:
         (
             "",
             picture(_pixels(ellipses), "ellipses", 92),
-            f"The Gaussians at {_SHRUNK:g} of their size",
+            "The Gaussians at half their size",
         ),
         (
             "",
-            f'<video src="data:video/mp4;base64,{video}" controls="" loop="" muted=""></video>',
-            "The fit: the steps become longer towards the end",
+            '<video controls="" autoplay="" loop="" muted="" '
+            f'src="data:video/mp4;base64,{video}"></video>',
+            "The fit; the video becomes faster towards the end",
         ),
     ]
     inner = "\n".join(

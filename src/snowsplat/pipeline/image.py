@@ -93,7 +93,7 @@ def fit_image(
         raise UserError(f"{output}: is a file; use a folder for the output")
     if (output / "metrics.json").exists() and not overwrite:
         raise UserError(f"{output}: contains an earlier fit; use `overwrite` to replace it")
-    target = _load(photo, size)
+    target = load_photo(photo, size)
     Compute("cpu", threads).apply()
     output.mkdir(parents=True, exist_ok=True)
 
@@ -174,8 +174,14 @@ def _check_size(size: int) -> None:
         raise SettingError("size", f"{size} is out of range; use {least} to {most} pixels")
 
 
-def _load(photo: Path, size: int) -> Tensor:
-    """(H, W, 3) float32 in 0..1, on white if it is transparent. Raises UserError: unreadable."""
+def load_photo(photo: Path, size: int) -> Tensor:
+    """A photo, scaled down so that its longer side has at most `size` pixels.
+
+    Returns (H, W, 3) float32 in 0..1. A transparent photo is composited over white.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
     from snowsplat.data.decode import ImageSource, load_image, read_header
 
     header = read_header(photo)
