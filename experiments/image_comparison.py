@@ -94,8 +94,8 @@ def network(photo: Tensor, steps: int) -> Result:
     return Result(fit.image, fit.parameters, steps)
 
 
-def jpeg(photo: Tensor, most_bytes: int) -> Result:
-    """The JPEG file of the highest quality with at most this many bytes."""
+def jpeg(photo: Tensor, most_bytes: int) -> Result | None:
+    """The JPEG file of the highest quality with at most this many bytes; None if all are larger."""
     pixels = Image.fromarray((photo * 255).round().byte().contiguous().numpy())
     best = b""
     for quality in range(1, 101):
@@ -104,7 +104,7 @@ def jpeg(photo: Tensor, most_bytes: int) -> Result:
         if len(file.getvalue()) <= most_bytes:
             best = file.getvalue()
     if not best:
-        raise SystemExit(f"no JPEG file has at most {most_bytes} bytes")
+        return None
     image = torch.from_numpy(np.asarray(Image.open(io.BytesIO(best))).copy()).float() / 255
     return Result(image, 0, 0, len(best), image)
 
@@ -123,11 +123,13 @@ def primitive(program: str, photo: Tensor, count: int) -> Result:
 
 def measured(
     name: str, method: str, photo: Tensor, count: int, file_bytes: int, args: argparse.Namespace
-) -> tuple[Row, Tensor]:
-    """Run a method; its row and its image."""
+) -> tuple[Row, Tensor] | None:
+    """Run a method; its row and its image. None: there is no such image."""
     start, cpu = time.perf_counter(), _cpu_seconds()
     result = run_method(method, photo, count, file_bytes, args)
     seconds, cpu = time.perf_counter() - start, _cpu_seconds() - cpu
+    if result is None:
+        return None
     metrics = compare(result.image, photo)
     file_psnr = 0.0 if result.decoded is None else compare(result.decoded, photo).psnr
     row = Row(
@@ -181,7 +183,7 @@ def print_table(rows: list[Row]) -> None:
 
 def run_method(
     method: str, photo: Tensor, count: int, file_bytes: int, args: argparse.Namespace
-) -> Result:
+) -> Result | None:
     """The result of a method. `file_bytes` is the largest size of a JPEG file."""
     if method in ("front-to-back", "additive"):
         return gaussians(photo, method, count, args.steps)
@@ -222,7 +224,11 @@ def main() -> None:
         for count in args.counts:
             file_bytes = 0
             for method in methods:
-                row, image = measured(path.stem, method, photo, count, file_bytes, args)
+                found = measured(path.stem, method, photo, count, file_bytes, args)
+                if found is None:
+                    print(f"{path.stem} {method} {count}: no file is so small", flush=True)
+                    continue
+                row, image = found
                 file_bytes = file_bytes or row.bytes
                 rows.append(row)
                 images.append((f"{method} {row.psnr:.2f} dB", image))

@@ -57,7 +57,7 @@ def write_compact(path: Path, gaussians: ImageGaussians) -> ImageGaussians:
     Returns what `read_compact` reads from the file: the quantised Gaussians.
 
     Raises:
-        ValueError: a side of the image has more than 65,535 pixels, or a value is not finite.
+        ValueError: there are no Gaussians, or a value is not finite.
         OSError: the file cannot be written.
     """
     data = encode(gaussians)
@@ -85,13 +85,13 @@ def read_compact(path: Path) -> ImageGaussians:
 def encode(gaussians: ImageGaussians) -> bytes:
     """The content of a compact file. Raises ValueError as `write_compact`."""
     rows = gaussians.rows.detach().cpu().double().numpy().copy()
-    if not np.isfinite(rows).all():
-        raise ValueError("a value of the Gaussians is not finite")
+    if not (len(rows) and np.isfinite(rows).all()):
+        raise ValueError("there are no Gaussians, or a value is not finite")
     rows[:, ANGLE] %= np.pi  # an ellipse that is rotated by 180° is the same
     if gaussians.blending == "front-to-back":
         rows[:, OPACITY_LOGIT] = rows[:, OPACITY_LOGIT].clip(-_LARGEST_LOGIT, _LARGEST_LOGIT)
-    low = rows.min(axis=0, initial=np.inf) if len(rows) else np.zeros(rows.shape[1])
-    spread = rows.max(axis=0, initial=-np.inf) - low if len(rows) else low
+    low = rows.min(axis=0)
+    spread = rows.max(axis=0) - low
     steps = np.maximum(np.array(_STEPS[: rows.shape[1]]), spread / (_MOST_LEVELS - 1))
     levels = np.rint((rows - low) / steps).astype(np.uint16)
     if gaussians.blending == "additive":
@@ -131,13 +131,14 @@ def decode(data: bytes) -> ImageGaussians:
     scales = np.frombuffer(body[_HEADER.size : scales_end], "<f4")
     if len(scales) != 2 * columns or not np.isfinite([*scales, *background]).all():
         raise ValueError("the header of the file is damaged")
-    if count > MOST_GAUSSIANS:
+    if not 1 <= count <= MOST_GAUSSIANS:
         raise ValueError("the header of the file is damaged")
     levels = _levels(body[scales_end:], count, columns)
     if _BLENDINGS[blending] == "additive":
         levels[:, :2] = np.cumsum(levels[:, :2], axis=0, dtype=np.uint16)
     low, step = scales.reshape(columns, 2).T
-    rows = low + step * levels.astype(np.float32)
+    with np.errstate(over="ignore"):
+        rows = low + step * levels.astype(np.float32)
     if not np.isfinite(rows).all():
         raise ValueError("the values of the file are too large")
     return ImageGaussians(
