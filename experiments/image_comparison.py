@@ -95,18 +95,27 @@ def network(photo: Tensor, steps: int) -> Result:
 
 
 def jpeg(photo: Tensor, most_bytes: int) -> Result | None:
-    """The JPEG file of the highest quality with at most this many bytes; None if all are larger."""
+    """The best JPEG file with at most this many bytes, with or without chroma subsampling.
+
+    None: all files are larger.
+    """
     pixels = Image.fromarray((photo * 255).round().byte().contiguous().numpy())
-    best = b""
-    for quality in range(1, 101):
-        file = io.BytesIO()
-        pixels.save(file, "JPEG", quality=quality, optimize=True)
-        if len(file.getvalue()) <= most_bytes:
-            best = file.getvalue()
-    if not best:
+    found: list[tuple[float, bytes, Tensor]] = []
+    for subsampling in ("4:4:4", "4:2:0"):
+        best = b""
+        for quality in range(1, 101):
+            file = io.BytesIO()
+            pixels.save(file, "JPEG", quality=quality, subsampling=subsampling, optimize=True)
+            if len(best) < len(file.getvalue()) <= most_bytes:
+                best = file.getvalue()
+        if best:
+            decoded = np.asarray(Image.open(io.BytesIO(best))).copy()
+            image = torch.from_numpy(decoded).float() / 255
+            found.append((compare(image, photo).psnr, best, image))
+    if not found:
         return None
-    image = torch.from_numpy(np.asarray(Image.open(io.BytesIO(best))).copy()).float() / 255
-    return Result(image, 0, 0, len(best), image)
+    _, data, image = max(found, key=lambda each: each[0])
+    return Result(image, 0, 0, len(data), image)
 
 
 def primitive(program: str, photo: Tensor, count: int) -> Result:

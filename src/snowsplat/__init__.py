@@ -26,10 +26,12 @@ if TYPE_CHECKING:
     from snowsplat.data import Dataset, Points, View, load_dataset
     from snowsplat.evaluation.metrics import evaluate_views
     from snowsplat.formats import read_gaussians
+    from snowsplat.image.fit import FitOptions
     from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.convert import Edits, convert
     from snowsplat.pipeline.describe import describe
     from snowsplat.pipeline.evaluate import evaluate
+    from snowsplat.pipeline.image import decode_image, fit_image
     from snowsplat.pipeline.make import MakeOptions, make
     from snowsplat.pipeline.observer import Observer
     from snowsplat.pipeline.render import render_images
@@ -51,6 +53,7 @@ _MODULES = {
     "Compute": "pipeline.compute",
     "Dataset": "data",
     "Edits": "pipeline.convert",
+    "FitOptions": "image.fit",
     "Gaussians": "scene.gaussians",
     "MakeOptions": "pipeline.make",
     "Observer": "pipeline.observer",
@@ -63,9 +66,11 @@ _MODULES = {
     "VideoOptions": "pipeline.videos",
     "View": "data",
     "convert": "pipeline.convert",
+    "decode_image": "pipeline.image",
     "describe": "pipeline.describe",
     "evaluate": "pipeline.evaluate",
     "evaluate_views": "evaluation.metrics",
+    "fit_image": "pipeline.image",
     "load_dataset": "data",
     "load_trained": "pipeline.scene_source",
     "make": "pipeline.make",
@@ -83,6 +88,7 @@ __all__ = [
     "Compute",
     "Dataset",
     "Edits",
+    "FitOptions",
     "Gaussians",
     "MakeOptions",
     "Observer",
@@ -96,9 +102,11 @@ __all__ = [
     "View",
     "__version__",
     "convert",
+    "decode_image",
     "describe",
     "evaluate",
     "evaluate_views",
+    "fit_image",
     "load_dataset",
     "load_trained",
     "make",

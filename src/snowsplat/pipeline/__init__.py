@@ -6,6 +6,7 @@
     render.py    renders images of a scene
     videos.py    renders a video of a scene
     evaluate.py  measures PSNR, SSIM and LPIPS of a scene
+    image.py     approximates a photo by 2D Gaussians
     convert.py   merges, edits and converts scene files
     describe.py  describes the contents of a file or folder
     watch.py     shows the output folder of a training run in the browser
