@@ -101,7 +101,6 @@ constexpr double kCullSlack = 1e-3;
 // Splats are composited front to back. T = Π (1 − α) is the transmittance of the splats in front.
 // The weight of a splat is α T; a splat with α < 1/255 is skipped. A pixel is finished when the
 // next splat would make T < 1e-4.
-
 //
 // In the additive mode, the weight of a splat is o exp(−½ dᵀ K d), without a limit, and T stays 1. A
 // splat with a weight below 1/255 is skipped. The order of the splats has no effect, and ∂L/∂(log α)
