@@ -111,12 +111,13 @@ def resume(page: Page) -> None:
 
 def choose(page: Page, now: str, name: str) -> None:
     """Choose the entry ``name`` of the list that shows ``now``."""
-    box = f"[...document.querySelectorAll('input')].find(i => i.value === '{now}')"
-    page.wait_for("!!" + box)
-    page.evaluate(f"(() => {{ const i = {box}; i.focus(); i.click(); }})()")
+    box = "[...document.querySelectorAll('input')].find(i => i.value === '{}')"
+    page.wait_for("!!" + box.format(now))
+    page.evaluate(f"(() => {{ const i = {box.format(now)}; i.focus(); i.click(); }})()")
     option = f"[...document.querySelectorAll('[role=option]')].find(o => o.innerText === '{name}')"
     page.wait_for("!!" + option)
     page.evaluate(option + ".click()")
+    page.wait_for("!!" + box.format(name))
 
 
 def step_of(page: Page) -> int:
@@ -133,7 +134,7 @@ def differ(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(a - b).mean())
 
 
-def wait(true: Callable[[], bool], seconds: float = 20.0) -> None:
+def wait(true: Callable[[], bool], seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end
@@ -235,7 +236,10 @@ def test_display_modes(page):
         seen.append(settled(page))
         before = name
     choose(page, before, "Colour")
-    wait(lambda: differ(scene(page), seen[0]) < 1)
+    # On a busy machine, the first image may be one of those with a low resolution, which the
+    # server sends before the sharp one.
+    others = min(differ(seen[0], mode) for mode in seen[1:])
+    wait(lambda: differ(scene(page), seen[0]) < others / 3)
 
 
 def test_the_view_at_a_photo(page):
