@@ -25,7 +25,7 @@ class ColoredPoints(Protocol):
     rgb: Tensor  # (P, 3) uint8
 
 
-@dataclass
+@dataclass(eq=False)  # `==` of tensors has no truth value
 class Gaussians:
     """N anisotropic Gaussians in the world frame. All tensors share a floating dtype and a device.
 

@@ -1,14 +1,18 @@
 """The page's server with a client that sends poses as a browser does."""
 
+import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
+import torch
 
 from snowsplat.data import load_dataset
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.viewer.live.session import MOVE_SECONDS
-from snowsplat.viewer.live.viewer import NetworkViewer
+from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
 from ..clients import Visitor
 
@@ -42,3 +46,40 @@ def test_a_user_who_moves_at_once_leaves_the_photo(tmp_path):
             wait(lambda: "click one to view the scene" in controls._where.content)
     finally:
         viewer.close()
+
+
+def test_a_newer_scene_replaces_the_one_shown(tmp_path):
+    """`snowsplat watch` shows each new checkpoint, which may have another number of Gaussians."""
+    dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
+    gaussians = Gaussians.from_points(dataset.points)
+    few = gaussians.select(torch.arange(30))
+    saved, shown = [Scene(few, 1, ["30"])], []
+    ended = threading.Event()
+
+    def newest() -> Scene:
+        if ended.is_set():
+            raise KeyboardInterrupt
+        shown.append(saved[-1].number)
+        return saved[-1]
+
+    def show() -> None:
+        with suppress(KeyboardInterrupt):
+            viewer.show_newest(newest)
+
+    viewer = NetworkViewer(dataset)
+    thread = threading.Thread(target=show)
+    thread.start()
+    try:
+        with Visitor(viewer.url) as visitor:
+            wait(lambda: 1 in shown)
+            visitor.send_camera()
+            assert visitor.pictures(20.0, most=1) == 1
+            saved.append(Scene(gaussians, 2, ["50"]))
+            wait(lambda: shown.count(2) >= 2)
+            visitor.send_camera(position=[0.0, 0.5, -3.0])
+            assert visitor.pictures(20.0, most=1) == 1
+    finally:
+        ended.set()
+        thread.join(timeout=20.0)
+        viewer.close()
+    assert not thread.is_alive()
