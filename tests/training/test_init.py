@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
@@ -72,12 +73,14 @@ def test_the_limit_chooses_points_at_random(limit: int, count: int) -> None:
 
 
 @pytest.mark.parametrize(("limit", "count"), [(0, 70), (30, 30), (500, 70)])
-def test_random_points(limit: int, count: int) -> None:
-    dataset = replace(dataset_of(None), points=None)
+def test_random_points(limit: int, count: int, tmp_path: Path) -> None:
+    Image.new("RGB", (8, 6), (200, 100, 50)).save(tmp_path / "a.png")
+    dataset = dataset_of(None)
+    view = replace(dataset.train[0], image=ImageSource(tmp_path / "a.png", 8, 6))
+    dataset = replace(dataset, train=[view])
     gaussians = initialised(dataset, changed(CONFIG, max_gaussians=limit))
     assert len(gaussians) == count
-    low, high = dataset.bounds
-    assert ((gaussians.means >= low) & (gaussians.means <= high)).all()
+    assert (view.camera.project(gaussians.means)[1] > 0).all()
     torch.testing.assert_close(gaussians.opacities, torch.full((count,), 0.2))
     assert gaussians.sh_rest.shape == (count, 3, 3)
     assert torch.equal(morton_order(gaussians.means), torch.arange(count))

@@ -94,7 +94,7 @@ def test_many_cameras_are_sampled():
 def test_a_training_run_without_a_floater(tmp_path):
     """An opaque Gaussian in front of a camera is removed by density control."""
     dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 8, 48, 36, n_points=400))
-    trainer = Trainer(dataset, recipe("default", iterations=300, dense_init=0.0))
+    trainer = Trainer(dataset, recipe("default", iterations=300, init="points"))
     trainer.run(until=INTERVAL)
     viewer = dataset.train[0].camera.world_from_cam
     floater = (viewer[:, 3] + 0.1 * viewer[:, 2]).to(torch.float32)

@@ -19,12 +19,13 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
-from snowsplat.training import checkpoint, init
+from snowsplat.training import checkpoint
 from snowsplat.training.config import TrainConfig, changed
 from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.losses import view_loss
 from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.starts import STARTS
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.trainer import Progress, Trainer
 from snowsplat.util.errors import UserError
@@ -187,12 +188,12 @@ def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
 
 def test_a_resumed_run_does_not_initialise_again(dataset, monkeypatch):
     """Depth maps take time, and the Gaussians come from the checkpoint."""
-    config = changed(BUSY, dense_init=0.5, max_gaussians=500)
+    config = changed(BUSY, init="points+sweep", initial_points=0.5, max_gaussians=500)
     uninterrupted = trained(dataset, config)
     first = Trainer(dataset, config)
     first.run(until=30)
     state = {name: tensor.clone() for name, tensor in first.state_tensors().items()}
-    monkeypatch.setattr(init, "dense_points", None)
+    monkeypatch.setitem(STARTS, "sweep", None)
     second = Trainer(dataset, config, state=state)
     assert second.step == 30
     second.run()

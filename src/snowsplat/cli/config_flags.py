@@ -44,11 +44,13 @@ class ConfigFlags:
     memory."""
     ssim_weight: Annotated[float | None, flag("F", "--lambda-dssim", default=RECIPE)] = None
     """Weight of 1 - SSIM in the loss. The mean absolute difference has the weight 1 - F."""
-    initial_points: Annotated[int | None, flag("N", default=RECIPE)] = None
-    """Number of Gaussians at random positions to start from, if the dataset has no points."""
-    dense_init: Annotated[float | None, flag("F", default=RECIPE)] = None
-    """Compute depth maps from the photos, and start with points on the surfaces in addition to the
-    points of the dataset: F times the maximum number of Gaussians; 0: none."""
+    init: Annotated[str | None, flag("START[+START…]", default=RECIPE)] = None
+    """Where the first Gaussians come from. points: the points of the dataset; sweep: depth maps
+    computed from the photos (plane sweep); carve: voxels with the same colour in all photos (space
+    carving); random: random depths of random pixels. Example: points+sweep."""
+    initial_points: Annotated[int | float | None, flag("N|F", default=RECIPE)] = None
+    """Number of points of each start except points, which uses all. A value with a decimal point
+    (0.4) is a share of the maximum number of Gaussians."""
     grad_threshold: Annotated[
         float | None, flag("F", "--densify-grad-threshold", default=RECIPE)
     ] = None

@@ -218,7 +218,7 @@ class _Job:
         self.observer.note(_described(dataset))
         if budget is not None and plan is not None:
             self.observer.note(budget.described(plan))
-        if config.dense_init > 0.0:
+        if "sweep" in config.starts:
             self.observer.note("computing depth maps for the initialisation")
         trainer = Trainer(dataset, memory.plan.config, device=self.device)
         self.out.begin(dataset, settings, memory.plan.config)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import DENSITY_CONTROLS, AdaptiveDensity, DensityConfig
 from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.starts import STARTS
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import from_json
@@ -33,10 +34,10 @@ class TrainConfig:
         sh_interval: the degree in use begins at 0 and increases by one after this many steps; 0:
             use ``sh_degree`` from the first step.
         ssim_weight: λ of (1 − λ) · L1 + λ · D-SSIM.
-        initial_points: number of random points for a dataset without points.
-        dense_init: number of points that are added to those of the dataset for the initialisation,
-            as a share of the limit of Gaussians. They are computed from the photos; see
-            `dense_init.dense_points`. 0: none.
+        init: where the first Gaussians come from: names of `starts.STARTS`, joined by "+". If they
+            find nothing, for example "points" in a dataset without points, "random" is used.
+        initial_points: number of points of each start except "points", which uses all points of the
+            dataset; a float is a share of the limit of Gaussians.
         initial_opacity: the opacity of every Gaussian at initialisation.
         initial_scale: the scale of every Gaussian at initialisation, in units of the mean distance
             to its three nearest neighbours.
@@ -77,8 +78,8 @@ class TrainConfig:
     sh_degree: int = 3
     sh_interval: int = 1000
     ssim_weight: float = 0.2
-    initial_points: int = 100_000
-    dense_init: float = 0.0
+    init: str = "points"
+    initial_points: int | float = 100_000
     initial_opacity: float = 0.1
     initial_scale: float = 1.0
     learning_rates: LearningRates = field(default_factory=LearningRates)
@@ -100,7 +101,6 @@ class TrainConfig:
         rates, density = self.learning_rates, self.density
         for name, count in (
             ("iterations", self.iterations),
-            ("initial_points", self.initial_points),
             ("densify_interval", density.densify_interval),
         ):
             if count < 1:
@@ -139,12 +139,42 @@ class TrainConfig:
         ):
             if not 0.0 <= limit < math.inf:
                 raise SettingError(name, f"{limit:g} is not valid; use e.g. 0.5, or 0 for none")
-        if not 0.0 <= self.dense_init <= 1.0:
-            raise SettingError("dense_init", f"{self.dense_init:g} is not a share; use e.g. 0.4")
+        for name in self.starts:
+            if name not in STARTS:
+                names = ", ".join(STARTS)
+                raise SettingError("init", f"{name!r} does not exist; use one of {names}")
+        share = isinstance(self.initial_points, float)
+        if not (0.0 < self.initial_points <= 1.0 if share else self.initial_points >= 1):
+            raise SettingError(
+                "initial_points",
+                f"{self.initial_points:g} is neither a number nor a share of the limit of "
+                "Gaussians; use e.g. 20000 or 0.4",
+            )
         if self.leave_out_after < 0:
             raise SettingError(
                 "leave_out_after", f"{self.leave_out_after} is negative; use 0 for never"
             )
+
+    @property
+    def starts(self) -> tuple[str, ...]:
+        """The names in ``init``."""
+        return tuple(self.init.split("+"))
+
+    @property
+    def points_per_start(self) -> int:
+        """``initial_points`` as a number, at most the limit of Gaussians.
+
+        Raises:
+            SettingError: it is a share, but the number of Gaussians has no limit.
+        """
+        limit = self.density.max_gaussians
+        if isinstance(self.initial_points, int):
+            return min(self.initial_points, limit or self.initial_points)
+        if not limit:
+            raise SettingError(
+                "initial_points", "is a share of the limit of Gaussians; set max_gaussians as well"
+            )
+        return max(1, round(self.initial_points * limit))
 
     def capped(self, pixels: int, views: int) -> TrainConfig:
         """This configuration with the limit of Gaussians for a dataset.

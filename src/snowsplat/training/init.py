@@ -1,4 +1,4 @@
-"""`initial_gaussians`: initialisation, from points of the dataset, depth maps, or at random."""
+"""`initial_gaussians`: the first Gaussians, from the points of one or more starts."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
 from snowsplat.training.config import TrainConfig
-from snowsplat.training.dense_init import dense_points
 from snowsplat.training.finite import check_finite
-from snowsplat.util.errors import SettingError
+from snowsplat.training.starts import STARTS
 
 
 def initial_count(dataset: Dataset, config: TrainConfig) -> int:
     """The maximum number of Gaussians that `initial_gaussians` returns."""
     limit = config.density.max_gaussians
-    dense = round(config.dense_init * limit)
-    if dataset.points is not None:
-        count = len(dataset.points) + dense
-    else:
-        count = dense or config.initial_points
-    return min(count, limit or count)
+    points = 0 if dataset.points is None else len(dataset.points)
+    count = sum(points if name == "points" else config.points_per_start for name in config.starts)
+    return min(count or config.points_per_start, limit or count)
+
+
+def starts_at_random(dataset: Dataset, config: TrainConfig) -> bool:
+    """Whether most of the first Gaussians probably lie in empty space."""
+    without = {"random"} if dataset.points is not None else {"random", "points"}
+    return without.issuperset(config.starts)
 
 
 def initial_gaussians(
@@ -34,45 +36,31 @@ def initial_gaussians(
     generator: torch.Generator,
     device: torch.device,
 ) -> Gaussians:
-    """One Gaussian per point of the dataset, or random Gaussians if there are no points.
+    """One Gaussian for each point of the starts of ``config.init``.
 
-    If ``config.dense_init`` is positive, the points of `dense_points` are added to those of the
-    dataset. There are at most ``density.max_gaussians``. As in section 5.1 of the paper, they are
-    isotropic. The scale is the mean distance to the three nearest neighbours times
-    ``config.initial_scale``; the colour is that of the point; the opacity is
-    ``config.initial_opacity``. The rows are in Morton order.
+    There are at most ``density.max_gaussians``. As in section 5.1 of the paper, they are isotropic.
+    The scale is the mean distance to the three nearest neighbours times ``config.initial_scale``;
+    the colour is that of the point; the opacity is ``config.initial_opacity``. The rows are in
+    Morton order.
 
     Args:
-        images: the photos of the dataset, for `dense_points`.
-        generator: a random generator on the CPU. It draws the random points; if the dataset has too
-            many points, it selects those that are used.
+        images: the photos of the dataset.
+        generator: a random generator on the CPU. If there are too many points, it selects those
+            that are used.
 
     Raises:
         UserError: some points are so far apart that single precision cannot represent their
             Gaussians.
-        SettingError: ``dense_init`` is set, but the number of Gaussians has no limit.
+        SettingError: ``initial_points`` is a share, but the number of Gaussians has no limit.
     """
+    points = _points_of(config.starts, dataset, config, images, generator)
+    if not len(points):
+        points = _points_of(("random",), dataset, config, images, generator)
     limit = config.density.max_gaussians or math.inf
-    points = dataset.points
-    if config.dense_init > 0.0:
-        if limit == math.inf:
-            raise SettingError(
-                "dense_init", "is a share of the limit of Gaussians; set max_gaussians as well"
-            )
-        dense = dense_points(dataset, images, round(config.dense_init * limit), generator)
-        points = _joined(points, dense)
-    if points is None:
-        count = int(min(config.initial_points, limit))
-        gaussians = Gaussians.random_in_bounds(
-            dataset.bounds, count, generator, config.sh_degree, config.initial_opacity
-        )
-    else:
-        if len(points) > limit:
-            chosen = torch.randperm(len(points), generator=generator)[: int(limit)]
-            points = Points(points.xyz[chosen], points.rgb[chosen])
-        points = points.to(device)
-        gaussians = Gaussians.from_points(points, config.sh_degree, config.initial_opacity)
-    gaussians = gaussians.to(device)
+    if len(points) > limit:
+        chosen = torch.randperm(len(points), generator=generator)[: int(limit)]
+        points = Points(points.xyz[chosen], points.rgb[chosen])
+    gaussians = Gaussians.from_points(points.to(device), config.sh_degree, config.initial_opacity)
     gaussians.log_scales += math.log(config.initial_scale)
     check_finite(
         "the points of the dataset",
@@ -82,10 +70,13 @@ def initial_gaussians(
     return gaussians.select(morton_order(gaussians.means))
 
 
-def _joined(points: Points | None, dense: Points) -> Points | None:
-    if points is None:
-        return dense if len(dense) else None
-    return Points(
-        torch.cat([points.xyz, dense.xyz.to(points.xyz.device)]),
-        torch.cat([points.rgb, dense.rgb.to(points.rgb.device)]),
-    )
+def _points_of(
+    starts: tuple[str, ...],
+    dataset: Dataset,
+    config: TrainConfig,
+    images: ImageLoader,
+    generator: torch.Generator,
+) -> Points:
+    count = 0 if starts == ("points",) else config.points_per_start
+    found = [STARTS[name](dataset, images, count, generator) for name in starts]
+    return Points(torch.cat([p.xyz for p in found]), torch.cat([p.rgb for p in found]))

@@ -148,10 +148,11 @@ def plan_memory(
     largest, median = sizes[-1], sizes[len(sizes) // 2]
     config = config.capped(median, len(dataset.train))
     cost = GPU if device.type == "cuda" else CPU
-    starts_random = dataset.points is None and not present
+    # Random points are also used if the other starts find nothing.
+    random = not present and (dataset.points is None or "random" in config.starts)
     scene = _SceneCost(
         each=cost.of_gaussian(config.sh_degree),
-        random=config.initial_points if starts_random else 0,
+        random=config.points_per_start if random else 0,
         extra=_EXTRA_OF_RANDOM * cost.gaussian,
     )
     stored = max(largest, *(view.image.stored for view in dataset.train))

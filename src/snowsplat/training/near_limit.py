@@ -24,7 +24,7 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.dense_init.source_views import source_views
+from snowsplat.training.starts.source_views import source_views
 from snowsplat.training.unseen_cameras import beside
 
 #: Number of steps between two applications.

@@ -37,7 +37,7 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
-from snowsplat.training.dense_init.source_views import source_views
+from snowsplat.training.starts.source_views import source_views
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.unseen_cameras import beside
 

@@ -34,7 +34,8 @@ def default() -> TrainConfig:
     return replace(
         config,
         iterations=2000,
-        dense_init=0.4,
+        init="points+sweep",
+        initial_points=0.4,
         initial_opacity=0.3,
         initial_scale=0.6,
         learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),

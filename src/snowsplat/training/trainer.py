@@ -19,7 +19,7 @@ from snowsplat.scene.render import project
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.decay import Decay
 from snowsplat.training.finite import check_state
-from snowsplat.training.init import initial_gaussians
+from snowsplat.training.init import initial_gaussians, starts_at_random
 from snowsplat.training.losses import view_loss
 from snowsplat.training.near_limit import NearLimit
 from snowsplat.training.optim import Adam
@@ -127,7 +127,7 @@ class Trainer:
             device=self.device,
         )
         # The Gaussians of a resumed training run are replaced by those of the state.
-        start = config if state is None else replace(config, dense_init=0.0)
+        start = config if state is None else replace(config, init="points")
         with single_threaded():
             self.gaussians = initial_gaussians(
                 dataset, start, self._images, self._generators["start"], self.device
@@ -143,7 +143,7 @@ class Trainer:
             len(self.gaussians),
             schedule=self.schedule,
             extent=dataset.extent,
-            random_init=dataset.points is None and config.dense_init == 0.0,
+            random_init=starts_at_random(dataset, config),
             generator=self._generators["density"],
             device=self.device,
         )

@@ -70,9 +70,9 @@ def test_the_time_is_used():
 
 
 def test_depth_maps_need_enough_time():
-    assert planned(10, 552, 986).config.dense_init == 0.0
-    assert planned(120, 552, 986).config.dense_init == recipe("default").dense_init > 0.0
-    without = make_plan(dataset(552, 986), recipe("default", dense_init=0.0), 60, 1.0)
+    assert planned(10, 552, 986).config.init == "points"
+    assert planned(120, 552, 986).config.init == recipe("default").init == "points+sweep"
+    without = make_plan(dataset(552, 986), recipe("default", init="points"), 60, 1.0)
     steps = without.config.iterations - planned(60, 552, 986).config.iterations
     assert 0.02 < steps / without.config.iterations < 0.15  # they take some of the time
 

@@ -15,8 +15,8 @@ import torch
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.training.config import TrainConfig, changed
-from snowsplat.training.dense_init import map_pixels
 from snowsplat.training.init import initial_count
+from snowsplat.training.starts import map_pixels
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.time_budget.step_cost import Work
 from snowsplat.training.trainer import Trainer
@@ -122,8 +122,8 @@ def make_plan(
         maps = map_pixels(len(dataset.train), width, height) / 1e6
         maps *= _SECONDS_PER_MAP_MEGAPIXEL * time_ratio
         if maps > _MAX_SHARE_OF_MAPS * seconds:
-            sized = replace(sized, dense_init=0.0)
-        left = seconds - _SETUP_SECONDS - (maps if sized.dense_init > 0.0 else 0.0)
+            sized = replace(sized, init=_without_sweep(sized.init))
+        left = seconds - _SETUP_SECONDS - (maps if "sweep" in sized.starts else 0.0)
         work = Work(sized, width * height, len(dataset.test))
         initial = initial_count(dataset, sized)
         steps, mean = _steps(work, left, time_ratio, initial)
@@ -176,8 +176,8 @@ def measure_time_ratio(
         replace(dataset, train=views, test=[], points=points),
         replace(
             config,
-            initial_points=min(config.initial_points, _SAMPLE_POINTS),
-            dense_init=0.0,
+            init="points",
+            initial_points=_SAMPLE_POINTS,
             iterations=_SAMPLE_STEPS,
             coarse_to_fine=(0, 0) if downscale == 1 else (0, 1.0),
             sh_interval=0,
@@ -225,6 +225,10 @@ def _capped(config: TrainConfig, pixels: int, gaussian_factor: float) -> TrainCo
             config, density=changed(config, max_gaussians=round(gaussian_factor * cap)).density
         )
     return config.capped(pixels, views=0)  # the limit follows the time, not the views
+
+
+def _without_sweep(init: str) -> str:
+    return "+".join(name for name in init.split("+") if name != "sweep") or "random"
 
 
 def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:

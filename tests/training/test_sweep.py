@@ -19,11 +19,11 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.training.config import TrainConfig, changed
-from snowsplat.training.dense_init import dense_points
-from snowsplat.training.dense_init.depth_maps import DepthMap, depth_maps
-from snowsplat.training.dense_init.fusion import consistent, thinned, world_points
-from snowsplat.training.dense_init.source_views import source_views
 from snowsplat.training.init import initial_gaussians
+from snowsplat.training.starts import swept_points
+from snowsplat.training.starts.depth_maps import DepthMap, depth_maps
+from snowsplat.training.starts.fusion import consistent, thinned, world_points
+from snowsplat.training.starts.source_views import source_views
 from snowsplat.util.errors import SettingError
 
 WIDTH, HEIGHT = 96, 72
@@ -204,7 +204,7 @@ def test_thinned_points_are_the_means_of_their_voxels() -> None:
 
 
 def test_dense_points_lie_on_the_surface(dataset: Dataset) -> None:
-    points = dense_points(dataset, photos(dataset), 300, torch.Generator().manual_seed(0))
+    points = swept_points(dataset, photos(dataset), 300, torch.Generator().manual_seed(0))
     assert 100 < len(points) <= 300
     distance = points.xyz[:, 2] - (DISTANCE + SLOPE * points.xyz[:, 0])
     assert float(distance.abs().median()) < 0.02
@@ -212,18 +212,18 @@ def test_dense_points_lie_on_the_surface(dataset: Dataset) -> None:
     assert float((points.rgb - expected).abs().median()) < 25
 
 
-def test_initial_gaussians_with_dense_points(dataset: Dataset) -> None:
+def test_initial_gaussians_with_swept_points(dataset: Dataset) -> None:
     assert dataset.points is not None
-    config = changed(TrainConfig(), max_gaussians=1000, dense_init=0.4)
+    config = changed(TrainConfig(), max_gaussians=1000, init="points+sweep", initial_points=0.4)
     first, same = (initialised(dataset, config) for _ in range(2))
     assert len(dataset.points) + 200 < len(first) <= len(dataset.points) + 400
     assert torch.equal(first.means, same.means)
-    without = initialised(dataset, replace(config, dense_init=0.0))
+    without = initialised(dataset, replace(config, init="points"))
     assert len(without) == len(dataset.points)
 
 
 def test_a_dataset_without_points(dataset: Dataset) -> None:
-    config = changed(TrainConfig(), max_gaussians=1000, dense_init=0.4)
+    config = changed(TrainConfig(), max_gaussians=1000, init="points+sweep", initial_points=0.4)
     gaussians = initialised(replace(dataset, points=None), config)
     distance = gaussians.means[:, 2] - (DISTANCE + SLOPE * gaussians.means[:, 0])
     assert 100 < len(gaussians) <= 400
@@ -237,7 +237,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads(dataset: Dataset) -
         for n in (1, 3):
             torch.set_num_threads(n)
             random = torch.Generator().manual_seed(1)
-            clouds.append(dense_points(dataset, photos(dataset), 300, random))
+            clouds.append(swept_points(dataset, photos(dataset), 300, random))
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(clouds[0].xyz, clouds[1].xyz)
@@ -245,8 +245,8 @@ def test_the_result_does_not_depend_on_the_number_of_threads(dataset: Dataset) -
 
 
 def test_dense_points_need_a_limit(dataset: Dataset) -> None:
-    config = changed(TrainConfig(), max_gaussians=0, dense_init=0.4)
+    config = changed(TrainConfig(), max_gaussians=0, init="points+sweep", initial_points=0.4)
     with pytest.raises(SettingError, match="max_gaussians"):
         initialised(dataset, config)
     with pytest.raises(SettingError, match="share"):
-        changed(TrainConfig(), dense_init=2.0)
+        changed(TrainConfig(), initial_points=2.0)

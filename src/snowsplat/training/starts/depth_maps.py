@@ -15,6 +15,7 @@ from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
+from snowsplat.training.starts.photos import reduced_photo, usable_pixels
 
 #: Photos are reduced so that their longer side has at most this number of pixels.
 _LONGER_SIDE = 640
@@ -71,17 +72,7 @@ def map_size(width: int, height: int) -> tuple[int, int]:
 
 def photo_for_map(view: View, images: ImageLoader) -> LoadedImage:
     """The photo of a view at the size of its depth map, on the CPU."""
-    width, height = map_size(view.camera.width, view.camera.height)
-    factor = next((f for f in (4, 2) if view.camera.width >= f * width), 1)
-    photo = images.get(view, factor).to(torch.device("cpu"))
-    size = (height, width)
-    if photo.planes.shape[1:] == size:
-        return photo
-    planes = interpolate(photo.planes[None].to(torch.float32), size, mode="area")[0]
-    mask = photo.mask
-    if mask is not None:
-        mask = interpolate(mask[None, None].to(torch.float32), size, mode="area")[0, 0] > 0.5
-    return LoadedImage(planes.round().to(torch.uint8), mask)
+    return reduced_photo(view, images, *map_size(view.camera.width, view.camera.height))
 
 
 @dataclass(frozen=True)
@@ -95,13 +86,9 @@ class _Picture:
     @staticmethod
     def of(view: View, images: ImageLoader) -> _Picture:
         photo = photo_for_map(view, images)
-        usable = photo.mask
-        if photo.alpha is not None:
-            opaque = photo.alpha >= 128
-            usable = opaque if usable is None else usable & opaque
         luminance = photo.rgb.to(torch.float32) @ _LUMINANCE / 255.0
         height, width = luminance.shape
-        return _Picture(view.camera.scaled(width, height), luminance, usable)
+        return _Picture(view.camera.scaled(width, height), luminance, usable_pixels(photo))
 
 
 def _depth_map(

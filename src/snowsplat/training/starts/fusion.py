@@ -9,7 +9,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import Points
 from snowsplat.scene.geometry import transform_points
-from snowsplat.training.dense_init.depth_maps import DepthMap
+from snowsplat.training.starts.depth_maps import DepthMap
 
 #: Two inverse depths of one point agree if they differ by at most this share.
 _TOLERANCE = 0.02

@@ -1,4 +1,4 @@
-"""`dense_points`: a dense point cloud of a dataset, for the initialisation."""
+"""`swept_points`: points on the surfaces, from depth maps that a plane sweep computes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.image_loader import ImageLoader
-from snowsplat.training.dense_init.depth_maps import depth_maps, map_size, photo_for_map
-from snowsplat.training.dense_init.fusion import consistent, thinned, world_points
-from snowsplat.training.dense_init.source_views import source_views
+from snowsplat.training.starts.depth_maps import depth_maps, map_size, photo_for_map
+from snowsplat.training.starts.fusion import consistent, thinned, world_points
+from snowsplat.training.starts.source_views import source_views
 
 #: Number of source views of each depth map.
 _SOURCES = 4
@@ -26,7 +26,7 @@ _MAX_PIXELS = 16_000_000
 _BYTES_PER_PIXEL = 10
 
 
-def dense_points(
+def swept_points(
     dataset: Dataset, images: ImageLoader, count: int, generator: torch.Generator
 ) -> Points:
     """At most ``count`` points on the surfaces that several photos show, in the world frame, on the
@@ -59,7 +59,7 @@ def dense_points(
 
 
 def map_pixels(views: int, width: int, height: int) -> int:
-    """About the number of pixels of all depth maps that `dense_points` computes for this number of
+    """About the number of pixels of all depth maps that `swept_points` computes for this number of
     views of this size.
     """
     return min(_MAX_PIXELS, views * math.prod(map_size(width, height)))

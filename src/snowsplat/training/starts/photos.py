@@ -1,0 +1,33 @@
+"""Photos at a reduced size, for the starts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from snowsplat.data.dataset import View
+from snowsplat.data.decode import LoadedImage
+from snowsplat.data.image_loader import ImageLoader
+
+
+def reduced_photo(view: View, images: ImageLoader, width: int, height: int) -> LoadedImage:
+    """The photo of a view at this size, which is not larger than the photo, on the CPU."""
+    factor = next((f for f in (4, 2) if view.camera.width >= f * width), 1)
+    photo = images.get(view, factor).to(torch.device("cpu"))
+    size = (height, width)
+    if photo.planes.shape[1:] == size:
+        return photo
+    planes = interpolate(photo.planes[None].to(torch.float32), size, mode="area")[0]
+    mask = photo.mask
+    if mask is not None:
+        mask = interpolate(mask[None, None].to(torch.float32), size, mode="area")[0, 0] > 0.5
+    return LoadedImage(planes.round().to(torch.uint8), mask)
+
+
+def usable_pixels(photo: LoadedImage) -> Tensor | None:
+    """(H, W) bool: False for masked and transparent pixels; None if all pixels are usable."""
+    if photo.alpha is None:
+        return photo.mask
+    opaque = photo.alpha >= 128
+    return opaque if photo.mask is None else photo.mask & opaque

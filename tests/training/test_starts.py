@@ -1,0 +1,174 @@
+"""The starts that need no points: random rays and space carving; the choice of starts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.data.decode import ImageSource
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import look_at, transform_points
+from snowsplat.training.config import TrainConfig, changed
+from snowsplat.training.init import initial_count, initial_gaussians, starts_at_random
+from snowsplat.training.starts import carved_points, random_points
+from snowsplat.util.errors import SettingError
+
+SIZE = 64
+RADIUS = 1.0
+
+
+def texture(points: Tensor) -> Tensor:
+    """(…, 3) in 0..1: smooth colours of positions on the unit sphere."""
+    return 0.55 + 0.4 * torch.sin(4.0 * points + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def sphere_in(camera: Camera) -> tuple[Tensor, Tensor]:
+    """The colours (H, W, 3) of the textured unit sphere in a view, and where it is (H, W)."""
+    y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    cam = torch.stack(
+        [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, torch.ones(x.shape)],
+        dim=-1,
+    ).to(torch.float64)
+    start = camera.position.to(torch.float64)
+    ends = transform_points(camera.world_from_cam.to(torch.float64), cam.reshape(-1, 3))
+    ray = torch.nn.functional.normalize(ends - start, dim=1)
+    along = -(ray @ start)
+    discriminant = along**2 - (start @ start - RADIUS**2)
+    hit = start + (along - discriminant.clamp(min=0.0).sqrt())[:, None] * ray
+    shown = (discriminant > 0).reshape(y.shape)
+    return texture(hit.to(torch.float32)).reshape(*y.shape, 3) * shown[..., None], shown
+
+
+def cameras() -> list[Camera]:
+    """Sixteen cameras around the sphere, at two heights."""
+    angles = torch.linspace(0.0, 2.0 * math.pi, 17, dtype=torch.float64)[:16]
+    heights = torch.tensor([-1.2, 1.5], dtype=torch.float64).repeat(8)
+    centres = torch.stack([3.0 * angles.cos(), heights, 3.0 * angles.sin()], dim=1)
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    origin = torch.zeros(3, dtype=torch.float64)
+    return [
+        Camera(SIZE, SIZE, 75.0, 75.0, SIZE / 2, SIZE / 2, look_at(centre, origin, up))
+        for centre in centres
+    ]
+
+
+def written(folder: Path, transparent: bool) -> Dataset:
+    views = []
+    for i, camera in enumerate(cameras()):
+        colors, shown = sphere_in(camera)
+        channels = [255.0 * colors] + [255.0 * shown[..., None]] * transparent
+        pixels = torch.cat(channels, dim=2).round().numpy().astype(np.uint8)
+        Image.fromarray(pixels).save(folder / f"{i}.png")
+        views.append(View(f"{i}", camera, ImageSource(folder / f"{i}.png", SIZE, SIZE)))
+    return Dataset(views, [], None, 3.5)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["transparent", "opaque"])
+def sphere(request, tmp_path_factory) -> Dataset:
+    """Photos of the textured sphere, before a transparent or a black background."""
+    return written(tmp_path_factory.mktemp("sphere"), request.param)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_carved_points_lie_on_the_surface(sphere: Dataset) -> None:
+    points = carved_points(sphere, ImageLoader(sphere.train), 2000, generator())
+    low, high = sphere.bounds
+    voxel = float((high - low).max()) / 96
+    colored = points.rgb.to(torch.int32).amax(1) > 50  # a black background is a consistent shape
+    xyz, rgb = points.xyz[colored], points.rgb[colored]
+    assert len(xyz) > 600
+    distance = xyz.norm(dim=1) - RADIUS
+    assert float(distance.abs().median()) < voxel
+    assert float(distance.abs().quantile(0.9)) < 4 * voxel
+    on_sphere = torch.nn.functional.normalize(xyz, dim=1)
+    assert float((rgb - 255 * texture(on_sphere)).abs().median()) < 20
+
+
+def test_without_a_view_that_shows_it_nothing_is_carved(sphere: Dataset) -> None:
+    points = carved_points(
+        replace(sphere, train=sphere.train[:1]), ImageLoader(sphere.train), 100, generator()
+    )
+    assert len(points) == 0
+
+
+def test_random_points_have_the_colours_of_their_rays(tmp_path: Path) -> None:
+    """A photo whose left half is red; the points of a single view project to their colour."""
+    pixels = np.zeros((48, 64, 3), np.uint8)
+    pixels[:, :32, 0], pixels[:, 32:, 2] = 200, 100
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    camera = Camera(64, 48, 50.0, 50.0, 30.0, 25.0, torch.eye(4, dtype=torch.float64)[:3])
+    view = View("a", camera, ImageSource(tmp_path / "a.png", 64, 48))
+    dataset = Dataset([view], [], None, 1.0)
+    points = random_points(dataset, ImageLoader([view]), 500, generator())
+    assert len(points) == 500
+    pixel, depth = camera.project(points.xyz)
+    assert (depth > 0).all()
+    assert float(depth.max() / depth.min()) > 5
+    left = pixel[:, 0] < 32
+    assert torch.equal(points.rgb[:, 0] == 200, left)
+    assert torch.equal(points.rgb[:, 2] == 100, ~left)
+    assert 180 < int(left.sum()) < 320
+
+
+def test_random_points_are_in_several_views(sphere: Dataset) -> None:
+    points = random_points(sphere, ImageLoader(sphere.train), 400, generator())
+    number = torch.zeros(400)
+    for view in sphere.train:
+        pixel, depth = view.camera.project(points.xyz)
+        number += (depth > 0) & ((pixel >= 0) & (pixel < SIZE)).all(1)
+    assert (number >= 2).all()
+    opaque = points.rgb.to(torch.int32).amax(1) > 20
+    transparent = Image.open(sphere.train[0].image.path).mode == "RGBA"
+    assert bool(opaque.all()) == transparent  # transparent pixels are not used
+
+
+@pytest.mark.parametrize("start", [carved_points, random_points])
+def test_the_same_seed_gives_the_same_points(sphere: Dataset, start) -> None:
+    threads = torch.get_num_threads()
+    clouds = []
+    try:
+        for n, seed in ((1, 0), (3, 0), (1, 1)):
+            torch.set_num_threads(n)
+            clouds.append(start(sphere, ImageLoader(sphere.train), 300, generator(seed)))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(clouds[0].xyz, clouds[1].xyz)
+    assert torch.equal(clouds[0].rgb, clouds[1].rgb)
+    assert not torch.equal(clouds[0].xyz, clouds[2].xyz)
+
+
+def test_starts_are_joined(sphere: Dataset) -> None:
+    points = Points(torch.rand(30, 3), torch.zeros(30, 3, dtype=torch.uint8))
+    dataset = replace(sphere, points=points)
+    config = changed(TrainConfig(), init="points+random", initial_points=0.25, max_gaussians=200)
+    images = ImageLoader(dataset.train)
+    gaussians = initial_gaussians(dataset, config, images, generator(), torch.device("cpu"))
+    assert len(gaussians) == 30 + 50 == initial_count(dataset, config)
+    assert not starts_at_random(dataset, config)
+    assert starts_at_random(dataset, replace(config, init="random"))
+    assert starts_at_random(replace(dataset, points=None), config)
+    assert initial_count(replace(dataset, points=None), replace(config, init="points")) == 50
+
+
+@pytest.mark.parametrize("init", ["", "cloud", "points+", "points,sweep"])
+def test_unknown_starts(init: str) -> None:
+    with pytest.raises(SettingError, match="points, random, carve, sweep"):
+        TrainConfig(init=init)
+
+
+@pytest.mark.parametrize("value", [0, -3, 0.0, 1.5, math.nan])
+def test_unusable_numbers_of_points(value: float) -> None:
+    with pytest.raises(SettingError, match=r"20000 or 0\.4"):
+        TrainConfig(initial_points=value)
