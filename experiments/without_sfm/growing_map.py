@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
-from poses import Poses
+from poses import Poses, exponential
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate
+from torch.nn.functional import interpolate
 
 from snowsplat import ops
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import invert_rigid, transform_points
+from snowsplat.scene.geometry import compose_rigid, invert_rigid, transform_points
 from snowsplat.scene.render import render
 from snowsplat.scene.sh_constants import SH_C0
 
@@ -25,7 +26,9 @@ RATES = {
     "opacity_logits": 3e-2,
     "sh_dc": 8e-3,
 }
-POSE_RATE = 2e-3
+POSE_RATE = 4e-3
+#: Rotations around the optical axis with which tracking starts, in radians.
+ROLLS = (0.0, -0.2, 0.2)
 
 
 def reduced(photo: Tensor, factor: int) -> Tensor:
@@ -53,7 +56,11 @@ def photo_gaussians(
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     depth = 1.0 / inverse_depth
     cam = torch.stack(
-        [(x + 0.5 - camera.cx) / camera.fx * depth, (y + 0.5 - camera.cy) / camera.fy * depth, depth],
+        [
+            (x + 0.5 - camera.cx) / camera.fx * depth,
+            (y + 0.5 - camera.cy) / camera.fy * depth,
+            depth,
+        ],
         dim=2,
     ).reshape(-1, 3)
     means = transform_points(invert_rigid(camera.cam_from_world).to(torch.float32), cam)
@@ -76,8 +83,8 @@ def photo_gaussians(
 def first_depths(photos: list[Tensor], poses: Poses, levels: list[tuple[int, int, int]]) -> Tensor:
     """The inverse depths (H, W) of photo 0, together with the poses of the other photos.
 
-    Everything starts at depth 1 and with equal poses. The inverse depths are those of a coarse grid,
-    interpolated bilinearly, which becomes finer from level to level, and so do the photos.
+    Everything starts at depth 1 and with equal poses. The inverse depths are those of a coarse
+    grid, interpolated bilinearly, which becomes finer from level to level, and so do the photos.
 
     Args:
         levels: for each level, the factor by which photos are reduced, the number of cells along
@@ -92,10 +99,7 @@ def first_depths(photos: list[Tensor], poses: Poses, levels: list[tuple[int, int
         optimizer = torch.optim.Adam(
             [{"params": [grid], "lr": 0.02}, {"params": [poses.motion], "lr": POSE_RATE}]
         )
-        camera = poses.camera_of(0, factor)
-        camera = Camera(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, poses.base[0]
-        )
+        camera = replace(poses.camera_of(0, factor), cam_from_world=poses.base[0])
         small = [reduced(photo, factor) for photo in photos]
         for step in range(steps):
             log_inverse = interpolate(
@@ -132,28 +136,44 @@ class GrowingMap:
     photos: list[Tensor]
     gaussians: Gaussians
 
-    def track(self, i: int, levels: list[tuple[int, int]]) -> None:
-        """Estimate the pose of photo i with constant Gaussians, from the motion before it."""
+    def track(self, i: int, levels: list[tuple[int, int]]) -> float:
+        """Estimate the pose of photo i with constant Gaussians; returns the loss.
+
+        The first level starts from several motions: that of the photo before times 0, 1 and 2, each
+        also with a rotation around the optical axis, because cameras in a hand roll.
+
+        Args:
+            levels: the factor by which the photo is reduced, and the number of steps.
+        """
         base = self.poses.base
-        with torch.no_grad():
-            if i >= 2:
-                step = compose(base[i - 1], invert_rigid(base[i - 2]))
-                base[i] = compose(step, base[i - 1])
-            else:
-                base[i] = base[i - 1]
+        step = compose_rigid(base[i - 1], invert_rigid(base[i - 2]))
+        still = base[i - 1].clone()
+        moved = compose_rigid(step, still)
+        rolls = [exponential(torch.tensor([0.0, 0.0, r, 0.0, 0.0, 0.0]).double()) for r in ROLLS]
+        found = []
+        for start, roll in product((still, moved, compose_rigid(step, moved)), rolls):
+            base[i] = compose_rigid(roll, start)
+            found.append((self.align(i, *levels[0]), base[i].clone()))
+        base[i] = min(found, key=lambda each: each[0])[1]
+        return [self.align(i, *level) for level in levels[1:]][-1]
+
+    def align(self, i: int, factor: int, steps: int) -> float:
+        """Optimise the pose of photo i, reduced by a factor, with constant Gaussians."""
         frozen = self.gaussians.detach()
-        for factor, steps in levels:
-            rate = POSE_RATE * (1.0 if factor > 1 else 0.5)
-            optimizer = torch.optim.Adam([self.poses.motion], lr=rate)
-            target = reduced(self.photos[i], factor)
-            for _ in range(steps):
-                output = render(frozen, self.poses.camera_of(i, factor))
-                covered = (output.alpha > 0.9).detach()[..., None]
-                loss = image_loss(output.image, torch.where(covered, target, output.image.detach()))
-                optimizer.zero_grad()
-                loss.backward()
-                optimizer.step()
-            self.poses.fold()
+        optimizer = torch.optim.Adam([self.poses.motion])
+        target = reduced(self.photos[i], factor)
+        for step in range(steps):
+            rate = 0.5 * POSE_RATE * factor * 0.1 ** (step / steps)
+            optimizer.param_groups[0]["lr"] = rate
+            output = render(frozen, self.poses.camera_of(i, factor))
+            covered = (output.alpha > 0.9).detach()[..., None]
+            loss = image_loss(output.image, torch.where(covered, target, output.image.detach()))
+            loss = loss / covered.float().mean().clamp(min=0.1)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        self.poses.fold()
+        return float(loss.detach())
 
     @torch.no_grad()
     def extend(self, i: int) -> int:
@@ -193,12 +213,6 @@ class GrowingMap:
         self.gaussians = Gaussians(**{n: t.detach() for n, t in parameters.items()}, sh_rest=rest)
         keep = self.gaussians.opacities > 0.05
         self.gaussians = self.gaussians.select(keep)
-
-
-def compose(a: Tensor, b: Tensor) -> Tensor:
-    from snowsplat.scene.geometry import compose_rigid
-
-    return compose_rigid(a, b)
 
 
 def filled(image: Tensor) -> Tensor:

@@ -24,6 +24,12 @@ class Poses:
         self.base = identity.repeat(count, 1, 1)  # (N, 3, 4), cam_from_world
         self.motion = torch.zeros(count, 6, dtype=torch.float64, requires_grad=True)
 
+    def part(self, count: int) -> Poses:
+        """The poses of the first photos; ``base`` shares its memory."""
+        part = Poses(self.camera, count)
+        part.base = self.base[:count]
+        return part
+
     def pose(self, i: int) -> Tensor:
         """(3, 4), differentiable with respect to ``motion``."""
         return compose_rigid(exponential(self.motion[i]), self.base[i])
