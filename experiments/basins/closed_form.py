@@ -114,9 +114,7 @@ def travel_time(
 def reach(time: float, sigma: float, tau: float, a: float = 1.0, A: float = 1.0) -> float:
     """The distance from which gradient flow arrives at d = ρ/10 in the given time."""
     rho = math.hypot(sigma, tau)
-    return _largest(
-        lambda d: travel_time(d, rho / 10, sigma, tau, a, A) < time, rho / 10, 20 * rho
-    )
+    return _largest(lambda d: travel_time(d, rho / 10, sigma, tau, a, A) < time, rho / 10, 20 * rho)
 
 
 def visible_distance(

@@ -1,83 +1,89 @@
 """Rules that add, move and remove Gaussians, with a fixed number of slots for each restart.
 
-The rules are those of 3D Gaussian Splatting, as far as they make sense for a sum of Gaussians on a
-line: the amplitude has the role of the opacity.
+They are the rules of 3D Gaussian Splatting, as far as they make sense for a sum of Gaussians: the
+amplitude has the role of the opacity.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
-from fit import Population
-from targets import AMPLITUDE, LOG_SIGMA, MEAN, Target, evaluate
+from fit import Population, decay
+from targets import AMPLITUDE, LOG_SIGMA, MEAN, Target
 from torch import Tensor
 
-#: A Gaussian with a smaller amplitude is dead. Targets have amplitudes of 0.5 to 1.
+#: A Gaussian with a smaller amplitude is dead. The targets have amplitudes of 0.5 to 1.
 DEAD = 0.05
-#: Number of steps between two changes, and the part of the steps in which there are changes.
-_INTERVAL = 50
-_UNTIL = 0.6
+_UNTIL = 0.6  # of the steps
 
 
-def _due(step: int, share: float) -> bool:
-    return step > 0 and step % _INTERVAL == 0 and share < _UNTIL
+@dataclass(frozen=True)
+class Changes:
+    """When a rule acts.
 
+    Attributes:
+        interval: number of steps between two changes.
+        count: at each change, at most this number of Gaussians of each restart is changed.
+    """
 
-def _dead(population: Population) -> Tensor:
-    """(B, K): slots without a Gaussian, or with one that is nearly invisible."""
-    return ~population.alive | (population.parameters[..., AMPLITUDE].abs() < DEAD)
+    interval: int = 50
+    count: int = 1
 
-
-def _draw(weights: Tensor, generator: torch.Generator) -> Tensor:
-    """(B,): a column of each row of weights (B, W), with a proportional probability."""
-    return torch.multinomial(weights + 1e-300, 1, generator=generator)[:, 0]
+    def due(self, step: int, share: float) -> bool:
+        """Whether there is a change after this step."""
+        return step > 0 and step % self.interval == 0 and share < _UNTIL
 
 
 @dataclass
 class CloneAndSplit:
-    """Kerbl et al. 2023: the Gaussian with the largest mean |∂L/∂μ| is cloned or split.
+    """Kerbl et al. 2023: Gaussians with the largest mean |∂L/∂μ| are cloned or split.
 
-    Dead Gaussians are removed. At each change, a restart with a free slot gets one more Gaussian.
-    A clone is at the same place. Both have half of the amplitude, so that the sum is unchanged (the
-    paper keeps the opacity), and they separate because the averages of Adam are 0 for the clone.
+    Dead Gaussians are removed, and free slots are filled. A clone is at the same place, with half
+    of the amplitude for each, so that the sum is unchanged (the paper keeps the opacity). Both
+    separate because the averages of Adam are 0 for the clone.
 
     Attributes:
         generator: for the positions of children.
-        large: a Gaussian that is wider than this is split into two, of 1/1.6 of its width.
+        large: a wider Gaussian is split into two, with 1/1.6 of its width.
     """
 
     generator: torch.Generator
     large: float = 1.0
+    changes: Changes = field(default_factory=Changes)
     _sum: Tensor | None = None
 
     def after_step(self, step: int, share: float, population: Population, grad: Tensor) -> None:
-        size = grad[..., MEAN].abs()
-        self._sum = size if self._sum is None else self._sum + size
-        if not _due(step, share):
+        norm = grad[..., MEAN].norm(dim=-1)
+        self._sum = norm if self._sum is None else self._sum + norm
+        if not self.changes.due(step, share):
             return
         dead = _dead(population)
-        dead[dead.all(dim=1)] = ~population.alive[dead.all(dim=1)]  # the last ones stay
+        dead[dead.all(dim=1)] = False
         population.alive &= ~dead
         population.parameters[..., AMPLITUDE] *= population.alive
-        rows = (~population.alive).any(dim=1).nonzero()[:, 0]
-        slots = (~population.alive[rows]).int().argmax(dim=1)
-        parents = (self._sum * population.alive)[rows].argmax(dim=1)
-        self._sum = None
-        child = population.parameters[rows, parents]
-        wide = child[:, LOG_SIGMA] > math.log(self.large)
-        offsets = torch.randn(2, len(rows), generator=self.generator, dtype=child.dtype)
-        offsets *= child[:, LOG_SIGMA].exp() * wide
-        shrink = math.log(1.6) * wide
-        share_of_amplitude = torch.where(wide, 1.0, 0.5)
-        pair = []
-        for offset in offsets:
-            mean, log_sigma, amplitude = child.unbind(dim=1)
-            columns = [mean + offset, log_sigma - shrink, amplitude * share_of_amplitude]
-            pair.append(torch.stack(columns, dim=1))
-        population.parameters[rows, parents] = pair[0]
-        population.put(rows, slots, pair[1])
+        score, self._sum = self._sum * population.alive, None
+        for _ in range(self.changes.count):
+            free = ~population.alive
+            rows = (free.any(dim=1) & (score > 0).any(dim=1)).nonzero()[:, 0]
+            slots, parents = free[rows].int().argmax(dim=1), score[rows].argmax(dim=1)
+            score[rows, parents] = 0
+            first, second = self._children(population.parameters[rows, parents])
+            population.parameters[rows, parents] = first
+            population.put(rows, slots, second)
+
+    def _children(self, parents: Tensor) -> tuple[Tensor, Tensor]:
+        wide = parents[:, LOG_SIGMA] > math.log(self.large)
+        children = []
+        for _ in range(2):
+            child = parents.clone()
+            xi = torch.randn(child[:, MEAN].shape, generator=self.generator, dtype=child.dtype)
+            child[:, MEAN] += (child[:, LOG_SIGMA].exp() * wide)[:, None] * xi
+            child[:, LOG_SIGMA] -= math.log(1.6) * wide
+            child[:, AMPLITUDE] *= torch.where(wide, 1.0, 0.5)
+            children.append(child)
+        return children[0], children[1]
 
 
 @dataclass
@@ -96,20 +102,21 @@ class Mcmc:
     generator: torch.Generator
     noise: float
     relocate: bool = True
+    changes: Changes = field(default_factory=Changes)
 
     def after_step(self, step: int, share: float, population: Population, grad: Tensor) -> None:
         p = population.parameters
-        amount = self.noise * (0.5 + 0.5 * math.cos(math.pi * share))
-        xi = torch.randn(p.shape[:2], generator=self.generator, dtype=p.dtype)
-        p[..., MEAN] += amount * p[..., LOG_SIGMA].exp() * xi
-        if not self.relocate or not _due(step, share):
+        xi = torch.randn(p[..., MEAN].shape, generator=self.generator, dtype=p.dtype)
+        p[..., MEAN] += self.noise * decay(share) * p[..., LOG_SIGMA].exp()[..., None] * xi
+        if not self.relocate or not self.changes.due(step, share):
             return
-        dead = _dead(population)
-        rows = (dead.any(dim=1) & ~dead.all(dim=1)).nonzero()[:, 0]
-        slots = dead[rows].int().argmax(dim=1)
-        parents = _draw(p[rows, :, AMPLITUDE].abs() * ~dead[rows], self.generator)
-        p[rows, parents, AMPLITUDE] /= 2
-        population.put(rows, slots, p[rows, parents])
+        for _ in range(self.changes.count):
+            dead = _dead(population)
+            rows = (dead.any(dim=1) & ~dead.all(dim=1)).nonzero()[:, 0]
+            slots = dead[rows].int().argmax(dim=1)
+            parents = _draw(p[rows, :, AMPLITUDE].abs() * ~dead[rows], self.generator)
+            p[rows, parents, AMPLITUDE] /= 2
+            population.put(rows, slots, p[rows, parents])
 
 
 @dataclass
@@ -121,23 +128,37 @@ class Refill:
     Attributes:
         generator: of the places.
         target: the signal.
-        x: (P,) the positions that are drawn.
         sigma: the width with which a Gaussian begins.
     """
 
     generator: torch.Generator
     target: Target
-    x: Tensor
     sigma: float = 1.0
+    changes: Changes = field(default_factory=Changes)
 
     def after_step(self, step: int, share: float, population: Population, grad: Tensor) -> None:
-        if not _due(step, share):
+        if not self.changes.due(step, share):
             return
-        dead = _dead(population)
-        rows = dead.any(dim=1).nonzero()[:, 0]
-        slots = dead[rows].int().argmax(dim=1)
-        error = (self.target.value(self.x) - evaluate(population.parameters, self.x))[rows]
-        place = _draw(error**2, self.generator)
-        amplitude = error.gather(1, place[:, None])[:, 0] / 2
-        columns = [self.x[place], torch.full_like(amplitude, math.log(self.sigma)), amplitude]
-        population.put(rows, slots, torch.stack(columns, dim=1))
+        places = self.target.places()
+        for _ in range(self.changes.count):
+            dead = _dead(population)
+            rows = dead.any(dim=1).nonzero()[:, 0]
+            if len(rows) == 0:
+                return
+            slots = dead[rows].int().argmax(dim=1)
+            error = self.target.residual(population.parameters)[rows]
+            index = _draw(error**2, self.generator)
+            amplitude = error.gather(1, index[:, None]) / 2
+            log_sigma = torch.full_like(amplitude, math.log(self.sigma))
+            population.put(rows, slots, torch.cat([places[index], log_sigma, amplitude], dim=1))
+
+
+def _dead(population: Population) -> Tensor:
+    """(B, K): slots without a Gaussian, or with one that is nearly invisible."""
+    return ~population.alive | (population.parameters[..., AMPLITUDE].abs() < DEAD)
+
+
+def _draw(weights: Tensor, generator: torch.Generator) -> Tensor:
+    """(B,): a column of each row of weights (B, W), with a proportional probability."""
+    smallest = torch.finfo(weights.dtype).tiny  # all weights may be 0
+    return torch.multinomial(weights + smallest, 1, generator=generator)[:, 0]
