@@ -41,7 +41,7 @@ def site() -> Path:
     sources = [*ROOT.glob("*/README.md"), *ROOT.glob("third_party/mathjax-*"), *included]
     for folder in ("docs", "src"):
         files = (ROOT / folder).rglob("*")
-        sources += [file for file in files if file.suffix in (".css", ".md", ".py", ".svg")]
+        sources += [file for file in files if file.suffix in (".css", ".js", ".md", ".py", ".svg")]
     return cached("docs-site", sources, build) / "html"
 
 

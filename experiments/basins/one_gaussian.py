@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from functools import cache
 
 import torch
 from closed_form import escape_time, overlap, reach, visible_distance
@@ -44,29 +44,29 @@ def _successes(start: Tensor, target: Mixture, options: Options, per: int) -> Te
     return good.reshape(-1, per)
 
 
+@cache
+def _best_rate(optimizer: str, n: int, only_means: bool, steps: int) -> float:
+    """The rate with the most successes from all distances."""
+    start = starts(_DISTANCES, (0.5, 2.0), 20, _CHOOSE)
+    target = Mixture(_DOMAIN, _TARGET, n)
+
+    def successes(rate: float) -> float:
+        options = Options(optimizer, rate, steps=steps, only_means=only_means)
+        return float(_successes(start, target, options, 20).double().mean())
+
+    return max(_RATES[optimizer], key=successes)
+
+
 def basin(trials: int, steps: int) -> Iterator[Row]:
     """P(success) by distance, for each optimiser, in one to three dimensions."""
     for n in (1, 2, 3):
         target = Mixture(_DOMAIN, _TARGET, n)
-        for optimizer, rates in _RATES.items():
+        start = starts(_DISTANCES, (0.5, 2.0), trials, seed=n)
+        for optimizer in _RATES:
             for only_means in (True, False):
-                options = Options(optimizer, steps=steps, only_means=only_means)
-                choose = starts(_DISTANCES, (0.5, 2.0), max(trials // 5, 2), _CHOOSE)
-                per = max(trials // 5, 2)
-
-                def score(
-                    rate: float,
-                    choose: Tensor = choose,
-                    target: Mixture = target,
-                    options: Options = options,
-                    per: int = per,
-                ) -> float:
-                    good = _successes(choose, target, replace(options, rate=rate), per)
-                    return float(good.double().mean())
-
-                rate = max(rates, key=score)
-                start = starts(_DISTANCES, (0.5, 2.0), trials, seed=n)
-                good = _successes(start, target, replace(options, rate=rate), trials)
+                rate = _best_rate(optimizer, n, only_means, steps)
+                options = Options(optimizer, rate, steps=steps, only_means=only_means)
+                good = _successes(start, target, options, trials)
                 for d, row in zip(_DISTANCES.tolist(), good, strict=True):
                     settings = {"n": n, "optimizer": optimizer, "only_means": only_means}
                     yield probability(row, study="basin", **settings, rate=rate, distance=d)
@@ -95,7 +95,8 @@ def width(trials: int, steps: int) -> Iterator[Row]:
     """P(success) by the width at the start, for distances uniform in 0..10."""
     random = torch.Generator().manual_seed(11)
     for n in (1, 2):
-        for optimizer, rate in (("gradient descent", 1.0 if n == 1 else 0.3), ("Adam", 0.1)):
+        for optimizer in ("gradient descent", "Adam"):
+            rate = _best_rate(optimizer, n, False, steps)
             for exponent in range(-2, 10):
                 sigma = 2 ** (exponent / 2)
                 d = 10 * torch.rand(4 * trials, generator=random, dtype=torch.float64)
@@ -110,12 +111,15 @@ def blur(trials: int, steps: int) -> Iterator[Row]:
     """P(success) by distance, if the target is blurred at first (coarse to fine)."""
     distances = torch.arange(0, 20.5, 1.0, dtype=torch.float64)
     start = starts(distances, (0.5, 2.0), trials, seed=5)
-    for optimizer, rate in (("gradient descent", 1.0), ("Adam", 0.1)):
+    for optimizer in ("gradient descent", "Adam"):
+        rate = _best_rate(optimizer, 1, False, steps)
         for s in (0.0, 2.0, 4.0, 8.0):
             options = Options(optimizer, rate, steps=steps, blur=s)
             good = _successes(start, Mixture(_DOMAIN, _TARGET), options, trials)
             for d, row in zip(distances.tolist(), good, strict=True):
-                yield probability(row, study="blur", optimizer=optimizer, blur=s, distance=d)
+                yield probability(
+                    row, study="blur", optimizer=optimizer, rate=rate, blur=s, distance=d
+                )
 
 
 def adam_limits(trials: int, steps: int) -> Iterator[Row]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,10 +18,19 @@ a, A, TAU = 0.7, 1.3, 1.2
 
 
 @pytest.fixture(scope="module")
-def closed_form():
+def experiment():
+    """A function that imports a module of the experiment."""
+    folder = ROOT / "experiments" / "basins"
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT / "experiments" / "basins")
-        yield importlib.import_module("closed_form")
+        patch.syspath_prepend(folder)
+        yield importlib.import_module
+    for file in folder.glob("*.py"):
+        sys.modules.pop(file.stem, None)
+
+
+@pytest.fixture(scope="module")
+def closed_form(experiment):
+    return experiment("closed_form")
 
 
 def grid(n: int) -> tuple[torch.Tensor, float]:
@@ -235,3 +245,133 @@ def test_a_blurred_target_is_a_wider_and_lower_gaussian(closed_form):
     pull = closed_form.position_gradient(d, 0.8, wide, A=TAU / wide)
     expected = math.sqrt(0.8**2 + TAU**2 + s**2)
     assert float(d[pull.argmax()]) == pytest.approx(expected, abs=2e-3)
+
+
+# The code of the experiment.
+
+
+def test_the_losses_of_signals_are_the_integrals(experiment):
+    """The loss of a sum of Gaussians without a grid; for mixtures and boxes, with blur."""
+    targets = experiment("targets")
+    x = torch.arange(-40, 60, 0.01, dtype=torch.float64)
+    model = torch.tensor([[[1.0, 0.2, 0.8], [4.0, -0.4, -0.3]]], dtype=torch.float64)
+    mixture = torch.tensor([[[0.0, 0.0, 1.0], [5.0, 0.3, 0.6]]], dtype=torch.float64)
+    edges = torch.tensor([[1.0], [6.0]], dtype=torch.float64)
+    signals = [targets.Mixture((0.0, 10.0), mixture), targets.Box((0.0, 10.0), *edges)]
+    for signal in signals:
+        value = signal.value(x)[0]
+        error = targets.evaluate(model, x)[0] - value
+        expected = float(error.square().sum() / value.square().sum())
+        assert float(signal.relative_error(model)[0]) == pytest.approx(expected, rel=5e-3)
+        places = signal.places()[:, 0]
+        assert torch.allclose(
+            signal.residual(model), signal.value(places) - targets.evaluate(model, places)
+        )
+        # With blur: only the product with the target changes.
+        kernel = torch.exp(-(torch.arange(-8, 8, 0.01, dtype=torch.float64) ** 2) / (2 * 1.5**2))
+        kernel /= kernel.sum()
+        blurred = torch.nn.functional.conv1d(value[None, None], kernel[None, None], padding=800)
+        blurred = blurred[0, 0, : len(x)]
+        product = targets.evaluate(model, x)[0] * (value - blurred)
+        difference = float(signal.loss(model, 1.5) - signal.loss(model, 0.0))
+        assert difference == pytest.approx(float(product.sum()) * 0.01, abs=5e-3)
+
+
+@pytest.mark.parametrize("optimizer", ["gradient descent", "momentum", "Adam"])
+def test_fits_arrive_from_near_and_not_from_far(experiment, optimizer):
+    fit, targets = experiment("fit"), experiment("targets")
+    target = targets.Mixture((-9.0, 9.0), torch.tensor([[[0.0, 0.0, 1.0]]], dtype=torch.float64))
+    start = torch.tensor([[[1.5, 0.3, 0.6]], [[9.0, 0.3, 0.6]]], dtype=torch.float64)
+    rate = {"gradient descent": 0.3, "momentum": 0.05, "Adam": 0.03}[optimizer]
+    error = target.relative_error(fit.fit(start, target, fit.Options(optimizer, rate, steps=400)))
+    assert float(error[0]) < 1e-3
+    assert float(error[1]) > 0.5
+
+
+def test_adam_is_that_of_torch(experiment):
+    fit, targets = experiment("fit"), experiment("targets")
+    target = targets.Mixture((-9.0, 9.0), torch.tensor([[[0.0, 0.0, 1.0]]], dtype=torch.float64))
+    start = torch.tensor([[[1.5, 0.3, 0.6]]], dtype=torch.float64)
+    found = fit.fit(start, target, fit.Options("Adam", 0.05, steps=40, eps=1e-8))
+    p = start.clone().requires_grad_()
+    optimizer = torch.optim.Adam([p], lr=0.05)
+    for step in range(40):
+        optimizer.param_groups[0]["lr"] = 0.05 * fit.decay(step / 40)
+        optimizer.zero_grad()
+        target.loss(p, 0.0).sum().backward()
+        optimizer.step()
+    assert torch.allclose(found, p.detach(), atol=1e-12)
+
+
+def population(experiment, rows, alive=None):
+    p = torch.tensor([rows], dtype=torch.float64)
+    alive = torch.ones(p.shape[:2], dtype=torch.bool) if alive is None else torch.tensor([alive])
+    return experiment("fit").Population(p, alive)
+
+
+def test_clone_keeps_the_sum_and_split_makes_smaller_children(experiment):
+    density = experiment("density")
+    for log_sigma, shrink in ((-1.0, 0.0), (1.0, math.log(1.6))):
+        some = population(experiment, [[0.0, log_sigma, 0.8], [0, 0, 0]], [True, False])
+        some.first[:], some.second[:] = 1.0, 1.0
+        rule = density.CloneAndSplit(torch.Generator().manual_seed(0))
+        rule.after_step(50, 0.1, some, torch.ones_like(some.parameters))
+        assert bool(some.alive.all())
+        mean, scale, amplitude = some.parameters[0].unbind(dim=1)
+        assert scale.tolist() == pytest.approx([log_sigma - shrink] * 2)
+        if shrink:
+            assert float(mean[0]) != float(mean[1])
+        else:
+            assert mean.tolist() == [0.0, 0.0]
+            assert float(amplitude.sum()) == pytest.approx(0.8)
+        assert not some.first[0, 1].any()
+        assert some.first[0, 0].all()
+
+
+def test_mcmc_moves_dead_gaussians_and_keeps_the_sum(experiment):
+    some = population(experiment, [[0.0, 0.0, 0.8], [9.0, 0.0, 0.001]])
+    rule = experiment("density").Mcmc(torch.Generator().manual_seed(0), noise=0.0)
+    rule.after_step(50, 0.1, some, torch.zeros_like(some.parameters))
+    assert some.parameters[0].tolist() == [[0.0, 0.0, 0.4]] * 2
+    rule.noise = 0.1
+    rule.after_step(51, 0.1, some, torch.zeros_like(some.parameters))
+    assert 0 < float(some.parameters[0, :, 0].abs().max()) < 1
+
+
+def test_refill_puts_a_dead_gaussian_where_the_error_is(experiment):
+    targets = experiment("targets")
+    wanted = torch.tensor([[[2.0, 0.0, 1.0], [8.0, 0.0, 0.9]]], dtype=torch.float64)
+    some = population(experiment, [[2.0, 0.0, 1.0], [5.0, 0.0, 0.0]])
+    target = targets.Mixture((0.0, 10.0), wanted)
+    rule = experiment("density").Refill(torch.Generator().manual_seed(0), target, sigma=0.7)
+    rule.after_step(50, 0.1, some, torch.zeros_like(some.parameters))
+    mean, log_sigma, amplitude = some.parameters[0, 1].tolist()
+    assert abs(mean - 8) < 3
+    assert log_sigma == pytest.approx(math.log(0.7))
+    assert amplitude == pytest.approx(0.45 * math.exp(-((mean - 8) ** 2) / 2), rel=1e-6)
+
+
+def test_the_rasterizer_of_the_images(experiment):
+    """It draws Gaussians with any amplitude, and cuts them off at 1/255."""
+    images = experiment("images")
+    rows = torch.tensor([[30.2, 33.7, math.log(3), 1.0], [12.0, 40.0, math.log(2), -0.5]])
+    image = images.draw(rows)
+    exact = torch.zeros_like(image)
+    for x, y, log_sigma, amplitude in rows.tolist():
+        shape = torch.exp(-(images._radius(x, y) ** 2) / (2 * math.exp(2 * log_sigma)))
+        exact += amplitude * torch.where(shape >= 1 / 255, shape, torch.zeros_like(shape))
+    assert torch.allclose(image, exact, atol=1e-3)
+    p = rows[:1].clone().requires_grad_()
+    far = images.Picture(images.draw(torch.tensor([[30.2 + 3 * 6.8, 33.7, math.log(3), 1.0]])))
+    grad = torch.autograd.grad(far.loss(p[None], 0.0).sum(), p)[0]
+    assert grad[0, :2].abs().max() < 1e-4  # only from its own sampling
+    assert grad[0, 3] > 1  # the amplitude decreases
+
+
+def test_wilson_interval(experiment):
+    wilson = experiment("result").wilson
+    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-3)
+    assert wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-3)
+    low, high = wilson(300, 300)
+    assert low > 0.98
+    assert high == pytest.approx(1.0)

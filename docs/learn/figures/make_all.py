@@ -7,6 +7,7 @@ import density_control
 import gaussian
 import gradients
 import history
+import initialisation
 import ply
 import projection
 import rasterizer
@@ -23,6 +24,7 @@ for module in (
     gradients,
     rasterizer,
     reference_walk,
+    initialisation,
     density_control,
     ply,
     history,
