@@ -15,12 +15,13 @@ from torch import Tensor
 RULES = ("none", "clone and split", "noise", "MCMC", "refill")
 SPACING = 5.0  # the length of the line for each target
 _CHOOSE = 1000
+_STARTS = 10_000  # starts and targets with the same seed would have the same random positions
 _RATES = {
     "gradient descent": (0.1, 0.3, 1.0),
     "momentum": (0.03, 0.1, 0.3),
     "Adam": (0.03, 0.1, 0.3),
 }
-_NOISES = (0.01, 0.03, 0.1)
+_NOISES = (0.01, 0.03, 0.1, 0.3)
 
 
 def mixture(restarts: int, k: int, seed: int) -> Mixture:
@@ -66,7 +67,7 @@ def run(
     They begin in the first `share` of the line. Clone-and-split begins with half of the Gaussians.
     The width at the start is half of the mean distance of the Gaussians on the whole line.
     """
-    random = torch.Generator().manual_seed(seed)
+    random = torch.Generator().manual_seed(_STARTS + seed)
     start = random_start(restarts, count, share * length, length / count / 2, random)
     alive = torch.ones(restarts, count, dtype=torch.bool)
     density: DensityControl | None = None

@@ -375,3 +375,14 @@ def test_wilson_interval(experiment):
     low, high = wilson(300, 300)
     assert low > 0.98
     assert high == pytest.approx(1.0)
+
+
+def test_starts_do_not_know_the_targets(experiment, monkeypatch):
+    """Starts and targets have different random positions, although both have the same seed."""
+    mixtures, options = experiment("mixtures"), experiment("fit").Options()
+    target, starts = mixtures.mixture(50, 6, seed=0), []
+    monkeypatch.setattr(mixtures, "fit", lambda start, *_, **__: starts.append(start) or start)
+    mixtures.run(target, 50, 6, options, 0)
+    mean = starts[0][..., 0]
+    # Independent positions in 0..30 have a mean distance of 10.
+    assert float((mean - target.parameters[..., 0]).abs().mean()) == pytest.approx(10, abs=1.5)
