@@ -168,16 +168,16 @@
   }
 
   function drawLoss() {
-    const x = i => 44 + i / STEPS * 276, y = e => 22 + -Math.log10(Math.max(e, 1e-4)) / 4 * 110;
+    const x = i => 50 + i / STEPS * 270, y = e => 22 + -Math.log10(Math.max(e, 1e-4)) / 4 * 110;
     let svg = text(2, 12, "relative error") + text(320, 166, "steps", 'text-anchor="end"');
     [1, 0.1, 0.01, 0.001, 0.0001].forEach(e => {
-      svg += curve(`M44 ${y(e)}H320`, "line", "", 1) +
-        text(38, y(e) + 4, e, 'text-anchor="end"');
+      svg += curve(`M50 ${y(e)}H320`, "line", "", 1) +
+        text(44, y(e) + 4, e, 'text-anchor="end"');
     });
     [0, STEPS / 2, STEPS].forEach(i => { svg += text(x(i), 150, i, 'text-anchor="middle"'); });
     const points = errors.map((e, i) => `${x(i).toFixed(1)} ${y(Math.min(e, 1.5)).toFixed(1)}`);
     if (points.length) svg += curve(`M${points.join("L")}`, "blue");
-    lossPanel.innerHTML = svg + curve(`M44 ${y(FOUND)}H320`, "green", 'stroke-dasharray="4 4"');
+    lossPanel.innerHTML = svg + curve(`M50 ${y(FOUND)}H320`, "green", 'stroke-dasharray="4 4"');
   }
 
   function drawPull() {

@@ -78,7 +78,8 @@ def near_and_far() -> None:
 def loss_and_pull() -> None:
     d = np.linspace(-8, 8, 321)
     loss = Drawing(330, 220, x=(-8, 8), y=(0, 1.1), margins=(40, 26, 10, 40))
-    loss.axes("distance d", "loss / largest loss", counts=(5, 5))
+    ticks = [(v, str(v).replace("-", "−")) for v in (-8, -4, 0, 4, 8)]
+    loss.axes("distance d", "loss / largest loss", x_ticks=ticks, counts=(5, 5))
     pull = Drawing(330, 220, x=(0, 8), y=(0, 1.1), margins=(40, 26, 10, 40))
     pull.axes("distance d", "pull / largest pull", counts=(5, 5))
     names = {}
@@ -118,14 +119,15 @@ def widths() -> None:
 
 
 def blurs() -> None:
-    panel = probability_panel((0, 20), "distance of the start, in σ of the target")
-    names = {}
-    for s, colour in ((0.0, "soft"), (2.0, "blue"), (4.0, "green"), (8.0, "orange")):
-        points = rows("blur", optimizer="gradient descent", blur=s)
-        curve(panel, points, "distance", colour)
-        names["no blur" if s == 0 else f"s = {s:g}"] = colour
-    legend(panel, names)
-    panel.save("initialisation-blur", "Success by distance, for four amounts of blur")
+    for name, optimizer in (("descent", "gradient descent"), ("adam", "Adam")):
+        panel = probability_panel((0, 12), "distance of the start, in σ of the target")
+        names = {}
+        for s, colour in ((0.0, "soft"), (2.0, "blue"), (4.0, "green"), (8.0, "orange")):
+            points = [r for r in rows("blur", optimizer=optimizer, blur=s) if r["distance"] <= 12]
+            curve(panel, points, "distance", colour)
+            names["no blur" if s == 0 else f"s = {s:g}"] = colour
+        legend(panel, names)
+        panel.save(f"initialisation-blur-{name}", f"Success by distance and blur, {optimizer}")
 
 
 def counts() -> None:
@@ -168,10 +170,10 @@ def pictures() -> None:
         draw(picture_fit(Picture(image), "corner", rule, seed=0)[0]).detach().clamp(0, 1)
         for rule in ("none", "clone and split", "refill")
     ]
-    for name, row in (("targets", targets), ("fits", torch.cat(fits, dim=1))):
+    for name, row in (("targets-2d", targets), ("fits", torch.cat(fits, dim=1))):
         panel = Drawing(330, 112, x=(0, 3), y=(0, 1), margins=(0, 0, 0, 0))
         panel.picture(row[..., None].expand(-1, -1, 3).numpy(), (0, 0), (3, 1), pixelated=True)
-        words = "A ring, blobs, a landscape" if name == "targets" else "Three fits of the landscape"
+        words = "A ring, blobs, a landscape" if name != "fits" else "Three fits of the landscape"
         panel.save(f"initialisation-{name}", words)
 
 
