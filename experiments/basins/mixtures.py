@@ -19,7 +19,7 @@ _STARTS = 10_000  # starts and targets with the same seed would have the same ra
 _RATES = {
     "gradient descent": (0.1, 0.3, 1.0),
     "momentum": (0.03, 0.1, 0.3),
-    "Adam": (0.03, 0.1, 0.3),
+    "Adam": (0.03, 0.1, 0.3, 1.0),
 }
 _NOISES = (0.01, 0.03, 0.1, 0.3)
 

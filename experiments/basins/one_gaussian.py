@@ -14,9 +14,9 @@ from targets import MEAN, Mixture
 from torch import Tensor
 
 _RATES = {
-    "gradient descent": (0.1, 0.3, 1.0, 2.0),
-    "momentum": (0.03, 0.1, 0.3, 1.0),
-    "Adam": (0.01, 0.03, 0.1, 0.3),
+    "gradient descent": (0.1, 0.3, 1.0, 2.0, 3.0),
+    "momentum": (0.01, 0.03, 0.1, 0.3, 1.0, 3.0),
+    "Adam": (0.003, 0.01, 0.03, 0.1, 0.3),
 }
 _DISTANCES = torch.arange(0, 10.25, 0.5, dtype=torch.float64)
 _TARGET = torch.tensor([[[0.0, 0.0, 1.0]]], dtype=torch.float64)

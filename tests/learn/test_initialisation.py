@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -386,3 +388,105 @@ def test_starts_do_not_know_the_targets(experiment, monkeypatch):
     mean = starts[0][..., 0]
     # Independent positions in 0..30 have a mean distance of 10.
     assert float((mean - target.parameters[..., 0]).abs().mean()) == pytest.approx(10, abs=1.5)
+
+
+# The numbers of the page.
+
+
+def results(study: str, **values: object) -> list[dict]:
+    path = ROOT / "experiments" / "basins" / "results.json"
+    rows = [row for row in json.loads(path.read_text("utf-8")) if row["study"] == study]
+    return [row for row in rows if all(row[name] == value for name, value in values.items())]
+
+
+def page() -> str:
+    """The text of the page, with single spaces."""
+    text = (ROOT / "docs" / "learn" / "initialisation.md").read_text("utf-8")
+    return re.sub(r"\s+", " ", text)
+
+
+def percent(study: str, **values: object) -> str:
+    (row,) = results(study, **values)
+    return f"{100 * float(row['share']):.0f}%"
+
+
+def test_the_tables_of_the_page():
+    text = page()
+    travel = {}
+    for row in results("travel"):
+        assert row["measured"] == pytest.approx(row["expected"], abs=0.04)
+        travel[round(row["steps"] * row["rate"])] = row["expected"]
+    reach = " | ".join(f"{travel[work]:.2f}" for work in (10, 100, 1000, 10_000))
+    assert f"| reach, by the formula | {reach} |" in text
+    for row in results("adam", dtype="float64"):
+        noise = row["gradient_noise"]
+        power = round(math.log10(noise or row["eps"]))
+        name = rf"noise of \$10\^\{{{power}\}}\$" if noise else rf"epsilon = 10\^\{{{power}\}}\$"
+        found = re.search(name + r"[^|]*\| ([\d.]+) \| ([\d.]+) \|", text)
+        assert found is not None
+        assert float(found[1]) == pytest.approx(row["gradient_equals_limit"], abs=0.051)
+        assert float(found[2]) == pytest.approx(row["measured"], abs=0.051)
+    escape = results("escape")
+    for name, key in (("by Kramers' formula", "expected"), (", measured", "measured")):
+        row = " | ".join(f"{round(r[key])}" for r in escape)
+        assert re.search(rf"\| time,? ?{re.escape(name)} \| {re.escape(row)} \|", text)
+    images = {(r["image"], r["start"], r["rule"]): r for r in results("images")}
+    rules = ("none", "noise", "clone and split", "MCMC", "refill")
+    for image, start in dict.fromkeys(key[:2] for key in images):
+        cells = [images[image, start, rule] for rule in rules]
+        row = " | ".join(f"{r['mean']:.1f} ± {r['deviation']:.1f}" for r in cells)
+        assert f"| {image}, {start} | {row} |" in text
+
+
+def test_the_probabilities_of_the_page():
+    text = page()
+
+    def rule(name: str, count: int, share: float = 1.0, signal: str = "mixture") -> str:
+        where = {"signal": signal, "gaussians": count, "start_share": share}
+        return percent("rules", rule=name, **where)
+
+    refill, none = ([rule(name, n) for n in (6, 9, 12)] for name in ("refill", "none"))
+    joined = [f"{a}, {b} and {c}" for a, b, c in (refill, none)]
+    assert f"{joined[0]}, instead of {joined[1]} without density control" in text
+    third = [rule(name, 12, 0.333) for name in ("refill", "MCMC", "clone and split", "none")]
+    assert "only refill succeeds often ({}); MCMC has {}, clone and split {}, and".format(
+        *third[:3]
+    ) in text  # fmt: skip
+    assert f"no density control {third[3]}." in text
+    names = ("none", "MCMC", "clone and split", "refill")
+    everywhere = [rule(name, 8, 1.0, "box") for name in names]
+    assert (
+        "is {} without density control, {} with MCMC, {} with clone and split and {} with refill"
+    ).format(*everywhere) in text
+    corner = [rule(name, 8, 0.333, "box") for name in names]
+    assert "third of the line, it is {}, {}, {} and {}.".format(*corner) in text
+    found = [percent("targets", k=k, gaussians=k) for k in (1, 4, 8)]
+    assert "{} of the fits find one target, {} four, and {} eight".format(*found) in text
+    assert f"find eight targets in {percent('targets', k=8, gaussians=16)} of the fits" in text
+    for optimizer in ("gradient descent", "Adam"):
+        few, many = (percent("gaussians", optimizer=optimizer, gaussians=n) for n in (6, 18))
+        assert re.search(rf"{optimizer} (improves )?from {few} to {many}", text)
+
+
+def test_the_basins_of_the_page():
+    """The statements about one Gaussian and about two targets."""
+
+    def share(optimizer: str, distance: float, only_means: bool = False) -> float:
+        more = {"optimizer": optimizer, "only_means": only_means, "distance": distance}
+        (row,) = results("basin", n=1, **more)
+        return float(row["share"])
+
+    slow = ("gradient descent", "momentum")
+    text = page()
+    assert all(share("Adam", d / 2, True) == 1 for d in range(21))
+    assert all(share(name, d / 2, True) == 1 for name in slow for d in range(10))
+    worst, best = min(share(name, 3.0) for name in slow), max(share(name, 5.0) for name in slow)
+    assert (
+        f"succeed from 3 in at least {worst:.0%} of the fits, and from 5 in at most {best:.0%}"
+    ) in text
+    assert all(share("Adam", d / 2) == 1 for d in range(9))
+    assert f"Adam in all fits from 4 and in {share('Adam', 5.0):.0%} from 5" in text
+    for row in results("two_targets"):
+        assert row["share"] == (1.0 if row["h_over_rho"] < 1 else 0.0)
+    counts = {row["distance"]: row["successes"] for row in results("cutoff")}
+    assert [counts[d] for d in (1, 6, 6.5, 7, 8)] == [8, 8, 6, 1, 0]

@@ -136,7 +136,8 @@ def counts() -> None:
     for factor, colour in ((1, "blue"), (2, "orange")):
         points = [r for r in rows("targets") if r["gaussians"] == factor * r["k"]]
         curve(panel, points, "k", colour)
-    legend(panel, names)
+    for i, (name, colour) in enumerate(names.items()):
+        panel.text((1, 0), name, colour, anchor="start", dx=8, dy=-27 + 17 * i)
     panel.save("initialisation-targets", "Success by the number of targets")
     panel = probability_panel((4, 18), "number of Gaussians, for 6 targets")
     for optimizer, colour in OPTIMISERS.items():
@@ -149,16 +150,16 @@ def counts() -> None:
 def density() -> None:
     cases = ((6, 1.0), (9, 1.0), (12, 1.0), (12, 0.333))
     words = ((0, "6"), (1, "9"), (2, "12"), (3, "12, in a third"))
-    panel = Drawing(340, 240, x=(-0.5, 3.5), y=(0, 1.04), margins=(40, 26, 6, 40))
-    panel.axes("", "share of starts that succeed", x_ticks=words)
+    panel = Drawing(340, 270, x=(-0.5, 3.5), y=(0, 1.0), margins=(40, 56, 6, 40))
+    panel.axes("number of Gaussians", "share of starts that succeed", x_ticks=words)
     for j, (rule, colour) in enumerate(zip(RULES, COLOURS, strict=True)):
         for i, (count, share) in enumerate(cases):
             (r,) = rows("rules", signal="mixture", gaussians=count, start_share=share, rule=rule)
             at = i + 0.155 * (j - 2)
             panel.rectangle((at - 0.07, 0), (at + 0.07, r["share"]), fill=colour)
             panel.line([(at, r["low"]), (at, r["high"])], "ink", 1.2)
-    for j, (name, colour) in enumerate(zip(RULES.values(), COLOURS, strict=True)):
-        panel.text((-0.5, 1.04), name, colour, anchor="start", dx=6, dy=14 + 16 * j)
+    for x, name, colour in zip((0, 46, 96, 178, 232), RULES.values(), COLOURS, strict=True):
+        panel.text((-0.5, 1.0), name, colour, anchor="start", dx=x, dy=-34)
     panel.save("initialisation-rules", "Success of five rules of density control")
 
 
