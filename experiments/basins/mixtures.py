@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import torch
-from density import CloneAndSplit, Mcmc, Refill
+from density import DEAD, CloneAndSplit, Mcmc, Refill
 from fit import DensityControl, Options, fit
 from result import SUCCESS, Row, probability
-from targets import Box, Mixture, Target
+from targets import AMPLITUDE, Box, Mixture, Target
 from torch import Tensor
 
 RULES = ("none", "clone and split", "noise", "MCMC", "refill")
@@ -50,7 +51,12 @@ def random_start(
     return torch.stack([mean, math.log(sigma) * one, 0.3 * one], dim=2)
 
 
-def run(
+def run(target: Target, *settings: Any, **more: Any) -> Tensor:
+    """(restarts,): the relative errors at the end of fits; the arguments are those of `solve`."""
+    return target.relative_error(solve(target, *settings, **more))
+
+
+def solve(
     target: Target,
     restarts: int,
     count: int,
@@ -62,7 +68,7 @@ def run(
     length: float = 30.0,
     share: float = 1.0,
 ) -> Tensor:
-    """(restarts,): the relative errors at the end of fits with `count` Gaussians.
+    """(restarts, count, 3): the Gaussians at the end of fits.
 
     They begin in the first `share` of the line. Clone-and-split begins with half of the Gaussians.
     The width at the start is half of the mean distance of the Gaussians on the whole line.
@@ -78,7 +84,7 @@ def run(
         density = Refill(random, target)
     elif rule != "none":
         density = Mcmc(random, noise, relocate=rule == "MCMC")
-    return target.relative_error(fit(start, target, options, alive=alive, density=density))
+    return fit(start, target, options, alive=alive, density=density)
 
 
 def _median(error: Tensor) -> float:
@@ -144,7 +150,7 @@ def rules(restarts: int, seeds: int, steps: int) -> Iterator[Row]:
             for seed in range(seeds):
                 target = mixture(restarts, 6, seed) if signal == "mixture" else box(restarts, seed)
                 more = {"rule": rule, "noise": noise.get(rule, 0.0), "share": share}
-                errors.append(run(target, restarts, count, options, seed, **more))  # type: ignore[arg-type]
+                errors.append(run(target, restarts, count, options, seed, **more))
             error = torch.cat(errors)
             settings = {"study": "rules", "signal": signal, "gaussians": count, "rule": rule}
             row = probability(
@@ -152,3 +158,29 @@ def rules(restarts: int, seeds: int, steps: int) -> Iterator[Row]:
             )
             shares = [round(float((e < SUCCESS).double().mean()), 3) for e in errors]
             yield {**row, "median_error": _median(error), "seeds": shares}
+
+
+def failures(restarts: int, seeds: int, steps: int) -> Iterator[Row]:
+    """What is wrong in the fits of six Gaussians to six targets that fail.
+
+    `with_dead`: a Gaussian is dead. `shared`: a target is the nearest one of several Gaussians
+    that are not dead, and another target is the nearest one of none.
+    """
+    for rule in ("none", "refill"):
+        failed = with_dead = shared = 0
+        for seed in range(seeds):
+            target = mixture(restarts, 6, seed)
+            end = solve(target, restarts, 6, Options("Adam", 0.1, steps=steps), seed, rule=rule)
+            bad = target.relative_error(end) >= SUCCESS
+            model, wanted = end[bad], target.parameters[bad]
+            live = model[..., AMPLITUDE].abs() >= DEAD
+            distance = (model[:, :, None, 0] - wanted[:, None, :, 0]).abs()
+            nearest = torch.nn.functional.one_hot(distance.argmin(dim=2), 6) * live[..., None]
+            owners = nearest.sum(dim=1)  # (failed, 6): the number of Gaussians of each target
+            failed += len(model)
+            with_dead += int((~live).any(dim=1).sum())
+            shared += int(((owners > 1).any(dim=1) & (owners == 0).any(dim=1)).sum())
+        yield {
+            "study": "failures", "rule": rule, "trials": restarts * seeds, "failed": failed,
+            "with_dead": with_dead, "shared": shared,
+        }  # fmt: skip

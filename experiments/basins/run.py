@@ -36,6 +36,7 @@ def studies(restarts: int, steps: int, seeds: int) -> dict[str, Iterator[Row]]:
         "two targets": one_gaussian.two_targets(restarts, steps),
         "escape": one_gaussian.escape(5 * restarts),
         "counts": mixtures.counts(restarts, seeds, steps),
+        "failures": mixtures.failures(restarts, seeds, steps),
         "rules": mixtures.rules(restarts, seeds, steps),
         "cutoff": pictures.cutoff(max(restarts // 12, 2), steps // 3),
         "images": pictures.rules(seeds, steps * 3 // 10),
@@ -49,6 +50,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--output", type=Path, default=Path(__file__).with_name("results.json"))
     options = parser.parse_args()
+    if min(options.restarts, options.steps, options.seeds) < 1:
+        parser.error("--restarts, --steps and --seeds must be at least 1")
     torch.set_num_threads(1)
     rows: list[Row] = []
     for name, study in studies(options.restarts, options.steps, options.seeds).items():

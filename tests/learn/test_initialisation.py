@@ -390,6 +390,19 @@ def test_starts_do_not_know_the_targets(experiment, monkeypatch):
     assert float((mean - target.parameters[..., 0]).abs().mean()) == pytest.approx(10, abs=1.5)
 
 
+@pytest.mark.slow
+def test_the_studies_run_with_few_restarts(experiment):
+    """Each study yields rows with the settings that the figures select."""
+    studies = experiment("run").studies(restarts=2, steps=60, seeds=1)
+    for name in ("two targets", "failures", "rules", "images"):
+        rows = list(studies[name])
+        published = results(name.replace(" ", "_"))
+        assert [set(row) for row in rows] == [set(row) for row in published]
+        settings = ("signal", "gaussians", "start_share", "rule", "image", "start", "h_over_rho")
+        for key in settings:
+            assert [row.get(key) for row in rows] == [row.get(key) for row in published]
+
+
 # The numbers of the page.
 
 
@@ -460,6 +473,11 @@ def test_the_probabilities_of_the_page():
     ).format(*everywhere) in text
     corner = [rule(name, 8, 0.333, "box") for name in names]
     assert "third of the line, it is {}, {}, {} and {}.".format(*corner) in text
+    none, refill = (results("failures", rule=name)[0] for name in ("none", "refill"))
+    assert f"still fails in {refill['failed']} of {refill['trials']} fits" in text
+    assert refill["with_dead"] == 0
+    assert f"In {refill['shared']} of them, one target" in text
+    assert f"{none['failed']} fits fail, {none['with_dead']} of them with a dead" in text
     found = [percent("targets", k=k, gaussians=k) for k in (1, 4, 8)]
     assert "{} of the fits find one target, {} four, and {} eight".format(*found) in text
     assert f"find eight targets in {percent('targets', k=8, gaussians=16)} of the fits" in text
@@ -486,6 +504,11 @@ def test_the_basins_of_the_page():
     ) in text
     assert all(share("Adam", d / 2) == 1 for d in range(9))
     assert f"Adam in all fits from 4 and in {share('Adam', 5.0):.0%} from 5" in text
+    near = [
+        row["share"] for name in slow
+        for row in results("basin", n=3, optimizer=name, only_means=False) if row["distance"] < 2.5
+    ]  # fmt: skip
+    assert f"fail in up to {1 - min(near):.0%} of the fits from distances of less than" in text
     for row in results("two_targets"):
         assert row["share"] == (1.0 if row["h_over_rho"] < 1 else 0.0)
     counts = {row["distance"]: row["successes"] for row in results("cutoff")}
