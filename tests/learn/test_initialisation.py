@@ -249,6 +249,16 @@ def test_a_blurred_target_is_a_wider_and_lower_gaussian(closed_form):
     assert float(d[pull.argmax()]) == pytest.approx(expected, abs=2e-3)
 
 
+def test_the_exercises(closed_form):
+    narrow, wide = (closed_form.position_gradient(4.0, s, 1e-6) for s in (1.0, 2.0))
+    assert float(wide / narrow) == pytest.approx(101, abs=0.5)
+    rho2 = 1 + 1 + 9.9**2
+    assert math.sqrt(rho2) == pytest.approx(10, abs=0.01)
+    near, far = (closed_form.travel_time(k, 0.1, math.sqrt(0.5), math.sqrt(0.5)) for k in (4, 5))
+    assert far / near == pytest.approx(53, abs=0.5)
+    assert math.exp(4.5) * 8 / 12.5 == pytest.approx(58, abs=0.5)
+
+
 # The code of the experiment.
 
 
