@@ -10,7 +10,7 @@ from torch import Tensor
 
 from snowsplat.ops import reference
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.scene.geometry import Similarity, quat_from_rotation
+from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
 
 # Directions on the sphere for `sh_rotation`. 16 determine degree 3; more are better conditioned.
 _DIRECTIONS = 64
@@ -29,7 +29,7 @@ def transform(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
     return Gaussians(
         means=similarity.apply(gaussians.means.to(torch.float64)).to(dtype),
         log_scales=gaussians.log_scales + math.log(similarity.scale),
-        quats=_quat_product(turn, quats),
+        quats=quat_product(turn, quats),
         opacity_logits=gaussians.opacity_logits,
         sh_dc=gaussians.sh_dc,
         sh_rest=_rotate_sh(gaussians.sh_rest, similarity.rotation),
@@ -110,16 +110,3 @@ def _rotate_sh(sh_rest: Tensor, rotation: Tensor) -> Tensor:
         parts.append(torch.einsum("ij,njc->nic", matrix.to(sh_rest.dtype), band))
         start += len(matrix)
     return torch.cat(parts, 1) if parts else sh_rest
-
-
-def _quat_product(a: Tensor, b: Tensor) -> Tensor:
-    """The product of quaternions wxyz (..., 4): rotates by ``b`` first, then by ``a``."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    product = [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-    return torch.stack(product, -1)

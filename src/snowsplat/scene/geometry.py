@@ -65,6 +65,19 @@ def quat_from_rotation(rotations: Tensor) -> Tensor:
     return torch.where(quats[..., :1] < 0, -quats, quats)
 
 
+def quat_product(a: Tensor, b: Tensor) -> Tensor:
+    """The product of quaternions wxyz (..., 4): rotates by ``b`` first, then by ``a``."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    product = [
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ]
+    return torch.stack(product, -1)
+
+
 def invert_rigid(a_from_b: Tensor) -> Tensor:
     """``b_from_a`` (..., 3, 4) of a rigid transform ``a_from_b`` (..., 3, 4)."""
     rotation_t = a_from_b[..., :3].transpose(-1, -2)

@@ -1,0 +1,328 @@
+"""The motion of the Gaussians in the globe: they stand, whirl, fall as snow, and fly home.
+
+The model is a liquid that moves, and flakes that it carries. All equations have exact solutions
+over a time step, so that the motion is stable for long steps, too:
+
+- The velocity v of a flake approaches that of the liquid, u, plus its terminal velocity w:
+  dv/dt = −k (v − u − w). This is drag and gravity g = k w.
+- The liquid moves with u = e · (vortex around the vertical axis + Σ Aⱼ cos(kⱼ·x + ωⱼ t + φⱼ)).
+  Aⱼ is perpendicular to kⱼ, so u has no divergence: flakes are not concentrated anywhere. Shaking
+  increases the strength e, which decays exponentially.
+- The glass is a wall at the distance `WALL`. It reverses the normal velocity times `BOUNCE`.
+- Flakes pile up on the floor. The height of the pile is that of a grid, in which each cell counts
+  the flakes that rest there. A flake slides down where the pile is steeper than `REPOSE`.
+- A flake flies home on the cubic Hermite curve that reaches its home with velocity 0 in the
+  remaining time τ. The rest of such a curve is again such a curve. No curve needs to be stored, and
+  the flake arrives exactly.
+
+`constants` are the numbers that the page needs; its script contains the same equations
+(`page/simulation.js`), and a test compares both. Lengths are in radii of the glass, times in
+seconds. The frame is that of `snowsplat.globe.dimensions`: y is down.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from snowsplat.globe.dimensions import FLOOR, FLOOR_RADIUS, WALL
+
+LONGEST_STEP = 1 / 30  # seconds
+
+# Flakes: drag k (1/s) and terminal velocity w (1/s); each flake has values in these ranges.
+DRAG = (2.5, 5.0)
+FALL = (0.19, 0.40)
+SPIN = 9.0  # radians per unit of length
+# Radius of flakes: standard deviations are limited to this range while a Gaussian is snow.
+FLAKE = (0.0022, 0.0058)
+MORPH = 0.45  # seconds in which a Gaussian becomes a flake
+
+# Liquid.
+VORTEX = 1.5  # rad/s at the axis
+UPDRAFT = 0.75  # upward at the axis, downward near the glass
+DECAY = 1.25  # seconds in which the strength decreases to 1/e
+STRONGEST = 1.6
+WAVES = 5
+# While the flow is stronger than this (another value in this range for each flake), it lifts flakes
+# from the floor, with a velocity of HOP times the strength.
+LIFT = (0.06, 0.4)
+HOP = 1.0
+
+# Shaking: an oscillating acceleration (units/s²) along a horizontal direction.
+SHAKE_SECONDS = 1.1
+SHAKE_FREQUENCY = 3.4  # Hz
+SHAKE_ACCELERATION = 22.0
+# Strength of the flow, and loosening of the Gaussians, per unit of |acceleration| · time.
+STIR = 0.12
+LOOSEN = 0.115
+# A stronger acceleration (units/s²) interrupts the flight home.
+INTERRUPTS = 3.0
+# A Gaussian is loose when the loosening exceeds its hold.
+HOLD = (0.12, 1.0)
+# Share of the shaking that reaches the velocity of a loose flake.
+SHARE = 0.16
+
+BOUNCE = 0.35
+PILE_CELLS = 28  # along each side of the grid
+PILE_DEPTH = 0.085  # mean depth of the pile if all flakes rest
+HIGHEST = 0.3  # of the pile
+REPOSE = 0.8  # slope
+SLIDE = 0.35  # speed of sliding per slope
+
+# Flying home: flakes start in this range of time, and each needs FLIGHT seconds.
+STARTS = 1.5
+FLIGHT = 1.9
+LAUNCH = (0.7, 0.9)  # vortex (rad/s) and upward velocity at the start
+REMEMBER_SECONDS = STARTS + FLIGHT
+
+
+def _waves() -> np.ndarray:
+    """(WAVES, 8): wave vector k, amplitude A perpendicular to k, frequency ω, phase φ."""
+    random = np.random.default_rng(7)
+    rows = []
+    for j in range(WAVES):
+        direction = random.normal(size=3)
+        k = direction / np.linalg.norm(direction) * (2.2 + 1.1 * j)
+        across = np.cross(k, random.normal(size=3))
+        amplitude = across / np.linalg.norm(across) * (0.95 / (1.0 + 0.35 * j))
+        rows.append([*k, *amplitude, random.uniform(0.6, 1.8), random.uniform(0, 2 * math.pi)])
+    return np.round(np.array(rows), 6)
+
+
+_WAVES = _waves()
+
+
+def constants() -> dict[str, Any]:
+    """The numbers of this module and the shape of the globe, for the script of the page."""
+    names = [name for name in globals() if name.isupper() and not name.startswith("_")]
+    return {name: globals()[name] for name in names} | {"WAVE": _WAVES.tolist()}
+
+
+def random_numbers(count: int, channel: int) -> np.ndarray:
+    """(count,) float64 in [0, 1): the same numbers in the script of the page.
+
+    A hash of the row and the channel: two rounds of multiplication and xorshift on 32 bits.
+    """
+    x = np.arange(count, dtype=np.uint32) * np.uint32(8) + np.uint32(channel)
+    for factor in (0x7FEB352D, 0x846CA68B):
+        x ^= x >> np.uint32(16)
+        x *= np.uint32(factor)
+    x ^= x >> np.uint32(16)
+    return x / 4294967296.0
+
+
+def shake_acceleration(seconds: float) -> float:
+    """The acceleration of the globe during a shake, ``seconds`` after its start."""
+    if not 0.0 <= seconds < SHAKE_SECONDS:
+        return 0.0
+    envelope = math.sin(math.pi * seconds / SHAKE_SECONDS)
+    return SHAKE_ACCELERATION * envelope * math.sin(2 * math.pi * SHAKE_FREQUENCY * seconds)
+
+
+def shake_offset(seconds: float) -> float:
+    """The displacement of the globe, about that of `shake_acceleration`, without its drift."""
+    return -shake_acceleration(seconds) / (2 * math.pi * SHAKE_FREQUENCY) ** 2
+
+
+@dataclass
+class Snow:
+    """N Gaussians in motion. Coordinates are stored as three rows, x, y (down) and z.
+
+    Attributes:
+        home: (3, N) float32: where they stand.
+        position: (3, N) float32.
+        velocity: (3, N) float32, per second.
+        angle: (N,) float32: radians around an axis of each flake.
+        morph: (N,) float32. 0: as in the scene; 1: a flake.
+        resting: (N,) bool: lies in the pile.
+        loosening: how much the scene was shaken.
+        strength: of the flow.
+        time: seconds since the start.
+        remembering: seconds since `remember`; None if the Gaussians do not fly home.
+    """
+
+    home: np.ndarray
+    position: np.ndarray = field(init=False)
+    velocity: np.ndarray = field(init=False)
+    angle: np.ndarray = field(init=False)
+    morph: np.ndarray = field(init=False)
+    resting: np.ndarray = field(init=False)
+    loosening: float = 0.0
+    strength: float = 0.0
+    time: float = 0.0
+    remembering: float | None = None
+
+    def __post_init__(self) -> None:
+        self.home = np.ascontiguousarray(self.home, dtype=np.float32)
+        count = self.home.shape[1]
+        self.position, self.velocity = self.home.copy(), np.zeros_like(self.home)
+        self.angle, self.morph = np.zeros((2, count), np.float32)
+        self.resting = np.zeros(count, bool)
+        first, second, drag, fall, start, lift = (random_numbers(count, i) for i in range(6))
+        # The scene loosens from the top, and is built again from the floor.
+        height = np.clip((FLOOR - self.home[1]) / (FLOOR + WALL), 0.0, 1.0)
+        order = 0.55 * first + 0.45 * (1.0 - height)
+        self._hold = _in_range(HOLD, order)
+        self._drag = _in_range(DRAG, drag)
+        self._fall = _in_range(FALL, fall)
+        self._lift = _in_range(LIFT, lift)
+        self._start = (STARTS * (0.35 * start + 0.65 * height)).astype(np.float32)
+        self._turn = np.where(second < 0.5, -SPIN, SPIN).astype(np.float32)
+
+    @property
+    def standing(self) -> bool:
+        """Whether no Gaussian is loose."""
+        return self.loosening <= HOLD[0]
+
+    def remember(self) -> None:
+        """All loose Gaussians begin to fly home. They are there after `REMEMBER_SECONDS`."""
+        if not self.standing and self.remembering is None:
+            self.remembering = 0.0
+
+    def step(
+        self, seconds: float, acceleration: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Advance by ``seconds``, during which the globe has this acceleration (units/s²).
+
+        Raises:
+            ValueError: the step is longer than `LONGEST_STEP`.
+        """
+        if not 0 < seconds <= LONGEST_STEP * 1.0001:
+            raise ValueError(f"a step has at most {LONGEST_STEP:.4f} s, not {seconds}")
+        pushed = math.hypot(*acceleration) * seconds
+        decay = math.exp(-seconds / DECAY)
+        self.strength = min(STRONGEST, self.strength * decay + STIR * pushed)
+        self.loosening += LOOSEN * pushed
+        self.time += seconds
+        if self.standing:
+            self.loosening *= decay  # a soft push has no effect later
+            return
+        if math.hypot(*acceleration) > INTERRUPTS:
+            self.remembering = None
+        flying = np.zeros(len(self.angle), bool)
+        if self.remembering is not None:
+            flying = self.remembering >= self._start
+        loose = self.loosening > self._hold
+        self._fall_step(seconds, loose & ~flying, acceleration)
+        if self.remembering is not None:
+            self._fly_step(seconds, loose & flying)
+            self.remembering += seconds
+            if self.remembering > REMEMBER_SECONDS:
+                self._stand()
+
+    def flow(self, position: np.ndarray) -> np.ndarray:
+        """(3, M): the velocity of the liquid at ``position`` (3, M) for the strength 1."""
+        x, y, z = position
+        across = np.minimum(x * x + z * z, np.float32(1.0))
+        u = np.stack([-VORTEX * z, UPDRAFT * (2.0 * across - 1.0), VORTEX * x])
+        for kx, ky, kz, ax, ay, az, frequency, phase in _WAVES.tolist():
+            wave = np.cos(kx * x + ky * y + kz * z + (frequency * self.time + phase))
+            for axis, amplitude in enumerate((ax, ay, az)):
+                u[axis] += amplitude * wave
+        return u
+
+    def pile(self) -> np.ndarray:
+        """(PILE_CELLS, PILE_CELLS): the height of the pile in each cell, by row z and column x."""
+        x, z = (_cell(self.position[axis, self.resting]) for axis in (0, 2))
+        counts = np.bincount(z * PILE_CELLS + x, minlength=PILE_CELLS**2).astype(np.float32)
+        # The mean height is PILE_DEPTH if all flakes rest on the disc.
+        cells = math.pi * (PILE_CELLS / 2) ** 2
+        heights = np.minimum(counts * (PILE_DEPTH * cells / len(self.angle)), HIGHEST)
+        return heights.reshape(PILE_CELLS, PILE_CELLS)
+
+    def _fall_step(
+        self, seconds: float, moves: np.ndarray, acceleration: tuple[float, float, float]
+    ) -> None:
+        lifted = self.strength > self._lift
+        self.resting &= ~lifted
+        heights = self.pile()
+        rows = np.flatnonzero(moves & ~self.resting)
+        if not len(rows):
+            return
+        x, v = self.position[:, rows], self.velocity[:, rows]
+        target = np.float32(self.strength) * self.flow(x)
+        target[1] += self._fall[rows]
+        v += (target - v) * -np.expm1(-seconds * self._drag[rows])
+        v -= (np.array(acceleration, np.float32) * np.float32(SHARE * seconds))[:, None]
+        x += v * np.float32(seconds)
+        height, slope_x, slope_z = _sample(heights, x)
+        sunk = x[1] - (FLOOR - height)
+        touching = sunk > 0
+        x[1] -= np.where(touching, sunk, 0)
+        hops = touching & lifted[rows]
+        v[1, hops] = -HOP * self.strength * (0.5 + self._lift[rows[hops]])
+        steep = np.hypot(slope_x, slope_z) > REPOSE
+        settles, slides = touching & ~hops & ~steep, touching & ~hops & steep
+        v[:, settles] = 0
+        v[:, slides] = np.stack([-SLIDE * slope_x, 0 * slope_x, -SLIDE * slope_z])[:, slides]
+        self.resting[rows[settles]] = True
+        _collide_with_glass(x, v)
+        self.position[:, rows], self.velocity[:, rows] = x, v
+        self.angle[rows] += self._turn[rows] * (np.sqrt((v * v).sum(0)) * np.float32(seconds))
+        self.morph[rows] += (1.0 - self.morph[rows]) * np.float32(-math.expm1(-seconds / MORPH))
+
+    def _fly_step(self, seconds: float, moves: np.ndarray) -> None:
+        assert self.remembering is not None
+        rows = np.flatnonzero(moves)
+        x, v = self.position[:, rows], self.velocity[:, rows]
+        since = np.float32(self.remembering) - self._start[rows]
+        starts = since < seconds
+        self.resting[rows] = False
+        v[0, starts] -= LAUNCH[0] * x[2, starts]
+        v[1, starts] -= LAUNCH[1]
+        v[2, starts] += LAUNCH[0] * x[0, starts]
+        turn = np.float32(2 * math.pi)
+        self.angle[rows[starts]] -= turn * np.rint(self.angle[rows[starts]] / turn)
+        # The cubic Hermite curve from (x, v) to (home, 0) in the remaining time, at `seconds`.
+        left = np.maximum(np.float32(FLIGHT) - since, np.float32(seconds))
+        s = np.float32(seconds) / left
+        way = self.home[:, rows] - x
+        x += way * (s * s * (3 - 2 * s)) + v * (left * s * (1 - s) ** 2)
+        v = way * (6 * s * (1 - s) / left) + v * ((1 - s) * (1 - 3 * s))
+        _collide_with_glass(x, v)
+        arrives = s >= 1
+        x[:, arrives], v[:, arrives] = self.home[:, rows[arrives]], 0
+        self.position[:, rows], self.velocity[:, rows] = x, v
+        self.angle[rows] *= (1 - s) ** 2
+        self.morph[rows] *= 1 - s
+
+    def _stand(self) -> None:
+        self.position[:] = self.home
+        self.velocity[:], self.angle[:], self.morph[:], self.resting[:] = 0, 0, 0, False
+        self.loosening, self.remembering = 0.0, None
+
+
+def _in_range(limits: tuple[float, float], share: np.ndarray) -> np.ndarray:
+    return (limits[0] + (limits[1] - limits[0]) * share).astype(np.float32)
+
+
+def _collide_with_glass(x: np.ndarray, v: np.ndarray) -> None:
+    """Move flakes (3, M) that are outside of the glass back to it, and reflect them."""
+    out = np.flatnonzero((x * x).sum(0) > WALL * WALL)
+    normal = x[:, out] / np.sqrt((x[:, out] ** 2).sum(0))
+    x[:, out] = normal * np.float32(WALL)
+    speed = (v[:, out] * normal).sum(0)
+    v[:, out] -= normal * (np.maximum(speed, 0) * np.float32(1 + BOUNCE))
+
+
+def _cell(coordinate: np.ndarray) -> np.ndarray:
+    cell = ((coordinate + FLOOR_RADIUS) * (PILE_CELLS / (2 * FLOOR_RADIUS))).astype(np.int64)
+    return np.clip(cell, 0, PILE_CELLS - 1)
+
+
+def _sample(heights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bilinear interpolation of the pile at x (3, M): the height, and its slope along x and z."""
+    per_unit = PILE_CELLS / (2 * FLOOR_RADIUS)
+    fx, fz = (
+        np.clip((x[axis] + FLOOR_RADIUS) * per_unit - 0.5, 0, PILE_CELLS - 1.001) for axis in (0, 2)
+    )
+    ix, iz = fx.astype(np.int64), fz.astype(np.int64)
+    fx, fz = fx - ix, fz - iz
+    a, b = heights[iz, ix], heights[iz, ix + 1]
+    c, d = heights[iz + 1, ix], heights[iz + 1, ix + 1]
+    low, high = a + (b - a) * fx, c + (d - c) * fx
+    slope_x = ((b - a) * (1 - fz) + (d - c) * fz) * per_unit
+    return low + (high - low) * fz, slope_x, (high - low) * per_unit
