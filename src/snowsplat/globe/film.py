@@ -29,7 +29,7 @@ from snowsplat.scene.render import render
 
 # Seconds from the start: when the globe is shaken, and when the scene is remembered.
 SHAKE_AT = 1.3
-REMEMBER_AT = 8.3
+REMEMBER_AT = 9.6
 SECONDS = REMEMBER_AT + REMEMBER_SECONDS + 1.3
 
 #: The camera: distance from the middle of the globe and its base, elevation (radians), and the

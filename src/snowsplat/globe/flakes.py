@@ -17,7 +17,7 @@ from snowsplat.scene.geometry import quat_product
 from snowsplat.scene.sh_constants import SH_C0
 
 #: Share of white in the colour of a flake.
-WHITE = 0.35
+WHITE = 0.58
 #: Opacity of a flake, unless the Gaussian is more opaque.
 OPAQUE = 0.9
 
@@ -50,8 +50,8 @@ def appearance(gaussians: Gaussians, snow: Snow) -> Gaussians:
 
 def spin_axes(count: int) -> np.ndarray:
     """(3, count) float32: unit vectors around which flakes turn, evenly distributed."""
-    z = 2.0 * random_numbers(count, 6) - 1.0
-    azimuth = 2.0 * math.pi * random_numbers(count, 7)
+    z = 2.0 * random_numbers(count, 9) - 1.0
+    azimuth = 2.0 * math.pi * random_numbers(count, 10)
     across = np.sqrt(1.0 - z * z)
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z]).astype(np.float32)
 

@@ -5,9 +5,13 @@ over a time step, so that the motion is stable for long steps, too:
 
 - The velocity v of a flake approaches that of the liquid, u, plus its terminal velocity w:
   dv/dt = −k (v − u − w). This is drag and gravity g = k w.
-- The liquid moves with u = e · (vortex around the vertical axis + Σ Aⱼ cos(kⱼ·x + ωⱼ t + φⱼ)).
-  Aⱼ is perpendicular to kⱼ, so u has no divergence: flakes are not concentrated anywhere. Shaking
-  increases the strength e, which decays exponentially.
+- The liquid moves with u = e · (V + ∇ × (b ψ)). V is a vortex around the vertical axis. The vector
+  potential ψ is the sum of a ring, which moves the liquid up at the axis and down at the glass, and
+  of waves Aⱼ sin(kⱼ·x + ωⱼ t + φⱼ). b is 0 at the glass and at the floor. Therefore u has no
+  divergence and is parallel to these walls, and flakes are not concentrated anywhere (the idea of
+  R. Bridson, J. Hourihan, M. Nordenstam, "Curl-noise for procedural fluid flow", SIGGRAPH 2007). u
+  is computed on a grid and interpolated. Shaking increases the strength e, which decays
+  exponentially.
 - The glass is a wall at the distance `WALL`. It reverses the normal velocity times `BOUNCE`.
 - Flakes pile up on the floor. The height of the pile is that of a grid, in which each cell counts
   the flakes that rest there. A flake slides down where the pile is steeper than `REPOSE`.
@@ -33,41 +37,47 @@ from snowsplat.globe.dimensions import FLOOR, FLOOR_RADIUS, WALL
 LONGEST_STEP = 1 / 30  # seconds
 
 # Flakes: drag k (1/s) and terminal velocity w (1/s); each flake has values in these ranges.
-DRAG = (2.5, 5.0)
-FALL = (0.19, 0.40)
+DRAG = (5.0, 9.0)
+FALL = (0.13, 0.31)
+# Each flake also circles: the speed in still liquid, and its increase by the strength of the flow;
+# the rates are in rad/s.
+CIRCLE = (0.03, 0.45)
+CIRCLE_RATE = (2.0, 5.0)
 SPIN = 9.0  # radians per unit of length
 # Radius of flakes: standard deviations are limited to this range while a Gaussian is snow.
 FLAKE = (0.0022, 0.0058)
 MORPH = 0.45  # seconds in which a Gaussian becomes a flake
 
 # Liquid.
-VORTEX = 1.5  # rad/s at the axis
-UPDRAFT = 0.75  # upward at the axis, downward near the glass
-DECAY = 1.25  # seconds in which the strength decreases to 1/e
-STRONGEST = 1.6
+VORTEX = 0.75  # rad/s at the axis
+RING = 0.85
+WAVES = 6
+FLOW_CELLS = 17  # along each side of the grid
+DECAY = 1.7  # seconds in which the strength decreases to 1/e
+STRONGEST = 2.0
 WAVES = 5
 # While the flow is stronger than this (another value in this range for each flake), it lifts flakes
 # from the floor, with a velocity of HOP times the strength.
-LIFT = (0.06, 0.4)
-HOP = 1.0
+LIFT = (0.04, 0.28)
+HOP = 3.0
 
 # Shaking: an oscillating acceleration (units/s²) along a horizontal direction.
 SHAKE_SECONDS = 1.1
 SHAKE_FREQUENCY = 3.4  # Hz
 SHAKE_ACCELERATION = 22.0
 # Strength of the flow, and loosening of the Gaussians, per unit of |acceleration| · time.
-STIR = 0.12
+STIR = 0.3
 LOOSEN = 0.115
 # A stronger acceleration (units/s²) interrupts the flight home.
 INTERRUPTS = 3.0
 # A Gaussian is loose when the loosening exceeds its hold.
 HOLD = (0.12, 1.0)
 # Share of the shaking that reaches the velocity of a loose flake.
-SHARE = 0.16
+SHARE = 0.2
 
 BOUNCE = 0.35
 PILE_CELLS = 28  # along each side of the grid
-PILE_DEPTH = 0.085  # mean depth of the pile if all flakes rest
+PILE_DEPTH = 0.07  # mean depth of the pile if all flakes rest
 HIGHEST = 0.3  # of the pile
 REPOSE = 0.8  # slope
 SLIDE = 0.35  # speed of sliding per slope
@@ -75,7 +85,8 @@ SLIDE = 0.35  # speed of sliding per slope
 # Flying home: flakes start in this range of time, and each needs FLIGHT seconds.
 STARTS = 1.5
 FLIGHT = 1.9
-LAUNCH = (0.7, 0.9)  # vortex (rad/s) and upward velocity at the start
+LAUNCH = (0.2, 1.5)  # upward velocity at the start
+LAUNCH_VORTEX = 1.2  # rad/s
 REMEMBER_SECONDS = STARTS + FLIGHT
 
 
@@ -84,21 +95,23 @@ def _waves() -> np.ndarray:
     random = np.random.default_rng(7)
     rows = []
     for j in range(WAVES):
-        direction = random.normal(size=3)
-        k = direction / np.linalg.norm(direction) * (2.2 + 1.1 * j)
-        across = np.cross(k, random.normal(size=3))
-        amplitude = across / np.linalg.norm(across) * (0.95 / (1.0 + 0.35 * j))
-        rows.append([*k, *amplitude, random.uniform(0.6, 1.8), random.uniform(0, 2 * math.pi)])
+        # Directions are evenly distributed on a half sphere: -k is the same wave.
+        height, azimuth = (j + 0.5) / WAVES, j * math.pi * (3 - math.sqrt(5))
+        across = math.sqrt(1 - height * height)
+        length = 2.6 + 0.9 * j
+        k = length * np.array([across * math.cos(azimuth), height, across * math.sin(azimuth)])
+        side = np.cross(k, random.normal(size=3))
+        amplitude = side / np.linalg.norm(side) * (1.9 / length)
+        rows.append([*k, *amplitude, random.uniform(0.5, 1.5), random.uniform(0, 2 * math.pi)])
     return np.round(np.array(rows), 6)
 
 
-_WAVES = _waves()
+WAVE = _waves().tolist()
 
 
 def constants() -> dict[str, Any]:
     """The numbers of this module and the shape of the globe, for the script of the page."""
-    names = [name for name in globals() if name.isupper() and not name.startswith("_")]
-    return {name: globals()[name] for name in names} | {"WAVE": _WAVES.tolist()}
+    return {name: value for name, value in globals().items() if name.isupper()}
 
 
 def random_numbers(count: int, channel: int) -> np.ndarray:
@@ -106,7 +119,7 @@ def random_numbers(count: int, channel: int) -> np.ndarray:
 
     A hash of the row and the channel: two rounds of multiplication and xorshift on 32 bits.
     """
-    x = np.arange(count, dtype=np.uint32) * np.uint32(8) + np.uint32(channel)
+    x = np.arange(count, dtype=np.uint32) * np.uint32(16) + np.uint32(channel)
     for factor in (0x7FEB352D, 0x846CA68B):
         x ^= x >> np.uint32(16)
         x *= np.uint32(factor)
@@ -161,15 +174,20 @@ class Snow:
         self.position, self.velocity = self.home.copy(), np.zeros_like(self.home)
         self.angle, self.morph = np.zeros((2, count), np.float32)
         self.resting = np.zeros(count, bool)
-        first, second, drag, fall, start, lift = (random_numbers(count, i) for i in range(6))
+        first, second, drag, fall, start, lift, rate, phase, height = (
+            random_numbers(count, i) for i in range(9)
+        )
         # The scene loosens from the top, and is built again from the floor.
-        height = np.clip((FLOOR - self.home[1]) / (FLOOR + WALL), 0.0, 1.0)
-        order = 0.55 * first + 0.45 * (1.0 - height)
+        level = np.clip((FLOOR - self.home[1]) / (FLOOR + WALL), 0.0, 1.0)
+        order = 0.55 * first + 0.45 * (1.0 - level)
         self._hold = _in_range(HOLD, order)
         self._drag = _in_range(DRAG, drag)
         self._fall = _in_range(FALL, fall)
         self._lift = _in_range(LIFT, lift)
-        self._start = (STARTS * (0.35 * start + 0.65 * height)).astype(np.float32)
+        self._start = (STARTS * (0.35 * start + 0.65 * level)).astype(np.float32)
+        self._rate = _in_range(CIRCLE_RATE, rate)
+        self._phase = _in_range((0.0, 2 * math.pi), phase)
+        self._launch = _in_range(LAUNCH, height)
         self._turn = np.where(second < 0.5, -SPIN, SPIN).astype(np.float32)
 
     @property
@@ -215,13 +233,17 @@ class Snow:
 
     def flow(self, position: np.ndarray) -> np.ndarray:
         """(3, M): the velocity of the liquid at ``position`` (3, M) for the strength 1."""
-        x, y, z = position
-        across = np.minimum(x * x + z * z, np.float32(1.0))
-        u = np.stack([-VORTEX * z, UPDRAFT * (2.0 * across - 1.0), VORTEX * x])
-        for kx, ky, kz, ax, ay, az, frequency, phase in _WAVES.tolist():
-            wave = np.cos(kx * x + ky * y + kz * z + (frequency * self.time + phase))
-            for axis, amplitude in enumerate((ax, ay, az)):
-                u[axis] += amplitude * wave
+        grid = flow_grid(self.time).reshape(3, -1)
+        place = np.clip((position + 1) * ((FLOW_CELLS - 1) / 2), 0, FLOW_CELLS - 1.001)
+        index = place.astype(np.int32)
+        fx, fy, fz = place - index
+        corner = (index[2] * FLOW_CELLS + index[1]) * FLOW_CELLS + index[0]
+        u = np.zeros_like(position)
+        for dz, wz in ((0, 1 - fz), (1, fz)):
+            for dy, wy in ((0, wz * (1 - fy)), (1, wz * fy)):
+                for dx, weight in ((0, wy * (1 - fx)), (1, wy * fx)):
+                    at = corner + ((dz * FLOW_CELLS + dy) * FLOW_CELLS + dx)
+                    u += weight * grid[:, at]
         return u
 
     def pile(self) -> np.ndarray:
@@ -245,6 +267,11 @@ class Snow:
         x, v = self.position[:, rows], self.velocity[:, rows]
         target = np.float32(self.strength) * self.flow(x)
         target[1] += self._fall[rows]
+        circle = self._phase[rows] + self._rate[rows] * np.float32(self.time % 1000.0)
+        speed = np.float32(CIRCLE[0] + CIRCLE[1] * self.strength)
+        target[0] += speed * np.cos(circle)
+        target[1] -= speed * np.sin(2 * circle)
+        target[2] += speed * np.sin(circle)
         v += (target - v) * -np.expm1(-seconds * self._drag[rows])
         v -= (np.array(acceleration, np.float32) * np.float32(SHARE * seconds))[:, None]
         x += v * np.float32(seconds)
@@ -271,9 +298,9 @@ class Snow:
         since = np.float32(self.remembering) - self._start[rows]
         starts = since < seconds
         self.resting[rows] = False
-        v[0, starts] -= LAUNCH[0] * x[2, starts]
-        v[1, starts] -= LAUNCH[1]
-        v[2, starts] += LAUNCH[0] * x[0, starts]
+        v[0, starts] -= LAUNCH_VORTEX * x[2, starts]
+        v[1, starts] -= self._launch[rows[starts]]
+        v[2, starts] += LAUNCH_VORTEX * x[0, starts]
         turn = np.float32(2 * math.pi)
         self.angle[rows[starts]] -= turn * np.rint(self.angle[rows[starts]] / turn)
         # The cubic Hermite curve from (x, v) to (home, 0) in the remaining time, at `seconds`.
@@ -293,6 +320,24 @@ class Snow:
         self.position[:] = self.home
         self.velocity[:], self.angle[:], self.morph[:], self.resting[:] = 0, 0, 0, False
         self.loosening, self.remembering = 0.0, None
+
+
+def flow_grid(time: float) -> np.ndarray:
+    """(3, cells z, cells y, cells x) float32: the flow of strength 1 on a grid over [−1, 1]³."""
+    ticks = np.linspace(-1, 1, FLOW_CELLS)
+    z, y, x = np.meshgrid(ticks, ticks, ticks, indexing="ij")
+    potential = np.stack([-RING * z, 0 * y, RING * x])
+    curl = np.stack([0 * x, np.full_like(x, -2 * RING), 0 * z])
+    for kx, ky, kz, ax, ay, az, frequency, phase in WAVE:
+        angle = kx * x + ky * y + kz * z + (frequency * time + phase)
+        potential += np.sin(angle) * np.array([ax, ay, az])[:, None, None, None]
+        across = np.cross([kx, ky, kz], [ax, ay, az])
+        curl += np.cos(angle) * across[:, None, None, None]
+    # b = (1 − |x|²) (FLOOR − y), with b = 0 outside.
+    glass, floor = np.maximum(1 - (x * x + y * y + z * z), 0), np.maximum(FLOOR - y, 0)
+    slope = np.stack([-2 * x * floor, -2 * y * floor - glass, -2 * z * floor]) * (glass * floor > 0)
+    u = np.cross(slope, potential, axis=0) + glass * floor * curl
+    return (u + np.stack([-VORTEX * z, 0 * y, VORTEX * x])).astype(np.float32)
 
 
 def _in_range(limits: tuple[float, float], share: np.ndarray) -> np.ndarray:
