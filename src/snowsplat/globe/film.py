@@ -37,8 +37,8 @@ SECONDS = REMEMBER_AT + REMEMBER_SECONDS + 1.3
 DISTANCE, ELEVATION, FOCAL = 6.2, math.radians(9), 2.25
 #: y of the middle of the globe and its base: the camera looks at this height.
 MIDDLE = 0.04
-# Direction of the shaking in the frame of the camera: mostly to the sides.
-_SHAKE_DIRECTION = (0.94, 0.28, 0.20)
+#: Direction of the shaking in the frame of the camera: mostly to the sides.
+SHAKE_DIRECTION = (0.94, 0.28, 0.20)
 # If the cameras of the photos do not surround the scene, it turns by this angle to each side.
 _SWING = math.radians(30)
 
@@ -80,14 +80,14 @@ class Film:
                 output = render(appearance(gaussians, snow), camera)
             picture = backdrop.around(output.image.numpy(), output.alpha.numpy())
             pixels = shake_offset(time - SHAKE_AT) * camera.fx / DISTANCE
-            yield _shifted(picture, *(round(pixels * share) for share in _SHAKE_DIRECTION[:2]))
+            yield _shifted(picture, *(round(pixels * share) for share in SHAKE_DIRECTION[:2]))
             self._advance(snow, time, camera)
 
     def _advance(self, snow: Snow, time: float, camera: Camera) -> None:
         """Advance the simulation to the next frame."""
         steps = math.ceil(1 / self.fps / LONGEST_STEP - 1e-6)
         seconds = 1 / self.fps / steps
-        direction = camera.world_from_cam[:, :3].numpy() @ np.array(_SHAKE_DIRECTION)
+        direction = camera.world_from_cam[:, :3].numpy() @ np.array(SHAKE_DIRECTION)
         for j in range(steps):
             now = time + j * seconds
             if now <= REMEMBER_AT < now + seconds:

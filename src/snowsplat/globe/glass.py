@@ -25,7 +25,7 @@ LIGHT = (-0.48, -0.76, -0.44)
 PLATE = (0.40, 0.088)
 PLATE_Y = BASE[1].y + 0.005
 
-_FRESNEL = 0.045  # reflectance of the glass for perpendicular rays
+FRESNEL = 0.045  # reflectance of the glass for perpendicular rays
 _STEPS = 70  # of sphere tracing
 _NEAR = 2e-3
 _FAR = 12.0
@@ -123,7 +123,7 @@ def _shade(
     glass = hits & (entry[:, 1] < FLOOR)
     facing = np.clip(-(entry * rays).sum(1), 0, 1)
     reflected = rays + 2 * facing[:, None] * entry
-    fresnel = _FRESNEL + (1 - _FRESNEL) * (1 - facing) ** 5
+    fresnel = FRESNEL + (1 - FRESNEL) * (1 - facing) ** 5
     edge = 1 - facing
 
     # The inside: the floor, or the back of the glass.

@@ -1,0 +1,490 @@
+// The page: camera, input, and drawing with WebGL 2. A worker (simulation.js) moves the Gaussians.
+"use strict";
+
+const element = (id) => document.getElementById(id);
+const about = JSON.parse(element("about").textContent);
+const C = about.constants;
+const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
+
+// ---- Data
+
+function decode() {
+    const text = atob(element("data").textContent);
+    element("data").remove();
+    const bytes = new Uint8Array(text.length);
+    for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+    const kinds = { i2: Int16Array, u1: Uint8Array, i1: Int8Array };
+    const columns = {};
+    for (const { name, kind, offset, length, scale, low } of about.columns) {
+        const values = new kinds[kind](bytes.buffer, offset, length);
+        columns[name] = Float32Array.from(values, (value) => low + scale * value);
+    }
+    return columns;
+}
+
+// Six texels of parameters for each Gaussian: see splats.vert.
+function parametersOf(columns, count, width) {
+    const data = new Float32Array(4 * width * Math.ceil((6 * count) / width));
+    const heights = randomNumbers(count, 9), azimuths = randomNumbers(count, 10);
+    for (let i = 0; i < count; i++) {
+        const at = 24 * i;
+        data.set(columns.log_scales.subarray(3 * i, 3 * i + 3), at);
+        data[at + 3] = columns.opacity[i];
+        data.set(columns.quat.subarray(4 * i, 4 * i + 4), at + 4);
+        data.set(columns.color.subarray(3 * i, 3 * i + 3), at + 8);
+        data[at + 11] = 2 * Math.PI * azimuths[i];
+        for (let axis = 0; axis < 3; axis++) {
+            const from = 9 * i + 3 * axis;
+            data.set(columns.sh.subarray(from, from + 3), at + 12 + 4 * axis);
+        }
+        data[at + 15] = 2 * heights[i] - 1;
+    }
+    return data;
+}
+
+// ---- WebGL
+
+function program(gl, vertex, fragment) {
+    const linked = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+        const shader = gl.createShader(kind);
+        gl.shaderSource(shader, "#version 300 es\nprecision highp float;\n" + source);
+        gl.compileShader(shader);
+        if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) {
+            throw new Error(gl.getShaderInfoLog(shader));
+        }
+        gl.attachShader(linked, shader);
+    }
+    gl.bindAttribLocation(linked, 0, "corner");
+    gl.bindAttribLocation(linked, 1, "index");
+    gl.linkProgram(linked);
+    if (!gl.getProgramParameter(linked, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(linked));
+    const uniforms = {};
+    const number = gl.getProgramParameter(linked, gl.ACTIVE_UNIFORMS);
+    for (let i = 0; i < number; i++) {
+        const { name } = gl.getActiveUniform(linked, i);
+        uniforms[name] = gl.getUniformLocation(linked, name);
+    }
+    return { linked, uniforms };
+}
+
+function texture(gl, unit, format, width, height, layout, type, data) {
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    const made = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    const filter = type === gl.FLOAT ? gl.NEAREST : gl.LINEAR;
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, filter);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, filter);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    if (data instanceof HTMLCanvasElement) {
+        gl.texImage2D(gl.TEXTURE_2D, 0, format, layout, type, data);
+    } else {
+        gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, layout, type, data);
+    }
+    return made;
+}
+
+// The name of the scene, for the plate on the base.
+function engraving(name) {
+    const canvas = document.createElement("canvas");
+    canvas.width = 1024;
+    canvas.height = Math.round((1024 * C.PLATE[1]) / (C.PLATE[0] * C.BASE[1][2]));
+    const context = canvas.getContext("2d");
+    context.fillStyle = "#000";
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    context.fillStyle = "#fff";
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    let points = 0.5 * canvas.height;
+    do {
+        context.font = `500 ${points}px Georgia, "Times New Roman", serif`;
+        points *= 0.94;
+    } while (context.measureText(name).width > 0.86 * canvas.width && points > 8);
+    context.fillText(name, canvas.width / 2, canvas.height * 0.53);
+    return canvas;
+}
+
+const STATE_WIDTH = 1024, PARAMETER_WIDTH = 1536; // texels; a multiple of 6
+
+class Renderer {
+    constructor(canvas, columns, count) {
+        const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false });
+        if (!gl) throw new Error("no WebGL 2");
+        this.gl = gl;
+        this.canvas = canvas;
+        const { shaders, glsl } = about;
+        const screen = "in vec2 corner; void main() { gl_Position = vec4(corner, 0.0, 1.0); }";
+        this.behind = program(gl, screen, glsl + shaders.common + shaders.behind);
+        this.front = program(gl, screen, glsl + shaders.common + shaders.front);
+        this.splats = program(gl, glsl + shaders.vertex, shaders.fragment);
+        this.rows = Math.ceil(count / STATE_WIDTH);
+        this.state = texture(
+            gl, 0, gl.RGBA32F, STATE_WIDTH, this.rows, gl.RGBA, gl.FLOAT, null);
+        const parameters = parametersOf(columns, count, PARAMETER_WIDTH);
+        texture(gl, 1, gl.RGBA32F, PARAMETER_WIDTH, parameters.length / 4 / PARAMETER_WIDTH,
+            gl.RGBA, gl.FLOAT, parameters);
+        texture(gl, 2, gl.R8, 0, 0, gl.RED, gl.UNSIGNED_BYTE, engraving(about.name));
+        gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+        const corners = new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]);
+        gl.bufferData(gl.ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+        gl.enableVertexAttribArray(0);
+        gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
+        this.order = gl.createBuffer();
+        gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+        gl.bufferData(gl.ARRAY_BUFFER, 4 * count, gl.DYNAMIC_DRAW);
+        gl.enableVertexAttribArray(1);
+        gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
+        gl.vertexAttribDivisor(1, 1);
+        this.target = gl.createFramebuffer();
+        this.count = 0;
+    }
+
+    // The Gaussians to display: a result of the worker.
+    update({ state, order, count }) {
+        const { gl } = this;
+        gl.activeTexture(gl.TEXTURE0);
+        gl.bindTexture(gl.TEXTURE_2D, this.state);
+        gl.texSubImage2D(
+            gl.TEXTURE_2D, 0, 0, 0, STATE_WIDTH, this.rows, gl.RGBA, gl.FLOAT, state);
+        gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+        gl.bufferSubData(gl.ARRAY_BUFFER, 0, order, 0, count);
+        this.count = count;
+    }
+
+    resize(width, height) {
+        const { gl, canvas } = this;
+        if (canvas.width === width && canvas.height === height && this.inside) return;
+        canvas.width = width;
+        canvas.height = height;
+        if (this.inside) gl.deleteTexture(this.inside);
+        this.inside = texture(gl, 3, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE, null);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+        gl.framebufferTexture2D(
+            gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.inside, 0);
+    }
+
+    // globe, scene: cameras {position, axes} in front of the globe, and of the turned scene.
+    draw(globe, scene, focal, centre) {
+        const { gl, canvas } = this;
+        const lens = ({ uniforms }) => {
+            gl.uniform2f(uniforms.focal, focal, focal);
+            gl.uniform2fv(uniforms.centre, centre);
+            gl.uniform2f(uniforms.size, canvas.width, canvas.height);
+        };
+        const backdrop = (pass) => {
+            gl.useProgram(pass.linked);
+            lens(pass);
+            gl.uniformMatrix3fv(pass.uniforms.turn, false, globe.axes.flat());
+            gl.uniform3fv(pass.uniforms.origin, globe.position);
+            gl.uniform1i(pass.uniforms.plate, 2);
+            gl.uniform1i(pass.uniforms.inside, 3);
+            gl.disable(gl.BLEND);
+            gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+        };
+        gl.viewport(0, 0, canvas.width, canvas.height);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+        backdrop(this.behind);
+        gl.useProgram(this.splats.linked);
+        lens(this.splats);
+        gl.uniformMatrix3fv(this.splats.uniforms.camera, true, scene.axes.flat());
+        gl.uniform3fv(this.splats.uniforms.eye, scene.position);
+        gl.uniform1i(this.splats.uniforms.state, 0);
+        gl.uniform1i(this.splats.uniforms.parameters, 1);
+        gl.enable(gl.BLEND);
+        gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+        gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+        backdrop(this.front);
+    }
+}
+
+// ---- Camera
+
+// Orbit of the globe, as in snowsplat/globe/film.py. Rows of `axes`: right, down, forward.
+function orbit(azimuth, elevation, distance) {
+    const ce = Math.cos(elevation), se = Math.sin(elevation);
+    const ca = Math.cos(azimuth), sa = Math.sin(azimuth);
+    return {
+        position: [distance * ce * sa, C.MIDDLE - distance * se, -distance * ce * ca],
+        axes: [[ca, 0, sa], [se * sa, ce, -se * ca], [-ce * sa, se, ce * ca]],
+    };
+}
+
+// ---- The globe
+
+const SWING = Math.PI / 6; // the scene turns by this angle to each side if its back is unknown
+const TURN_SECONDS = 60;
+const SLOW = 1000 / 30; // milliseconds per frame
+const LEAST_COUNT = 10000, LEAST_RATIO = 0.6;
+
+class Globe {
+    constructor() {
+        this.canvas = element("view");
+        const columns = decode();
+        this.total = this.count = about.count;
+        this.renderer = new Renderer(this.canvas, columns, this.total);
+        const code = new Blob([about.simulation], { type: "text/javascript" });
+        this.worker = new Worker(URL.createObjectURL(code));
+        this.worker.onmessage = ({ data }) => this.receive(data);
+        this.home = columns.position;
+        this.worker.postMessage({ home: columns.position, constants: C });
+        this.buffers = {
+            state: new Float32Array(4 * STATE_WIDTH * this.renderer.rows),
+            order: new Uint32Array(this.total),
+        };
+        this.result = { standing: true, remembering: null };
+        this.azimuth = 0;
+        this.elevation = C.ELEVATION;
+        this.zoom = 1;
+        this.seconds = 0; // since the page was opened, for the turning of the scene
+        this.turned = 0; // azimuth of the scene in the globe
+        this.shaken = Infinity; // seconds since the button was pressed
+        this.push = [0, 0, 0]; // acceleration by the pointer or the phone, in the camera's frame
+        this.pixelRatio = Math.min(devicePixelRatio || 1, 2);
+        this.adapts = true;
+        this.intervals = [];
+        this.pending = [];
+        this.waiting = null;
+        this.listen();
+        this.request([], true);
+        requestAnimationFrame((now) => this.frame(now));
+    }
+
+    // ---- Simulation
+
+    cameras() {
+        const globe = orbit(this.azimuth, this.elevation, C.DISTANCE);
+        return { globe, scene: orbit(this.azimuth + this.turned, this.elevation, C.DISTANCE) };
+    }
+
+    // Ask the worker for the state after these steps. One request is under way at a time.
+    request(steps, force) {
+        const forward = this.cameras().scene.axes[2];
+        const key = `${forward.map((f) => f.toFixed(3))} ${this.count}`;
+        const rests = this.result.standing && !steps.some(([, a]) => Math.hypot(...a) > 0);
+        if (!this.buffers || (!force && rests && key === this.sorted)) return false;
+        this.sorted = key;
+        const { state, order } = this.buffers;
+        this.buffers = null;
+        this.worker.postMessage(
+            { steps, forward, count: this.count, remember: this.remembers, state, order },
+            [state.buffer, order.buffer]);
+        this.remembers = false;
+        return true;
+    }
+
+    receive(result) {
+        this.result = result;
+        this.renderer.update(result);
+        this.buffers = { state: result.state, order: result.order };
+        element("remember").disabled = result.standing || result.remembering !== null;
+        this.drawn = false;
+        if (this.waiting) this.waiting();
+        this.waiting = null;
+    }
+
+    // The acceleration of the globe in the frame of the scene, `seconds` from now.
+    acceleration(seconds) {
+        const since = this.shaken + seconds;
+        let inCamera = this.push;
+        if (since < C.SHAKE_SECONDS) {
+            const strength = C.SHAKE_ACCELERATION * Math.sin((Math.PI * since) / C.SHAKE_SECONDS)
+                * Math.sin(2 * Math.PI * C.SHAKE_FREQUENCY * since);
+            inCamera = C.SHAKE_DIRECTION.map((share, i) => strength * share + this.push[i]);
+        }
+        const { axes } = this.cameras().scene;
+        return [0, 1, 2].map((i) => axes.reduce((sum, axis, j) => sum + axis[i] * inCamera[j], 0));
+    }
+
+    shake() {
+        this.shaken = 0;
+        this.remembers = false;
+        this.hideHint();
+    }
+
+    remember() {
+        this.remembers = true;
+    }
+
+    // Steps for this time, none of which is longer than the simulation allows.
+    steps(seconds) {
+        const number = Math.max(1, Math.ceil(seconds / C.LONGEST_STEP - 1e-6));
+        return Array.from({ length: number }, (_, i) => [
+            seconds / number, this.acceleration((i * seconds) / number)]);
+    }
+
+    // Advance at once, without drawing: for tests. The promise is fulfilled when it is done.
+    async advance(seconds) {
+        for (let left = seconds; left > 1e-6; left -= C.LONGEST_STEP) {
+            while (!this.buffers) await new Promise((done) => (this.waiting = done));
+            const now = Math.min(left, C.LONGEST_STEP);
+            const steps = this.steps(now);
+            this.shaken += now;
+            this.request(steps, true);
+        }
+        while (!this.buffers) await new Promise((done) => (this.waiting = done));
+    }
+
+    // ---- Drawing
+
+    frame(now) {
+        requestAnimationFrame((next) => this.frame(next));
+        const interval = Math.min(now - (this.last ?? now), 250);
+        this.last = now;
+        if (this.paused || document.hidden) return;
+        const seconds = interval / 1000;
+        this.turn(seconds);
+        // A slow computer shows the motion more slowly, instead of with long steps.
+        const simulated = Math.min(seconds, 3 * C.LONGEST_STEP);
+        if (simulated > 0 && this.buffers) {
+            const { standing } = this.result;
+            if (this.request(this.steps(simulated), this.remembers)) this.drawn = false;
+            this.shaken += simulated;
+            this.push = this.push.map((a) => a * Math.exp(-simulated / 0.06));
+            if (!standing) this.adapt(interval);
+            else this.intervals.length = 0;
+        }
+        this.draw();
+    }
+
+    turn(seconds) {
+        if (reducedMotion.matches || this.dragging) return;
+        this.seconds += seconds;
+        const turns = (2 * Math.PI * this.seconds) / TURN_SECONDS;
+        this.turned = about.surrounded ? turns : SWING * Math.sin(turns);
+        this.drawn = false;
+    }
+
+    draw() {
+        const { canvas, renderer } = this;
+        const width = Math.max(1, Math.round(canvas.clientWidth * this.pixelRatio));
+        const height = Math.max(1, Math.round(canvas.clientHeight * this.pixelRatio));
+        if (this.drawn && canvas.width === width && canvas.height === height) return;
+        renderer.resize(width, height);
+        const focal = C.FOCAL * Math.min(width, 0.94 * height) * this.zoom;
+        const centre = [0.5 * width, 0.47 * height];
+        if (this.shaken < C.SHAKE_SECONDS && !reducedMotion.matches) {
+            const strength = Math.sin((Math.PI * this.shaken) / C.SHAKE_SECONDS)
+                * Math.sin(2 * Math.PI * C.SHAKE_FREQUENCY * this.shaken);
+            const offset = (-C.SHAKE_ACCELERATION * strength * focal)
+                / (2 * Math.PI * C.SHAKE_FREQUENCY) ** 2 / C.DISTANCE;
+            centre[0] += offset * C.SHAKE_DIRECTION[0];
+            centre[1] += offset * C.SHAKE_DIRECTION[1];
+        }
+        const { globe, scene } = this.cameras();
+        renderer.draw(globe, scene, focal, centre);
+        this.drawn = true;
+    }
+
+    // Below 30 frames a second: fewer pixels, then fewer Gaussians, the least important ones first.
+    adapt(interval) {
+        if (!this.adapts || interval <= 0) return;
+        this.intervals.push(interval);
+        if (this.intervals.length < 30) return;
+        const middle = this.intervals.sort((a, b) => a - b)[15];
+        this.intervals.length = 0;
+        if (middle <= SLOW) return;
+        if (this.pixelRatio > LEAST_RATIO && this.result.milliseconds < SLOW) {
+            this.pixelRatio = Math.max(LEAST_RATIO, this.pixelRatio * 0.8);
+        } else {
+            const fewer = Math.round(this.count * 0.8);
+            this.count = Math.min(this.count, Math.max(fewer, LEAST_COUNT));
+        }
+    }
+
+    // ---- Input
+
+    listen() {
+        const { canvas } = this;
+        let x = 0, y = 0, time = 0, vx = 0, vy = 0;
+        canvas.addEventListener("pointerdown", (event) => {
+            canvas.setPointerCapture(event.pointerId);
+            [x, y, time] = [event.clientX, event.clientY, event.timeStamp];
+            vx = vy = 0;
+            this.dragging = true;
+        });
+        canvas.addEventListener("pointermove", (event) => {
+            if (!this.dragging) return;
+            const dx = event.clientX - x, dy = event.clientY - y;
+            const seconds = Math.max((event.timeStamp - time) / 1000, 0.004);
+            [x, y, time] = [event.clientX, event.clientY, event.timeStamp];
+            this.rotate(-dx * 0.007, dy * 0.004);
+            // Fast changes of direction shake the globe. Velocities are in radii per second.
+            const radius = 0.36 * Math.min(canvas.clientWidth, canvas.clientHeight);
+            const [wx, wy] = [dx / seconds / radius, dy / seconds / radius];
+            const ax = (wx - vx) / Math.max(seconds, 0.016), ay = (wy - vy) / Math.max(seconds, 0.016);
+            [vx, vy] = [wx, wy];
+            if (Math.hypot(ax, ay) > 150) this.pushBy(0.12 * ax, 0.12 * ay, 0);
+        });
+        for (const end of ["pointerup", "pointercancel"]) {
+            canvas.addEventListener(end, () => (this.dragging = false));
+        }
+        canvas.addEventListener("wheel", (event) => {
+            event.preventDefault();
+            this.zoom = Math.min(2.5, Math.max(0.6, this.zoom * Math.exp(-0.001 * event.deltaY)));
+            this.drawn = false;
+        }, { passive: false });
+        addEventListener("keydown", (event) => {
+            const onButton = event.target instanceof HTMLButtonElement;
+            if (event.key === " " && !onButton) this.shake();
+            else if (event.key === "Enter" && !onButton) this.remember();
+            else if (event.key === "ArrowLeft") this.rotate(0.1, 0);
+            else if (event.key === "ArrowRight") this.rotate(-0.1, 0);
+            else if (event.key === "ArrowUp") this.rotate(0, 0.06);
+            else if (event.key === "ArrowDown") this.rotate(0, -0.06);
+            else return;
+            event.preventDefault();
+        });
+        element("shake").addEventListener("click", () => {
+            this.shake();
+            this.askForMotion();
+        });
+        element("remember").addEventListener("click", () => this.remember());
+        if (!globalThis.DeviceMotionEvent?.requestPermission) this.listenToMotion();
+    }
+
+    rotate(azimuth, elevation) {
+        this.azimuth += azimuth;
+        this.elevation = Math.min(1.0, Math.max(0.0, this.elevation + elevation));
+        this.drawn = false;
+        this.hideHint();
+    }
+
+    pushBy(x, y, z) {
+        const size = Math.hypot(x, y, z), most = C.SHAKE_ACCELERATION;
+        this.push = [x, y, z].map((a) => (a * Math.min(size, most)) / size);
+    }
+
+    // Safari asks the user for permission, after a click.
+    askForMotion() {
+        if (this.motion) return;
+        this.motion = true;
+        const ask = globalThis.DeviceMotionEvent?.requestPermission;
+        if (!ask) return;
+        ask.call(DeviceMotionEvent)
+            .then((answer) => answer === "granted" && this.listenToMotion())
+            .catch(() => {}); // not allowed: the buttons are enough
+    }
+
+    listenToMotion() {
+        addEventListener("devicemotion", ({ acceleration }) => {
+            const { x, y, z } = acceleration ?? {};
+            // The axes of a phone are right, up, and towards the user.
+            if (Math.hypot(x ?? 0, y ?? 0, z ?? 0) > 4) this.pushBy(1.5 * x, -1.5 * y, -1.5 * z);
+        });
+    }
+
+    hideHint() {
+        element("hint").style.opacity = 0;
+    }
+}
+
+try {
+    window.snowGlobe = new Globe();
+} catch (error) {
+    const line = document.createElement("p");
+    line.textContent = "This page needs a browser with WebGL 2.";
+    document.body.append(line);
+    throw error;
+}
