@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.convert import Edits, convert
     from snowsplat.pipeline.describe import describe
     from snowsplat.pipeline.evaluate import evaluate
+    from snowsplat.pipeline.globe import GlobeOptions, make_globe
     from snowsplat.pipeline.image import decode_image, fit_image
     from snowsplat.pipeline.make import MakeOptions, make
     from snowsplat.pipeline.observer import Observer
@@ -55,6 +56,7 @@ _MODULES = {
     "Edits": "pipeline.convert",
     "FitOptions": "image.fit",
     "Gaussians": "scene.gaussians",
+    "GlobeOptions": "pipeline.globe",
     "MakeOptions": "pipeline.make",
     "Observer": "pipeline.observer",
     "Points": "data",
@@ -74,6 +76,7 @@ _MODULES = {
     "load_dataset": "data",
     "load_trained": "pipeline.scene_source",
     "make": "pipeline.make",
+    "make_globe": "pipeline.globe",
     "read_gaussians": "formats",
     "recipe": "training.recipes",
     "render_images": "pipeline.render",
@@ -90,6 +93,7 @@ __all__ = [
     "Edits",
     "FitOptions",
     "Gaussians",
+    "GlobeOptions",
     "MakeOptions",
     "Observer",
     "Points",
@@ -110,6 +114,7 @@ __all__ = [
     "load_dataset",
     "load_trained",
     "make",
+    "make_globe",
     "read_gaussians",
     "recipe",
     "render_images",

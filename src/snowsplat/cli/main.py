@@ -36,6 +36,7 @@ SUBCOMMANDS = {
     "watch": "Show an ongoing or finished training run in the browser, with its photos.",
     "convert": "Write a scene in another file format; crop, decimate, transform or merge scenes.",
     "image": "Approximate a photo by 2D Gaussians, or render such an approximation.",
+    "globe": "Put a scene into a snow globe: a web page, and a video.",
     "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }
 
@@ -54,6 +55,7 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: makes a 3D scene from ph
   snowsplat watch OUT                     show the training in the browser
   snowsplat convert SCENE [MORE …] FILE   another format; crop, decimate, merge
   snowsplat image PHOTO -o OUT            a photo as 1000 Gaussians
+  snowsplat globe SCENE                   a snow globe, as a web page
   snowsplat info PATH                     describe a file or a folder
 
 A dataset is a folder of photos with their camera poses.

@@ -1,6 +1,6 @@
 """How a Gaussian looks while it is snow: small, opaque, brighter, and turned.
 
-The page does the same on the GPU (`page/splats.glsl`).
+The page does the same on the GPU (`web/splats.vert`).
 """
 
 from __future__ import annotations

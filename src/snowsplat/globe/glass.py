@@ -1,7 +1,7 @@
 """The picture around the Gaussians: background, floor, glass and base, by ray tracing.
 
 `draw` computes it once per camera. `Backdrop.around` puts a rendering of the Gaussians into it. The
-page does the same on the GPU (`page/backdrop.glsl`), with the same colours.
+page does the same on the GPU (`web/behind.frag`, `web/front.frag`), with the same colours.
 """
 
 from __future__ import annotations
@@ -90,7 +90,9 @@ def _draw_rows(
     turn, origin = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
     rays = (in_camera @ turn.T).reshape(-1, 3)
     corner = np.hypot(camera.width / camera.fx, camera.height / camera.fy) / 2
-    behind, keep, add = _shade(rays, origin, turn, (np.hypot(u, v) / corner).astype(np.float32).reshape(-1), plate)
+    behind, keep, add = _shade(
+        rays, origin, turn, (np.hypot(u, v) / corner).astype(np.float32).reshape(-1), plate
+    )
 
     def mean(values: np.ndarray) -> np.ndarray:
         shape = last - first, samples, camera.width, samples, values.shape[-1]
@@ -135,7 +137,9 @@ def _shade(
     exit_y = (origin + leave[:, None] * rays)[:, 1]
     air = _mix(*INSIDE, _smooth(-1.0, FLOOR, exit_y))
     air = _blend(behind, air, np.full(len(rays), 0.62, np.float32))
-    snow = np.array(SNOW, np.float32) * (1 - 0.30 * _smooth(0.45, 1.0, radius / FLOOR_RADIUS))[:, None]
+    snow = (
+        np.array(SNOW, np.float32) * (1 - 0.30 * _smooth(0.45, 1.0, radius / FLOOR_RADIUS))[:, None]
+    )
     inside = np.where(on_floor[:, None], snow, air)
     behind = np.where((glass | on_floor)[:, None], inside, behind)
 

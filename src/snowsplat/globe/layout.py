@@ -37,8 +37,9 @@ _FLOOR_SHARE = 0.12
 _HEIGHT_CELLS = 80
 # Opacities decrease to 0 between these distances from the centre, including 2 σ of the Gaussian.
 _FADE = (0.84, 0.97)
-# A Gaussian is isolated if its neighbours are farther away than this multiple of the median.
-_ISOLATED = 12.0
+# A Gaussian is isolated if its neighbours are farther away than 3 times its size, and than this
+# multiple of the median.
+_ISOLATED = 8.0
 # How far the scene may extend below the floor. A table top is not perfectly flat.
 _SUNK = 0.03
 _WIDEST_GAP = math.radians(110)
@@ -62,10 +63,10 @@ def arrange(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> Arra
     """At most ``count`` Gaussians of the subject of a scene, in the frame of the globe.
 
     The subject is at the focus of the cameras. Without cameras, it is at the median of the
-    Gaussians, and −y is up. It is scaled so that it fills the globe, and it stands on the floor: the
-    largest horizontal surface near the focus or, without such a surface, its lowest Gaussians. What
-    is outside of the glass or below the floor is left out, as are isolated Gaussians. Opacities
-    decrease towards the glass.
+    Gaussians, and −y is up. It is scaled so that it fills the globe. It stands on the floor of the
+    globe: the largest horizontal surface near the focus becomes the floor or, without such a
+    surface, the lowest Gaussians do. What is outside of the glass or below the floor is left out,
+    as are isolated Gaussians. Opacities decrease towards the glass.
 
     Args:
         gaussians: the scene.
@@ -84,9 +85,12 @@ def arrange(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> Arra
     inside = _inside(transform(gaussians, frame))
     if len(inside) > 8:
         spacing = ops.neighbours(inside.means, k=4).mean(1)
-        inside = inside.select(spacing <= _ISOLATED * spacing.median())
+        isolated = (spacing > _ISOLATED * spacing.median()) & (spacing > 3 * inside.scales.amax(1))
+        inside = inside.select(~isolated)
     if not len(inside):
-        raise UserError("no Gaussians are near the point that the cameras look at")
+        raise UserError(
+            "no Gaussians are left near the middle of the scene; look at it with snowsplat view"
+        )
     inside = decimate(inside, count)
     importance = inside.opacities.log() + inside.log_scales.amax(1)
     order = importance.argsort(descending=True, stable=True)
@@ -130,9 +134,7 @@ def _globe_frame(gaussians: Gaussians, cameras: Sequence[Camera]) -> Similarity:
     return Similarity(scale, rotation, down - scale * rotation @ origin)
 
 
-def _floor_height(
-    gaussians: Gaussians, rotation: Tensor, around: Tensor, radius: float
-) -> float:
+def _floor_height(gaussians: Gaussians, rotation: Tensor, around: Tensor, radius: float) -> float:
     """y of the largest horizontal surface near the focus, relative to the focus; down is positive.
 
     Without such a surface, it is the height above which 99.5% of the near Gaussians are.

@@ -165,7 +165,9 @@ def _reduced_colors(gaussians: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
     degree = SH_REST_COUNTS.index(gaussians.sh_rest.shape[1])
     azimuth = torch.arange(24, dtype=torch.float64) * (2 * torch.pi / 24)
     elevation = torch.deg2rad(torch.arange(-10, 51, 10, dtype=torch.float64))
-    azimuth, elevation = (grid.ravel() for grid in torch.meshgrid(azimuth, elevation, indexing="ij"))
+    azimuth, elevation = (
+        grid.ravel() for grid in torch.meshgrid(azimuth, elevation, indexing="ij")
+    )
     level = elevation.cos()
     # The direction from the camera; y is down.
     directions = torch.stack([level * azimuth.sin(), elevation.sin(), level * azimuth.cos()], 1)

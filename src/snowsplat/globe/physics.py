@@ -19,8 +19,8 @@ over a time step, so that the motion is stable for long steps, too:
   remaining time τ. The rest of such a curve is again such a curve. No curve needs to be stored, and
   the flake arrives exactly.
 
-`constants` are the numbers that the page needs; its script contains the same equations
-(`page/simulation.js`), and a test compares both. Lengths are in radii of the glass, times in
+The script of the page contains the same equations (`web/simulation.js`); it gets the `constants`
+from here, and a test compares both. Lengths are in radii of the glass, times in
 seconds. The frame is that of `snowsplat.globe.dimensions`: y is down.
 """
 
@@ -51,11 +51,10 @@ MORPH = 0.45  # seconds in which a Gaussian becomes a flake
 # Liquid.
 VORTEX = 0.75  # rad/s at the axis
 RING = 0.85
-WAVES = 6
+WAVES = 5
 FLOW_CELLS = 17  # along each side of the grid
 DECAY = 1.7  # seconds in which the strength decreases to 1/e
 STRONGEST = 2.0
-WAVES = 5
 # While the flow is stronger than this (another value in this range for each flake), it lifts flakes
 # from the floor, with a velocity of HOP times the strength.
 LIFT = (0.04, 0.28)
@@ -76,7 +75,8 @@ HOLD = (0.12, 1.0)
 SHARE = 0.2
 
 BOUNCE = 0.35
-PILE_CELLS = 28  # along each side of the grid
+PILE_CELLS = (6, 28)  # along each side of the grid, for few and for many flakes
+FLAKES_PER_CELL = 45
 PILE_DEPTH = 0.07  # mean depth of the pile if all flakes rest
 HIGHEST = 0.3  # of the pile
 REPOSE = 0.8  # slope
@@ -174,6 +174,8 @@ class Snow:
         self.position, self.velocity = self.home.copy(), np.zeros_like(self.home)
         self.angle, self.morph = np.zeros((2, count), np.float32)
         self.resting = np.zeros(count, bool)
+        cells = math.sqrt(count * 4 / math.pi / FLAKES_PER_CELL)
+        self._cells = int(np.clip(cells, *PILE_CELLS))
         first, second, drag, fall, start, lift, rate, phase, height = (
             random_numbers(count, i) for i in range(9)
         )
@@ -247,13 +249,24 @@ class Snow:
         return u
 
     def pile(self) -> np.ndarray:
-        """(PILE_CELLS, PILE_CELLS): the height of the pile in each cell, by row z and column x."""
-        x, z = (_cell(self.position[axis, self.resting]) for axis in (0, 2))
-        counts = np.bincount(z * PILE_CELLS + x, minlength=PILE_CELLS**2).astype(np.float32)
+        """(cells, cells) float32: the height of the pile in each cell, by row z and column x."""
+        cells = self._cells
+        x, z = (
+            np.clip(
+                ((self.position[axis, self.resting] + FLOOR_RADIUS) * self._per_unit).astype(int),
+                0,
+                cells - 1,
+            )
+            for axis in (0, 2)
+        )
+        counts = np.bincount(z * cells + x, minlength=cells * cells).astype(np.float32)
         # The mean height is PILE_DEPTH if all flakes rest on the disc.
-        cells = math.pi * (PILE_CELLS / 2) ** 2
-        heights = np.minimum(counts * (PILE_DEPTH * cells / len(self.angle)), HIGHEST)
-        return heights.reshape(PILE_CELLS, PILE_CELLS)
+        height = PILE_DEPTH * math.pi * (cells / 2) ** 2 / len(self.angle)
+        return np.minimum(counts * height, HIGHEST).reshape(cells, cells)
+
+    @property
+    def _per_unit(self) -> float:
+        return self._cells / (2 * FLOOR_RADIUS)
 
     def _fall_step(
         self, seconds: float, moves: np.ndarray, acceleration: tuple[float, float, float]
@@ -282,6 +295,8 @@ class Snow:
         hops = touching & lifted[rows]
         v[1, hops] = -HOP * self.strength * (0.5 + self._lift[rows[hops]])
         steep = np.hypot(slope_x, slope_z) > REPOSE
+        # The glass keeps the pile from sliding outwards.
+        steep &= np.hypot(x[0], x[2]) < FLOOR_RADIUS - 1 / self._per_unit
         settles, slides = touching & ~hops & ~steep, touching & ~hops & steep
         v[:, settles] = 0
         v[:, slides] = np.stack([-SLIDE * slope_x, 0 * slope_x, -SLIDE * slope_z])[:, slides]
@@ -353,16 +368,12 @@ def _collide_with_glass(x: np.ndarray, v: np.ndarray) -> None:
     v[:, out] -= normal * (np.maximum(speed, 0) * np.float32(1 + BOUNCE))
 
 
-def _cell(coordinate: np.ndarray) -> np.ndarray:
-    cell = ((coordinate + FLOOR_RADIUS) * (PILE_CELLS / (2 * FLOOR_RADIUS))).astype(np.int64)
-    return np.clip(cell, 0, PILE_CELLS - 1)
-
-
 def _sample(heights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Bilinear interpolation of the pile at x (3, M): the height, and its slope along x and z."""
-    per_unit = PILE_CELLS / (2 * FLOOR_RADIUS)
+    cells = len(heights)
+    per_unit = cells / (2 * FLOOR_RADIUS)
     fx, fz = (
-        np.clip((x[axis] + FLOOR_RADIUS) * per_unit - 0.5, 0, PILE_CELLS - 1.001) for axis in (0, 2)
+        np.clip((x[axis] + FLOOR_RADIUS) * per_unit - 0.5, 0, cells - 1.001) for axis in (0, 2)
     )
     ix, iz = fx.astype(np.int64), fz.astype(np.int64)
     fx, fz = fx - ix, fz - iz

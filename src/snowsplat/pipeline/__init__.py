@@ -7,6 +7,7 @@
     videos.py    renders a video of a scene
     evaluate.py  measures PSNR, SSIM and LPIPS of a scene
     image.py     approximates a photo by 2D Gaussians
+    globe.py     puts a scene into a snow globe
     convert.py   merges, edits and converts scene files
     describe.py  describes the contents of a file or folder
     watch.py     shows the output folder of a training run in the browser

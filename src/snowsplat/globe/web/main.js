@@ -441,7 +441,7 @@ class Globe {
             this.askForMotion();
         });
         element("remember").addEventListener("click", () => this.remember());
-        if (!globalThis.DeviceMotionEvent?.requestPermission) this.listenToMotion();
+        this.listenToMotion();
     }
 
     rotate(azimuth, elevation) {
@@ -468,11 +468,13 @@ class Globe {
     }
 
     listenToMotion() {
-        addEventListener("devicemotion", ({ acceleration }) => {
+        this.onMotion ??= ({ acceleration }) => {
             const { x, y, z } = acceleration ?? {};
             // The axes of a phone are right, up, and towards the user.
             if (Math.hypot(x ?? 0, y ?? 0, z ?? 0) > 4) this.pushBy(1.5 * x, -1.5 * y, -1.5 * z);
-        });
+        };
+        removeEventListener("devicemotion", this.onMotion);
+        addEventListener("devicemotion", this.onMotion);
     }
 
     hideHint() {

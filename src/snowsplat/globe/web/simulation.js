@@ -50,7 +50,10 @@ class Snow {
         this.launch = inRange(C.LAUNCH, random[8]);
         this.grid = new Float32Array(3 * C.FLOW_CELLS ** 3);
         this.waves = Float64Array.from(C.WAVE.flat());
-        this.pile = new Float32Array(C.PILE_CELLS ** 2);
+        const cells = Math.sqrt((count * 4) / Math.PI / C.FLAKES_PER_CELL);
+        this.cells = Math.trunc(Math.min(Math.max(cells, C.PILE_CELLS[0]), C.PILE_CELLS[1]));
+        this.perUnit = this.cells / (2 * C.FLOOR_RADIUS);
+        this.pile = new Float32Array(this.cells ** 2);
     }
 
     get standing() {
@@ -124,20 +127,18 @@ class Snow {
     }
 
     cell(coordinate) {
-        const { C } = this;
-        const cell = Math.trunc(
-            (coordinate + C.FLOOR_RADIUS) * (C.PILE_CELLS / (2 * C.FLOOR_RADIUS)));
-        return Math.min(C.PILE_CELLS - 1, Math.max(0, cell));
+        const cell = Math.trunc((coordinate + this.C.FLOOR_RADIUS) * this.perUnit);
+        return Math.min(this.cells - 1, Math.max(0, cell));
     }
 
     updatePile() {
         const { C, pile, position } = this;
-        const height = (C.PILE_DEPTH * Math.PI * (C.PILE_CELLS / 2) ** 2) / this.count;
+        const height = (C.PILE_DEPTH * Math.PI * (this.cells / 2) ** 2) / this.count;
         pile.fill(0);
         for (let i = 0; i < this.count; i++) {
             if (!this.resting[i]) continue;
             const x = this.cell(position[3 * i]), z = this.cell(position[3 * i + 2]);
-            pile[z * C.PILE_CELLS + x] += height;
+            pile[z * this.cells + x] += height;
         }
         for (let i = 0; i < pile.length; i++) pile[i] = Math.min(pile[i], C.HIGHEST);
     }
@@ -149,7 +150,8 @@ class Snow {
         for (let i = 0; i < this.count; i++) if (strength > this.lift[i]) this.resting[i] = 0;
         this.updateFlow();
         this.updatePile();
-        const perUnit = C.PILE_CELLS / (2 * C.FLOOR_RADIUS), lastCell = C.PILE_CELLS - 1.001;
+        const { perUnit, cells: pileCells } = this, lastCell = pileCells - 1.001;
+        const atGlass = (C.FLOOR_RADIUS - 1 / perUnit) ** 2;
         const push = C.SHARE * seconds;
         const circling = C.CIRCLE[0] + C.CIRCLE[1] * strength;
         const morphs = 1 - Math.exp(-seconds / C.MORPH);
@@ -192,9 +194,9 @@ class Snow {
             const px = clamp((x + C.FLOOR_RADIUS) * perUnit - 0.5, lastCell);
             const pz = clamp((z + C.FLOOR_RADIUS) * perUnit - 0.5, lastCell);
             const jx = px | 0, jz = pz | 0, qx = px - jx, qz = pz - jz;
-            const at = jz * C.PILE_CELLS + jx;
+            const at = jz * pileCells + jx;
             const a = pile[at], b = pile[at + 1];
-            const c = pile[at + C.PILE_CELLS], d = pile[at + C.PILE_CELLS + 1];
+            const c = pile[at + pileCells], d = pile[at + pileCells + 1];
             const low = a + (b - a) * qx, high = c + (d - c) * qx;
             const ground = C.FLOOR - (low + (high - low) * qz);
             if (y > ground) {
@@ -203,7 +205,10 @@ class Snow {
                 const slopeZ = (high - low) * perUnit;
                 if (strength > this.lift[i]) {
                     vy = -C.HOP * strength * (0.5 + this.lift[i]);
-                } else if (slopeX * slopeX + slopeZ * slopeZ > C.REPOSE * C.REPOSE) {
+                } else if (
+                    slopeX * slopeX + slopeZ * slopeZ > C.REPOSE * C.REPOSE
+                    && x * x + z * z < atGlass
+                ) {
                     vx = -C.SLIDE * slopeX;
                     vy = 0;
                     vz = -C.SLIDE * slopeZ;
