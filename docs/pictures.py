@@ -4,7 +4,8 @@
     python docs/pictures.py out/demo
 
 Needs Chromium. Writes to docs/pictures: scene.webp (a moving picture: the camera moves around the
-scene), web.webp and live.webp (the two viewers) and report.webp (the report of the training).
+scene), globe.webp (a moving picture: the scene in a snow globe), web.webp and live.webp (the two
+viewers) and report.webp (the report of the training).
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ WIDTH, HEIGHT = 1280, 800
 #: The moving picture: a size and rate that make it small enough for a page that is often opened.
 FILM = snowsplat.VideoOptions(path="ellipse", seconds=6.0, fps=12.0, size="640x400")
 FILM_QUALITY = 50
+GLOBE = snowsplat.GlobeOptions(name="snowsplat", size="400", fps=10.0)
+GLOBE_QUALITY = 30
 
 
 def film(scene: Path, target: Path) -> None:
@@ -39,15 +42,28 @@ def film(scene: Path, target: Path) -> None:
     with TemporaryDirectory() as folder:
         video = Path(folder) / "film.mp4"
         snowsplat.render_video(scene, FILM, target=video)
-        with av.open(str(video)) as container:
-            first, *rest = [frame.to_image() for frame in container.decode(video=0)]
+        animate(video, target, FILM.fps, FILM_QUALITY)
+
+
+def globe(scene: Path, target: Path) -> None:
+    """An animated WebP file of the scene in a snow globe."""
+    with TemporaryDirectory() as folder:
+        video = Path(folder) / "globe.mp4"
+        snowsplat.make_globe(scene, Path(folder) / "globe.html", GLOBE, video=video)
+        animate(video, target, GLOBE.fps, GLOBE_QUALITY)
+
+
+def animate(video: Path, target: Path, fps: float, quality: int) -> None:
+    """The frames of a video as an animated WebP file."""
+    with av.open(str(video)) as container:
+        first, *rest = [frame.to_image() for frame in container.decode(video=0)]
     first.save(
         target,
         save_all=True,
         append_images=rest,
-        duration=round(1000 / FILM.fps),
+        duration=round(1000 / fps),
         loop=0,
-        quality=FILM_QUALITY,
+        quality=quality,
         method=6,
     )
 
@@ -85,6 +101,7 @@ def main(demo: Path) -> None:
     made = demo / "made"
     PICTURES.mkdir(exist_ok=True)
     film(made, PICTURES / "scene.webp")
+    globe(made, PICTURES / "globe.webp")
     with Browser(WIDTH, HEIGHT, frames=5.0) as browser, TemporaryDirectory() as folder:
         shoot(browser.open((made / "scene" / "report.html").as_uri()), PICTURES / "report.webp")
         html = Path(folder) / "scene.html"

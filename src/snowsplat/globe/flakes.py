@@ -16,7 +16,9 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import quat_product
 from snowsplat.scene.sh_constants import SH_C0
 
-#: Share of white in the colour of a flake.
+#: The colour of a flake: that of the Gaussian with its largest channel at 1, but at most this many
+#: times as bright, mixed with a share of white.
+BRIGHTER = 2.5
 WHITE = 0.58
 #: Opacity of a flake, unless the Gaussian is more opaque.
 OPAQUE = 0.9
@@ -33,7 +35,9 @@ def appearance(gaussians: Gaussians, snow: Snow) -> Gaussians:
     low, high = (math.log(radius) for radius in FLAKE)
     scales = gaussians.log_scales
     opacities = gaussians.opacities
-    dc, white = gaussians.sh_dc, (1.0 - 0.5) / SH_C0
+    colors = gaussians.base_colors
+    bright = colors / colors.amax(1, keepdim=True).clamp(1.0 / BRIGHTER, 1.0)
+    change = bright + WHITE * (1.0 - bright) - colors
     return Gaussians(
         means=torch.from_numpy(snow.position.T.copy()),
         log_scales=scales + morph[:, None] * (scales.clamp(low, high) - scales),
@@ -43,7 +47,7 @@ def appearance(gaussians: Gaussians, snow: Snow) -> Gaussians:
             (opacities + morph * (opacities.clamp_min(OPAQUE) - opacities)).logit(1e-6),
             gaussians.opacity_logits,
         ),
-        sh_dc=dc + (WHITE * morph)[:, None, None] * (white - dc),
+        sh_dc=gaussians.sh_dc + (morph[:, None] * change / SH_C0)[:, None],
         sh_rest=gaussians.sh_rest * (1.0 - morph)[:, None, None],
     )
 

@@ -263,7 +263,7 @@ def _base_light(
     ambient *= 0.45 + 0.55 * _smooth(GROUND, GROUND - 0.14, y)
     reflected = rays - 2 * (rays * normal).sum(1)[:, None] * normal
     facing = np.clip(-(rays * normal).sum(1), 0, 1)
-    mirror = (gloss + (1 - gloss) * 0.35 * (1 - facing) ** 5) * open_space
+    mirror = (gloss + (1 - gloss) * 0.12 * (1 - facing) ** 5) * open_space
     tint = np.where((gloss > 0.3)[:, None], np.array(BRASS), 1.0)
     shine = _environment(reflected @ turn) * mirror[:, None] * tint
     return albedo * (diffuse * (0.4 + 0.6 * open_space) + ambient)[:, None] + 0.8 * shine

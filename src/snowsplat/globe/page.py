@@ -97,7 +97,7 @@ def glsl_constants() -> str:
         for module, names in (
             (dimensions, ("FLOOR", "FLOOR_RADIUS", "BLEND", "GROUND")),
             (glass, ("PLATE_Y", "FRESNEL")),
-            (flakes, ("WHITE", "OPAQUE")),
+            (flakes, ("BRIGHTER", "WHITE", "OPAQUE")),
             (reference, ("C1",)),
         )
         for name in names

@@ -84,7 +84,7 @@ vec3 baseLight(vec3 ray, float t) {
     float open_ = clamp(profile(p + 0.09 * normal) / 0.09, 0.0, 1.0);
     ambient *= (0.35 + 0.65 * open_) * (0.45 + 0.55 * smooth_(GROUND, GROUND - 0.14, p.y));
     float facing = clamp(-dot(ray, normal), 0.0, 1.0);
-    float mirror = (gloss + (1.0 - gloss) * 0.35 * pow(1.0 - facing, 5.0)) * open_;
+    float mirror = (gloss + (1.0 - gloss) * 0.12 * pow(1.0 - facing, 5.0)) * open_;
     vec3 shine = environment(reflect(ray, normal) * turn) * mirror * (gloss > 0.3 ? BRASS : vec3(1.0));
     return albedo * (diffuse * (0.4 + 0.6 * open_) + ambient) + 0.8 * shine;
 }

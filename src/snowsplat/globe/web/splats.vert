@@ -68,6 +68,8 @@ void main() {
 
     vec3 view = normalize(now.xyz - eye);
     vec3 light = C1 * (alongZ.rgb * view.z - alongY.rgb * view.y - alongX.rgb * view.x);
-    splat.rgb = mix(base.rgb, vec3(1.0), WHITE * morph) + (1.0 - morph) * light;
+    float most = max(base.r, max(base.g, base.b));
+    vec3 flake = mix(base.rgb / clamp(most, 1.0 / BRIGHTER, 1.0), vec3(1.0), WHITE);
+    splat.rgb = mix(base.rgb + light, flake, morph);
     splat = vec4(max(splat.rgb, 0.0), opacity);
 }
