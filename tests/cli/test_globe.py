@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from snowsplat.formats import write_gaussians
-from snowsplat.globe import film
+from snowsplat.globe import video as module
 from snowsplat.scene.gaussians import Gaussians
 
 
@@ -20,15 +20,15 @@ def scene(tmp_path_factory):
 
 
 def test_page_and_video(run, scene, tmp_path, monkeypatch):
-    # The same film, with shorter parts.
-    monkeypatch.setattr(film, "SHAKE_AT", 0.2)
-    monkeypatch.setattr(film, "REMEMBER_AT", 1.6)
+    # The same video, with shorter parts.
+    monkeypatch.setattr(module, "SHAKE_AT", 0.2)
+    monkeypatch.setattr(module, "REMEMBER_AT", 1.6)
     page, video = tmp_path / "a.html", tmp_path / "a.mp4"
     flags = ("--size", 96, "--fps", 4, "--name", "A <box>", "-n", 1000)
     result = run("globe", scene, "-o", page, "--video", video, *flags)
     assert result.code == 0, result.err
     assert f"{page}: 1,000 Gaussians" in result.out
-    assert f"{video}: {round(film.SECONDS * 4)} frames 96x96" in result.out
+    assert f"{video}: {round(module.SECONDS * 4)} frames 96x96" in result.out
     assert "<title>A &lt;box&gt; - snow globe</title>" in page.read_text(encoding="utf-8")
     with av.open(str(video)) as container:
         images = [f.to_ndarray(format="rgb24").astype(int) for f in container.decode(video=0)]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.globe.film import SHAKE_DIRECTION, orbit_camera
 from snowsplat.globe.glass import draw
 from snowsplat.globe.layout import Arrangement
 from snowsplat.globe.page import _reduced_colors, encode, write_page
 from snowsplat.globe.physics import LONGEST_STEP, Snow, random_numbers, shake_acceleration
+from snowsplat.globe.video import SHAKE_DIRECTION, orbit_camera
 from snowsplat.ops import reference
 from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.render import render

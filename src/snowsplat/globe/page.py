@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from snowsplat.globe import dimensions, film, flakes, glass, physics
+from snowsplat.globe import dimensions, flakes, glass, physics, video
 from snowsplat.globe.layout import Arrangement
 from snowsplat.ops import reference
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
@@ -82,11 +82,11 @@ def constants() -> dict[str, Any]:
     return physics.constants() | {
         "BASE": [[ring.y, ring.half, ring.radius, ring.edge] for ring in dimensions.BASE],
         "PLATE": glass.PLATE,
-        "DISTANCE": film.DISTANCE,
-        "ELEVATION": film.ELEVATION,
-        "FOCAL": film.FOCAL,
-        "MIDDLE": film.MIDDLE,
-        "SHAKE_DIRECTION": film.SHAKE_DIRECTION,
+        "DISTANCE": video.DISTANCE,
+        "ELEVATION": video.ELEVATION,
+        "FOCAL": video.FOCAL,
+        "MIDDLE": video.MIDDLE,
+        "SHAKE_DIRECTION": video.SHAKE_DIRECTION,
     }
 
 

@@ -14,7 +14,7 @@ from snowsplat.pipeline.videos import VideoSize
 from snowsplat.util.errors import SettingError, UserError
 
 if TYPE_CHECKING:
-    from snowsplat.globe.film import Film
+    from snowsplat.globe.video import GlobeVideo
 
 _LARGEST = 1_000_000  # Gaussians: the page has 26 bytes for each
 _LONGEST_NAME = 60
@@ -115,33 +115,33 @@ def make_globe(
     Compute("cpu", threads).apply()
     source = load_viewable(scene, iteration)
 
-    from snowsplat.globe.film import Film
     from snowsplat.globe.layout import arrange
     from snowsplat.globe.page import write_page
     from snowsplat.globe.plate import engraving
+    from snowsplat.globe.video import GlobeVideo
 
     arrangement = arrange(source.gaussians, source.cameras, options.gaussians)
     name = options.name or _name(scene)[:_LONGEST_NAME]
     write_page(target, arrangement, name)
     if video is not None:
         width, height = options.video_size
-        film = Film(arrangement, engraving(name), width, height, options.fps)
-        _write(film, Path(video), observer)
+        globe_video = GlobeVideo(arrangement, engraving(name), width, height, options.fps)
+        _write(globe_video, Path(video), observer)
     count = len(arrangement.gaussians)
     return GlobeResult(target, None if video is None else Path(video), count)
 
 
-def _write(film: Film, file: Path, observer: Observer) -> None:
+def _write(video: GlobeVideo, file: Path, observer: Observer) -> None:
     from snowsplat.trajectory.video import video_writer
     from snowsplat.util.stages import Outcome
 
     started = time.monotonic()
     report = observer.begin("video")
-    with video_writer(file, film.width, film.height, film.fps) as add:
-        for i, frame in enumerate(film.frames()):
+    with video_writer(file, video.width, video.height, video.fps) as add:
+        for i, frame in enumerate(video.frames()):
             add(frame)
-            report(i + 1, film.count, "frames")
-    result = {"files": [str(file)], "frames": film.count, "size": [film.width, film.height]}
+            report(i + 1, video.count, "frames")
+    result = {"files": [str(file)], "frames": video.count, "size": [video.width, video.height]}
     observer.end("video", Outcome(result, time.monotonic() - started, False))
 
 

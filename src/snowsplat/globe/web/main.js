@@ -201,7 +201,7 @@ class Renderer {
 
 // ---- Camera
 
-// Orbit of the globe, as in snowsplat/globe/film.py. Rows of `axes`: right, down, forward.
+// Orbit of the globe, as in snowsplat/globe/video.py. Rows of `axes`: right, down, forward.
 function orbit(azimuth, elevation, distance) {
     const ce = Math.cos(elevation), se = Math.sin(elevation);
     const ca = Math.cos(azimuth), sa = Math.sin(azimuth);

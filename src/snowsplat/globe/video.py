@@ -1,4 +1,4 @@
-"""The film of a globe: the scene stands, is shaken, falls as snow, and is remembered.
+"""The video of a globe: the scene stands, is shaken, falls as snow, and is remembered.
 
 The glass and the base do not move, except while the globe is shaken. The scene turns in it, as in
 a globe with a music box. The last frame continues with the first one.
@@ -44,15 +44,14 @@ _SWING = math.radians(30)
 
 
 @dataclass(frozen=True)
-class Film:
-    """A film of a globe.
+class GlobeVideo:
+    """A video of a globe.
 
     Attributes:
         arrangement: the Gaussians.
         plate: (h, w) in 0..1: the text on the plate of the base; None: no plate.
         width, height: pixels.
         fps: frames per second.
-        seconds: length. The complete film is `SECONDS` long.
     """
 
     arrangement: Arrangement
@@ -60,15 +59,14 @@ class Film:
     width: int
     height: int
     fps: float
-    seconds: float = SECONDS
 
     @property
     def count(self) -> int:
         """The number of frames."""
-        return max(1, round(self.seconds * self.fps))
+        return max(1, round(SECONDS * self.fps))
 
     def frames(self) -> Iterator[np.ndarray]:
-        """The frames, (height, width, 3) uint8. The same film has the same frames, bit by bit."""
+        """The frames, (height, width, 3) uint8. The same video has the same frames, bit by bit."""
         gaussians = self.arrangement.gaussians
         snow = Snow(gaussians.means.T.numpy())
         still = orbit_camera(0.0, self.width, self.height)
@@ -96,7 +94,7 @@ class Film:
             snow.step(seconds, (x, y, z))
 
     def _azimuth(self, time: float) -> float:
-        turn = 2 * math.pi * time / self.seconds
+        turn = 2 * math.pi * time / SECONDS
         return turn if self.arrangement.surrounded else _SWING * math.sin(turn)
 
 
