@@ -59,7 +59,7 @@ def write_page(path: Path | str, arrangement: Arrangement, name: str) -> None:
         "simulation": simulation,
     }
     # The page also uses the random numbers of the simulation.
-    script = simulation + _source("main.js").replace('"use strict";', "", 1)
+    script = simulation + _source("renderer.js") + _source("main.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; script-src 'sha256-{digest}' blob:; worker-src blob:; " + (
         "style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"

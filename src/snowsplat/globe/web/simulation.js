@@ -327,15 +327,14 @@ function serve(scope) {
         for (const [seconds, acceleration] of data.steps) snow.step(seconds, acceleration);
         snow.pack(data.state);
         snow.sort(data.forward, data.order);
-        const { standing, remembering, strength, loosening } = snow;
-        const resting = snow.resting.reduce((sum, rests) => sum + rests, 0);
+        const { standing, remembering, time } = snow;
         scope.postMessage(
             {
                 state: data.state,
                 order: data.order,
                 count: data.count,
                 milliseconds: performance.now() - started,
-                standing, remembering, strength, loosening, resting,
+                standing, remembering, time,
             },
             [data.state.buffer, data.order.buffer],
         );
