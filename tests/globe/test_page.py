@@ -212,6 +212,31 @@ def test_input(page):
 
 
 @pytest.mark.browser
+def test_the_scene_turns_unless_the_user_prefers_less_motion(page):
+    for value, turns in (("reduce", False), ("no-preference", True)):
+        feature = {"name": "prefers-reduced-motion", "value": value}
+        page.call("Emulation.setEmulatedMedia", features=[feature])
+        page.evaluate("snowGlobe.turned = 0, snowGlobe.turn(1)")
+        assert (page.evaluate("snowGlobe.turned") > 0) is turns
+    page.evaluate("snowGlobe.turned = 0, snowGlobe.seconds = 0")
+
+
+@pytest.mark.browser
+def test_the_buttons_work_while_the_page_runs(page):
+    """The scene is shaken and remembered in real time, or in slow motion on a slow computer."""
+    press = "document.getElementById('%s').click()"
+    page.evaluate("snowGlobe.shaken = Infinity, snowGlobe.paused = false")
+    page.wait_for("snowGlobe.result.standing")
+    assert page.evaluate("document.getElementById('remember').disabled")
+    page.evaluate(press % "shake")
+    page.wait_for("!document.getElementById('remember').disabled", 60)
+    page.evaluate("snowGlobe.shaken = Infinity")
+    page.evaluate(press % "remember")
+    page.wait_for("snowGlobe.result.standing", 120)
+    page.evaluate("snowGlobe.paused = true, snowGlobe.turned = 0, snowGlobe.seconds = 0")
+
+
+@pytest.mark.browser
 def test_a_slow_computer_shows_fewer_pixels_and_then_fewer_gaussians(page):
     page.evaluate("snowGlobe.adapts = true, snowGlobe.intervals.length = 0")
     page.evaluate("for (let i = 0; i < 30; i++) snowGlobe.adapt(25)")

@@ -27,18 +27,18 @@ class Globe {
     constructor() {
         this.canvas = element("view");
         const columns = decode();
-        this.total = this.count = about.count;
-        this.renderer = new Renderer(this.canvas, columns, this.total);
+        this.count = about.count; // of the Gaussians that are displayed
+        this.renderer = new Renderer(this.canvas, columns, this.count);
         const code = new Blob([about.simulation], { type: "text/javascript" });
         this.worker = new Worker(URL.createObjectURL(code));
         this.worker.onmessage = ({ data }) => this.receive(data);
-        this.home = columns.position;
         this.worker.postMessage({ home: columns.position, constants: C });
         this.buffers = {
             state: new Float32Array(4 * STATE_WIDTH * this.renderer.rows),
-            order: new Uint32Array(this.total),
+            order: new Uint32Array(this.count),
         };
-        this.result = { standing: true, remembering: null };
+        this.result = { standing: true, remembering: null, milliseconds: 0 };
+        this.owed = 0; // seconds that have passed, but are not yet simulated
         this.azimuth = 0;
         this.elevation = C.ELEVATION;
         this.zoom = 1;
@@ -49,7 +49,6 @@ class Globe {
         this.pixelRatio = Math.min(devicePixelRatio || 1, 2);
         this.adapts = true;
         this.intervals = [];
-        this.pending = [];
         this.waiting = null;
         this.listen();
         this.request([], true);
@@ -140,15 +139,15 @@ class Globe {
         if (this.paused || document.hidden) return;
         const seconds = interval / 1000;
         this.turn(seconds);
-        // A slow computer shows the motion more slowly, instead of with long steps.
-        const simulated = Math.min(seconds, 3 * C.LONGEST_STEP);
-        if (simulated > 0 && this.buffers) {
-            const { standing } = this.result;
-            if (this.request(this.steps(simulated), this.remembers)) this.drawn = false;
-            this.shaken += simulated;
-            this.push = this.push.map((a) => a * Math.exp(-simulated / 0.06));
-            if (!standing) this.adapt(interval);
-            else this.intervals.length = 0;
+        if (this.result.standing) this.intervals.length = 0;
+        else this.adapt(Math.max(interval, this.result.milliseconds));
+        // A very slow computer shows the motion more slowly.
+        this.owed = Math.min(this.owed + seconds, 3 * C.LONGEST_STEP);
+        if (this.owed > 0 && this.buffers) {
+            this.request(this.steps(this.owed), this.remembers);
+            this.shaken += this.owed;
+            this.push = this.push.map((a) => a * Math.exp(-this.owed / 0.06));
+            this.owed = 0;
         }
         this.draw();
     }

@@ -341,5 +341,5 @@ function serve(scope) {
     };
 }
 
+// The page itself also includes this file, for the random numbers.
 if (typeof WorkerGlobalScope !== "undefined") serve(self);
-if (typeof module !== "undefined") module.exports = { Snow, randomNumbers };
