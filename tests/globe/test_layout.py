@@ -93,6 +93,24 @@ def test_the_frame_of_the_scene_has_no_effect():
     assert torch.allclose(plain.log_scales.sum(), tilted.log_scales.sum(), rtol=1e-3)
 
 
+def test_unusual_cameras():
+    down = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 3.0]], dtype=torch.float64)
+    above = Camera(200, 150, 180.0, 180.0, 100.0, 75.0, down)  # at y = -3, looks down
+    assert above.position.tolist() == [0, -3, 0]
+    result = arrange(table(), [above], 100_000)
+    assert result.gaussians.means[:, 1].max() < FLOOR + 0.05
+    assert len(result.gaussians) > 2000
+    assert not result.surrounded
+    # All cameras are at one point and look outwards; nothing is there.
+    outwards = []
+    for i in range(8):
+        target = torch.tensor([math.sin(i * math.pi / 4), -2.0, math.cos(i * math.pi / 4)]).double()
+        pose = look_at(torch.tensor([0.0, -2.0, 0.0]).double(), target, UP)
+        outwards.append(Camera(200, 150, 180.0, 180.0, 100.0, 75.0, pose))
+    with pytest.raises(UserError, match="no Gaussians are left"):
+        arrange(table(), outwards, 100)
+
+
 def test_a_file_without_cameras():
     result = arrange(table().select(torch.arange(3800)), [], 100_000)
     assert result.surrounded

@@ -19,7 +19,14 @@ from snowsplat.scene.edit import decimate, transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.scene.initial_view import overview
-from snowsplat.trajectory.focus import DEFAULT_UP, focus_of, positions_of, up_of, viewing_distance
+from snowsplat.trajectory.focus import (
+    DEFAULT_UP,
+    focus_of,
+    positions_of,
+    rotations_of,
+    up_of,
+    viewing_distance,
+)
 from snowsplat.util.errors import UserError
 
 # Gaussians with a lower opacity are left out: as snow, they would be invisible.
@@ -102,15 +109,21 @@ def _globe_frame(gaussians: Gaussians, cameras: Sequence[Camera]) -> Similarity:
     means = gaussians.means.double()
     if cameras:
         up = up_of(cameras)
-        focus = focus_of(cameras, viewing_distance(cameras, gaussians.means))
+        distance = viewing_distance(cameras, gaussians.means)
+        focus = focus_of(cameras, distance)
         distances = (positions_of(cameras) - focus).norm(dim=1)
-        radius = _SUBJECT_RATIO * float(distances.median())
+        # The distances are 0 if the cameras look outwards from one point.
+        radius = _SUBJECT_RATIO * max(float(distances.median()), 0.01 * distance)
         front = positions_of(cameras)[0] - focus
+        # If the first photo was taken at the focus or vertically above it, the direction in front is
+        # that towards the back or the lower edge of the camera.
+        _, below, forward = rotations_of(cameras)[0]
+        front = front + 1e-3 * distance * (below - forward)
     else:
         up, view = DEFAULT_UP, overview(gaussians)
         focus = torch.tensor(view.target, dtype=torch.float64)
         front = torch.tensor(view.position, dtype=torch.float64) - focus
-        # `overview` shows the subject from 2.77 times its radius.
+        # `overview` shows the subject from this multiple of its radius: 1.6 / tan 30°.
         radius = float(front.norm()) / 2.77
     # Rows: right, down, forward of a level camera in front of the scene. Its frame becomes that of
     # the globe, so that the globe is first seen from the direction of the first photo.
@@ -126,7 +139,7 @@ def _globe_frame(gaussians: Gaussians, cameras: Sequence[Camera]) -> Similarity:
         width = _quantile(level_distance[near], weights[near], 0.98)
     else:
         height = width = radius
-    # A slim subject is not enlarged until it touches the glass, nor a flat one.
+    # A slim subject is not enlarged until it touches the glass.
     fits = max(min(width, radius), 0.25 * radius) / (_FILLS * FLOOR_RADIUS)
     scale = 1.0 / max(fits, min(height, 2.0 * radius) / _TALLEST)
     origin = focus + rotation.T @ torch.tensor([0.0, floor, 0.0], dtype=torch.float64)
