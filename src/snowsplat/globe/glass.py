@@ -215,6 +215,7 @@ def _trace(rays: np.ndarray, origin: np.ndarray) -> np.ndarray:
         found[rows[ends]] = distance[ends]
         going = ~ends & (distance < toward[rows] + 1.1)
         rows, distance = rows[going], distance[going]
+    found[rows] = distance  # rays that pass close to an edge, in many small steps
     return found
 
 

@@ -38,7 +38,8 @@ float trace(vec3 ray, out float covered) {
     float toward = dot(middle - origin, ray);
     if (length(origin + toward * ray - middle) > 1.05) return 12.0;
     float t = max(toward - 1.1, 0.0), nearest = 1e6, at = 12.0;
-    for (int i = 0; i < 70 && t < toward + 1.1; i++) {
+    int steps = 0;
+    for (; steps < 70 && t < toward + 1.1; steps++) {
         float d = profile(origin + t * ray);
         if (d < 0.002) {
             covered = 1.0;
@@ -50,6 +51,10 @@ float trace(vec3 ray, out float covered) {
             at = t;
         }
         t += d;
+    }
+    if (steps == 70) { // it passes close to an edge, in many small steps
+        covered = 1.0;
+        return t;
     }
     covered = 1.0 - clamp(nearest, 0.0, 1.0);
     return at;
