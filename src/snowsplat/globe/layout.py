@@ -115,8 +115,8 @@ def _globe_frame(gaussians: Gaussians, cameras: Sequence[Camera]) -> Similarity:
         # The distances are 0 if the cameras look outwards from one point.
         radius = _SUBJECT_RATIO * max(float(distances.median()), 0.01 * distance)
         front = positions_of(cameras)[0] - focus
-        # If the first photo was taken at the focus or vertically above it, the direction in front is
-        # that towards the back or the lower edge of the camera.
+        # If the first camera is at the focus or vertically above it, the front is behind this
+        # camera, or below its lower edge.
         _, below, forward = rotations_of(cameras)[0]
         front = front + 1e-3 * distance * (below - forward)
     else:

@@ -2,7 +2,7 @@
 
 The page makes no network requests, and can be opened from disk in any browser with WebGL 2. Its
 script and shaders are in the folder `web`; the constants in them come from the modules of this
-package. The Gaussians are quantised and embedded in base64, in about 26 bytes each.
+package. The Gaussians are quantised to 26 bytes each, and embedded in base64.
 """
 
 from __future__ import annotations
