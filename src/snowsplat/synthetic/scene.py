@@ -91,18 +91,36 @@ class Scene:
             result[:, block] = self._block(own, directions[:, block], spread, mirrored)
         return result
 
-    def _block(
-        self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool
-    ) -> np.ndarray:
+    def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Distances (R,) float32 to the first hits along rays, in metres; infinite without a hit.
+
+        Args:
+            origins: (3, 1) or (3, R) float32, metres.
+            directions: (3, R) float32, of length 1.
+        """
+        candidates = self._candidates(origins, directions)
+        return self._nearest(origins, directions, candidates)[0]
+
+    def _nearest(
+        self, origins: np.ndarray, directions: np.ndarray, candidates: Sequence[int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (R,) to the first hits, and the indices (R,) of their shapes; -1: no hit."""
         count = directions.shape[1]
         nearest = np.full(count, np.inf, np.float32)
         owner = np.full(count, -1)
-        candidates = self._candidates(origins, directions)
         for i in candidates:
             distance = self._shapes[i].hit(origins, directions)
             closer = distance < nearest
             np.copyto(nearest, distance, where=closer)
             owner[closer] = i
+        return nearest, owner
+
+    def _block(
+        self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool
+    ) -> np.ndarray:
+        count = directions.shape[1]
+        candidates = self._candidates(origins, directions)
+        nearest, owner = self._nearest(origins, directions, candidates)
         positions = origins + np.where(owner >= 0, nearest, 0) * directions
         texture = np.zeros(count, np.int64)
         uv, normals = np.zeros((2, count), np.float32), np.zeros_like(directions)
