@@ -9,7 +9,7 @@ import torch
 from scenes import FOCAL
 from torch import Tensor, nn
 
-from snowsplat.lift.discs import OPACITY, discs
+from snowsplat.lift.discs import OPACITY, SIGMA, discs
 from snowsplat.lift.edges import find_links
 from snowsplat.lift.surface import surface_of
 from snowsplat.scene.camera import Camera
@@ -26,7 +26,7 @@ class Prediction:
     Attributes:
         log_depth: (N, H, W), the logarithm of camera z in metres, for a camera of focal length
             `FOCAL`.
-        log_size: (N, H, W), the logarithm of the size of the Gaussians, in pixels.
+        log_size: (N, H, W), the logarithm of the size of the Gaussians, in units of `SIGMA`.
         opacity: (N, H, W), in (0, 1).
     """
 
@@ -43,7 +43,7 @@ class Prediction:
             surface.tangents.flatten(0, 1),
             image.flatten(0, 1),
             camera,
-            size=self.log_size[i].flatten().exp(),
+            sigma=SIGMA * self.log_size[i].flatten().exp(),
             opacity=self.opacity[i].flatten(),
         )
 

@@ -10,9 +10,11 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import quat_from_rotation, transform_points
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 
-#: Standard deviation of the Gaussian of a pixel, in pixels. Two neighbours meet at 1.25
-#: standard deviations of each. Smaller discs leave holes from closer viewpoints, larger ones blur.
+#: Standard deviation of the Gaussian of a pixel, in pixels. Smaller discs leave holes when they are
+#: seen from closer, larger ones blur.
 SIGMA = 0.4
+# The rasterizer adds this variance to each splat (Kerbl et al. 2023), in pixels squared.
+_DILATION = 0.3
 #: Opacity of a disc.
 OPACITY = 0.99
 # Thickness of a disc relative to its shorter axis.
@@ -25,14 +27,14 @@ def discs(
     colors: Tensor,
     camera: Camera,
     *,
-    size: Tensor | float = 1.0,
+    sigma: Tensor | float = SIGMA,
     opacity: Tensor | float = OPACITY,
 ) -> Gaussians:
     """A flat Gaussian for each point of a surface, of SH degree 0.
 
-    Let J be the 3×2 matrix of the tangents, in world units per pixel. A circle of ``size`` pixels
-    in the image is the ellipse J x on the tangent plane, so the covariance is (σ · size)² J Jᵀ, with
-    σ = `SIGMA`. Seen from the camera, every disc is a circle. Its axes are the eigenvectors of this
+    Let J be the 3×2 matrix of the tangents, in world units per pixel. A circle in the
+    image is the ellipse J x on the tangent plane, so the covariance is σ² J Jᵀ. Seen from the
+    camera, every disc is a circle with the standard deviation σ. Its axes are the eigenvectors of this
     matrix, which follow from those of the 2×2 matrix JᵀJ. The third axis is the normal.
 
     Args:
@@ -40,17 +42,17 @@ def discs(
         tangents: (N, 3, 2) in the camera frame, in world units per pixel.
         colors: (N, 3) in 0..1.
         camera: its pose places the discs in the world frame.
-        size: (N,) or a number, the width of the part of the image that a disc covers, in pixels.
+        sigma: (N,) or a number, the standard deviation in the image, in pixels.
         opacity: (N,) or a number, in (0, 1).
 
     Returns:
         N Gaussians in the world frame; differentiable with respect to ``points``, ``colors``,
-        ``size`` and ``opacity``.
+        ``sigma`` and ``opacity``.
     """
     axes, lengths = _axes(tangents)
     pose = camera.world_from_cam.to(points.dtype)
     rotations = pose[:, :3] @ axes
-    sigma = SIGMA * torch.as_tensor(size, dtype=points.dtype).expand(len(points))
+    sigma = torch.as_tensor(sigma, dtype=points.dtype).expand(len(points))
     opacity = torch.as_tensor(opacity, dtype=points.dtype).expand(len(points))
     return Gaussians(
         means=transform_points(pose, points),
@@ -76,3 +78,15 @@ def _axes(tangents: Tensor) -> tuple[Tensor, Tensor]:
     shorter = area / longer  # det JᵀJ is the square of the area
     axes = torch.stack([first, torch.linalg.cross(normal, first), normal], dim=2)
     return axes, torch.stack([longer, shorter, _THICKNESS * shorter], dim=1)
+
+
+def sigma_of_block(size: Tensor) -> Tensor:
+    """The standard deviations of the discs of square blocks of pixels, in pixels.
+
+    After the rasterizer has added its variance, neighbouring discs of any size overlap as those of
+    pixels do.
+
+    Args:
+        size: (N,) the widths of the blocks in pixels, at least 1.
+    """
+    return ((SIGMA**2 + _DILATION) * size.square() - _DILATION).sqrt()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from snowsplat.lift.blocks import merge_pixels, pixel_blocks
 from snowsplat.lift.colors import match_photo
-from snowsplat.lift.discs import discs
+from snowsplat.lift.discs import discs, sigma_of_block
 from snowsplat.lift.edges import EDGE_THRESHOLD, find_links, snap_to_surfaces
 from snowsplat.lift.surface import surface_of
 from snowsplat.scene.camera import Camera
@@ -71,7 +71,7 @@ def lift(
         blocks.mean(surface.tangents),
         blocks.mean(photo),
         camera,
-        size=blocks.size,
+        sigma=sigma_of_block(blocks.size),
     )
     # The discs of unknown pixels do not exist; what is visible there has no influence on the rest.
     known_photo = torch.where(known[..., None], photo, 0.0)

@@ -89,12 +89,15 @@ class Trainer:
         schedule: Schedule | None = None,
         device: torch.device | None = None,
         state: dict[str, Tensor] | None = None,
+        initial: Gaussians | None = None,
     ) -> None:
         """
         Args:
             schedule: the schedule of a resumed training run; default: ``config.iterations`` steps.
             device: the device for training; default: the CPU.
             state: the state of a resumed training run; see `load_state`.
+            initial: the Gaussians to start from, of the SH degree of ``config``; default:
+                `initial_gaussians`.
 
         Raises:
             UserError: the dataset has no training views, or some points are so far apart that
@@ -129,9 +132,12 @@ class Trainer:
         # The Gaussians of a resumed training run are replaced by those of the state.
         start = config if state is None else replace(config, init="points")
         with single_threaded():
-            self.gaussians = initial_gaussians(
-                dataset, start, self._images, self._generators["start"], self.device
-            )
+            if initial is not None:
+                self.gaussians = initial.clone().to(self.device)
+            else:
+                self.gaussians = initial_gaussians(
+                    dataset, start, self._images, self._generators["start"], self.device
+                )
         self._optimizer = Adam(
             self.gaussians,
             config.learning_rates,
