@@ -15,6 +15,7 @@ from snowsplat.lift.surface import surface_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
+from snowsplat.util.process import single_threaded
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,13 @@ def lift(
     known = depth.isfinite() & (depth > 0)
     if not bool(known.any()):
         raise ValueError("lift: no pixel has a known depth")
-    depth = torch.where(known, depth, torch.nan)
+    with single_threaded():
+        return _lift(photo, torch.where(known, depth, torch.nan), camera, options)
+
+
+def _lift(photo: Tensor, depth: Tensor, camera: Camera, options: LiftOptions) -> Gaussians:
     depth = snap_to_surfaces(depth, options.edge)
+    known = depth.isfinite()
     links = find_links(depth, options.edge)
     surface = surface_of(depth, camera, links)
     if options.max_gaussians is None:
@@ -73,7 +79,7 @@ def lift(
         camera,
         sigma=sigma_of_block(blocks.size),
     )
-    # The discs of unknown pixels do not exist; what is visible there has no influence on the rest.
+    # Pixels of unknown depth have no discs. Black, the background, leaves the others unchanged.
     known_photo = torch.where(known[..., None], photo, 0.0)
     gaussians = match_photo(gaussians, camera, known_photo)
     return gaussians.select(morton_order(gaussians.means))
