@@ -2,11 +2,11 @@
 
     python experiments/lift_generalise.py -o OUT
 
-A network of 387,000 weights learns from photos of our ray tracer, whose true depth is known. It first
-overfits 4 photos, which shows that the code works. Then it learns from 400 photos, and is tested on
-scenes, textures and focal lengths that it has not seen. A second network learns from 400 photos with
-both texture families and both focal lengths. Scenes and weights are kept in OUT, so an interrupted
-run resumes. Results: lift_generalise.json beside this file, and pictures in OUT.
+A network of 387,000 weights learns from photos of our ray tracer, whose true depth is known. It
+first overfits 4 photos, which shows that the code works. Then it learns from 400 photos, and is
+tested on scenes, textures and focal lengths that it has not seen. A second network learns from 400
+photos with both texture families and both focal lengths. Scenes and weights are kept in OUT, so an
+interrupted run resumes. Results: lift_generalise.json beside this file, and pictures in OUT.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).with_name("lift_network")))
 
-from measures import measure, priors_of  # noqa: E402
-from network import DepthNet  # noqa: E402
-from pictures import draw_curves, draw_failures  # noqa: E402
-from scenes import FOCAL, OTHER_FOCAL, Shots, make_shots  # noqa: E402
-from training import Curves, examples, train  # noqa: E402
+from measures import measure, priors_of
+from network import DepthNet
+from pictures import draw_curves, draw_failures
+from scenes import FOCAL, OTHER_FOCAL, Shots, make_shots
 
-from snowsplat import ops  # noqa: E402
+from snowsplat import ops
+from training import Curves, examples, train
 
 RESULTS = Path(__file__).with_suffix(".json")
 SEED = 0
@@ -103,16 +103,22 @@ def evaluate(
     """All tables: a row per method and set of photos."""
     methods: dict[str, Callable] = dict(priors_of(base))
     methods |= {name: net for name, (net, _, _) in nets.items()}
-    overfit = nets["4 photos"][0]
-    rows = [{"method": "4 photos", "photos": "the same 4", **measure(overfit, four)}]
-    rows.append({"method": "400 photos", "photos": "40 of them", **measure(nets["400 photos"][0], base.first(40))})
+    overfit, learnt = nets["4 photos"][0], nets["400 photos"][0]
+    rows: list[dict[str, Any]] = []
+
+    def add(method: str, photos: str, measured: dict[str, float]) -> None:
+        rows.append({"method": method, "photos": photos, **measured})
+        print(rows[-1], flush=True)
+
+    add("4 photos", "the same 4", measure(overfit, four))
+    add("400 photos", "40 of them", measure(learnt, base.first(40)))
     for name, shots in tests.items():
         for method, predict in methods.items():
-            rows.append({"method": method, "photos": name, **measure(predict, shots)})
+            add(method, name, measure(predict, shots))
             if shots.focal != FOCAL:
                 corrected = measure(predict, shots, known_focal=True)
-                rows.append({"method": f"{method}, focal length known", "photos": name, **corrected})
-        rows.append({"method": "true depth", "photos": name, **measure(None, shots)})
+                add(f"{method}, focal length known", name, corrected)
+        add("true depth", name, measure(None, shots))
     return {
         "weights": overfit.weights(),
         "seed": SEED,

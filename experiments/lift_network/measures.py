@@ -9,11 +9,11 @@ import torch.nn.functional as F
 from network import Prediction, focal_scale, without_offsets
 from scenes import Shots
 from torch import Tensor
-from training import Example, examples
 
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.lift.edges import find_links
 from snowsplat.scene.render import render
+from training import Example, examples
 
 #: Images (N, H, W, 3) -> depths and discs.
 Predictor = Callable[[Tensor], Prediction]

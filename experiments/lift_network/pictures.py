@@ -11,10 +11,10 @@ from network import DepthNet, focal_scale
 from PIL import Image, ImageDraw
 from scenes import SIZE, Shots
 from torch import Tensor
-from training import Curves, Example, examples
 
 from snowsplat.pipeline.image_files import depth_in_color, to_8bit
 from snowsplat.scene.render import render
+from training import Curves, Example, examples
 
 _COLORS = ((200, 60, 40), (40, 100, 180), (40, 150, 80))
 _WIDTH, _HEIGHT, _MARGIN = 560, 300, 44
@@ -72,9 +72,7 @@ def draw_failures(nets: dict[str, DepthNet], tests: dict[str, Shots], out: Path)
         rows.append(_row(net, Example(shots, int(np.argmax(errors))), scale))
     sheet = Image.fromarray(np.concatenate(rows))
     size = sheet.width * _ENLARGED, sheet.height * _ENLARGED
-    sheet.resize(size, Image.Resampling.NEAREST).save(
-        out / "failures.webp", quality=85, method=6
-    )
+    sheet.resize(size, Image.Resampling.NEAREST).save(out / "failures.webp", quality=85, method=6)
 
 
 def _row(net: DepthNet, example: Example, scale: float) -> np.ndarray:

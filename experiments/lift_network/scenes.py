@@ -56,9 +56,7 @@ class Shots:
 
     def camera(self, i: int) -> Camera:
         height, width = self.depths.shape[1:]
-        return Camera(
-            width, height, self.focal, self.focal, width / 2, height / 2, self.poses[i]
-        )
+        return Camera(width, height, self.focal, self.focal, width / 2, height / 2, self.poses[i])
 
     def image(self, i: int) -> Tensor:
         """(H, W, 3) float32 in 0..1."""
@@ -107,7 +105,10 @@ def random_scene(family: Family, random: np.random.Generator) -> Scene:
             shape = Ellipsoid((x, y, radius), (radius, radius, radius))
         else:
             shape = Frustum(
-                (x, y, 0), size * random.uniform(1.0, 2.5), 0.5 * size, random.uniform(0.1, 0.5) * size
+                (x, y, 0),
+                size * random.uniform(1.0, 2.5),
+                0.5 * size,
+                random.uniform(0.1, 0.5) * size,
             )
         paint = [
             _texture(family, _OBJECT_TEXELS, random.uniform(2, 5), random) for _ in shape.sizes
@@ -124,7 +125,9 @@ def _two_poses(random: np.random.Generator) -> tuple[Tensor, Tensor]:
     position = np.array(
         [random.uniform(-0.8, 0.8), random.uniform(-3.2, -2.4), random.uniform(1.1, 1.9)]
     )
-    target = np.array([random.uniform(-0.4, 0.4), random.uniform(0.0, 0.8), random.uniform(0.2, 0.7)])
+    target = np.array(
+        [random.uniform(-0.4, 0.4), random.uniform(0.0, 0.8), random.uniform(0.2, 0.7)]
+    )
     aside = position + np.array([random.choice([-1, 1]) * random.uniform(0.15, 0.3), 0, 0])
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     first, second = (
@@ -133,9 +136,7 @@ def _two_poses(random: np.random.Generator) -> tuple[Tensor, Tensor]:
     return first, second
 
 
-def _texture(
-    family: Family, texels: int, cells: float, random: np.random.Generator
-) -> np.ndarray:
+def _texture(family: Family, texels: int, cells: float, random: np.random.Generator) -> np.ndarray:
     """sRGB (texels, texels, 3) in two random colours, with ``cells`` periods along a side."""
     size = (texels, texels)
     first, second = random.uniform(0.1, 0.95, (2, 3)).astype(np.float32)

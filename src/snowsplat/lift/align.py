@@ -100,9 +100,7 @@ def _best_pair(x: Tensor, y: Tensor, limit: float, with_shift: bool) -> tuple[fl
     return float(scales[best]), float(shifts[best])
 
 
-def _least_squares(
-    x: Tensor, y: Tensor, weights: Tensor, with_shift: bool
-) -> tuple[float, float]:
+def _least_squares(x: Tensor, y: Tensor, weights: Tensor, with_shift: bool) -> tuple[float, float]:
     if not with_shift:
         return float((weights * x * y).sum() / (weights * x * x).sum()), 0.0
     total = weights.sum()

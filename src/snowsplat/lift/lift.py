@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,7 @@ from snowsplat.lift.surface import surface_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
+from snowsplat.util.errors import SettingError
 from snowsplat.util.process import single_threaded
 
 
@@ -27,10 +29,21 @@ class LiftOptions:
             relative to the larger depth.
         max_gaussians: merge pixels of uniform parts into larger Gaussians, until there are at most
             this many; None: a Gaussian for each pixel.
+
+    Raises:
+        SettingError: a value is not positive.
     """
 
     edge: float = EDGE_THRESHOLD
     max_gaussians: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.edge < math.inf:
+            raise SettingError("edge", f"{self.edge:g} is not a positive share; use e.g. 0.05")
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise SettingError(
+                "max_gaussians", f"{self.max_gaussians} is too small; use at least 1"
+            )
 
 
 def lift(

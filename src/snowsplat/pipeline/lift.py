@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json

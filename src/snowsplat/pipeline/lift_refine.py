@@ -14,8 +14,6 @@ from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from snowsplat.data import Dataset, Points, View
     from snowsplat.lift.lift import LiftOptions
     from snowsplat.scene.camera import Camera
@@ -78,9 +76,7 @@ def refine_photo(
     with ImageLoader([view], background=(1.0, 1.0, 1.0)) as loader:
         pixels = loader.get(view).rgb.float().div(255).contiguous()
     z = depth.read(pixels, view.camera, options.edge)
-    alignment = align(
-        z, posed.points.xyz, view.camera, with_shift=depth.values_are == "disparity"
-    )
+    alignment = align(z, posed.points.xyz, view.camera, with_shift=depth.values_are == "disparity")
     z = alignment.apply(z)
     limit = round(_LIFTED_SHARE * config.density.max_gaussians)
     options = replace(options, max_gaussians=min(options.max_gaussians or limit, limit))
