@@ -88,8 +88,7 @@ def make_shots(cache: Path, scenes: int, family: Family, focal: float, seed: int
 
 def random_scene(family: Family, random: np.random.Generator) -> Scene:
     """A room with three to six objects on its floor, in the textures of a family."""
-    width, depth, height = _ROOM
-    room = Box((0, 0, height / 2), _ROOM, inside=True)
+    room = Box((0, 0, _ROOM[2] / 2), _ROOM, inside=True)
     walls = [_texture(family, _WALL_TEXELS, random.uniform(3, 8), random) for _ in range(6)]
     objects = [SceneObject(room, walls)]
     for _ in range(random.integers(3, 7)):
@@ -104,12 +103,8 @@ def random_scene(family: Family, random: np.random.Generator) -> Scene:
             radius = 0.6 * size
             shape = Ellipsoid((x, y, radius), (radius, radius, radius))
         else:
-            shape = Frustum(
-                (x, y, 0),
-                size * random.uniform(1.0, 2.5),
-                0.5 * size,
-                random.uniform(0.1, 0.5) * size,
-            )
+            tall, top = size * random.uniform(1.0, 2.5), size * random.uniform(0.1, 0.5)
+            shape = Frustum((x, y, 0), tall, 0.5 * size, top)
         paint = [
             _texture(family, _OBJECT_TEXELS, random.uniform(2, 5), random) for _ in shape.sizes
         ]

@@ -1,4 +1,4 @@
-"""Networks on disk: an ONNX file and a folder of transformers, both made here; no network access."""
+"""Networks on disk: an ONNX file and a folder of transformers, both made here."""
 
 from __future__ import annotations
 

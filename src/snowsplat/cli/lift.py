@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -12,6 +12,9 @@ from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.pipeline.lift import DepthSource, LiftResult
 
 
 @dataclass
@@ -62,8 +65,8 @@ class Lift:
     swing: Annotated[bool, switch()] = False
     """Also render swing.mp4, a video from viewpoints around that of the photo."""
     refine: Annotated[Path | None, flag("DATASET")] = None
-    """A dataset of photos with camera poses that contains PHOTO. The depth is aligned to its points,
-    and the scene is trained on all of its photos."""
+    """A dataset of photos with camera poses that contains PHOTO. The depth is aligned to its
+    points, and the scene is trained on all of its photos."""
     iterations: Annotated[int, flag("N", default="1000")] = 1000
     """Number of training steps with --refine."""
     eval: Annotated[bool, switch()] = False
@@ -81,29 +84,13 @@ class Lift:
             raise UserError(
                 "lift needs a photo and an output folder: snowsplat lift PHOTO --depth MAP -o OUT"
             )
-        from snowsplat.lift.lift import LiftOptions
-        from snowsplat.pipeline.lift import DepthSource, lift_photo
-        from snowsplat.pipeline.lift_refine import refine_photo
+        from snowsplat.pipeline.lift import DepthSource
 
         source = DepthSource(self.depth, self.model, self.depth_is, self.near, self.far)
-        options = LiftOptions(self.edge, self.max_gaussians)
-        common = {"swing": self.swing, "threads": self.threads, "overwrite": self.overwrite}
         if self.refine is None:
-            result = lift_photo(
-                *(self.photo, self.output, source, options),
-                size=self.size,
-                focal=self.focal,
-                **common,
-            )
+            result = self._lift(self.photo, self.output, source)
         else:
-            with TerminalObserver(self.quiet) as observer:
-                result = refine_photo(
-                    *(self.photo, self.output, source, self.refine, options),
-                    iterations=self.iterations,
-                    hold_out=8 if self.eval else None,
-                    observer=observer,
-                    **common,
-                )
+            result = self._refine(self.photo, self.output, source, self.refine)
         if result.alignment is not None:
             fit = result.alignment
             print(
@@ -123,3 +110,31 @@ class Lift:
         if result.swing is not None:
             print(f"{result.swing}: the video")
         return 0
+
+    def _lift(self, photo: Path, output: Path, source: DepthSource) -> LiftResult:
+        from snowsplat.lift.lift import LiftOptions
+        from snowsplat.pipeline.lift import lift_photo
+
+        return lift_photo(
+            *(photo, output, source, LiftOptions(self.edge, self.max_gaussians)),
+            size=self.size,
+            focal=self.focal,
+            swing=self.swing,
+            threads=self.threads,
+            overwrite=self.overwrite,
+        )
+
+    def _refine(self, photo: Path, output: Path, source: DepthSource, dataset: Path) -> LiftResult:
+        from snowsplat.lift.lift import LiftOptions
+        from snowsplat.pipeline.lift_refine import refine_photo
+
+        with TerminalObserver(self.quiet) as observer:
+            return refine_photo(
+                *(photo, output, source, dataset, LiftOptions(self.edge, self.max_gaussians)),
+                iterations=self.iterations,
+                hold_out=8 if self.eval else None,
+                swing=self.swing,
+                threads=self.threads,
+                overwrite=self.overwrite,
+                observer=observer,
+            )

@@ -34,8 +34,8 @@ def discs(
 
     Let J be the 3×2 matrix of the tangents, in world units per pixel. A circle in the
     image is the ellipse J x on the tangent plane, so the covariance is σ² J Jᵀ. Seen from the
-    camera, every disc is a circle with the standard deviation σ. Its axes are the eigenvectors of this
-    matrix, which follow from those of the 2×2 matrix JᵀJ. The third axis is the normal.
+    camera, every disc is a circle with the standard deviation σ. Its axes are the eigenvectors of
+    this matrix, which follow from those of the 2×2 matrix JᵀJ. The third axis is the normal.
 
     Args:
         points: (N, 3) in the camera frame, in world units.
