@@ -27,12 +27,15 @@ if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import evaluate_views
     from snowsplat.formats import read_gaussians
     from snowsplat.image.fit import FitOptions
+    from snowsplat.lift.lift import LiftOptions
     from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.convert import Edits, convert
     from snowsplat.pipeline.describe import describe
     from snowsplat.pipeline.evaluate import evaluate
     from snowsplat.pipeline.globe import GlobeOptions, make_globe
     from snowsplat.pipeline.image import decode_image, fit_image
+    from snowsplat.pipeline.lift import DepthSource, LiftResult, lift_photo
+    from snowsplat.pipeline.lift_refine import refine_photo
     from snowsplat.pipeline.make import MakeOptions, make
     from snowsplat.pipeline.observer import Observer
     from snowsplat.pipeline.render import render_images
@@ -53,10 +56,13 @@ _MODULES = {
     "Camera": "scene.camera",
     "Compute": "pipeline.compute",
     "Dataset": "data",
+    "DepthSource": "pipeline.lift",
     "Edits": "pipeline.convert",
     "FitOptions": "image.fit",
     "Gaussians": "scene.gaussians",
     "GlobeOptions": "pipeline.globe",
+    "LiftOptions": "lift.lift",
+    "LiftResult": "pipeline.lift",
     "MakeOptions": "pipeline.make",
     "Observer": "pipeline.observer",
     "Points": "data",
@@ -74,11 +80,13 @@ _MODULES = {
     "evaluate_views": "evaluation.metrics",
     "fit_image": "pipeline.image",
     "load_dataset": "data",
+    "lift_photo": "pipeline.lift",
     "load_trained": "pipeline.scene_source",
     "make": "pipeline.make",
     "make_globe": "pipeline.globe",
     "read_gaussians": "formats",
     "recipe": "training.recipes",
+    "refine_photo": "pipeline.lift_refine",
     "render_images": "pipeline.render",
     "render_video": "pipeline.videos",
     "resume": "pipeline.train",
@@ -90,10 +98,13 @@ __all__ = [
     "Camera",
     "Compute",
     "Dataset",
+    "DepthSource",
     "Edits",
     "FitOptions",
     "Gaussians",
     "GlobeOptions",
+    "LiftOptions",
+    "LiftResult",
     "MakeOptions",
     "Observer",
     "Points",
@@ -111,12 +122,14 @@ __all__ = [
     "evaluate",
     "evaluate_views",
     "fit_image",
+    "lift_photo",
     "load_dataset",
     "load_trained",
     "make",
     "make_globe",
     "read_gaussians",
     "recipe",
+    "refine_photo",
     "render_images",
     "render_video",
     "resume",

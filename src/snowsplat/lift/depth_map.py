@@ -139,7 +139,7 @@ def _read_exr(path: Path) -> np.ndarray:
         import OpenEXR
     except ImportError:
         raise UserError(
-            f"{path}: reading EXR files needs a package; run pip install OpenEXR, or convert it to NPY"
+            f"{path}: EXR files need a package; run pip install OpenEXR, or convert it to NPY"
         ) from None
     with OpenEXR.File(str(path), header_only=True) as header:
         box = header.header()["dataWindow"]
