@@ -91,9 +91,9 @@ def near_edges(depth: Tensor) -> Tensor:
     return F.max_pool2d(ends[None, None], size, 1, _EDGE_RADIUS)[0, 0] > 0
 
 
-def error_map(predict: Predictor, example: Example, scale: float) -> tuple[Tensor, Tensor]:
+def error_map(predict: Predictor, example: Example) -> tuple[Tensor, Tensor]:
     """The predicted depth (H, W), and its relative error (H, W)."""
     with torch.no_grad():
-        depth = predict(example.shots.image(example.i)[None]).log_depth[0].exp() * scale
+        depth = predict(example.shots.image(example.i)[None]).log_depth[0].exp()
     truth = example.shots.depths[example.i]
     return depth, (depth - truth).abs() / truth

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from scenes import FOCAL
 from torch import Tensor, nn
 
-from snowsplat.lift.discs import OPACITY, SIGMA, discs
+from snowsplat.lift.discs import OPACITY, discs
 from snowsplat.lift.edges import find_links
 from snowsplat.lift.surface import surface_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 
+# Standard deviation of the disc of a pixel, in pixels. The second views have the resolution of the
+# photos, so smaller discs than those of `snowsplat lift` leave no gaps.
+_SIGMA = 0.4
 _WIDTHS = (16, 32, 64, 96)
 _GROUPS = 8
 
@@ -26,7 +31,7 @@ class Prediction:
     Attributes:
         log_depth: (N, H, W), the logarithm of camera z in metres, for a camera of focal length
             `FOCAL`.
-        log_size: (N, H, W), the logarithm of the size of the Gaussians, in units of `SIGMA`.
+        log_size: (N, H, W), the logarithm of the size of the Gaussians, in units of `_SIGMA`.
         opacity: (N, H, W), in (0, 1).
     """
 
@@ -43,14 +48,41 @@ class Prediction:
             surface.tangents.flatten(0, 1),
             image.flatten(0, 1),
             camera,
-            sigma=SIGMA * self.log_size[i].flatten().exp(),
+            sigma=_SIGMA * self.log_size[i].flatten().exp(),
             opacity=self.opacity[i].flatten(),
         )
 
 
 def without_offsets(log_depth: Tensor) -> Prediction:
-    """A prediction of depths (N, H, W) alone, with the discs of `snowsplat lift`."""
+    """A prediction of depths (N, H, W) alone, with opaque discs of one size."""
     return Prediction(log_depth, torch.zeros_like(log_depth), torch.full_like(log_depth, OPACITY))
+
+
+def with_resampling(net: DepthNet, focal: float) -> Callable[[Tensor], Prediction]:
+    """The network, for photos of a longer focal length, which are first scaled down.
+
+    A photo is scaled by `FOCAL` / ``focal`` and placed in the middle of a photo of the training.
+    Then each of its pixels has the ray that it has in the training. The border repeats the
+    outermost pixels.
+    """
+
+    def predict(images: Tensor) -> Prediction:
+        size = images.shape[1]
+        small = 2 * round(size * FOCAL / focal / 2)
+        margin = (size - small) // 2
+        planes = F.interpolate(
+            images.permute(0, 3, 1, 2), (small, small), mode="bilinear", antialias=True
+        )
+        padded = F.pad(planes, [margin] * 4, mode="replicate")
+        whole = net(padded.permute(0, 2, 3, 1))
+
+        def cut(values: Tensor) -> Tensor:
+            middle = values[:, None, margin : margin + small, margin : margin + small]
+            return F.interpolate(middle, (size, size), mode="bilinear")[:, 0]
+
+        return Prediction(cut(whole.log_depth), cut(whole.log_size), cut(whole.opacity))
+
+    return predict
 
 
 def _block(inputs: int, outputs: int) -> nn.Sequential:
@@ -78,7 +110,7 @@ class DepthNet(nn.Module):
         self.pool = nn.AvgPool2d(2)
         self.grow = nn.Upsample(scale_factor=2, mode="bilinear")
         self.head = nn.Conv2d(_WIDTHS[0], 3, 1)
-        # The first prediction is the mean depth, and the discs of `snowsplat lift`.
+        # The first prediction is the mean depth, with the discs of `without_offsets`.
         nn.init.zeros_(self.head.weight)
         bias = [mean_log_depth, 0.0, math.log(OPACITY / (1 - OPACITY))]
         self.head.bias.data.copy_(torch.tensor(bias))

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from measures import error_map
-from network import DepthNet, focal_scale
+from measures import Predictor, error_map
+from network import DepthNet, with_resampling
 from PIL import Image, ImageDraw
-from scenes import SIZE, Shots
+from scenes import FOCAL, SIZE, Shots
 from torch import Tensor
 
 from snowsplat.pipeline.image_files import depth_in_color, to_8bit
@@ -58,31 +58,30 @@ def draw_curves(curves: dict[str, Curves], path: Path) -> None:
     sheet.save(path, quality=85, method=6)
 
 
-def draw_failures(nets: dict[str, DepthNet], tests: dict[str, Shots], out: Path) -> None:
-    """For each test set, the photo with the largest error of the network of 400 photos.
+def draw_failures(net: DepthNet, tests: dict[str, Shots], out: Path) -> None:
+    """For each test set, the photo with the largest error. Longer focal lengths are resampled.
 
     A row has the photo, the true depth, the predicted depth, the error from black (none) to white
     (50% or more), the true second view, and the predicted second view.
     """
-    net = nets["400 photos"]
     rows = []
     for shots in tests.values():
-        scale = focal_scale(shots.focal)
-        errors = [float(error_map(net, e, scale)[1].mean()) for e in examples([shots])]
-        rows.append(_row(net, Example(shots, int(np.argmax(errors))), scale))
+        predict = net if shots.focal == FOCAL else with_resampling(net, shots.focal)
+        errors = [float(error_map(predict, e)[1].mean()) for e in examples([shots])]
+        rows.append(_row(predict, Example(shots, int(np.argmax(errors)))))
     sheet = Image.fromarray(np.concatenate(rows))
     size = sheet.width * _ENLARGED, sheet.height * _ENLARGED
     sheet.resize(size, Image.Resampling.NEAREST).save(out / "failures.webp", quality=85, method=6)
 
 
-def _row(net: DepthNet, example: Example, scale: float) -> np.ndarray:
+def _row(predict: Predictor, example: Example) -> np.ndarray:
     shots, i = example.shots, example.i
-    depth, error = error_map(net, example, scale)
+    depth, error = error_map(predict, example)
     truth = shots.depths[i]
     near, far = float(truth.min()), float(truth.max())
     with torch.no_grad():
-        prediction = net(shots.image(i)[None])
-        gaussians = prediction.gaussians(0, shots.image(i), shots.camera(i), scale)
+        prediction = predict(shots.image(i)[None])
+        gaussians = prediction.gaussians(0, shots.image(i), shots.camera(i))
         second = render(gaussians, shots.camera(example.second)).image
     images = [
         shots.images[i].numpy(),

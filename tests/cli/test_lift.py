@@ -24,8 +24,10 @@ def photo(tmp_path_factory) -> Path:
     """A photo of 48×36 pixels with a 35 mm equivalent focal length; beside it, its depth."""
     folder = tmp_path_factory.mktemp("lift")
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    disc = np.hypot(x - 20, y - 18) < 9
-    pixels = np.where(disc[..., None], (200, 90, 40), np.stack([4 * x, 5 * y, 90 + 0 * x], -1))
+    inside = 9 - np.hypot(x - 20, y - 18)
+    disc, share = inside > 0, (0.5 + inside / 2).clip(0, 1)[..., None]  # with a soft edge
+    behind = np.stack([4 * x, 5 * y, 90 + 0 * x], -1)
+    pixels = behind + share * (np.array([200, 90, 40]) - behind)
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 28
     path = folder / "room.png"

@@ -80,7 +80,9 @@ def test_discs_of_blocks_overlap_like_those_of_pixels():
     size = torch.tensor([1.0, 2.0, 16.0])
     sigma = sigma_of_block(size)
     assert float(sigma[0]) == pytest.approx(SIGMA)
-    torch.testing.assert_close((sigma.square() + 0.3) / size.square(), torch.full((3,), 0.46))
+    torch.testing.assert_close(
+        (sigma.square() + 0.3) / size.square(), torch.full((3,), SIGMA**2 + 0.3)
+    )
 
 
 def test_points_are_differentiable_in_the_depth():

@@ -15,7 +15,7 @@ from snowsplat.scene.sh_constants import SH_C0
 
 # More steps reproduce the photo better, but other viewpoints worse: the colours then compensate for
 # each other at this pose only.
-_STEPS = 5
+_STEPS = 10
 
 
 def match_photo(

@@ -10,9 +10,9 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import quat_from_rotation, transform_points
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 
-#: Standard deviation of the Gaussian of a pixel, in pixels. Smaller discs leave holes when they are
-#: seen from closer, larger ones blur.
-SIGMA = 0.4
+#: Standard deviation of the Gaussian of a pixel, in pixels. With smaller discs, dark gaps are
+#: visible in a window that is larger than the photo. Larger discs blur other viewpoints.
+SIGMA = 0.55
 # The rasterizer adds this variance to each splat (Kerbl et al. 2023), in pixels squared.
 _DILATION = 0.3
 #: Opacity of a disc.
