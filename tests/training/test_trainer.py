@@ -186,6 +186,15 @@ def test_resuming_is_bit_identical(dataset, config, stop, tmp_path):
     assert_identical(second.gaussians, uninterrupted)
 
 
+def test_a_run_starts_from_given_gaussians_and_does_not_change_them(dataset):
+    initial = true_scene()
+    trainer = Trainer(dataset, TrainConfig(iterations=3), initial=initial)
+    assert trainer.evaluate().psnr > 45
+    trainer.run()
+    assert torch.equal(initial.means, true_scene().means)
+    assert not torch.equal(trainer.gaussians.means, initial.means)
+
+
 def test_a_resumed_run_does_not_initialise_again(dataset, monkeypatch):
     """Depth maps take time, and the Gaussians come from the checkpoint."""
     config = changed(BUSY, init="points+sweep", initial_points=0.5, max_gaussians=500)
