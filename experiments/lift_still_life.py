@@ -191,7 +191,7 @@ def measure_refinement(scene: Scene, base: Tensor, out: Path) -> dict[str, Any]:
     assert result.evaluation is not None
     assert result.alignment is not None
     psnrs = {}
-    for name, settings in {"default": {}, "points only": {"dense_init": 0.0}}.items():
+    for name, settings in {"default": {}, "points only": {"init": "points"}}.items():
         config = recipe("default", iterations=ITERATIONS, **settings)
         trainer = Trainer(load_dataset(folder, hold_out=2), config)
         trainer.run()

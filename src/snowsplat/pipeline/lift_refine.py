@@ -71,7 +71,7 @@ def refine_photo(
     view = _view_of(posed, Path(photo))
     if posed.points is None:
         raise UserError(f"{dataset}: has no points, which the depth is aligned to; use lift alone")
-    config = _capped(recipe("default", iterations=iterations, dense_init=0.0), posed)
+    config = _capped(recipe("default", iterations=iterations, init="points"), posed)
     Compute("cpu", threads).apply()
     with ImageLoader([view], background=(1.0, 1.0, 1.0)) as loader:
         pixels = loader.get(view).rgb.float().div(255).contiguous()
