@@ -137,6 +137,10 @@ def test_invalid_input_is_one_line(photo, lifted, refused, tmp_path):
         assert flag in refused("lift", photo, "--depth", depth, "-o", new, flag, value)
     assert "--near and --far" in refused("lift", photo, "--depth", depth, "-o", new, "--near", 1)
     assert "does not download" in refused("lift", photo, "--model", "depth.onnx", "-o", new)
+    rest = ("--depth", depth, "-o", new)
+    assert "set --refine" in refused("lift", photo, *rest, "--eval")
+    assert "set --refine" in refused("lift", photo, *rest, "--iterations", 9)
+    assert "leave them out" in refused("lift", photo, *rest, "--refine", new, "--size", 99)
     assert not new.exists()
 
 

@@ -107,11 +107,13 @@ def test_files_that_are_no_depth_maps(tmp_path):
     )
     np.save(tmp_path / "words.npy", np.array([["a"]]))
     np.save(tmp_path / "objects.npy", np.array([[None]]), allow_pickle=True)
+    Image.fromarray(np.zeros((4, 4), np.uint8)).convert("P").save(tmp_path / "palette.png")
     (tmp_path / "damaged.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     (tmp_path / "damaged.npy").write_bytes(b"\x93NUMPY\x01")
     (tmp_path / "map.txt").write_text("1 2 3")
     for name, problem in {
         "photo.png": "one number per pixel",
+        "palette.png": "palette of colours",
         "words.npy": "one number per pixel",
         "objects.npy": "cannot be read",
         "damaged.png": "cannot be read",

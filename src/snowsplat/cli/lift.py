@@ -55,7 +55,7 @@ class Lift:
     focal: Annotated[float | None, flag("PIXELS", default="from EXIF data")] = None
     """Focal length in pixels of the photo as stored. Without EXIF data, that of the main camera of
     phones is assumed."""
-    size: Annotated[int, flag("PIXELS", default="640")] = 640
+    size: Annotated[int | None, flag("PIXELS", default="640")] = None
     """Pixels along the longer side. A larger photo is scaled down."""
     max_gaussians: Annotated[int | None, flag("N", default="one per pixel")] = None
     """Merge the pixels of uniform parts, until there are at most this many Gaussians."""
@@ -67,7 +67,7 @@ class Lift:
     refine: Annotated[Path | None, flag("DATASET")] = None
     """A dataset of photos with camera poses that contains PHOTO. The depth is aligned to its
     points, and the scene is trained on all of its photos."""
-    iterations: Annotated[int, flag("N", default="1000")] = 1000
+    iterations: Annotated[int | None, flag("N", default="1000")] = None
     """Number of training steps with --refine."""
     eval: Annotated[bool, switch()] = False
     """With --refine: hold out every 8th photo, and evaluate the scene on these photos."""
@@ -83,6 +83,12 @@ class Lift:
         if self.photo is None or self.output is None:
             raise UserError(
                 "lift needs a photo and an output folder: snowsplat lift PHOTO --depth MAP -o OUT"
+            )
+        if self.refine is None and (self.eval or self.iterations is not None):
+            raise UserError("`eval` and `iterations` are about the training; set `refine` as well")
+        if self.refine is not None and (self.size is not None or self.focal is not None):
+            raise UserError(
+                "`size` and `focal` are those of the dataset with `refine`; leave them out"
             )
         from snowsplat.pipeline.lift import DepthSource
 
@@ -117,7 +123,7 @@ class Lift:
 
         return lift_photo(
             *(photo, output, source, LiftOptions(self.edge, self.max_gaussians)),
-            size=self.size,
+            size=640 if self.size is None else self.size,
             focal=self.focal,
             swing=self.swing,
             threads=self.threads,
@@ -131,7 +137,7 @@ class Lift:
         with TerminalObserver(self.quiet) as observer:
             return refine_photo(
                 *(photo, output, source, dataset, LiftOptions(self.edge, self.max_gaussians)),
-                iterations=self.iterations,
+                iterations=1000 if self.iterations is None else self.iterations,
                 hold_out=8 if self.eval else None,
                 swing=self.swing,
                 threads=self.threads,

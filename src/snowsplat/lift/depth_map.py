@@ -46,6 +46,8 @@ def read_depth_file(path: Path) -> np.ndarray:
             values = _read_exr(path)
         else:
             with open_image(path, ("PNG", "TIFF")) as image:
+                if image.mode == "P":
+                    raise ValueError("it has a palette of colours; save grey values")
                 values = np.asarray(image)
     except UserError:
         raise
