@@ -19,6 +19,7 @@ _PAGES = {
     _ROOT / "CONTRIBUTING.md": _DOCS / "project" / "contributing.md",
     _ROOT / "README.md": _DOCS / "index.md",
     _ROOT / "benchmarks" / "README.md": _DOCS / "project" / "benchmarks.md",
+    _ROOT / "notebooks" / "README.md": _DOCS / "guides" / "notebooks.md",
     _ROOT / "third_party" / "README.md": _DOCS / "project" / "third-party.md",
 }
 _LINK = re.compile(r"\]\((?![a-z]+:|#)([^)#\s]+)(#[^)\s]*)?\)")
