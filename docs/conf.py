@@ -23,6 +23,7 @@ extensions = [
     "local_mathjax",
     "repository_links",
     "subcommand_help",
+    "translations",
 ]
 exclude_patterns = ["extensions", "static", "learn/figures"]
 

@@ -4,7 +4,7 @@
 The caption, with formulas such as $x$.
 ```
 
-The arguments are names of files in `figures/`, without ".svg". The files become elements of the
+The arguments are names of files in `docs/learn/figures/`, without ".svg". The files become elements of the
 page. So the style sheet of the site can change their colours with the theme, and a formula of the
 caption is typeset. The panels are side by side if there is enough space, otherwise below each
 other.
@@ -28,7 +28,7 @@ class Drawing(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         panels = []
         for name in self.arguments[0].split():
-            _, path = self.env.relfn2path(f"figures/{name}.svg")
+            _, path = self.env.relfn2path(f"/learn/figures/{name}.svg")
             if not Path(path).exists():
                 raise self.error(f"{path} is missing; see docs/learn/figures/README.md")
             self.env.note_dependency(path)

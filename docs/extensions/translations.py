@@ -1,0 +1,83 @@
+"""Checks that the Chinese pages are complete and not older than the English ones.
+
+`docs/zh/` has a page for each page of `TRANSLATED`; README.md has README.zh-CN.md beside it. The
+first line of a Chinese page contains a digest of the English text that it translates:
+
+    <!-- translation of quick-start.md 0123456789abcdef -->
+
+If a page is missing, or the English text has changed, there is a warning (an error in `make docs`)
+that says what to do. The digest ignores line breaks, so wrapping a paragraph again changes nothing.
+The extension also sets the language of the Chinese pages, which Sphinx knows only for a whole site.
+"""
+
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.util import logging
+
+_DOCS = Path(__file__).resolve().parents[1]
+#: Pages of `docs/` that are translated, as patterns.
+TRANSLATED = ("installation.md", "quick-start.md", "learn/*.md")
+#: Pages of `docs/zh/` that are not translations.
+OWN = ("index.md", "glossary.md")
+_FIRST_LINE = re.compile(r"<!-- translation of (\S+) ([0-9a-f]{16}) -->\n")
+
+logger = logging.getLogger(__name__)
+
+
+def digest(text: str) -> str:
+    """16 hexadecimal digits that change with the text, but not with its line breaks."""
+    return hashlib.sha256(" ".join(text.split()).encode()).hexdigest()[:16]
+
+
+def pairs(docs: Path) -> Iterator[tuple[Path, Path]]:
+    """The English pages that are translated, each with its Chinese page."""
+    yield docs.parent / "README.md", docs.parent / "README.zh-CN.md"
+    for pattern in TRANSLATED:
+        for page in sorted(docs.glob(pattern)):
+            yield page, docs / "zh" / page.relative_to(docs)
+
+
+def problems(docs: Path) -> Iterator[str]:
+    """One line for each Chinese page that is missing, too old, or has no English page."""
+    known = {docs / "zh" / name for name in OWN}
+    for english, chinese in pairs(docs):
+        known.add(chinese)
+        source = english.relative_to(docs.parent)
+        name = chinese.relative_to(docs.parent)
+        current = digest(english.read_text(encoding="utf-8"))
+        line = f"<!-- translation of {english.name} {current} -->"
+        if not chinese.exists():
+            yield f"{name}: missing; translate {source}, and begin with the line {line}"
+            continue
+        match = _FIRST_LINE.match(chinese.read_text(encoding="utf-8"))
+        if match is None:
+            yield f"{name}: does not name the text that it translates; begin with the line {line}"
+        elif match[1] != english.name:
+            yield f"{name}: is a translation of {match[1]}; begin with the line {line}"
+        elif match[2] != current:
+            yield f"{name}: older than {source}; update it, then change its first line to {line}"
+    for chinese in sorted((docs / "zh").rglob("*.md")):
+        if chinese not in known:
+            name = chinese.relative_to(docs.parent)
+            yield f"{name}: there is no English page of this name; remove it or rename it"
+
+
+def _check(app: Sphinx) -> None:
+    for problem in problems(_DOCS):
+        logger.warning("%s", problem, type="translation")
+
+
+def _language(app: Sphinx, page: str, template: str, context: dict[str, Any], _: Any) -> None:
+    if page.startswith("zh/"):
+        context["language"] = "zh-CN"
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    app.connect("builder-inited", _check)
+    app.connect("html-page-context", _language)
+    return {"parallel_read_safe": True}
