@@ -4,10 +4,10 @@
 The caption, with formulas such as $x$.
 ```
 
-The arguments are names of files in `docs/learn/figures/`, without ".svg". The files become elements of the
-page. So the style sheet of the site can change their colours with the theme, and a formula of the
-caption is typeset. The panels are side by side if there is enough space, otherwise below each
-other.
+The arguments are names of files in `docs/learn/figures/`, without ".svg". The files become elements
+of the page. So the style sheet of the site can change their colours with the theme, and a formula
+of the caption is typeset. The panels are side by side if there is enough space, otherwise below
+each other.
 """
 
 from pathlib import Path

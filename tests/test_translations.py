@@ -1,0 +1,142 @@
+"""The Chinese pages: the check in the documentation build, and whether they are complete."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+EXTENSION = ROOT / "docs" / "extensions"
+
+
+@pytest.fixture(scope="module")
+def translations():
+    pytest.importorskip("sphinx", reason="needs Sphinx (make dev installs it)")
+    sys.path.insert(0, str(EXTENSION))
+    try:
+        import translations
+    finally:
+        sys.path.remove(str(EXTENSION))
+    return translations
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def docs(tmp_path, translations) -> Path:
+    """A small project whose pages are all translated."""
+    for name in ("README.md", "docs/quick-start.md", "docs/learn/camera.md", "docs/formats.md"):
+        write(tmp_path / name, f"# {name}\n\nSome text\nin two lines.\n")
+    for name in translations.OWN:
+        write(tmp_path / "docs" / "zh" / name, "# 中文\n")
+    for english, chinese in translations.pairs(tmp_path / "docs"):
+        digest = translations.digest(english.read_text(encoding="utf-8"))
+        write(chinese, f"<!-- translation of {english.name} {digest} -->\n# 标题\n\n文字\n")
+    return tmp_path / "docs"
+
+
+def test_complete_translations_have_no_problems(translations, docs):
+    names = [chinese.relative_to(docs.parent) for _, chinese in translations.pairs(docs)]
+    assert list(map(str, names)) == [
+        "README.zh-CN.md",
+        "docs/zh/quick-start.md",
+        "docs/zh/learn/camera.md",
+    ]
+    assert list(translations.problems(docs)) == []
+
+
+def test_other_line_breaks_are_no_problem(translations, docs):
+    write(docs / "quick-start.md", "# docs/quick-start.md\n\nSome text in\ntwo lines.\n")
+    assert list(translations.problems(docs)) == []
+
+
+def test_a_changed_page_is_a_problem_until_the_first_line_is_changed(translations, docs):
+    write(docs / "quick-start.md", "# docs/quick-start.md\n\nSome other text.\n")
+    (problem,) = translations.problems(docs)
+    assert problem.startswith("docs/zh/quick-start.md: older than docs/quick-start.md; update it")
+    line = problem.partition(" to ")[2]
+    page = docs / "zh" / "quick-start.md"
+    _, _, rest = page.read_text(encoding="utf-8").partition("\n")
+    write(page, f"{line}\n{rest}")
+    assert list(translations.problems(docs)) == []
+
+
+@pytest.mark.parametrize("name", ["README.zh-CN.md", "docs/zh/learn/camera.md"])
+def test_a_missing_page_is_a_problem(translations, docs, name):
+    (docs.parent / name).unlink()
+    (problem,) = translations.problems(docs)
+    assert problem.startswith(f"{name}: missing; translate ")
+
+
+def test_a_page_without_a_digest_or_with_that_of_another_page_is_a_problem(translations, docs):
+    write(docs / "zh" / "quick-start.md", "# 标题\n")
+    (problem,) = translations.problems(docs)
+    assert "does not name the text that it translates" in problem
+    digest = translations.digest((docs / "quick-start.md").read_text(encoding="utf-8"))
+    write(docs / "zh" / "quick-start.md", f"<!-- translation of camera.md {digest} -->\n# 标题\n")
+    (problem,) = translations.problems(docs)
+    assert "is a translation of camera.md" in problem
+
+
+def test_a_page_without_an_english_page_is_a_problem(translations, docs):
+    write(docs / "zh" / "learn" / "old.md", "# 旧\n")
+    (problem,) = translations.problems(docs)
+    assert problem.startswith("docs/zh/learn/old.md: there is no English page of this name")
+
+
+# The pages of this project
+
+FENCE = re.compile(r"^```(.*)\n((?:.*\n)*?)```$", re.MULTILINE)
+
+
+def blocks(text: str) -> list[tuple[str, str]]:
+    """Code, includes and figures: their first lines, and their contents except for captions."""
+    found = []
+    for first, content in FENCE.findall(text):
+        first = re.sub(r"(\.\./)+", "", first)
+        found.append((first, "" if first.startswith("{drawing}") else content))
+    return found
+
+
+def formulas(text: str) -> tuple[list[str], set[str]]:
+    """The formulas in their own lines, in order, and those within text and captions."""
+    text = FENCE.sub(lambda block: block[2] if block[1].startswith("{drawing}") else "", text)
+    text = re.sub(r"`[^`\n]+`", "", text)
+    text = re.sub(r"\\text\{[^}]*\}", "", text)  # words in a formula
+    display = re.compile(r"^\$\$\n(.*?)\n\$\$$", re.MULTILINE | re.DOTALL)
+    inline = re.findall(r"\$([^$]+)\$", display.sub("", text))
+    alone = [" ".join(formula.split()) for formula in display.findall(text)]
+    return alone, {" ".join(formula.split()) for formula in inline}
+
+
+def outline(text: str) -> list[str]:
+    """The kinds of the lines that have one: levels of headings, tables, lists, answers."""
+    text = FENCE.sub("", text)
+    return re.findall(r"^(#+ |\||[-] |\d+\. |</?details>)", text, re.MULTILINE)
+
+
+def test_every_chinese_page_contains_what_the_english_page_contains(translations):
+    pages = list(translations.pairs(ROOT / "docs"))
+    assert len(pages) >= 17
+    for english, chinese in pages:
+        original = english.read_text(encoding="utf-8")
+        translated = chinese.read_text(encoding="utf-8")
+        assert blocks(translated) == blocks(original), chinese
+        assert formulas(translated)[0] == formulas(original)[0], chinese
+        assert formulas(translated)[1] == formulas(original)[1], chinese
+        if english.name != "README.md":  # has a separate table of Chinese pages
+            assert outline(translated) == outline(original), chinese
+        assert len(re.findall(r"[\u4e00-\u9fff]", translated)) > 400, chinese
+
+
+def test_links_of_the_chinese_readme_lead_to_files():
+    text = (ROOT / "README.zh-CN.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^):#]+)[#)]", text)
+    assert len(links) > 20
+    for link in links:
+        assert (ROOT / link).exists(), link
