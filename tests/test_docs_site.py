@@ -37,7 +37,7 @@ def build(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def site() -> Path:
-    included = [ROOT / name for name in ("pyproject.toml", "CONTRIBUTING.md", "CHANGELOG.md")]
+    included = [ROOT / "pyproject.toml", *ROOT.glob("*.md")]
     sources = [*ROOT.glob("*/README.md"), *ROOT.glob("third_party/mathjax-*"), *included]
     for folder in ("docs", "src"):
         files = (ROOT / folder).rglob("*")
@@ -81,6 +81,17 @@ def test_no_page_loads_files_from_other_sites(site):
         page = file.read_text(encoding="utf-8")
         assert 'src="http' not in page, file
         assert 'rel="stylesheet" type="text/css" href="http' not in page, file
+
+
+def test_pages_in_two_languages_link_to_each_other(site):
+    for page in ("index", "quick-start", "learn/gaussian"):
+        english, chinese = site / f"{page}.html", site / "zh" / f"{page}.html"
+        for file, other, language in ((english, chinese, "en"), (chinese, english, "zh-CN")):
+            text = file.read_text(encoding="utf-8")
+            assert f'<html class="no-js" lang="{language}"' in text
+            (link,) = re.findall(r'<p class="language"><a href="([^"]*)"', text)
+            assert (file.parent / link).resolve() == other
+    assert 'class="language"' not in (site / "formats.html").read_text(encoding="utf-8")
 
 
 def test_every_public_name_is_described(site):

@@ -7,7 +7,8 @@ first line of a Chinese page contains a digest of the English text that it trans
 
 If a page is missing, or the English text has changed, there is a warning (an error in `make docs`)
 that says what to do. The digest ignores line breaks, so wrapping a paragraph again changes nothing.
-The extension also sets the language of the Chinese pages, which Sphinx knows only for a whole site.
+The extension also sets the language of the Chinese pages, which Sphinx knows only for a whole site,
+and links each page to the same page in the other language.
 """
 
 import hashlib
@@ -73,8 +74,15 @@ def _check(app: Sphinx) -> None:
 
 
 def _language(app: Sphinx, page: str, template: str, context: dict[str, Any], _: Any) -> None:
-    if page.startswith("zh/"):
+    chinese = page.startswith("zh/")
+    if chinese:
         context["language"] = "zh-CN"
+    other = page.removeprefix("zh/") if chinese else f"zh/{page}"
+    if other in app.env.all_docs:
+        language, name = ("en", "English") if chinese else ("zh-CN", "中文")
+        address = app.builder.get_relative_uri(page, other)
+        link = f'<a href="{address}" lang="{language}" hreflang="{language}">{name}</a>'
+        context["body"] = f'<p class="language">{link}</p>{context["body"]}'
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
