@@ -238,6 +238,19 @@ def test_masks_beside_the_images(dataset_copy):
         assert loader.get(views[1], 2).mask.all()
 
 
+def test_depth_maps_beside_the_images(dataset_copy):
+    folder = dataset_copy("colmap-bin")
+    (folder / "depths").mkdir()
+    for name in ("view_01.png", "view_02.png.npy", "view_03.txt"):
+        (folder / "depths" / name).touch()
+    views = load_dataset(folder, hold_out=None).train
+    names = {view.name: view.depth and view.depth.name for view in views}
+    assert {name: depth for name, depth in names.items() if depth} == {
+        "view_01.png": "view_01.png",
+        "view_02.png": "view_02.png.npy",
+    }
+
+
 @pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])
 def test_a_file_that_is_not_an_image_is_rejected_when_loading(dataset_copy, content):
     folder = dataset_copy("colmap-bin")

@@ -250,6 +250,15 @@ def test_masks(scene, tmp_path):
         load_dataset(folder)
 
 
+def test_depth_maps(scene, tmp_path):
+    """Of nerfstudio; missing ones and those outside of the folder are ignored."""
+    (tmp_path / "0.npy").touch()
+    paths = ["0.npy", "absent.npy", "../0.npy", 3]
+    folder = scene({"fl_x": 50}, [{"depth_file_path": path} for path in paths])
+    views = load_dataset(folder, hold_out=None).train
+    assert [view.depth for view in views] == [tmp_path / "0.npy", None, None, None]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

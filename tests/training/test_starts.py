@@ -164,7 +164,7 @@ def test_starts_are_joined(sphere: Dataset) -> None:
 
 @pytest.mark.parametrize("init", ["", "cloud", "points+", "points,sweep"])
 def test_unknown_starts(init: str) -> None:
-    with pytest.raises(SettingError, match="points, random, carve, sweep"):
+    with pytest.raises(SettingError, match="points, random, carve, depth, sweep"):
         TrainConfig(init=init)
 
 

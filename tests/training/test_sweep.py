@@ -21,8 +21,9 @@ from snowsplat.scene.geometry import look_at
 from snowsplat.training.config import TrainConfig, changed
 from snowsplat.training.init import initial_gaussians
 from snowsplat.training.starts import swept_points
-from snowsplat.training.starts.depth_maps import DepthMap, depth_maps
-from snowsplat.training.starts.fusion import consistent, thinned, world_points
+from snowsplat.training.starts.depth_map import DepthMap
+from snowsplat.training.starts.fusion import consistent, thinned
+from snowsplat.training.starts.plane_sweep import depth_maps
 from snowsplat.training.starts.source_views import source_views
 from snowsplat.util.errors import SettingError
 
@@ -182,7 +183,7 @@ def test_points_of_a_map() -> None:
     pose = torch.eye(4, dtype=torch.float64)[:3]
     pose[:, 3] = -50.0
     depth_map = DepthMap(Camera(2, 2, 1.0, 1.0, 1.0, 1.0, pose), torch.full((2, 2), 0.5))
-    xyz = world_points(depth_map, torch.tensor([[True, True], [False, False]]))
+    xyz = depth_map.points(torch.tensor([[True, True], [False, False]]))
     torch.testing.assert_close(xyz, 50.0 + torch.tensor([[-1.0, -1.0, 2.0], [1.0, -1.0, 2.0]]))
 
 

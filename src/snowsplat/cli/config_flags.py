@@ -46,8 +46,9 @@ class ConfigFlags:
     """Weight of 1 - SSIM in the loss. The mean absolute difference has the weight 1 - F."""
     init: Annotated[str | None, flag("START[+START…]", default=RECIPE)] = None
     """Where the first Gaussians come from. points: the points of the dataset; sweep: depth maps
-    computed from the photos (plane sweep); carve: voxels with the same colour in all photos (space
-    carving); random: random depths of random pixels. Example: points+sweep."""
+    computed from the photos (plane sweep); depth: the depth maps of the dataset (depths/IMG.png);
+    carve: voxels with the same colour in all photos (space carving); random: random depths of
+    random pixels. Example: points+sweep."""
     initial_points: Annotated[int | float | None, flag("N|F", default=RECIPE)] = None
     """Number of points of each start except points, which uses all. A value with a decimal point
     (0.4) is a share of the maximum number of Gaussians."""

@@ -68,6 +68,7 @@ class View:
     camera: Camera
     image: ImageSource
     mask: ImageSource | None = None  # black pixels of the mask are ignored in the image
+    depth: Path | None = None  # a depth map of the image, of any size; see `read_depth_file`
 
 
 @dataclass
@@ -125,6 +126,7 @@ class PosedImage:
     mask: Path | None = None
     split: Literal["train", "test"] | None = None  # from the dataset's own files
     divided: int = 1  # 2, 4 or 8 if ``folder`` is images_2, images_4 or images_8
+    depth: Path | None = None  # as `View.depth`
 
     @property
     def path(self) -> Path:

@@ -11,6 +11,7 @@ from pathlib import Path
 from snowsplat.data.colmap import find_models, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
+from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.transforms_json import find_transforms, read_transforms
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
@@ -37,7 +38,8 @@ def load_dataset(
 
     Args:
         path: a folder with a COLMAP model (``sparse/0`` …, binary or text) and images; a folder
-            with ``transforms.json`` or ``transforms_train.json``; or such a JSON file.
+            with ``transforms.json`` or ``transforms_train.json``; or such a JSON file. The folder
+            may contain depth maps of the images, ``depths/IMG.png`` (or TIFF, NPY, EXR).
         images: name of the folder of images.
         resolution: 1, 2, 4 or 8 divides the image size; the folders ``images_2`` … are used if
             they are complete. Any other number is a width in pixels to which wider images are
@@ -116,6 +118,7 @@ def read_files(
     """
     root = Path(path)
     posed, points, description = _read(root, images)
+    posed = _with_depth_maps((root.parent if root.is_file() else root) / "depths", posed)
     posed = _with_smaller_copies(posed, resolution)
     headers = [read_header(image.path) for image in posed]
     sizes = _file_sizes(posed, headers)
@@ -151,6 +154,21 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
         "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET"
     )
+
+
+def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
+    """The same images, with ``IMG.png`` or ``IMG.jpg.png`` of the folder, or a file of another
+    format, as depth map of ``IMG.jpg``.
+    """
+    if not folder.is_dir():
+        return posed
+    found = []
+    for image in posed:
+        stems = (str(Path(image.file).with_suffix("")), image.file)
+        names = (folder / (stem + suffix) for stem in stems for suffix in DEPTH_SUFFIXES)
+        depth = image.depth or next((name for name in names if is_file(name)), None)
+        found.append(dataclasses.replace(image, depth=depth))
+    return found
 
 
 def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> list[PosedImage]:
@@ -253,7 +271,7 @@ def _view(
     if image.mask is not None:
         mask = ImageSource(image.mask, width, height, sideways)
     source = ImageSource(image.path, width, height, sideways, header.width * header.height)
-    return View(image.name, image.camera.scaled(width, height), source, mask)
+    return View(image.name, image.camera.scaled(width, height), source, mask, image.depth)
 
 
 def _final_size(

@@ -6,7 +6,7 @@ Three variants of the format are supported:
   ``transforms_val.json`` with ``camera_angle_x``; image names have no suffix.
 - instant-ngp: ``transforms.json`` with intrinsics in pixels (``fl_x``, ``cx``, ``w`` …).
 - nerfstudio: as instant-ngp, but each frame may have its own intrinsics, and there may be
-  ``ply_file_path``, ``mask_path`` and ``train_filenames``. Specification:
+  ``ply_file_path``, ``mask_path``, ``depth_file_path`` and ``train_filenames``. Specification:
   https://docs.nerf.studio/quickstart/data_conventions.html
 
 All variants store world_from_cam in OpenGL axes (x right, y up, z backward). It is converted to
@@ -131,6 +131,7 @@ def _posed_image(
         (root / file).relative_to(folder).as_posix(),
         _mask(where, root, values.maps[0]),  # masks belong to frames, not to files
         split,
+        depth=_depth_map(root, values.maps[0]),
     )
 
 
@@ -201,6 +202,13 @@ def _mask(where: str, root: Path, frame: Mapping[str, Any]) -> Path | None:
             f"{where}: the mask {path} is missing; add it or remove its entry from the file"
         )
     return path
+
+
+def _depth_map(root: Path, frame: Mapping[str, Any]) -> Path | None:
+    """The depth map of a frame; None if it is missing, because most recipes do not need it."""
+    name = frame.get("depth_file_path")
+    path = inside(root, name.replace("\\", "/")) if isinstance(name, str) and name else None
+    return path if path is not None and is_file(path) else None
 
 
 def _number(where: str, values: Mapping[str, Any], key: str) -> float | None:

@@ -16,9 +16,9 @@ from snowsplat.util.files import write_json
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from snowsplat.data.depth_alignment import Alignment
+    from snowsplat.data.depth_file import DepthKind
     from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.lift.align import Alignment
-    from snowsplat.lift.depth_map import DepthKind
     from snowsplat.lift.lift import LiftOptions
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
@@ -70,7 +70,7 @@ class DepthSource:
         Raises:
             UserError: an unusable file, model or range; another aspect ratio than the photo.
         """
-        from snowsplat.lift.depth_map import read_depth_file, to_z
+        from snowsplat.data.depth_file import read_depth_file, to_z
         from snowsplat.lift.depth_model import estimate_depth
         from snowsplat.lift.edges import resize_depth
 

@@ -58,7 +58,7 @@ def refine_photo(
         KeyboardInterrupt: Ctrl-C; the folder then contains the scene after 0 steps.
     """
     from snowsplat.data import ImageLoader
-    from snowsplat.lift.align import align
+    from snowsplat.data.depth_alignment import align
     from snowsplat.lift.lift import LiftOptions, lift
     from snowsplat.training.recipes import recipe
     from snowsplat.training.trainer import Trainer

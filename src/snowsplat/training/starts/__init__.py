@@ -13,10 +13,20 @@ import torch
 from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.training.starts.carve import carved_points
+from snowsplat.training.starts.depth import depth_points
+from snowsplat.training.starts.map_views import map_pixels
 from snowsplat.training.starts.random_rays import random_points
-from snowsplat.training.starts.sweep import map_pixels, swept_points
+from snowsplat.training.starts.sweep import swept_points
 
-__all__ = ["STARTS", "Start", "carved_points", "map_pixels", "random_points", "swept_points"]
+__all__ = [
+    "STARTS",
+    "Start",
+    "carved_points",
+    "depth_points",
+    "map_pixels",
+    "random_points",
+    "swept_points",
+]
 
 #: dataset, its photos, maximum number of points, random generator on the CPU -> points in the world
 #: frame, on the CPU; there may be none.
@@ -36,5 +46,6 @@ STARTS: dict[str, Start] = {
     "points": _dataset_points,
     "random": random_points,
     "carve": carved_points,
+    "depth": depth_points,
     "sweep": swept_points,
 }

@@ -1,4 +1,6 @@
-"""The check of depth maps by one another, and the reduction of their points to a given number."""
+"""Depth maps of several views become points: the maps check one another, and points that are close
+to one another are merged.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +10,43 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Points
-from snowsplat.scene.geometry import transform_points
-from snowsplat.training.starts.depth_maps import DepthMap
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.training.starts.depth_map import DepthMap, photo_for_map
+from snowsplat.training.starts.map_views import MapViews
 
 #: Two inverse depths of one point agree if they differ by at most this share.
 _TOLERANCE = 0.02
+#: This number of pixels per resulting point is used.
+_PIXELS_PER_POINT = 16
 #: Number of steps in the search for the voxel size.
 _BISECTIONS = 12
+
+
+def fused_points(
+    chosen: MapViews,
+    maps: Sequence[DepthMap | None],
+    images: ImageLoader,
+    count: int,
+    generator: torch.Generator,
+) -> Points:
+    """At most ``count`` points: those of the pixels that are `consistent`, `thinned`.
+
+    Args:
+        maps: the depth map of each view; None if it has none.
+        generator: a random generator on the CPU.
+    """
+    confirmed = consistent(maps, chosen.sources)
+    share = _PIXELS_PER_POINT * count / max(1, sum(int(pixels.sum()) for pixels in confirmed))
+    points, widths = [torch.zeros(0, 3)], [torch.zeros(0)]
+    colors = [torch.zeros(0, 3, dtype=torch.uint8)]
+    for view, depth_map, pixels in zip(chosen.views, maps, confirmed, strict=True):
+        if depth_map is None:
+            continue
+        pixels &= torch.rand(pixels.shape, generator=generator) < share
+        points.append(depth_map.points(pixels))
+        colors.append(photo_for_map(view, images).rgb[pixels])
+        widths.append(1.0 / (depth_map.inverse_depth[pixels] * depth_map.camera.fx))
+    return thinned(torch.cat(points), torch.cat(colors), torch.cat(widths), count)
 
 
 def consistent(maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]) -> list[Tensor]:
@@ -29,7 +61,7 @@ def consistent(maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]
             confirmed.append(torch.zeros(0, 0, dtype=torch.bool))
             continue
         known = depth_map.inverse_depth > 0.0
-        points = world_points(depth_map, known)
+        points = depth_map.points(known)
         agrees = torch.zeros(len(points), dtype=torch.bool)
         for j in chosen:
             other = maps[j]
@@ -47,16 +79,6 @@ def _agrees(points: Tensor, depth_map: DepthMap) -> Tensor:
     inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
     found = depth_map.inverse_depth[y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)]
     return inside & (found > 0) & ((found * depth - 1.0).abs() <= _TOLERANCE)
-
-
-def world_points(depth_map: DepthMap, chosen: Tensor) -> Tensor:
-    """(P, 3) float32: the points of the chosen pixels, (H, W) bool, in the world frame."""
-    camera = depth_map.camera
-    y, x = chosen.nonzero(as_tuple=True)
-    depth = 1.0 / depth_map.inverse_depth[y, x]
-    right, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
-    cam = torch.stack([right * depth, down * depth, depth], dim=1)
-    return transform_points(camera.world_from_cam.to(torch.float32), cam)
 
 
 def thinned(points: Tensor, colors: Tensor, widths: Tensor, count: int) -> Points:

@@ -27,12 +27,15 @@ class Alignment:
         shift: in 1 / world units; 0 for depths that are known up to a factor.
         points: number of points in the photo.
         error: the median of the absolute residuals, relative to the median disparity.
+        spread: the median of the absolute deviations of the disparities of the points from their
+            median, relative to it: the error of a map of one depth.
     """
 
     scale: float
     shift: float
     points: int
     error: float
+    spread: float
 
     def apply(self, depth: Tensor) -> Tensor:
         """The depth map in world units; NaN where the disparity is not positive."""
@@ -78,8 +81,10 @@ def align(depth: Tensor, points: Tensor, camera: Camera, *, with_shift: bool) ->
             "the depth map contradicts the points of the dataset: the fitted scale is not "
             "positive; check `depth_is`, and that the map belongs to this photo"
         )
-    error = float((y - scale * x - shift).abs().median() / y.median())
-    return Alignment(scale, shift, len(x), error)
+    middle = y.median()
+    error = float((y - scale * x - shift).abs().median() / middle)
+    spread = float((y - middle).abs().median() / middle)
+    return Alignment(scale, shift, len(x), error, spread)
 
 
 def _best_pair(x: Tensor, y: Tensor, limit: float, with_shift: bool) -> tuple[float, float]:

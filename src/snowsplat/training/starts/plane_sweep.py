@@ -11,14 +11,12 @@ from torch.nn.functional import interpolate
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
-from snowsplat.training.starts.photos import reduced_photo, usable_pixels
+from snowsplat.training.starts.depth_map import DepthMap, photo_for_map
+from snowsplat.training.starts.photos import usable_pixels
 
-#: Photos are reduced so that their longer side has at most this number of pixels.
-_LONGER_SIDE = 640
 #: Windows have (2 r + 1)² pixels.
 _RADIUS = 3
 #: The coarse sweep has one plane per pixel of displacement in the source view with the longest
@@ -38,14 +36,6 @@ _FEWEST_POINTS = 8
 _LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
 
 
-@dataclass(frozen=True)
-class DepthMap:
-    """The depths of one view; ``camera`` has the size of the map."""
-
-    camera: Camera
-    inverse_depth: Tensor  # (H, W) float32, 1 / world units; 0: unknown
-
-
 def depth_maps(
     views: Sequence[View], sources: Sequence[Sequence[int]], images: ImageLoader, points: Tensor
 ) -> list[DepthMap | None]:
@@ -62,17 +52,6 @@ def depth_maps(
         _depth_map(views[i], [views[j] for j in chosen], images, points)
         for i, chosen in enumerate(sources)
     ]
-
-
-def map_size(width: int, height: int) -> tuple[int, int]:
-    """Width and height of the depth map of a view of this size, in pixels."""
-    scale = min(1.0, _LONGER_SIDE / max(width, height))
-    return max(1, round(scale * width)), max(1, round(scale * height))
-
-
-def photo_for_map(view: View, images: ImageLoader) -> LoadedImage:
-    """The photo of a view at the size of its depth map, on the CPU."""
-    return reduced_photo(view, images, *map_size(view.camera.width, view.camera.height))
 
 
 @dataclass(frozen=True)

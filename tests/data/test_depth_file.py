@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.lift.depth_map import read_depth_file, to_z
+from snowsplat.data.depth_file import read_depth_file, to_z
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 

@@ -1,0 +1,110 @@
+"""`depth_points`: points on the surfaces, from the depth maps of the dataset."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.data.depth_alignment import align
+from snowsplat.data.depth_file import DepthKind, read_depth_file, to_z
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.camera import Camera
+from snowsplat.training.starts.depth_map import DepthMap, map_size, photo_for_map
+from snowsplat.training.starts.fusion import fused_points
+from snowsplat.training.starts.map_views import choose_views
+from snowsplat.training.starts.photos import usable_pixels
+from snowsplat.util.errors import SettingError, UserError
+
+logger = logging.getLogger(__name__)
+
+#: A map is used if the median error of its disparities is at most the first share of the disparity,
+#: or the second share of the error of a map of one depth.
+_SMALL_ERROR, _LARGEST_ERROR = 0.02, 0.5
+#: The largest difference between the aspect ratios of a map and its photo, relative.
+_ASPECT_TOLERANCE = 0.03
+_KINDS: tuple[DepthKind, ...] = ("z", "distance", "disparity")
+
+
+def depth_points(
+    dataset: Dataset, images: ImageLoader, count: int, generator: torch.Generator
+) -> Points:
+    """At most ``count`` points on the surfaces of the depth maps, in the world frame, on the CPU.
+
+    The maps may have any unit. Each of them is aligned to the points of the dataset that its photo
+    shows: as z and as distance up to a factor, and as disparity up to a factor and a shift (Ranftl
+    et al. 2022). The kind with the smallest error is used. If the dataset has no points, the values
+    must be z in world units. Pixels are used whose depth the map of another view confirms.
+
+    Args:
+        generator: a random generator on the CPU.
+
+    Raises:
+        SettingError: the dataset has no depth maps.
+        UserError: a depth map is damaged, or not one of its photo; no map agrees with the points.
+    """
+    if not any(view.depth for view in dataset.train):
+        raise SettingError(
+            "init",
+            "depth needs depth maps, and the dataset has none; add them as depths/IMG.png for the "
+            "photo IMG.jpg (PNG, TIFF, NPY or EXR), or choose another start",
+        )
+    chosen = choose_views(dataset, images, generator)
+    points = None if dataset.points is None else chosen.points
+    maps = [_depth_map(view, images, points) for view in chosen.views]
+    unused = sum(view.depth is not None for view in chosen.views) - sum(map(bool, maps))
+    if not any(maps):
+        raise UserError(
+            f"{dataset.description}: no depth map agrees with the points; check that the maps "
+            "belong to these photos, or choose another start than depth with `init`"
+        )
+    if unused:
+        logger.warning("%d depth maps do not agree with the points; not used", unused)
+    return fused_points(chosen, maps, images, count, generator)
+
+
+def _depth_map(view: View, images: ImageLoader, points: Tensor | None) -> DepthMap | None:
+    """The map of a view in world units; None without a map, or if it contradicts the points."""
+    if view.depth is None:
+        return None
+    values = read_depth_file(view.depth)
+    height, width = values.shape
+    camera = view.camera
+    if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
+        raise UserError(
+            f"{view.depth}: has {width}x{height} pixels, but its photo has {camera.width}x"
+            f"{camera.height}; use a depth map of the whole photo"
+        )
+    width, height = map_size(camera.width, camera.height)
+    camera = camera.scaled(width, height)
+    small = interpolate(torch.from_numpy(values)[None, None], (height, width), mode="nearest-exact")
+    z = _world_z(small[0, 0].numpy(), camera, points)
+    if z is None:
+        return None
+    known = z.isfinite()
+    usable = usable_pixels(photo_for_map(view, images))
+    if usable is not None:
+        known &= usable
+    return DepthMap(camera, torch.where(known, 1.0 / z, 0.0))
+
+
+def _world_z(values: np.ndarray, camera: Camera, points: Tensor | None) -> Tensor | None:
+    """(H, W): the kind of values and the scale with which they agree best with the points."""
+    if points is None:
+        return to_z(values, "z", camera)
+    best, least = None, math.inf
+    for kind in _KINDS:
+        try:
+            z = to_z(values, kind, camera)
+            alignment = align(z, points, camera, with_shift=kind == "disparity")
+        except UserError:  # not this kind, or the photo shows too few points
+            continue
+        usable = alignment.error <= max(_SMALL_ERROR, _LARGEST_ERROR * alignment.spread)
+        if usable and alignment.error < least:
+            best, least = alignment.apply(z), alignment.error
+    return best

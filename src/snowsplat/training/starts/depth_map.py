@@ -1,0 +1,46 @@
+"""The type `DepthMap`, and its size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat.data.dataset import View
+from snowsplat.data.decode import LoadedImage
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import transform_points
+from snowsplat.training.starts.photos import reduced_photo
+
+#: Photos are reduced so that their longer side has at most this number of pixels.
+_LONGER_SIDE = 640
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """The depths of one view; ``camera`` has the size of the map."""
+
+    camera: Camera
+    inverse_depth: Tensor  # (H, W) float32, 1 / world units; 0: unknown
+
+    def points(self, chosen: Tensor) -> Tensor:
+        """(P, 3) float32: the points of the chosen pixels, (H, W) bool, in the world frame."""
+        camera = self.camera
+        y, x = chosen.nonzero(as_tuple=True)
+        depth = 1.0 / self.inverse_depth[y, x]
+        right, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
+        cam = torch.stack([right * depth, down * depth, depth], dim=1)
+        return transform_points(camera.world_from_cam.to(torch.float32), cam)
+
+
+def map_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height of the depth map of a view of this size, in pixels."""
+    scale = min(1.0, _LONGER_SIDE / max(width, height))
+    return max(1, round(scale * width)), max(1, round(scale * height))
+
+
+def photo_for_map(view: View, images: ImageLoader) -> LoadedImage:
+    """The photo of a view at the size of its depth map, on the CPU."""
+    return reduced_photo(view, images, *map_size(view.camera.width, view.camera.height))

@@ -1,0 +1,63 @@
+"""The views of a dataset that get a depth map, and the source views that check it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat.data.dataset import Dataset, View
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.training.starts.depth_map import map_size
+from snowsplat.training.starts.source_views import source_views
+
+#: Number of source views of each depth map.
+_SOURCES = 4
+#: Number of points with which the source views are chosen.
+_SAMPLE = 1000
+#: The maximum number of pixels of all depth maps. If there are more, one view in two, in three … is
+#: used: the photos of a large dataset overlap more, and this limits time and memory.
+_MAX_PIXELS = 16_000_000
+#: Depth maps may have one pixel per this number of bytes of the memory for photos.
+_BYTES_PER_PIXEL = 10
+
+
+@dataclass(frozen=True)
+class MapViews:
+    """The result of `choose_views`.
+
+    Attributes:
+        views: training views.
+        sources: for each view, indices into ``views``, the best one first; see `source_views`.
+        points: (P, 3) in the world frame: those of the dataset; without points, random ones within
+            its bounds.
+    """
+
+    views: list[View]
+    sources: list[list[int]]
+    points: Tensor
+
+
+def choose_views(dataset: Dataset, images: ImageLoader, generator: torch.Generator) -> MapViews:
+    """Choose the views that get a depth map: all training views, if memory permits."""
+    cameras = [view.camera for view in dataset.train]
+    pixels = sum(math.prod(map_size(camera.width, camera.height)) for camera in cameras)
+    limit = min(_MAX_PIXELS, images.budget_bytes // _BYTES_PER_PIXEL)
+    views = dataset.train[:: math.ceil(pixels / max(limit, 1))]
+    points = _points(dataset, generator)
+    sample = points[torch.randperm(len(points), generator=generator)[:_SAMPLE]]
+    return MapViews(views, source_views([view.camera for view in views], sample, _SOURCES), points)
+
+
+def map_pixels(views: int, width: int, height: int) -> int:
+    """About the number of pixels of all depth maps for this number of views of this size."""
+    return min(_MAX_PIXELS, views * math.prod(map_size(width, height)))
+
+
+def _points(dataset: Dataset, generator: torch.Generator) -> Tensor:
+    if dataset.points is not None:
+        return dataset.points.xyz.cpu()
+    low, high = dataset.bounds
+    return low + (high - low) * torch.rand(4 * _SAMPLE, 3, generator=generator)
