@@ -97,8 +97,7 @@ FENCE = re.compile(r"^```(.*)\n((?:.*\n)*?)```$", re.MULTILINE)
 def blocks(text: str) -> list[tuple[str, str]]:
     """Code, includes and figures: their first lines, and their contents except for captions."""
     found = []
-    for first, content in FENCE.findall(text):
-        first = re.sub(r"(\.\./)+", "", first)
+    for first, content in FENCE.findall(re.sub(r"(\.\./)+", "", text)):
         found.append((first, "" if first.startswith("{drawing}") else content))
     return found
 
