@@ -181,7 +181,7 @@ def test_info_prints_no_control_characters(run, refused, tmp_path):
 
 
 def test_info_of_a_checkpoint(run, dataset, tmp_path):
-    flags = ("--iterations", 4, "--checkpoint-every", 4, "--dense-init", 0, "-q")
+    flags = ("--iterations", 4, "--checkpoint-every", 4, "--init", "points", "-q")
     assert run("train", dataset, "-o", tmp_path / "out", *flags).code == 0
     result = run("info", tmp_path / "out/checkpoints/step_000004.safetensors", "--json")
     values = json.loads(result.out)

@@ -117,7 +117,7 @@ def test_every_setting_is_a_flag_and_a_setting_of_some_recipe():
     for name in settings:
         assert name in flags
         value: object = (5,) if name == "test_iterations" else 1
-        value = "white" if name == "background" else value
+        value = {"background": "white", "init": "random"}.get(name, value)
         recipe("default", **{name: value})
     assert list(RECIPES) == list(get_args(Recipe))
 
@@ -372,7 +372,7 @@ def test_output_folders_with_other_files(refused, run, dataset, tmp_path):
         (["--densify-interval", 0], "--densify-interval: 0 is too small"),
         (["--recipe", "mcmc", "--densify-interval", 0], "--densify-interval: 0 is too small"),
         (["--minutes", 1, "--densify-interval", 0], "--densify-interval: 0 is too small"),
-        (["--initial-points", 0], "--initial-points: 0 is too small"),
+        (["--initial-points", 0], "--initial-points: 0 is neither"),
         (["--seed", 2**62], "--seed: 4611686018427387904 is too large"),
         (["--minutes", 1, "--iterations", 100], "cannot be combined"),
         (["--background", "black", "-w"], "different colours"),
