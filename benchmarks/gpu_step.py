@@ -26,6 +26,7 @@ from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import Execute, launch_by
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.scene.render import project, render
+from snowsplat.training.batch import BatchView
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.density import AdaptiveDensity
 from snowsplat.training.lr_schedule import LearningRates
@@ -104,12 +105,14 @@ class Step:
 
     @torch.no_grad()
     def queue(self) -> None:
-        self.trainer._optimize(STEP, self.camera, self.photo, self.background)
+        batch = [BatchView(self.view, self.camera, self.photo, self.background)]
+        self.trainer._optimize(STEP, batch)
 
     def run(self) -> float:
         """A complete step, repeated until the capacity suffices; returns its loss."""
         gaussians = self.trainer.gaussians
-        return self.trainer._runner.run(self.queue, STEP, gaussians, self.view, self.photo)
+        views, photos = [self.view], [self.photo]
+        return self.trainer._runner.run(self.queue, STEP, gaussians, views, photos)[0]
 
     def wait(self) -> None:
         """Wait for the loss of the step that was queued last."""

@@ -14,6 +14,7 @@ from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.near_limit import INTERVAL, NearLimit, nearest_depth, unseen_cameras
 from snowsplat.training.recipes import recipe
+from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.trainer import Trainer
 from snowsplat.util.errors import SettingError
 
@@ -38,7 +39,7 @@ def removed(cameras: list[Camera], points: Tensor | None, means: list[list[float
     gaussians = Gaussians.random_in_bounds(bounds, len(means), torch.Generator().manual_seed(5))
     gaussians.means = torch.tensor(means)
     before = gaussians.clone()
-    NearLimit(0.5, cameras, points).after_step(INTERVAL, gaussians)
+    NearLimit(0.5, cameras, points, Schedule(1000)).after_step(INTERVAL, gaussians)
     for name, tensor in gaussians.parameters().items():
         if name != "opacity_logits":
             assert torch.equal(tensor, before.parameters()[name])
@@ -80,13 +81,13 @@ def test_nothing_is_removed_without_points_or_without_a_limit():
         torch.tensor([[-1.0, -1.0, 1.0], [1.0, 1.0, 2.0]]), 9, torch.Generator().manual_seed(5)
     )
     before = gaussians.clone()
-    NearLimit(0.0, [camera(0.0)], wall()).after_step(INTERVAL, gaussians)
-    NearLimit(0.5, [camera(0.0)], wall()).after_step(INTERVAL + 1, gaussians)
+    NearLimit(0.0, [camera(0.0)], wall(), Schedule(1000)).after_step(INTERVAL, gaussians)
+    NearLimit(0.5, [camera(0.0)], wall(), Schedule(1000)).after_step(INTERVAL + 1, gaussians)
     assert torch.equal(gaussians.opacity_logits, before.opacity_logits)
 
 
 def test_many_cameras_are_sampled():
-    limit = NearLimit(0.5, [camera(0.001 * i) for i in range(500)], wall())
+    limit = NearLimit(0.5, [camera(0.001 * i) for i in range(500)], wall(), Schedule(1000))
     assert limit._views is not None
     assert len(limit._views) <= 64 * 5
 

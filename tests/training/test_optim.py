@@ -28,7 +28,7 @@ def one_step(adam: Adam, gaussians: Gaussians, step: int, regulariser: float) ->
     splats = Splats2D(torch.zeros(0, 16), torch.zeros(0, dtype=torch.int32), 3)
     splats.packed.grad = torch.zeros(0, 16)
     camera = Camera(10, 10, 10.0, 10.0, 5.0, 5.0, torch.eye(3, 4).double())
-    adam.step(gaussians, ViewGradient(splats, camera, 0), step)
+    adam.step(gaussians, [ViewGradient(splats, camera, 0)], step)
 
 
 def test_two_steps_of_kingma_and_ba():
@@ -118,7 +118,7 @@ def test_a_step_equals_the_reference(visible_only):
         step=7,
         visible_only=visible_only,
     )
-    adam.step(gaussians, gradient, 7)
+    adam.step(gaussians, [gradient], 7)
     for name, parameter in gaussians.parameters().items():
         torch.testing.assert_close(parameter, expected[name], rtol=1e-4, atol=1e-6)
         torch.testing.assert_close(adam.exp_avg[name], means[name], rtol=1e-4, atol=1e-4)
@@ -130,7 +130,7 @@ def test_a_step_equals_the_reference(visible_only):
 def test_rows_that_the_view_does_not_see_move_by_default():
     gaussians, adam, gradient = optimizer_and_gradient()
     before = gaussians.means.clone()
-    adam.step(gaussians, gradient, 1)
+    adam.step(gaussians, [gradient], 1)
     unseen = torch.ones(len(gaussians), dtype=torch.bool)
     unseen[gradient.splats.ids.long()] = False
     assert (gaussians.means[unseen] != before[unseen]).all()
@@ -140,7 +140,7 @@ def test_an_invalid_step_changes_nothing():
     gaussians, adam, gradient = optimizer_and_gradient()
     before = gaussians.clone()
     gradient.valid.fill_(False)
-    adam.step(gaussians, gradient, 1)
+    adam.step(gaussians, [gradient], 1)
     for name, parameter in before.parameters().items():
         assert torch.equal(gaussians.parameters()[name], parameter)
 
@@ -148,7 +148,7 @@ def test_an_invalid_step_changes_nothing():
 def test_nonfinite_rows_are_counted():
     gaussians, adam, gradient = optimizer_and_gradient()
     gradient.splats.packed.grad[3, 0] = math.nan  # ∂L/∂mean2d
-    adam.step(gaussians, gradient, 1)
+    adam.step(gaussians, [gradient], 1)
     assert gradient.nonfinite_rows[0] == 1
     assert gradient.nonfinite_rows[3] == 0  # the opacity does not depend on it
 

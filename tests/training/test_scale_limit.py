@@ -12,6 +12,7 @@ from snowsplat.scene.geometry import look_at
 from snowsplat.training import scale_limit
 from snowsplat.training.recipes import recipe
 from snowsplat.training.scale_limit import INTERVAL, ScaleLimit
+from snowsplat.training.step_schedule import Schedule
 from snowsplat.util.errors import SettingError
 
 
@@ -38,7 +39,7 @@ def scene() -> Gaussians:
 def test_scales_are_at_most_the_share_of_the_distance_to_the_nearest_camera(monkeypatch):
     monkeypatch.setattr(scale_limit, "_ROWS", 3)  # several parts
     before, after = scene(), scene()
-    ScaleLimit(0.5, CAMERAS).after_step(INTERVAL, after)
+    ScaleLimit(0.5, CAMERAS, Schedule(1000)).after_step(INTERVAL, after)
     limits = torch.tensor([1.0, 4.0, 2.5])
     torch.testing.assert_close(after.scales[:3], torch.minimum(before.scales[:3], limits[:, None]))
     assert after.log_scales.isfinite().all()
@@ -50,13 +51,13 @@ def test_scales_are_at_most_the_share_of_the_distance_to_the_nearest_camera(monk
 @pytest.mark.parametrize(("ratio", "step"), [(0.0, INTERVAL), (0.5, INTERVAL + 1)])
 def test_nothing_changes_without_a_limit_and_between_its_steps(ratio, step):
     before, after = scene(), scene()
-    ScaleLimit(ratio, CAMERAS).after_step(step, after)
+    ScaleLimit(ratio, CAMERAS, Schedule(1000)).after_step(step, after)
     assert torch.equal(after.log_scales, before.log_scales)
 
 
 def test_many_cameras_are_sampled():
     many = [camera(0.01 * i) for i in range(1000)]
-    limit = ScaleLimit(0.5, many)
+    limit = ScaleLimit(0.5, many, Schedule(1000))
     assert len(limit._centres) <= 64
     gaussians = scene()
     limit.after_step(INTERVAL, gaussians)

@@ -56,10 +56,11 @@ class Steps:
             splats.packed.requires_grad_()
             loss = splats.packed.sum()
             loss = loss - loss.detach() + self.loss
-        self.gradients.append(self.runner.backward(loss, splats, CAMERA, 0))
+        self.runner.backward(loss)
+        self.gradients.append(self.runner.gradient(splats, CAMERA, 0))
 
     def run(self, step: int = 7) -> float:
-        return self.runner.run(self.optimize, step, GAUSSIANS, VIEW, PHOTO)
+        return self.runner.run(self.optimize, step, GAUSSIANS, [VIEW], [PHOTO])[0]
 
     @property
     def valid(self) -> list[bool]:
@@ -142,7 +143,7 @@ def test_an_invalid_step_changes_neither_statistics_nor_parameters_nor_moments()
     sums = torch.zeros(3, 4)
     for gradient, changed in zip(steps.gradients, [False, True], strict=True):
         gradient.add_statistics(*sums)
-        adam.step(gaussians, gradient, 1)
+        adam.step(gaussians, [gradient], 1)
         assert sums.any(dim=1).tolist() == 3 * [changed]
         assert torch.equal(gaussians.opacity_logits, GAUSSIANS.opacity_logits) != changed
         assert bool(adam.exp_avg["opacity_logits"].any()) == changed
@@ -156,7 +157,8 @@ def test_the_absolute_gradient_is_computed_on_request(abs_grad: bool) -> None:
     splats.packed[:, :2] = torch.tensor([3.0, 2.0])
     with torch.enable_grad():
         loss = runner.rasterize(splats, CAMERA, torch.zeros(3))[0, 0, 0]
-    gradient = runner.backward(loss, splats, CAMERA, 0)
+    runner.backward(loss)
+    gradient = runner.gradient(splats, CAMERA, 0)
     if not abs_grad:
         assert gradient.splats.abs_grad is None
         return
@@ -177,7 +179,7 @@ def test_a_gradient_is_valid_and_counts_nothing_by_default() -> None:
     gradient = ViewGradient(splats, CAMERA, 0)
     norm_sum, views, max_radii = torch.zeros(3, 4)
     gradient.add_statistics(norm_sum, views, max_radii)
-    adam.step(gaussians, gradient, 1)
+    adam.step(gaussians, [gradient], 1)
     assert norm_sum.tolist() == 4 * [5.0]
     assert views.tolist() == 4 * [1.0]
     assert torch.equal(max_radii, splats.radii)

@@ -326,7 +326,7 @@ def test_a_dataset_without_points_starts_from_random_points(dataset):
 
 def test_every_view_once_an_epoch(dataset, monkeypatch):
     trainer = Trainer(dataset, CALM)
-    seen = [trainer._next_view(step)[1].position for step in range(1, 15)]
+    seen = [trainer._next_batch(1)[0].camera.position for _ in range(1, 15)]
     positions = torch.stack(seen)
     for epoch in (positions[:7], positions[7:]):
         assert len(epoch.unique(dim=0)) == 7
@@ -352,7 +352,8 @@ def test_photos_are_decoded_ahead_in_order_at_the_resolution_of_their_step(datas
     monkeypatch.setattr(trainer._images, "prefetch", recorded_prefetch)
     monkeypatch.setattr(trainer._images, "get", recorded_get)
     for step in range(1, 15):
-        trainer._next_view(step)
+        trainer.step = step - 1
+        trainer._next_batch(step)
     assert calls == [1, 4, 6, 9, 13]
 
 
@@ -379,10 +380,12 @@ def test_a_fixed_background_is_put_behind_transparent_photos_once(dataset, tmp_p
     Image.new("RGBA", (WIDTH, HEIGHT), (200, 100, 0, 0)).save(tmp_path / "a.png")
     source = ImageSource(tmp_path / "a.png", WIDTH, HEIGHT)
     alone = replace(dataset, train=[replace(dataset.train[0], image=source)])
-    photo = Trainer(alone, replace(CALM, background="white"))._next_view(1)[2]
+    photo = Trainer(alone, replace(CALM, background="white"))._next_batch(1)[0].photo
     assert photo.alpha is None
     assert (photo.rgb == 255).all()
-    assert Trainer(alone, replace(CALM, background="random"))._next_view(1)[2].alpha is not None
+    assert (
+        Trainer(alone, replace(CALM, background="random"))._next_batch(1)[0].photo.alpha is not None
+    )
 
 
 def test_the_cap_by_the_size_of_the_photos_uses_their_median(dataset):

@@ -110,7 +110,8 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
         return launch_by(record, name, params)
 
     trainer = Trainer(dataset, config)
-    _, camera, photo = trainer._next_view(1)
+    [view] = trainer._next_batch(1)
+    assert view.photo is not None
     monkeypatch.setitem(LAUNCHERS, "cuda", launch)
     monkeypatch.setattr(Tensor, "backward", backward_by_hand)
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
@@ -125,12 +126,17 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
             setattr(trainer._density, name, on_device(statistic))
         runner = trainer._runner
         runner.capacity = ops.Capacity(5000, on_device(torch.zeros(1, dtype=torch.int64)))
+        runner._required = runner.capacity.required
         runner._nonfinite_rows = on_device(runner._nonfinite_rows)
-        camera = replace(camera, cam_from_world=on_device(camera.cam_from_world))
-        photo = LoadedImage(on_device(photo.planes), on_device(photo.mask))
+        view = replace(
+            view,
+            camera=replace(view.camera, cam_from_world=on_device(view.camera.cam_from_world)),
+            photo=LoadedImage(on_device(view.photo.planes), on_device(view.photo.mask)),
+            background=on_device(torch.zeros(3)),
+        )
         torch.use_deterministic_algorithms(deterministic)
         try:
-            trainer._optimize(1, camera, photo, on_device(torch.zeros(3)))
+            trainer._optimize(1, [view])
         finally:
             torch.use_deterministic_algorithms(False)
     order = ["project_fwd", "tiles_", "rasterize_fwd", "photometric", "rasterize_bwd", "adam_"]

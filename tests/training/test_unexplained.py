@@ -227,14 +227,14 @@ def test_the_check_changes_no_bit_if_all_poses_are_right(right):
 @pytest.mark.slow
 def test_a_view_with_a_wrong_pose_is_not_used_after_the_check(wrong, monkeypatch):
     trainer, used = Trainer(wrong, CONFIG), []
-    next_view = trainer._next_view
+    next_batch = trainer._next_batch
 
     def recorded(step):
-        chosen = next_view(step)
-        used.append((step, chosen[0].name))
+        chosen = next_batch(step)
+        used.append((step, chosen[0].view.name))
         return chosen
 
-    monkeypatch.setattr(trainer, "_next_view", recorded)
+    monkeypatch.setattr(trainer, "_next_batch", recorded)
     trainer.run(until=100)
     assert trainer.left_out == ()  # it is decided before step 101
     trainer.run()

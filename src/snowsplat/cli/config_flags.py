@@ -16,6 +16,9 @@ class ConfigFlags:
 
     iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Number of training steps; each uses one photo."""
+    batch: Annotated[int | None, flag("N", default="1")] = None
+    """Number of photos per update of the Gaussians. All other settings still count photos; the
+    learning rates are multiplied by the square root of N."""
     max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Maximum number of Gaussians, which determines memory and time; 0: no limit."""
     checkpoint_every: Annotated[int | None, flag("N", default="none")] = None

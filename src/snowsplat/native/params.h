@@ -91,7 +91,7 @@ struct ProjectBackwardParams {
   GaussianTensors<T> gaussians;
   CameraParams<T> camera;
   const T* grad_packed;        // (n, 16)
-  GaussianGradients<T> grads;  // out; rows without a splat are not written
+  GaussianGradients<T> grads;  // in and out: the gradients are added
   double* pose;  // out, (project_pose_blocks, 15) sums, which the caller adds; or null
   SNOW_FIELDS(n, ids, gaussians, camera, grad_packed, grads, pose)
 };
@@ -112,7 +112,7 @@ struct AdamStepParams {
   int64_t n;             // Gaussians
   int64_t splats;        // rows of grad_packed
   const int32_t* ids;    // CPU: (splats,) the Gaussians, ascending. CUDA: (n,) the splats or −1
-  const T* grad_packed;  // (splats, 16)
+  const T* grad_packed;  // (splats, 16); or null: there are only additional gradients
   CameraParams<T> camera;
   int64_t sh_rest_rows, sh_degree;  // as in GaussianTensors
   AdamTensor<T> means, log_scales, quats, opacity_logits, sh_dc, sh_rest;

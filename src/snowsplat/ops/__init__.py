@@ -10,7 +10,7 @@ from snowsplat.ops.devices import default_device, resolve_device
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.nearest_neighbours import neighbours
 from snowsplat.ops.photometric import photometric_loss, ssim
-from snowsplat.ops.projection import project
+from snowsplat.ops.projection import add_project_gradients, project
 from snowsplat.ops.rasterizer import count_blended, rasterize
 from snowsplat.ops.splats import Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
@@ -21,6 +21,7 @@ __all__ = [
     "Splats2D",
     "accumulate_screen_statistics",
     "adam_step",
+    "add_project_gradients",
     "count_blended",
     "default_device",
     "get_num_threads",

@@ -22,7 +22,7 @@ def adam_step(
     exp_avg: Mapping[str, Tensor],
     exp_avg_sq: Mapping[str, Tensor],
     ids: Tensor,
-    packed_grad: Tensor,
+    packed_grad: Tensor | None,
     cam_from_world: Tensor,
     *,
     width: int,
@@ -51,7 +51,8 @@ def adam_step(
             gradient.
         exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
         ids, packed_grad: `splats.ids` (M,), ascending, and `splats.packed.grad` (M, 16). On a GPU,
-            rows with id -1 may be present or removed.
+            rows with id -1 may be present or removed. If `packed_grad` is None, the gradient is
+            only `.grad`, and `ids` are the visible rows.
         lr: the learning rate of each parameter.
         step: the number of this step, from 1 on (for the bias correction).
         visible_only: whether rows that are not in `ids` keep their values and moments. If False,
@@ -82,7 +83,9 @@ def adam_step(
         "adam_step", **dict(zip(PARAMETERS, tensors, strict=True)), sh_degree=sh_degree
     )
     means = tensors[0]
-    check_tensor("adam_step", "packed_grad", packed_grad, (len(ids), packed_width(3)), means)
+    if packed_grad is not None:
+        check_tensor("adam_step", "packed_grad", packed_grad, (len(ids), packed_width(3)), means)
+        packed_grad = packed_grad.contiguous()
     if ids.dtype != torch.int32 or ids.device != means.device:
         raise ValueError(
             f"adam_step: ids must be torch.int32 on {means.device}, got {ids.dtype} on {ids.device}"
@@ -117,7 +120,7 @@ def adam_step(
             n=len(means),
             splats=len(ids),
             ids=ids,
-            grad_packed=packed_grad.contiguous(),
+            grad_packed=packed_grad,
             camera=camera_params("adam_step", pose, width, height, fx, fy, cx, cy),
             sh_rest_rows=tensors[5].shape[1],
             sh_degree=sh_degree,

@@ -97,7 +97,7 @@ class AdamStepParams(Params):
     n: int
     splats: int
     ids: Tensor
-    grad_packed: Tensor
+    grad_packed: Tensor | None
     camera: CameraParams
     sh_rest_rows: int
     sh_degree: int

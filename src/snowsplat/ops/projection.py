@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -76,6 +77,58 @@ def project(
     parameters = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
     packed, ids = _Project.apply(sh_degree, camera, camera.cam_from_world, *parameters)
     return Splats2D(packed, ids, 3)
+
+
+@torch.no_grad()
+def add_project_gradients(
+    params: Mapping[str, Tensor],
+    grads: Mapping[str, Tensor],
+    ids: Tensor,
+    packed_grad: Tensor,
+    cam_from_world: Tensor,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sh_degree: int,
+) -> None:
+    """Propagates the gradient of splats through `project`, and adds the result to ``grads``.
+
+    So the gradients of several views can be summed before an `adam_step`. The camera arguments and
+    `sh_degree` must be those passed to `project`.
+
+    Args:
+        params: the parameters of the Gaussians, as for `adam_step`.
+        grads: tensors of the same names and shapes, contiguous; changed in place.
+        ids, packed_grad: `splats.ids` (M,), and `splats.packed.grad` (M, 16).
+
+    Raises ValueError if shapes, dtypes or devices do not match.
+    """
+    tensors = {name: params[name].detach() for name in _NAMES}
+    check_parameters("add_project_gradients", **tensors, sh_degree=sh_degree)
+    means = tensors["means"]
+    for name, tensor in tensors.items():
+        shape = tuple(tensor.shape)
+        check_tensor("add_project_gradients", f"grads[{name!r}]", grads[name], shape, tensor)
+    shape = (len(ids), packed_width(3))
+    check_tensor("add_project_gradients", "packed_grad", packed_grad, shape, means)
+    pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
+    camera = camera_params("add_project_gradients", pose, width, height, fx, fy, cx, cy)
+    launch(
+        variant("project_bwd", means),
+        ProjectBackwardParams(
+            n=len(ids),
+            ids=ids,
+            gaussians=_gaussian_tensors(sh_degree, *(t.contiguous() for t in tensors.values())),
+            camera=camera,
+            grad_packed=packed_grad.contiguous(),
+            grads=GaussianGradients(**{name: grads[name] for name in _NAMES}),
+            pose=None,
+        ),
+    )
 
 
 def camera_params(

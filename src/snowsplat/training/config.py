@@ -26,6 +26,10 @@ class TrainConfig:
 
     Attributes:
         iterations: number of steps; each step uses one view.
+        batch: number of views per update of the Gaussians. All other settings still count steps,
+            that is, views. The gradient of an update is the mean over the views of the batch; the
+            learning rates are multiplied by √batch, and Adam's β₁ and β₂ are raised to the power
+            batch (Zhao et al. 2024, arXiv:2406.18533).
         seed: seed of every random choice. On a CPU, the same seed results in a bit-identical scene,
             for any number of threads.
         background: the colour behind the scene; "random": a new colour in each step, which prevents
@@ -73,6 +77,7 @@ class TrainConfig:
     """
 
     iterations: int = 30_000
+    batch: int = 1
     seed: int = 0
     background: Literal["black", "white", "random"] = "black"
     sh_degree: int = 3
@@ -101,6 +106,7 @@ class TrainConfig:
         rates, density = self.learning_rates, self.density
         for name, count in (
             ("iterations", self.iterations),
+            ("batch", self.batch),
             ("densify_interval", density.densify_interval),
         ):
             if count < 1:

@@ -64,11 +64,13 @@ class Decay:
 
     def after_step(self, step: int, gaussians: Gaussians) -> None:
         """Reduce opacities and scales in place, in every `INTERVAL`-th step."""
-        if step % INTERVAL or step > self._schedule.step_of(self.rates.until):
+        times = self._schedule.multiples(step, INTERVAL)
+        if not times or step > self._schedule.step_of(self.rates.until):
             return
+        epochs = times * self._epochs
         if self._opacity > 0.0:
-            factor = math.exp(-self._opacity * self._epochs)
+            factor = math.exp(-self._opacity * epochs)
             opacities = factor * gaussians.opacities
             gaussians.opacity_logits.copy_(torch.logit(opacities, eps=1e-7))
         if self.rates.scale > 0.0:
-            gaussians.log_scales -= self.rates.scale * self._epochs
+            gaussians.log_scales -= self.rates.scale * epochs

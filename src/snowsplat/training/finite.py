@@ -109,9 +109,12 @@ def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussia
 
 
 def check_loss(
-    step: int, loss: float, gaussians: Gaussians, view: View, photo: LoadedImage
+    step: int, loss: float, gaussians: Gaussians, view: View, photo: LoadedImage | None
 ) -> None:
     """Check the loss of ``step``; if it is not finite, find the cause.
+
+    Args:
+        photo: that of ``view``; None if another process has it.
 
     Raises:
         Diverged: the loss is not finite.
@@ -120,7 +123,7 @@ def check_loss(
         return
     if found := rows_not_finite(gaussians.parameters()):
         cause = f"from non-finite Gaussians, {listed(found)}; {_FINITE_INIT}"
-    elif pixels := rows_not_finite({"": photo.planes.flatten(1).T}):
+    elif photo is not None and (pixels := rows_not_finite({"": photo.planes.flatten(1).T})):
         cause = f"from {pixels['']:,} non-finite pixels; fix or remove that photo"
     elif not view.camera.is_finite():
         cause = "from a non-finite camera; correct its pose or remove that photo"

@@ -25,6 +25,7 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.starts.source_views import source_views
+from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.unseen_cameras import beside
 
 #: Number of steps between two applications.
@@ -51,13 +52,16 @@ _ROWS = 1 << 14
 class NearLimit:
     """Removes Gaussians between the steps of a training run. It has no state."""
 
-    def __init__(self, share: float, cameras: Sequence[Camera], points: Tensor | None) -> None:
+    def __init__(
+        self, share: float, cameras: Sequence[Camera], points: Tensor | None, schedule: Schedule
+    ) -> None:
         """
         Args:
             share: the nearest depth of a Gaussian, relative to that of the points; 0: no limit.
             cameras: those of the training views, on the device of the Gaussians.
             points: (P, 3) of the dataset, in the world frame; None: no limit.
         """
+        self._schedule = schedule
         self._views: Tensor | None = None
         if share <= 0.0 or points is None or not cameras:
             return
@@ -75,7 +79,7 @@ class NearLimit:
 
     def after_step(self, step: int, gaussians: Gaussians) -> None:
         """Make the Gaussians that are too near transparent, in every `INTERVAL`-th step."""
-        if self._views is not None and step % INTERVAL == 0:
+        if self._views is not None and self._schedule.multiples(step, INTERVAL):
             near = torch.cat([self._is_near(means) for means in gaussians.means.split(_ROWS)])
             gaussians.opacity_logits.masked_fill_(near, _REMOVED)
 

@@ -7,15 +7,21 @@ in `lr_schedule`.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+
 import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops.scratch import take_rows
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.view_gradient import ViewGradient
+
+#: β₁ and β₂ for a batch of one view.
+BETAS = (0.9, 0.999)
 
 
 class Adam:
@@ -33,17 +39,20 @@ class Adam:
         schedule: Schedule,
         extent: float,
         visible_only: bool = False,
+        shards: Shards = ALONE,
     ) -> None:
         """
         Args:
             extent: extent of the scene, in world units; the learning rate of the means is
                 multiplied by it.
             visible_only: whether a step leaves Gaussians unchanged that its view does not see.
+            shards: the processes; ``gaussians`` are those of this process.
         """
         self.rates = rates
         self.schedule = schedule
         self.extent = extent
         self.visible_only = visible_only
+        self.shards = shards
         parameters = gaussians.parameters()
         self.exp_avg = {name: torch.zeros_like(p) for name, p in parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in parameters.items()}
@@ -52,22 +61,29 @@ class Adam:
         """The learning rate of each parameter at ``step``, which counts from 1."""
         return self.rates.at(step, self.schedule, self.extent)
 
-    def step(self, gaussians: Gaussians, gradient: ViewGradient, step: int) -> None:
-        """Update ``gaussians`` in place; ``step`` counts from 1.
+    def step(self, gaussians: Gaussians, gradients: Sequence[ViewGradient], step: int) -> None:
+        """Update ``gaussians`` in place by the sum of the gradients; ``step`` counts from 1.
 
         If a parameter has a ``.grad`` (from a regulariser), it is added to the gradient and
         cleared.
+
+        Args:
+            gradients: those of the views of the batch, at least one.
         """
         parameters = gaussians.parameters()
-        splats, camera = gradient.splats, gradient.camera
-        assert splats.ids is not None
-        assert splats.packed.grad is not None
+        gradient = gradients[-1]
+        camera, ids = gradient.camera, gradient.splats.ids
+        packed_grad: Tensor | None = gradient.packed_grad
+        if len(gradients) > 1:
+            ids, packed_grad = _add_up(parameters, gradients), None
+        assert ids is not None
+        batch = self.schedule.batch
         ops.adam_step(
             parameters,
             self.exp_avg,
             self.exp_avg_sq,
-            splats.ids,
-            splats.packed.grad,
+            ids,
+            packed_grad,
             camera.cam_from_world,
             width=camera.width,
             height=camera.height,
@@ -76,8 +92,9 @@ class Adam:
             cx=camera.cx,
             cy=camera.cy,
             sh_degree=gradient.sh_degree,
-            lr=self.rates_at(step),
-            step=step,
+            lr={name: math.sqrt(batch) * rate for name, rate in self.rates_at(step).items()},
+            step=self.schedule.update_of(step),
+            betas=(BETAS[0] ** batch, BETAS[1] ** batch),
             visible_only=self.visible_only,
             valid=gradient.valid,
             nonfinite_rows=gradient.nonfinite_rows,
@@ -89,12 +106,13 @@ class Adam:
         """Row i becomes the old row ``index[i]``; rows marked in ``fresh`` get zero moments.
 
         Args:
-            index: (M,) int64, repeats allowed.
-            fresh: (M,) bool.
+            index: (M,) int64, repeats allowed; rows of all processes.
+            fresh: bool, for the new rows of this process.
         """
+        take = self.shards.selection(index)
         for moments in (self.exp_avg, self.exp_avg_sq):
             for name, moment in moments.items():
-                moments[name] = take_rows(moment, index)
+                moments[name] = take(moment)
                 moments[name][fresh] = 0.0
 
     def zero(self, name: str) -> None:
@@ -112,3 +130,23 @@ class Adam:
         for name, average in self.exp_avg.items():
             for moments, key in ((self.exp_avg, "exp_avg"), (self.exp_avg_sq, "exp_avg_sq")):
                 moments[name] = tensors[f"{key}.{name}"].to(average.device, copy=True)
+
+
+def _add_up(parameters: Mapping[str, Tensor], gradients: Sequence[ViewGradient]) -> Tensor:
+    """Add the gradients of several views to ``.grad`` of the parameters.
+
+    Returns:
+        The ids of the Gaussians that at least one of the views shows, ascending.
+    """
+    sums = {}
+    for name, parameter in parameters.items():
+        sums[name] = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+        parameter.grad = sums[name]
+    means = parameters["means"]
+    seen = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    for gradient in gradients:
+        gradient.add_to(parameters, sums)
+        ids = gradient.splats.ids
+        assert ids is not None
+        seen[ids[ids >= 0].long()] = True
+    return torch.nonzero(seen)[:, 0].to(torch.int32)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.step_schedule import Schedule
 
 #: Number of steps between two applications.
 INTERVAL = 100
@@ -32,19 +33,20 @@ _ROWS = 1 << 14
 class ScaleLimit:
     """Limits the scales between the steps of a training run. It has no state."""
 
-    def __init__(self, ratio: float, cameras: Sequence[Camera]) -> None:
+    def __init__(self, ratio: float, cameras: Sequence[Camera], schedule: Schedule) -> None:
         """
         Args:
             ratio: largest scale, in units of the distance to the nearest camera; 0: no limit.
             cameras: those of the training views, on the device of the Gaussians.
         """
         self.ratio = ratio
+        self._schedule = schedule
         used = cameras[:: math.ceil(len(cameras) / _CAMERAS)]
         self._centres = torch.stack([camera.position for camera in used]).to(torch.float32)
 
     def after_step(self, step: int, gaussians: Gaussians) -> None:
         """Reduce the scales that exceed the limit, in place, in every `INTERVAL`-th step."""
-        if self.ratio > 0.0 and step % INTERVAL == 0:
+        if self.ratio > 0.0 and self._schedule.multiples(step, INTERVAL):
             limit = (self.ratio * self._distances(gaussians.means)).log()
             gaussians.log_scales.copy_(torch.minimum(gaussians.log_scales, limit[:, None]))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 #: A moment of the training: a step (int), or a fraction of all steps (float).
@@ -20,11 +22,32 @@ class Schedule:
         iterations: total number of steps.
         since: the step at which ``iterations`` was last changed.
         passed: the fraction of the schedule that was completed at step ``since``.
+        batch: number of steps that are taken together, with one update; see ``TrainConfig.batch``.
     """
 
     iterations: int
     since: int = 0
     passed: float = 0.0
+    batch: int = 1
+
+    def update_of(self, step: int) -> int:
+        """The number of updates up to ``step``."""
+        return math.ceil(step / self.batch)
+
+    def multiples(self, step: int, every: int) -> int:
+        """How many multiples of ``every`` are among the steps of the batch that ends at ``step``.
+
+        Without batches: 1 if ``step`` is a multiple, otherwise 0.
+        """
+        return step // every - self._before(step) // every
+
+    def contains(self, step: int, moments: Collection[int]) -> bool:
+        """Whether one of the moments is among the steps of the batch that ends at ``step``."""
+        return any(self._before(step) < moment <= step for moment in moments)
+
+    def _before(self, step: int) -> int:
+        """The last step before the batch that ends at ``step``."""
+        return self.batch * (self.update_of(step) - 1)
 
     def step_of(self, when: When) -> int:
         """The step of the moment ``when``; a past moment has a step in the past."""

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from snowsplat.data.dataset import Dataset, View
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.dataset import Dataset
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
-from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import project
+from snowsplat.training.batch import BatchView, batch_gradients
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.decay import Decay
 from snowsplat.training.finite import check_state
 from snowsplat.training.init import initial_gaussians, starts_at_random
-from snowsplat.training.losses import view_loss
 from snowsplat.training.near_limit import NearLimit
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
 from snowsplat.training.scale_limit import ScaleLimit
+from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.unexplained import unexplained_views
@@ -90,6 +88,7 @@ class Trainer:
         device: torch.device | None = None,
         state: dict[str, Tensor] | None = None,
         initial: Gaussians | None = None,
+        shards: Shards = ALONE,
     ) -> None:
         """
         Args:
@@ -98,6 +97,8 @@ class Trainer:
             state: the state of a resumed training run; see `load_state`.
             initial: the Gaussians to start from, of the SH degree of ``config``; default:
                 `initial_gaussians`.
+            shards: the processes that train together. Each of them creates a trainer with the same
+                arguments, and calls the same methods.
 
         Raises:
             UserError: the dataset has no training views, or some points are so far apart that
@@ -109,7 +110,8 @@ class Trainer:
         self.dataset = dataset
         sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
         self.config = config = config.capped(sizes[len(sizes) // 2], len(sizes))
-        self.schedule = schedule or Schedule(config.iterations)
+        self.schedule = replace(schedule or Schedule(config.iterations), batch=config.batch)
+        self.shards = shards
         self.step = 0
         self.within_step = False
         self.left_out: tuple[int, ...] = ()
@@ -131,19 +133,22 @@ class Trainer:
         )
         # The Gaussians of a resumed training run are replaced by those of the state.
         start = config if state is None else replace(config, init="points")
+        first = None
         with single_threaded():
-            if initial is not None:
-                self.gaussians = initial.clone().to(self.device)
-            else:
-                self.gaussians = initial_gaussians(
+            if shards.rank == 0 and initial is not None:
+                first = initial.clone().to(self.device)
+            elif shards.rank == 0:
+                first = initial_gaussians(
                     dataset, start, self._images, self._generators["start"], self.device
                 )
+        self.gaussians = shards.scattered(first)
         self._optimizer = Adam(
             self.gaussians,
             config.learning_rates,
             schedule=self.schedule,
             extent=dataset.extent,
             visible_only=config.visible_only,
+            shards=shards,
         )
         self._density = config.density.control(
             len(self.gaussians),
@@ -152,17 +157,25 @@ class Trainer:
             random_init=starts_at_random(dataset, config),
             generator=self._generators["density"],
             device=self.device,
+            shards=shards,
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
-        self._scale_limit = ScaleLimit(config.relative_scale, self._cameras)
+        self._scale_limit = ScaleLimit(config.relative_scale, self._cameras, self.schedule)
         points = None if dataset.points is None else dataset.points.xyz
-        self._near_limit = NearLimit(config.near_limit, self._cameras, points)
+        self._near_limit = NearLimit(config.near_limit, self._cameras, points, self.schedule)
         self._overfitting = OverfittingCheck(
             dataset, self._images, self.schedule, self._evaluation_background()
         )
-        self._runner = StepRunner(len(self.gaussians), self.device, config.density.abs_grad)
+        self._runner = StepRunner(
+            *(len(self.gaussians), self.device, config.density.abs_grad, config.batch, shards)
+        )
         if state is not None:
             self.load_state(state)
+
+    @property
+    def total(self) -> int:
+        """The number of Gaussians of all processes."""
+        return self.shards.total(len(self.gaussians))
 
     @property
     def overfitting(self) -> Overfitting | None:
@@ -183,17 +196,18 @@ class Trainer:
         with interrupts_between_steps() as raise_deferred_interrupt:
             while self.step < min(last, self.schedule.iterations):
                 loss = self.step_once()
-                metrics = self.evaluate() if self.step in self.config.test_iterations else None
+                tests = self.schedule.contains(self.step, self.config.test_iterations)
+                metrics = self.evaluate() if tests else None
                 if on_progress is not None:
                     iterations, downscale = self.schedule.iterations, self._downscale(self.step)
-                    count = len(self.gaussians)
+                    count = self.total
                     on_progress(Progress(self.step, loss, count, iterations, downscale, metrics))
-                raise_deferred_interrupt()
+                raise_deferred_interrupt(self.shards.any)
         self._runner.finish(self.step, self.gaussians)
 
     @torch.no_grad()
     def step_once(self) -> float:
-        """Run one iteration of Algorithm 1 and return its loss.
+        """Run one iteration of Algorithm 1, with one or a batch of views; return the mean loss.
 
         Raises:
             Diverged: the loss is not finite, or the update of the previous step was not finite.
@@ -215,30 +229,32 @@ class Trainer:
                 )
                 self._decay.after_step(self.step, self.gaussians)
                 self._scale_limit.after_step(self.step, self.gaussians)
-            step = self.step + 1
-            view, camera, photo = self._next_view(step)
-            background = self._next_background()
-            loss = self._runner.run(
-                lambda: self._optimize(step, camera, photo, background),
+            step = min(self.step + self.config.batch, self.schedule.iterations)
+            batch = self._next_batch(step)
+            losses = self._runner.run(
+                lambda: self._optimize(step, batch),
                 step,
                 self.gaussians,
-                view,
-                photo,
+                [each.view for each in batch],
+                [each.photo for each in batch],
             )
         self.step = step
         self.within_step = False
-        return loss
+        return sum(losses) / len(losses)
 
-    def _optimize(self, step: int, camera: Camera, photo: LoadedImage, background: Tensor) -> None:
-        """Rasterize, compare with the photo, and update the Gaussians."""
-        sh_degree = self.config.sh_degree_at(step)
-        splats = project(self.gaussians, camera, sh_degree)
-        with torch.enable_grad():  # `project` is outside: `ops.adam_step` computes its gradient
-            image = self._runner.rasterize(splats, camera, background)
-            loss = view_loss(image, photo, background, self.config.ssim_weight)
-        gradient = self._runner.backward(loss, splats, camera, sh_degree)
-        self._density.after_backward(step, self.gaussians, gradient)
-        self._optimizer.step(self.gaussians, gradient, step)
+    def _optimize(self, step: int, batch: Sequence[BatchView]) -> None:
+        """Rasterize, compare with the photos, and update the Gaussians."""
+        gradients = batch_gradients(
+            self.gaussians,
+            batch,
+            self._runner,
+            self.shards,
+            self.config.sh_degree_at(step),
+            self.config.ssim_weight,
+        )
+        for gradient in gradients:
+            self._density.after_backward(step, self.gaussians, gradient)
+        self._optimizer.step(self.gaussians, gradients, step)
 
     def evaluate(self) -> Evaluation:
         """Metrics of the test views in the current state. Black replaces a random background."""
@@ -246,20 +262,26 @@ class Trainer:
         with single_threaded():
             return evaluate_views(self.gaussians, self.dataset.test, background=background)
 
-    def _next_view(self, step: int) -> tuple[View, Camera, LoadedImage]:
-        """The next view in random order, with camera and photo at the resolution of the step."""
+    def _next_batch(self, step: int) -> list[BatchView]:
+        """The next views in random order, at the resolution of the step that ends with them."""
         downscale = self._downscale(step)
-        if len(self._order) <= LOOKAHEAD:
-            while len(self._order) <= LOOKAHEAD:
+        ahead = max(LOOKAHEAD, self.config.batch)
+        if len(self._order) <= ahead:
+            while len(self._order) <= ahead:
                 count = len(self.dataset.train)
                 order = torch.randperm(count, generator=self._generators["views"]).tolist()
                 self._order += [i for i in order if i not in self.left_out]
             self._prefetch(downscale)
-        elif downscale != self._downscale(step - 1):
+        elif downscale != self._downscale(self.step):
             self._prefetch(downscale)
-        i = self._order.pop(0)
-        view, camera = self.dataset.train[i], self._cameras[i].downscaled(downscale)
-        return view, camera, self._images.get(view, downscale)
+        batch = []
+        for position in range(step - self.step):
+            i = self._order.pop(0)
+            view, camera = self.dataset.train[i], self._cameras[i].downscaled(downscale)
+            own = position % self.shards.size == self.shards.rank
+            photo = self._images.get(view, downscale) if own else None
+            batch.append(BatchView(view, camera, photo, self._next_background()))
+        return batch
 
     def _leave_out_unexplained(self) -> None:
         """Decide once, after the step of ``leave_out_after``, which views are used from now on."""
@@ -294,7 +316,12 @@ class Trainer:
         return self.config.downscale_at(step, self.schedule)
 
     def _prefetch(self, downscale: int) -> None:
-        self._images.prefetch([self.dataset.train[i] for i in self._order], downscale)
+        own = [
+            self.dataset.train[i]
+            for position, i in enumerate(self._order)
+            if position % self.config.batch % self.shards.size == self.shards.rank
+        ]
+        self._images.prefetch(own, downscale)
 
     def state_tensors(self) -> dict[str, Tensor]:
         """The state on which the next steps depend, besides dataset, configuration and schedule.

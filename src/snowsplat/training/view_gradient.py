@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -35,6 +36,31 @@ class ViewGradient:
     sh_degree: int
     valid: Tensor | None = None
     nonfinite_rows: Tensor | None = None
+
+    @property
+    def packed_grad(self) -> Tensor:
+        """(M, 16): the gradient of ``splats.packed``."""
+        assert self.splats.packed.grad is not None
+        return self.splats.packed.grad
+
+    def add_to(self, parameters: Mapping[str, Tensor], grads: Mapping[str, Tensor]) -> None:
+        """Add the gradient with respect to the parameters of the Gaussians to ``grads``."""
+        assert self.splats.ids is not None
+        camera = self.camera
+        ops.add_project_gradients(
+            parameters,
+            grads,
+            self.splats.ids,
+            self.packed_grad,
+            camera.cam_from_world,
+            width=camera.width,
+            height=camera.height,
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            sh_degree=self.sh_degree,
+        )
 
     def add_statistics(
         self,

@@ -28,14 +28,18 @@ def single_threaded() -> Iterator[None]:
 _pending = threading.Event()
 
 
-def raise_deferred_interrupt() -> None:
-    """Raise KeyboardInterrupt if a Ctrl-C is deferred; for code that waits between steps."""
-    if _pending.is_set():
+def raise_deferred_interrupt(agree: Callable[[bool], bool] = bool) -> None:
+    """Raise KeyboardInterrupt if a Ctrl-C is deferred; for code that waits between steps.
+
+    Args:
+        agree: combines whether a Ctrl-C is deferred in this process with the same in the others.
+    """
+    if agree(_pending.is_set()):
         raise KeyboardInterrupt
 
 
 @contextmanager
-def interrupts_between_steps() -> Iterator[Callable[[], None]]:
+def interrupts_between_steps() -> Iterator[Callable[..., None]]:
     """Defer Ctrl-C until the function that the context provides is called.
 
     A second Ctrl-C is not deferred. Nothing is changed if Python's own handler of SIGINT has been
@@ -48,7 +52,7 @@ def interrupts_between_steps() -> Iterator[Callable[[], None]]:
 
     main_thread = threading.current_thread() is threading.main_thread()
     if not main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield lambda: None
+        yield lambda *_: None
         return
     signal.signal(signal.SIGINT, defer)
     try:

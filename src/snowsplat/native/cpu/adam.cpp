@@ -185,7 +185,10 @@ int64_t step(const AdamStepParams<T>& p) {
       g.rows = RowIndex<W>::of(ids, i, last);
       g.load(tensors);
       GaussianGroupGradient<V> d;
-      group_vjp<V>(g, cam, degree, p.grad_packed, i, last, d, nullptr, nullptr);
+      if (p.grad_packed)
+        group_vjp<V>(g, cam, degree, p.grad_packed, i, last, d, nullptr, nullptr);
+      else
+        d = {};
       V* small[5] = {d.shape.mean, d.shape.log_scale, d.shape.quat, &d.shape.opacity_logit, d.dc};
       for (int k = 0; k < 5; k++) update_lanes(rule, t[k], g.rows, small[k]);
       int64_t lane[W];

@@ -95,6 +95,16 @@ int64_t forward(const ProjectForwardParams<T>& p) {
   return 0;
 }
 
+// Adds `columns` columns of W rows, with one row per lane.
+template <class V, class T = typename V::Scalar>
+SNOW_INLINE void add_rows(T* base, int64_t stride, const RowIndex<V::width>& rows, int columns,
+                          const V* in) {
+  V sum[3 * (kMaxShCoefficients - 1) + 1];
+  gather_rows(base, stride, rows.row, columns, sum);
+  for (int k = 0; k < columns; k++) sum[k] += in[k];
+  scatter_rows(base, stride, rows.row, rows.count, columns, sum);
+}
+
 template <class V, class T = typename V::Scalar>
 int64_t backward(const ProjectBackwardParams<T>& p) {
   constexpr int W = V::width;
@@ -116,16 +126,14 @@ int64_t backward(const ProjectBackwardParams<T>& p) {
       V dposition[3];
       group_vjp(g, cam, degree, p.grad_packed, i, end, d, pose ? &dpose : nullptr,
                 pose ? dposition : nullptr);
-      const int64_t* row = g.rows.row;
-      const int count = g.rows.count;
-      scatter_rows(grads.means, 3, row, count, 3, d.shape.mean);
-      scatter_rows(grads.log_scales, 3, row, count, 3, d.shape.log_scale);
-      scatter_rows(grads.quats, 4, row, count, 4, d.shape.quat);
-      scatter_rows(grads.opacity_logits, 1, row, count, 1, &d.shape.opacity_logit);
-      scatter_rows(grads.sh_dc, 3, row, count, 3, d.dc);
-      scatter_rows(grads.sh_rest, 3 * tensors.sh_rest_rows, row, count, sh_columns(degree), d.rest);
+      add_rows(grads.means, 3, g.rows, 3, d.shape.mean);
+      add_rows(grads.log_scales, 3, g.rows, 3, d.shape.log_scale);
+      add_rows(grads.quats, 4, g.rows, 4, d.shape.quat);
+      add_rows(grads.opacity_logits, 1, g.rows, 1, &d.shape.opacity_logit);
+      add_rows(grads.sh_dc, 3, g.rows, 3, d.dc);
+      add_rows(grads.sh_rest, 3 * tensors.sh_rest_rows, g.rows, sh_columns(degree), d.rest);
       if (pose) {
-        for (int l = 0; l < count; l++) {
+        for (int l = 0; l < g.rows.count; l++) {
           for (int k = 0; k < 9; k++) sums[k] += double(dpose.rotation[k].v[l]);
           for (int k = 0; k < 3; k++) sums[9 + k] += double(dpose.translation[k].v[l]);
           for (int k = 0; k < 3; k++) sums[12 + k] += double(dposition[k].v[l]);

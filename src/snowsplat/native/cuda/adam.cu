@@ -67,8 +67,11 @@ SNOW_INLINE void step(const AdamStepParams<T>& p) {
   const int64_t i = thread_index(), first = int64_t(blockIdx.x) * kRowThreads;
   const int32_t splat = i < p.n ? p.ids[i] : kUnseen;
   nonfinite[threadIdx.x] = 0;
-  ids[threadIdx.x] = splat >= 0 ? int32_t(i) : -1;
-  splats[threadIdx.x] = i >= p.n || (p.visible_only && splat < 0) ? kNotUpdated : splat;
+  const bool has_gradient = splat >= 0 && p.grad_packed;
+  ids[threadIdx.x] = has_gradient ? int32_t(i) : -1;
+  splats[threadIdx.x] = i >= p.n || (p.visible_only && splat < 0) ? kNotUpdated
+                        : has_gradient                            ? splat
+                                                                  : kUnseen;
   if (threadIdx.x == 0) ids[kRowThreads] = -1, splats[kRowThreads] = kNotUpdated;
   __syncthreads();
 
@@ -77,7 +80,7 @@ SNOW_INLINE void step(const AdamStepParams<T>& p) {
                                         p.sh_rest_rows,         p.sh_degree};
   load_rest<kRowColumns>(gaussians, ids, tile);
   __syncthreads();
-  if (splat >= 0) {
+  if (has_gradient) {
     const PinholeCamera<T> cam(p.camera, T());
     PoseGradient<T> pose;
     T position[3];

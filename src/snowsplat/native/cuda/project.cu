@@ -74,14 +74,14 @@ SNOW_INLINE void forward(const ProjectForwardParams<T>& p) {
   });
 }
 
-// Copies columns of a tile to the rows `ids` of a tensor.
+// Adds columns of a tile to the rows `ids` of a tensor.
 template <int kBatch, class T>
-SNOW_INLINE void store_columns(const T* tile, int columns, const int32_t* ids, int64_t stride,
-                               T* tensor) {
+SNOW_INLINE void add_columns(const T* tile, int columns, const int32_t* ids, int64_t stride,
+                             T* tensor) {
   for_each_number<kBatch>(columns, [&](const int* row, const int* column) {
     for (int j = 0; j < kBatch; j++) {
       const int32_t id = ids[row[j]];
-      if (id >= 0) tensor[id * stride + column[j]] = tile[row[j] * kRowColumns + column[j]];
+      if (id >= 0) tensor[id * stride + column[j]] += tile[row[j] * kRowColumns + column[j]];
     }
   });
 }
@@ -107,13 +107,13 @@ SNOW_INLINE void backward(const ProjectBackwardParams<T>& p) {
     row_vjp(tensors, id, cam, grad_splat, row, d_pose, d_position);
   }
   __syncthreads();
-  store_columns<3>(tile + kMeanColumn, 3, id_of, 3, grads.means);
-  store_columns<3>(tile + kLogScaleColumn, 3, id_of, 3, grads.log_scales);
-  store_columns<4>(tile + kQuatColumn, 4, id_of, 4, grads.quats);
-  store_columns<1>(tile + kLogitColumn, 1, id_of, 1, grads.opacity_logits);
-  store_columns<3>(tile + kDcColumn, 3, id_of, 3, grads.sh_dc);
+  add_columns<3>(tile + kMeanColumn, 3, id_of, 3, grads.means);
+  add_columns<3>(tile + kLogScaleColumn, 3, id_of, 3, grads.log_scales);
+  add_columns<4>(tile + kQuatColumn, 4, id_of, 4, grads.quats);
+  add_columns<1>(tile + kLogitColumn, 1, id_of, 1, grads.opacity_logits);
+  add_columns<3>(tile + kDcColumn, 3, id_of, 3, grads.sh_dc);
   if (degree > 0)
-    store_columns<kRestBatch>(tile, sh_columns(degree), id_of, 3 * tensors.sh_rest_rows,
+    add_columns<kRestBatch>(tile, sh_columns(degree), id_of, 3 * tensors.sh_rest_rows,
                               grads.sh_rest);
   if (!p.pose) return;
 

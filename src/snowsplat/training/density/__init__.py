@@ -17,6 +17,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.density.adaptive import AdaptiveDensity
 from snowsplat.training.density.mcmc import McmcDensity
 from snowsplat.training.optim import Adam
+from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.training.view_gradient import ViewGradient
 
@@ -94,15 +95,17 @@ class DensityConfig(Protocol):
         random_init: bool,
         generator: torch.Generator,
         device: torch.device | None = None,
+        shards: Shards = ALONE,
     ) -> DensityControl:
         """The initial state.
 
         Args:
-            count: number of Gaussians.
+            count: number of Gaussians of this process.
             extent: extent of the scene, in world units.
             random_init: whether training starts from random points instead of SfM points.
             generator: a random generator on the CPU.
             device: the device of the Gaussians; default: the CPU.
+            shards: the processes of the training.
         """
         ...
 

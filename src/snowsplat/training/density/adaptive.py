@@ -17,6 +17,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
 from snowsplat.training.finite import check_parameters
 from snowsplat.training.optim import Adam
+from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.training.view_gradient import ViewGradient
 
@@ -84,6 +85,7 @@ class AdaptiveDensity:
         random_init: bool,
         generator: torch.Generator,
         device: torch.device | None = None,
+        shards: Shards = ALONE,
     ) -> AdaptiveDensityControl:
         """The initial state for ``count`` Gaussians in a scene of ``extent`` world units."""
         return AdaptiveDensityControl(
@@ -95,6 +97,7 @@ class AdaptiveDensity:
             grad_sum=torch.zeros(count, device=device),
             views=torch.zeros(count, device=device),
             max_radii=torch.zeros(count, device=device),
+            shards=shards,
         )
 
 
@@ -108,6 +111,7 @@ class AdaptiveDensityControl:
             ``settings.abs_grad``, of the norm of the absolute gradients.
         views: (N,) number of views in this sum: those in which the Gaussian was visible.
         max_radii: (N,) largest 3σ radius in these views, in pixels.
+        shards: the processes; N is the number of rows of this process.
     """
 
     settings: AdaptiveDensity
@@ -118,6 +122,7 @@ class AdaptiveDensityControl:
     grad_sum: Tensor
     views: Tensor
     max_radii: Tensor
+    shards: Shards = ALONE
 
     @property
     def first(self) -> int:
@@ -140,7 +145,8 @@ class AdaptiveDensityControl:
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         """Densify, prune or reset opacity, if the settings require it at ``step``."""
-        if self.first <= step <= self.last and step % self.settings.densify_interval == 0:
+        every = self.settings.densify_interval
+        if self.first <= step <= self.last and self.schedule.multiples(step, every):
             check_parameters(step, gaussians)
             gaussians = self._refine(step, gaussians, optimizer)
         if self._resets_at(step):
@@ -150,18 +156,22 @@ class AdaptiveDensityControl:
         return gaussians
 
     def _resets_at(self, step: int) -> bool:
-        if self.first_reset and step == self.first:
+        if self.first_reset and self.schedule.contains(step, (self.first,)):
             return step <= self.schedule.iterations - RESET_RECOVERY
         every = self.settings.opacity_reset_interval
-        return every > 0 and step % every == 0 and step <= self.last - RESET_RECOVERY
+        if every <= 0 or step > self.last - RESET_RECOVERY:
+            return False
+        return self.schedule.multiples(step, every) > 0
 
     def _refine(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
-        settings = self.settings
-        grads = self.grad_sum / self.views.clamp_min(1.0)
-        size = gaussians.log_scales.amax(dim=1).exp() / self.extent
-        alive = gaussians.opacities >= settings.prune_opacity
+        settings, shards = self.settings, self.shards
+        # The choice depends on all rows. Every process makes it in the same way.
+        grads = shards.all_rows(self.grad_sum / self.views.clamp_min(1.0))
+        size = shards.all_rows(gaussians.log_scales.amax(dim=1).exp() / self.extent)
+        alive = shards.all_rows(gaussians.opacities) >= settings.prune_opacity
         dense = self._densified(grads, alive)
         split = dense & (size > settings.percent_dense)
+
         # A split Gaussian is replaced with two children. A cloned Gaussian remains and gets a copy.
         # Children and copies start with zero moments. So the moments of a copy and of its original
         # are different, and the two move apart.
@@ -171,25 +181,24 @@ class AdaptiveDensityControl:
         if prunes_by_size and settings.prune_world_size > 0:
             large |= torch.where(split, size / SPLIT_SHRINK, size) > settings.prune_world_size
         if prunes_by_size and settings.prune_screen_size > 0:
-            large |= kept & (self.max_radii > settings.prune_screen_size)
+            large |= kept & (shards.all_rows(self.max_radii) > settings.prune_screen_size)
         kept, clones, parents = (
             torch.nonzero(rows & ~large)[:, 0] for rows in (kept, dense & ~split, split)
         )
-
         index = torch.cat([kept, clones, parents, parents])
         row = torch.arange(len(index), device=index.device)
         fresh, child = row >= len(kept), row >= len(kept) + len(clones)
-        means = gaussians.means[index]
-        means[child] += self._offsets(gaussians, index[child])
 
+        means = shards.all_rows(gaussians.means)[index]
+        means[child] += self._offsets(gaussians, index[child])
         order = morton_order(means)
         index, fresh, child = index[order], fresh[order], child[order]
-        optimizer.select(index, fresh)
+        optimizer.select(index, shards.own_rows(fresh))
+        shards.select_(gaussians, index)
+        gaussians.means = shards.own_rows(means[order])
+        gaussians.log_scales[shards.own_rows(child)] -= math.log(SPLIT_SHRINK)
         for name, tensor in self.state_tensors().items():
-            setattr(self, name, tensor.new_zeros(len(index)))
-        gaussians.select_(index)
-        gaussians.means = means[order]
-        gaussians.log_scales[child] -= math.log(SPLIT_SHRINK)
+            setattr(self, name, tensor.new_zeros(len(gaussians)))
         return gaussians
 
     def _densified(self, grads: Tensor, alive: Tensor) -> Tensor:
@@ -211,9 +220,10 @@ class AdaptiveDensityControl:
 
     def _offsets(self, gaussians: Gaussians, parents: Tensor) -> Tensor:
         """Samples (M, 3) of N(0, Σ) of the rows ``parents`` (M,): R S ε, in world units."""
-        scales = gaussians.log_scales[parents].exp()
+        scales = self.shards.all_rows(gaussians.log_scales)[parents].exp()
         offsets = scales * torch.randn(scales.shape, generator=self.generator).to(scales)
-        return (rotation_from_quat(gaussians.quats[parents]) @ offsets[:, :, None])[:, :, 0]
+        rotations = rotation_from_quat(self.shards.all_rows(gaussians.quats)[parents])
+        return (rotations @ offsets[:, :, None])[:, :, 0]
 
     def state_tensors(self) -> dict[str, Tensor]:
         """The statistics, by name. The tensors are not copied."""

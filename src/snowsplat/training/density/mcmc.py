@@ -22,6 +22,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
 from snowsplat.training.finite import check_parameters
 from snowsplat.training.optim import Adam
+from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_schedule import Schedule, When
 from snowsplat.training.view_gradient import ViewGradient
 from snowsplat.util.errors import SettingError
@@ -74,8 +75,9 @@ class McmcDensity:
         random_init: bool,
         generator: torch.Generator,
         device: torch.device | None = None,
+        shards: Shards = ALONE,
     ) -> McmcDensityControl:
-        """The initial state. Of the arguments, only ``schedule`` and ``generator`` are used.
+        """The initial state. ``extent``, ``random_init`` and ``device`` are not used.
 
         Raises:
             SettingError: ``max_gaussians`` is not positive.
@@ -84,7 +86,7 @@ class McmcDensity:
             raise SettingError(
                 "max_gaussians", "MCMC density control needs a limit; use a positive number"
             )
-        return McmcDensityControl(self, schedule, generator)
+        return McmcDensityControl(self, schedule, generator, shards)
 
 
 @dataclass
@@ -94,6 +96,7 @@ class McmcDensityControl:
     settings: McmcDensity
     schedule: Schedule
     generator: torch.Generator
+    shards: Shards = ALONE
 
     @property
     def first(self) -> int:
@@ -108,15 +111,17 @@ class McmcDensityControl:
     def after_backward(self, step: int, gaussians: Gaussians, gradient: ViewGradient) -> None:
         """Add the gradients of λ_o · mean(opacity) and λ_Σ · mean(scale), section 3.4."""
         opacities, scales = gaussians.opacities, gaussians.scales
-        opacity_weight = self.settings.opacity_regularizer / opacities.numel()
+        count = self.shards.total(len(gaussians))
+        opacity_weight = self.settings.opacity_regularizer / count
         gaussians.opacity_logits.grad = opacity_weight * opacities * (1.0 - opacities)
-        gaussians.log_scales.grad = self.settings.scale_regularizer / scales.numel() * scales
+        gaussians.log_scales.grad = self.settings.scale_regularizer / (3 * count) * scales
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         """Add noise; relocate and add Gaussians if the settings require it."""
         if step <= self.schedule.step_of(self.settings.noise_until):
             self._add_noise(gaussians, optimizer.rates_at(step)["means"])
-        if self.first <= step <= self.last and step % self.settings.densify_interval == 0:
+        every = self.settings.densify_interval
+        if self.first <= step <= self.last and self.schedule.multiples(step, every):
             check_parameters(step, gaussians)
             gaussians = self._relocate(gaussians, optimizer)
         return gaussians
@@ -126,21 +131,28 @@ class McmcDensityControl:
         gate = torch.sigmoid(NOISE_SHARPNESS * (self.settings.prune_opacity - gaussians.opacities))
         if gate.device.type == "cpu":
             rows: Tensor | slice = torch.nonzero(gate > NOISE_NEGLIGIBLE)[:, 0]
-            eta = torch.randn(len(gate[rows]), 3, 1, generator=self.generator)
+            eta = self._noise_of(len(gate[rows]), self.generator)
         else:  # noise takes little time on a GPU, and `nonzero` would wait for the GPU
             rows = slice(None)
             on_device = torch.Generator(gate.device)
             on_device.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
-            eta = torch.randn(len(gate), 3, 1, generator=on_device, device=gate.device)
+            eta = self._noise_of(len(gate), on_device)
         rotations = rotation_from_quat(gaussians.quats[rows])
         # With the limit, the variance is finite in single precision for any scale.
         variances = (2.0 * gaussians.log_scales[rows]).clamp(max=40.0).exp()[:, :, None]
         noise = (rotations @ (variances * (rotations.mT @ eta)))[:, :, 0]
         gaussians.means[rows] += rate * self.settings.noise * gate[rows, None] * noise
 
+    def _noise_of(self, rows: int, generator: torch.Generator) -> Tensor:
+        """(rows, 3, 1) of N(0, 1): the part of this process of the numbers for all rows."""
+        first, total = self.shards.first(rows), self.shards.total(rows)
+        eta = torch.randn(total, 3, 1, generator=generator, device=generator.device)
+        return eta[first : first + rows]
+
     def _relocate(self, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
-        count = len(gaussians)
-        opacities = gaussians.opacities
+        # The choice depends on all rows. Every process makes it in the same way.
+        opacities = self.shards.all_rows(gaussians.opacities)
+        count = len(opacities)
         survivors = torch.nonzero(opacities > self.settings.prune_opacity)[:, 0]
         if len(survivors) == 0:
             return gaussians
@@ -157,10 +169,11 @@ class McmcDensityControl:
         copies = 1 + torch.bincount(sources, minlength=count)
 
         index = torch.cat([survivors, sources])
-        index = index[morton_order(gaussians.means[index])]
-        shared = copies[index] > 1
-        gaussians.select_(index)
-        new_opacities, shrink = shared_opacity(gaussians.opacities[shared], copies[index][shared])
+        index = index[morton_order(self.shards.all_rows(gaussians.means)[index])]
+        self.shards.select_(gaussians, index)
+        copies = self.shards.own_rows(copies[index])
+        shared = copies > 1
+        new_opacities, shrink = shared_opacity(gaussians.opacities[shared], copies[shared])
         new_opacities = new_opacities.clamp(self.settings.prune_opacity, 1.0 - 1e-6)
         gaussians.opacity_logits[shared] = torch.logit(new_opacities)
         gaussians.log_scales[shared] += shrink.log()[:, None]

@@ -1,0 +1,73 @@
+"""The gradients of a batch of views: the part of a step in which processes exchange splats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat.data.dataset import View
+from snowsplat.data.decode import LoadedImage
+from snowsplat.ops.splats import Splats2D
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import project
+from snowsplat.training.losses import view_loss
+from snowsplat.training.shards import Shards
+from snowsplat.training.step_runner import StepRunner
+from snowsplat.training.view_gradient import ViewGradient
+
+
+@dataclass(frozen=True)
+class BatchView:
+    """A view of a batch, at the resolution of the step.
+
+    ``photo`` is None if another process blends this view.
+    """
+
+    view: View
+    camera: Camera
+    photo: LoadedImage | None
+    background: Tensor  # (3,)
+
+
+def rounds(batch: Sequence[BatchView], size: int) -> list[Sequence[BatchView]]:
+    """The views in groups of at most ``size``: in each round, process i blends view i."""
+    return [batch[first : first + size] for first in range(0, len(batch), size)]
+
+
+def batch_gradients(
+    gaussians: Gaussians,
+    batch: Sequence[BatchView],
+    runner: StepRunner,
+    shards: Shards,
+    sh_degree: int,
+    ssim_weight: float,
+) -> list[ViewGradient]:
+    """The gradients of the mean loss of the batch with respect to the splats of each view.
+
+    Args:
+        gaussians: those of this process.
+        batch: the views, the same in every process.
+        runner: rasterizes, and runs the backward pass.
+    """
+    views = rounds(batch, shards.size)
+    found: list[tuple[Splats2D, BatchView]] = []
+    for number, group in enumerate(views):
+        splats = [project(gaussians, each.camera, sh_degree) for each in group]
+        if shards.size > 1:
+            splats = [view.without_empty_rows() for view in splats]
+        blended = shards.exchange(splats)
+        loss = None
+        if blended is not None:
+            own = group[shards.rank]
+            assert own.photo is not None
+            with torch.enable_grad():  # `project` is outside: the optimiser computes its gradient
+                image = runner.rasterize(blended, own.camera, own.background)
+                loss = view_loss(image, own.photo, own.background, ssim_weight)
+        runner.backward(loss, share=1.0 / len(batch), last=number == len(views) - 1)
+        shards.return_gradients(blended, splats, absolute=runner.abs_grad)
+        found += zip(splats, group, strict=True)
+    return [runner.gradient(splats, each.camera, sh_degree) for splats, each in found]
