@@ -22,7 +22,7 @@ from snowsplat.data.dataset import View
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import render
+from snowsplat.scene.render import Renderer, render
 
 # Number of photos for which there is memory. Each photo is used once, so the memory only serves to
 # decode ahead.
@@ -131,6 +131,7 @@ def evaluate_views(
     lpips: Lpips | None = None,
     sh_degree: int | None = None,
     on_view: Callable[[ViewMetrics], None] | None = None,
+    render: Renderer = render,
 ) -> Evaluation:
     """Render each view and compare it with its photo.
 
@@ -141,6 +142,7 @@ def evaluate_views(
         lpips: measures LPIPS too, unless None.
         sh_degree: the largest SH degree to render; None uses all.
         on_view: called after each view.
+        render: renders the scene.
 
     Raises:
         UserError: a photo is missing or damaged.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -24,6 +25,10 @@ class RenderOutput:
     alpha: Tensor  # (H, W) in [0, 1]
     depth: Tensor | None  # (H, W), world units
     splats: Splats2D
+
+
+#: Gaussians, camera, background (3,) and SH degree (None: all) → an image; `render` is one.
+Renderer = Callable[[Gaussians, Camera, Tensor, int | None], RenderOutput]
 
 
 def project(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) -> Splats2D:

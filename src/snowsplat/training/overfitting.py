@@ -36,7 +36,7 @@ from snowsplat.data.dataset import Dataset, View
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import render
+from snowsplat.scene.render import Renderer, render
 from snowsplat.training.starts.source_views import source_views
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.unseen_cameras import beside
@@ -92,18 +92,25 @@ class OverfittingCheck:
     """
 
     def __init__(
-        self, dataset: Dataset, images: ImageLoader, schedule: Schedule, background: Tensor
+        self,
+        dataset: Dataset,
+        images: ImageLoader,
+        schedule: Schedule,
+        background: Tensor,
+        render: Renderer = render,
     ) -> None:
         """
         Args:
             images: the photos of the training views.
             background: (3,) colour in 0..1, on the device of the Gaussians.
+            render: renders the scene.
         """
         self.found: Overfitting | None = None
         self._dataset = dataset
         self._images = images
         self._schedule = schedule
         self._background = background
+        self._render = render
         self._unseen: list[UnseenView] | None = None  # computed at the first estimate
         self._estimates = 0  # number of estimates until now
         self._best = 0.0  # dB
@@ -135,7 +142,9 @@ class OverfittingCheck:
             self._unseen = unseen_views(views, xyz, self._images, self._background.cpu())
         if not self._unseen:
             return
-        estimate = estimated_psnr(gaussians, self._unseen, self._background, sh_degree)
+        estimate = estimated_psnr(
+            gaussians, self._unseen, self._background, sh_degree, self._render
+        )
         self._best = max(self._best, estimate)
         self._worse = self._worse + 1 if estimate <= self._best - _DIFFERENCE else 0
         if self._worse < _PATIENCE:
@@ -198,7 +207,11 @@ def unseen_views(
 
 @torch.no_grad()
 def estimated_psnr(
-    gaussians: Gaussians, unseen: Sequence[UnseenView], background: Tensor, sh_degree: int
+    gaussians: Gaussians,
+    unseen: Sequence[UnseenView],
+    background: Tensor,
+    sh_degree: int,
+    render: Renderer = render,
 ) -> float:
     """The estimate of the module's docstring in dB, 14 to 60.
 

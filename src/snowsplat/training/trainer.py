@@ -22,6 +22,7 @@ from snowsplat.training.near_limit import NearLimit
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
 from snowsplat.training.scale_limit import ScaleLimit
+from snowsplat.training.sharded_render import sharded_render
 from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
@@ -112,6 +113,7 @@ class Trainer:
         self.config = config = config.capped(sizes[len(sizes) // 2], len(sizes))
         self.schedule = replace(schedule or Schedule(config.iterations), batch=config.batch)
         self.shards = shards
+        self._render = sharded_render(shards)
         self.step = 0
         self.within_step = False
         self.left_out: tuple[int, ...] = ()
@@ -164,7 +166,7 @@ class Trainer:
         points = None if dataset.points is None else dataset.points.xyz
         self._near_limit = NearLimit(config.near_limit, self._cameras, points, self.schedule)
         self._overfitting = OverfittingCheck(
-            dataset, self._images, self.schedule, self._evaluation_background()
+            *(dataset, self._images, self.schedule, self._evaluation_background(), self._render)
         )
         self._runner = StepRunner(
             *(len(self.gaussians), self.device, config.density.abs_grad, config.batch, shards)
@@ -260,7 +262,9 @@ class Trainer:
         """Metrics of the test views in the current state. Black replaces a random background."""
         background = self._evaluation_background().tolist()
         with single_threaded():
-            return evaluate_views(self.gaussians, self.dataset.test, background=background)
+            return evaluate_views(
+                self.gaussians, self.dataset.test, background=background, render=self._render
+            )
 
     def _next_batch(self, step: int) -> list[BatchView]:
         """The next views in random order, at the resolution of the step that ends with them."""
@@ -294,6 +298,7 @@ class Trainer:
             self._images,
             background=self._evaluation_background(),
             sh_degree=self.config.sh_degree_at(self.step),
+            render=self._render,
         )
         self._checked = True
         if self.left_out:
@@ -326,15 +331,23 @@ class Trainer:
     def state_tensors(self) -> dict[str, Tensor]:
         """The state on which the next steps depend, besides dataset, configuration and schedule.
 
-        The tensors are not copied.
+        The tensors are not copied. With several processes, process 0 gets the rows of all of them;
+        the others get no rows.
         """
+        return self.shards.collected(self._shard_tensors()) | self._common_tensors()
+
+    def _shard_tensors(self) -> dict[str, Tensor]:
+        """The part of the state with one row for each Gaussian of this process."""
         parts = {
             "gaussians": self.gaussians.parameters(),
             "optimizer": self._optimizer.state_tensors(),
             "density": self._density.state_tensors(),
-            "random": {name: random.get_state() for name, random in self._generators.items()},
         }
-        tensors = {f"{part}.{key}": t for part, named in parts.items() for key, t in named.items()}
+        return {f"{part}.{key}": t for part, named in parts.items() for key, t in named.items()}
+
+    def _common_tensors(self) -> dict[str, Tensor]:
+        """The other part of the state, which is the same in all processes."""
+        tensors = {f"random.{name}": g.get_state() for name, g in self._generators.items()}
         order = torch.tensor(self._order, dtype=torch.int64)
         tensors |= {"step": torch.tensor(self.step), "order": order}
         if self.config.leave_out_after:  # otherwise, as in earlier versions of the format
@@ -352,7 +365,9 @@ class Trainer:
             UserError: the state has another density control, SH degree or dataset, or is not
                 finite.
         """
-        check_state(self.state_tensors(), tensors, len(self.dataset.train))
+        own = self._shard_tensors()
+        check_state(own | self._common_tensors(), tensors, len(self.dataset.train))
+        tensors = tensors | {name: self.shards.own_rows(tensors[name]) for name in own}
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {n[len(prefix) :]: t for n, t in tensors.items() if n.startswith(prefix)}

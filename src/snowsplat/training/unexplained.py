@@ -18,7 +18,7 @@ from torch import Tensor
 from snowsplat.data.dataset import View
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import render
+from snowsplat.scene.render import Renderer, render
 
 #: Width and height of the photos are divided by this number. More pixels do not help to
 #: distinguish wrong poses from correct ones. In the first steps of the recipes, the photos have
@@ -58,6 +58,7 @@ def unexplained_views(
     *,
     background: Tensor,
     sh_degree: int,
+    render: Renderer = render,
 ) -> tuple[int, ...]:
     """The indices of the views that the scene does not explain, ascending; see `standing_out`.
 
@@ -67,6 +68,7 @@ def unexplained_views(
         images: the photos of the views.
         background: (3,) colour in 0..1, on the device of the Gaussians.
         sh_degree: degree of the spherical harmonics in use.
+        render: renders the scene.
 
     Raises:
         UserError: a photo is missing or damaged.
