@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 
@@ -9,8 +10,9 @@ from snowsplat.cli.flags import with_flags
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import PageFlags
 from snowsplat.cli.train_flags import TrainFlags
+from snowsplat.pipeline import processes
 from snowsplat.pipeline.output_folder import OutputFolder
-from snowsplat.pipeline.train import resume, train
+from snowsplat.pipeline.train import follow_training, resume, train
 from snowsplat.pipeline.training_run import TrainingStopped
 from snowsplat.util.errors import UserError
 
@@ -27,6 +29,8 @@ class Train(TrainFlags):
       snowsplat train garden -o out --recipe paper   the 30,000 steps of the paper
       snowsplat train garden -o out --checkpoint-every 1000
       snowsplat train -o out --resume                continue from a checkpoint
+      snowsplat train garden -o out --batch 4 --processes 4
+      torchrun --nproc-per-node 4 -m snowsplat train garden -o out --batch 4
 
     Notes:
       The scene is written to OUT/point_cloud/iteration_N/point_cloud.ply.
@@ -38,6 +42,11 @@ class Train(TrainFlags):
         """Returns the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
         if self.output is None:
             raise UserError("train needs a folder for the result; add -o OUT")
+        if self.processes is not None and self.processes != 1 and processes.count() == 1:
+            return processes.launch(self.processes, sys.argv[1:])
+        if not processes.is_first():
+            follow_training(self.options().compute)
+            return 0
         if self.resume and self.overwrite:
             raise UserError("--resume and --overwrite cannot be combined; use one of them")
         dataset, options = self.dataset_path(), self.options()

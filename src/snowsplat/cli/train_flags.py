@@ -74,6 +74,10 @@ class JobFlags:
     """Device to train on."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads. The result does not depend on this number."""
+    processes: Annotated[int | None, flag("N", default="1")] = None
+    """Distribute the Gaussians over N processes on this computer, which needs less memory per
+    process. Use it with --batch of N or a multiple of N. With --deterministic or on a CPU, the
+    result is the same as that of one process."""
     deterministic: Annotated[bool, switch()] = False
     """On a GPU, make the results of repeated runs bit-identical. This needs more time and
     memory."""

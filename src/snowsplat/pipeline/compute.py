@@ -8,6 +8,7 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from snowsplat.pipeline import processes
 from snowsplat.util.errors import SettingError
 
 if TYPE_CHECKING:
@@ -22,7 +23,8 @@ class Compute:
 
     Attributes:
         device: "cpu", "cuda" or "cuda:1"; None: a GPU if a usable one is present.
-        threads: number of CPU threads; None: all cores. Results do not depend on this number.
+        threads: number of CPU threads; None: all cores, divided between the processes that train
+            together on this computer. Results do not depend on this number.
         deterministic: on a GPU, compute sums in a fixed order. Results are then bit-identical in
             every run, but the computation needs more time and memory. On a CPU, results are always
             bit-identical.
@@ -47,6 +49,8 @@ class Compute:
         Raises:
             UserError: the device is missing or unusable.
         """
+        import torch
+
         from snowsplat import ops
 
         # While a scene grows, each new tensor is a little larger than the old one. This fragments
@@ -56,7 +60,11 @@ class Compute:
             os.environ.setdefault("PYTORCH_CUDA_ALLOC_CONF", "expandable_segments:True")
         if self.threads is not None:
             ops.set_num_threads(self.threads)
+        elif processes.local_count() > 1:
+            ops.set_num_threads(max(1, ops.get_num_threads() // processes.local_count()))
         device = ops.resolve_device(self.device, note=logger.info)
+        if device.type == "cuda" and device.index is None and processes.count() > 1:
+            device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         if self.deterministic:
             _sum_in_a_fixed_order()
         return device

@@ -13,6 +13,7 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.memory_use import MemoryUse
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.processes import Setup, count, follow, joined
 from snowsplat.pipeline.time_budget import TimeBudget, check_minutes
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.training_run import TrainResult
     from snowsplat.training.checkpoint import Checkpoint
     from snowsplat.training.config import TrainConfig
+    from snowsplat.training.shards import Shards
     from snowsplat.training.trainer import Trainer
 
 # Settings that may be changed when a training run is resumed.
@@ -132,7 +134,9 @@ def train(
     options = options or TrainOptions()
     out = OutputFolder(Path(output))
     out.check_free(resume=False, overwrite=overwrite)
-    return _Job(out, options, observer, page, started).train(dataset)
+    job = _Job(out, options, observer, page, started)
+    with joined(job.device) as job.shards:
+        return job.train(dataset)
 
 
 def resume(
@@ -166,7 +170,20 @@ def resume(
     options = options or TrainOptions()
     out = OutputFolder(Path(output))
     out.check_free(resume=True, overwrite=False)
-    return _Job(out, options, observer, page, started).resume(dataset)
+    job = _Job(out, options, observer, page, started)
+    with joined(job.device) as job.shards:
+        return job.resume(dataset)
+
+
+def follow_training(compute: Compute) -> None:
+    """Take part in the training of process 0; for the other processes. Returns at its end.
+
+    Raises:
+        ProcessLost: process 0 or another process has ended with an error.
+    """
+    device = compute.apply()
+    with joined(device) as shards:
+        follow(shards, device)
 
 
 class _Job:
@@ -181,9 +198,13 @@ class _Job:
         started: float,
     ) -> None:
         from snowsplat.training import trainer  # noqa: F401 (before the memory is measured)
+        from snowsplat.training.shards import ALONE
 
         self.out, self.options, self.observer, self.page = out, options, observer, page
         self.started = started
+        self.shards: Shards = ALONE
+        if page is not None and count() > 1:
+            raise UserError("the page needs one process; leave out `view`, and use snowsplat watch")
         self.device = options.compute.apply()
         reset_peak()
         self.memory_before = resident_bytes()
@@ -220,7 +241,8 @@ class _Job:
             self.observer.note(budget.described(plan))
         if "sweep" in config.starts:
             self.observer.note("computing depth maps for the initialisation")
-        trainer = Trainer(dataset, memory.plan.config, device=self.device)
+        self.shards.of_first(Setup(settings, memory.plan.config))
+        trainer = Trainer(dataset, memory.plan.config, device=self.device, shards=self.shards)
         self.out.begin(dataset, settings, memory.plan.config)
         time_ratio = 1.0 if plan is None else plan.time_ratio
         return self._run(settings, name, trainer, budget, time_ratio, memory)
@@ -241,7 +263,11 @@ class _Job:
         config = _resumed_config(options, start, meta)
         dataset = settings.load()
         memory = self._memory(dataset, config, _gaussians_in(start))
-        trainer = Trainer(dataset, memory.plan.config, schedule, self.device, start.tensors)
+        self.shards.of_first(Setup(settings, memory.plan.config, schedule, start.path))
+        trainer = Trainer(
+            *(dataset, memory.plan.config, schedule, self.device, start.tensors),
+            shards=self.shards,
+        )
         start.tensors.clear()  # the trainer has a copy, which is the one in the memory plan
         self.out.write_config(settings, memory.plan.config)
         self.observer.note(_described(dataset))

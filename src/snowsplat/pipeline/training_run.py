@@ -13,6 +13,7 @@ from snowsplat.pipeline.checkpoint_meta import CheckpointMeta, Recipe
 from snowsplat.pipeline.memory_use import MemoryUse
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.processes import Announcement
 from snowsplat.pipeline.time_budget import TimeBudget
 from snowsplat.training.history import History
 from snowsplat.util.errors import UserError
@@ -21,6 +22,7 @@ from snowsplat.util.process_memory import peak_bytes
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.pipeline.live_page import LivePage
+    from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.time_budget.pace import Pace
     from snowsplat.training.trainer import Progress, Trainer
 
@@ -131,6 +133,7 @@ class TrainingRun:
             self.observer.steps_begin(self.first_step, self.trainer.schedule.iterations)
             try:
                 self._finish_interrupted_writes()
+                self._announce(None)
                 self.history.step_begins()
                 self.trainer.run(self._record)
             finally:
@@ -151,16 +154,24 @@ class TrainingRun:
             self.out.discard()
             raise
         else:
-            return self._finish()
+            result = self._finish()
+            self._announce(None)
+            return result
         scene = self._save_scene()
         self._save_checkpoint()
+        self._announce(None)
         raise TrainingStopped(f"stopped after step {self.trainer.step}: {scene}", scene)
+
+    def _announce(self, announcement: Announcement | None) -> None:
+        """Tell the other processes what to do; None: go on with the next step, or end."""
+        self.trainer.shards.of_first(announcement)
 
     def _record(self, progress: Progress) -> None:
         # If there are metrics, the time of the step includes an evaluation and is not counted.
         timed = progress.metrics is None
         self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=timed)
         self._after_step(progress)
+        self._announce(None)
         self.history.step_begins()
 
     def _after_step(self, progress: Progress) -> None:
@@ -175,7 +186,7 @@ class TrainingRun:
             self._told_end = True
         if self._checkpoint_is_due(progress.step):
             self._save_checkpoint()
-        if progress.step in self.save_iterations:
+        if self.trainer.schedule.contains(progress.step, self.save_iterations):
             self._save_scene()
         if self.page is not None:
             paused = self.page.after_step(
@@ -192,6 +203,7 @@ class TrainingRun:
                 schedule, progress.step, progress.downscale, progress.gaussians
             )
             if length is not None:
+                self._announce(Announcement("stretch", progress.step, length))
                 schedule.stretch(progress.step, length)
 
     def _seconds_left(self, progress: Progress) -> float:
@@ -212,7 +224,7 @@ class TrainingRun:
     def _checkpoint_is_due(self, step: int) -> bool:
         every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
         if every:
-            return step % every == 0
+            return self.trainer.schedule.multiples(step, every) > 0
         return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
 
     def _finish_interrupted_writes(self) -> None:
@@ -224,12 +236,21 @@ class TrainingRun:
 
         step = self.first_step
         checkpoint.remove_old(self.out.checkpoints, step)
-        if step in self.save_iterations and step not in self.out.scenes():
+        due = step > 0 and self.trainer.schedule.contains(step, self.save_iterations)
+        if due and step not in self.out.scenes():
             self._save_scene()
 
     def _save_scene(self) -> Path:
+        return self._write_scene(self._all_gaussians())
+
+    def _write_scene(self, gaussians: Gaussians) -> Path:
         self._restore_folder()
-        return self.out.write_scene(self.trainer.step, self.trainer.gaussians)
+        return self.out.write_scene(self.trainer.step, gaussians)
+
+    def _all_gaussians(self) -> Gaussians:
+        """The Gaussians of all processes."""
+        self._announce(Announcement("scene"))
+        return self.trainer.shards.collect(self.trainer.gaussians)
 
     def _restore_folder(self) -> None:
         """Create the folder again if it was moved or removed, so that the training is not lost."""
@@ -249,6 +270,7 @@ class TrainingRun:
             meta = replace(meta, schedule=self.trainer.schedule)
         # Write the history first: a run that resumes from the checkpoint needs the curves up to it.
         self.history.write(self.out.history)
+        self._announce(Announcement("checkpoint"))
         path = checkpoint.save(
             self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta.as_json()
         )
@@ -274,15 +296,17 @@ class TrainingRun:
 
     def _finish(self) -> TrainResult:
         step = self.trainer.step
-        scene = self._save_scene()
+        gaussians = self._all_gaussians()
+        scene = self._write_scene(gaussians)
         seconds, memory = time.monotonic() - self.started, self.memory.peak()
         if self.trainer.dataset.test:
             if self.evaluation is None or self.evaluation[0] != step:
+                self._announce(Announcement("evaluate"))
                 self._record_evaluation(step, self.trainer.evaluate())
             assert self.evaluation is not None
             self.out.write_metrics(step, "test", self.evaluation[1], self._left_out())
         self.history.write(self.out.history)
-        report = self._write_report()
+        report = self._write_report(gaussians)
         time_used = None
         if self.budget is not None:
             self.out.write_config(self.settings, replace(self.config, iterations=step))
@@ -292,7 +316,7 @@ class TrainingRun:
             report=report,
             step=step,
             first_step=self.first_step,
-            gaussians=len(self.trainer.gaussians),
+            gaussians=len(gaussians),
             seconds=seconds,
             memory=memory,
             reductions=self.memory.plan.reductions,
@@ -304,7 +328,7 @@ class TrainingRun:
         self.observer.trained(result)
         return result
 
-    def _write_report(self) -> Path:
+    def _write_report(self, gaussians: Gaussians) -> Path:
         from snowsplat.training.config import config_to_json
         from snowsplat.training.report import Trained, write_training_report
 
@@ -318,7 +342,7 @@ class TrainingRun:
             Trained(
                 name=out.resolve().name if out.is_absolute() else str(out),
                 dataset=self.trainer.dataset,
-                gaussians=self.trainer.gaussians,
+                gaussians=gaussians,
                 step=self.trainer.step,
                 background=self.out.settings()[1],
                 history=self.history,
