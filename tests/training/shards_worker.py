@@ -1,9 +1,9 @@
-"""A process of a training run of several processes, for the tests: trains and saves the result.
+"""A process of a training run of several processes, for the tests: trains and saves the results.
 
-    torchrun … shards_worker.py DATASET OUTPUT SETTINGS
+    python shards_worker.py DATASET OUTPUT RUNS
 
-SETTINGS are the arguments of `recipe`, as JSON. Process 0 writes the state, the losses, and the
-metrics of the test views.
+RUNS is a list of keyword arguments of `recipe`, as JSON. Process 0 writes for each of them the state,
+the losses, the PSNR of the test views, and the number of bytes that each process has sent.
 """
 
 from __future__ import annotations
@@ -13,32 +13,35 @@ import sys
 from pathlib import Path
 
 import torch
-import torch.distributed as dist
 
 from snowsplat import ops
 from snowsplat.data.load import load_dataset
+from snowsplat.pipeline.processes import joined
 from snowsplat.training.process_shards import ProcessShards
 from snowsplat.training.recipes import recipe
-from snowsplat.training.shards import ALONE
 from snowsplat.training.trainer import Trainer
 
 
-def main(dataset: str, output: str, text: str) -> None:
-    settings = json.loads(text)
-    stops = settings.pop("stops", None)
-    name = settings.pop("recipe", "default")
+def main(dataset: str, output: str, runs: str) -> None:
     ops.set_num_threads(1)
-    dist.init_process_group("gloo")
-    shards = ProcessShards(torch.device("cpu")) if dist.get_world_size() > 1 else ALONE
-    config = recipe(name, **settings)
-    losses = []
-    trainer = Trainer(load_dataset(dataset, hold_out=4), config, shards=shards)
-    trainer.run(lambda progress: losses.append(progress.loss), until=stops)
-    state = trainer.state_tensors()
-    metrics = trainer.evaluate()
-    if shards.rank == 0:
-        torch.save({"state": state, "losses": losses, "psnr": metrics.psnr}, Path(output))
-    dist.destroy_process_group()
+    results = []
+    with joined(torch.device("cpu")) as shards:
+        for settings in json.loads(runs):
+            losses: list[float] = []
+            trainer = Trainer(load_dataset(dataset, hold_out=4), recipe(**settings), shards=shards)
+            trainer.run(lambda progress, losses=losses: losses.append(progress.loss))
+            sent = shards.sent_bytes if isinstance(shards, ProcessShards) else 0
+            results.append(
+                {
+                    "state": trainer.state_tensors(),
+                    "losses": losses,
+                    "psnr": trainer.evaluate().psnr,
+                    "left_out": trainer.left_out,
+                    "sent": shards.table(torch.tensor([sent])).flatten().tolist(),
+                }
+            )
+        if shards.rank == 0:
+            torch.save(results, Path(output))
 
 
 if __name__ == "__main__":

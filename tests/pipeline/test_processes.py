@@ -1,0 +1,126 @@
+"""`train --processes` and `torchrun`: the same files as one process; a process that ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from snowsplat.pipeline import processes
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.util.errors import UserError
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc, and the name lo")
+FLAGS = ["--iterations", "120", "--batch", "4", "--checkpoint-every", "40", "--eval", "-q"]
+SCENE = "point_cloud/iteration_120/point_cloud.ply"
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "snowsplat", "train", *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("processes")
+    return write_toy_dataset(root / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
+
+
+@pytest.fixture(scope="module")
+def scene(dataset: Path) -> bytes:
+    """The scene that one process trains."""
+    out = dataset.parent / "alone"
+    subprocess.run(command(dataset, "-o", out, *FLAGS), check=True, timeout=300)
+    return (out / SCENE).read_bytes()
+
+
+@pytest.mark.slow
+def test_several_processes_write_the_files_of_one(dataset, scene, tmp_path):
+    out = tmp_path / "out"
+    run = command(dataset, "-o", out, *FLAGS, "--processes", 3)
+    done = subprocess.run(run, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert re.search(r"120 steps in .*\n.*report of the training\nstep 120: \d views", done.stdout)
+    assert (out / SCENE).read_bytes() == scene
+    names = {path.name for path in (dataset.parent / "alone").iterdir()}
+    assert {path.name for path in out.iterdir()} == names
+
+
+@pytest.mark.slow
+def test_a_killed_process_ends_all_and_another_number_of_processes_resumes(
+    dataset, scene, tmp_path
+):
+    out = tmp_path / "out"
+    run = command(dataset, "-o", out, *FLAGS, "--processes", 3)
+    parent = subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        while not list(out.glob("checkpoints/step_*")):
+            assert parent.poll() is None
+            time.sleep(0.02)
+        children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+        assert len(children) == 3
+        os.kill(int(children[2]), signal.SIGKILL)
+        killed = time.monotonic()
+        _, errors = parent.communicate(timeout=60)
+        assert time.monotonic() - killed < 30  # on a busy machine; usually 3 s
+    finally:
+        parent.kill()
+    assert parent.returncode == 2
+    assert errors.splitlines() == [
+        "snowsplat: lost the connection to another process of the training, which has ended; rerun "
+        "the command with --resume to continue from the last checkpoint",
+        "snowsplat: process 2 was ended by SIGKILL",
+    ]
+    assert not any(Path(f"/proc/{child}").exists() for child in children)
+    subprocess.run(command("-o", out, "--resume", "-q", "--processes", 2), check=True, timeout=300)
+    assert (out / SCENE).read_bytes() == scene
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_the_scene_and_a_checkpoint(dataset, tmp_path):
+    out = tmp_path / "out"
+    flags = [flag if flag != "120" else "100000" for flag in FLAGS]
+    run = command(dataset, "-o", out, *flags, "--processes", 2)
+    parent = subprocess.Popen(run, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        while not list(out.glob("checkpoints/step_*")):
+            assert parent.poll() is None
+            time.sleep(0.02)
+        os.killpg(parent.pid, signal.SIGINT)
+        output, _ = parent.communicate(timeout=60)
+    finally:
+        parent.kill()
+    assert parent.returncode == 130
+    step = int(re.search(r"stopped after step (\d+)", output)[1])
+    assert (out / f"point_cloud/iteration_{step}/point_cloud.ply").exists()
+    assert (out / f"checkpoints/step_{step:06d}.safetensors").exists()
+
+
+@pytest.mark.slow
+def test_torchrun(dataset, scene, tmp_path):
+    run = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    run += ["-m", "snowsplat", "train", str(dataset), "-o", str(tmp_path / "out"), *FLAGS]
+    subprocess.run(run, check=True, timeout=300, stderr=subprocess.DEVNULL)
+    assert (tmp_path / "out" / SCENE).read_bytes() == scene
+
+
+@pytest.mark.slow
+def test_an_error_of_the_first_process_is_reported_once(dataset, tmp_path):
+    run = command(dataset, "-o", tmp_path / "out", "--images", "absent", "--processes", 2)
+    done = subprocess.run(run, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "absent" in done.stderr
+
+
+def test_the_number_of_processes():
+    with pytest.raises(UserError, match="0 processes are too few"):
+        processes.launch(0, [])
+    assert processes.count() == 1
+    assert processes.is_first()

@@ -1,0 +1,105 @@
+"""Training in several processes: the same bits as in one process, for each density control."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training.shards import ALONE, share
+
+from ..ports import unused_port
+
+WORKER = Path(__file__).with_name("shards_worker.py")
+# All kinds of density control and of hooks between the steps; the last batch has fewer views.
+DENSE = {"iterations": 122, "densify_from": 20, "densify_interval": 20, "max_gaussians": 900}
+RUNS = [
+    {**DENSE, "batch": 4, "stop_overfitting": True, "leave_out_after": 0.3},
+    {**DENSE, "batch": 3, "name": "mcmc-short", "densify_until": 100, "test_iterations": (50,)},
+    {
+        **DENSE,
+        "batch": 2,
+        "name": "paper",
+        "opacity_reset_interval": 40,
+        "background": "random",
+        "visible_only": False,
+    },
+]
+
+
+def trained(folder: Path, processes: int) -> list[dict]:
+    shared = {
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(unused_port()),
+        "WORLD_SIZE": str(processes),
+        "GLOO_SOCKET_IFNAME": "lo",
+    }
+    output = folder / f"{processes}.pt"
+    command = [sys.executable, WORKER, folder / "dataset", output, json.dumps(RUNS)]
+    running = [
+        subprocess.Popen(command, env=os.environ | shared | {"RANK": str(rank)})
+        for rank in range(processes)
+    ]
+    try:
+        assert [process.wait(300) for process in running] == [0] * processes
+    finally:
+        for process in running:
+            process.kill()
+    return torch.load(output)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("shards")
+    write_toy_dataset(folder / "dataset", "colmap-bin", 9, 48, 36, n_points=400)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def alone(folder: Path) -> list[dict]:
+    return trained(folder, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the network interface has another name")
+@pytest.mark.parametrize("processes", [2, 4])
+def test_several_processes_give_the_same_bits(
+    folder: Path, alone: list[dict], processes: int
+) -> None:
+    together = trained(folder, processes)
+    for one, several in zip(alone, together, strict=True):
+        assert len(one["state"]["gaussians.means"]) > 300
+        assert several["losses"] == one["losses"]
+        assert several["psnr"] == one["psnr"]
+        assert several["left_out"] == one["left_out"]
+        assert several["state"].keys() == one["state"].keys()
+        for name, tensor in one["state"].items():
+            assert torch.equal(several["state"][name], tensor), name
+        assert min(several["sent"]) > 0
+
+
+@pytest.mark.parametrize("rows", [0, 1, 63, 64, 65, 1000, 1_000_000])
+@pytest.mark.parametrize("size", [1, 2, 3, 8])
+def test_shards_contain_all_rows_and_begin_at_multiples_of_64(rows: int, size: int) -> None:
+    shards = [share(rows, rank, size) for rank in range(size)]
+    assert shards[0][0] == 0
+    assert shards[-1][1] == rows
+    assert all(a[1] == b[0] for a, b in zip(shards, shards[1:], strict=False))
+    assert all(first % 64 == 0 or first == rows for first, _ in shards)
+    sizes = [end - first for first, end in shards]
+    assert max(sizes) - min(sizes) <= 128
+
+
+def test_one_process_has_all_rows() -> None:
+    rows = torch.arange(6.0).reshape(3, 2)
+    index = torch.tensor([2, 0, 2])
+    assert torch.equal(ALONE.selection(index)(rows), rows[index])
+    assert ALONE.all_rows(rows) is rows
+    assert ALONE.own_rows(rows) is rows
+    assert (ALONE.total(3), ALONE.first(3)) == (3, 0)
