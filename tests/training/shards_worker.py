@@ -2,8 +2,8 @@
 
     python shards_worker.py DATASET OUTPUT RUNS
 
-RUNS is a list of keyword arguments of `recipe`, as JSON. Process 0 writes for each of them the state,
-the losses, the PSNR of the test views, and the number of bytes that each process has sent.
+RUNS is a list of keyword arguments of `recipe`, as JSON. For each of them, process 0 writes the
+state, the losses, the PSNR of the test views, and the number of bytes that each process has sent.
 """
 
 from __future__ import annotations

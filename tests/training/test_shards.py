@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -90,7 +91,7 @@ def test_shards_contain_all_rows_and_begin_at_multiples_of_64(rows: int, size: i
     shards = [share(rows, rank, size) for rank in range(size)]
     assert shards[0][0] == 0
     assert shards[-1][1] == rows
-    assert all(a[1] == b[0] for a, b in zip(shards, shards[1:], strict=False))
+    assert all(a[1] == b[0] for a, b in pairwise(shards))
     assert all(first % 64 == 0 or first == rows for first, _ in shards)
     sizes = [end - first for first, end in shards]
     assert max(sizes) - min(sizes) <= 128

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +14,6 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
-from snowsplat.training.losses import view_loss
 from snowsplat.training.shards import Shards
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.view_gradient import ViewGradient
@@ -44,7 +43,7 @@ def batch_gradients(
     runner: StepRunner,
     shards: Shards,
     sh_degree: int,
-    ssim_weight: float,
+    loss_of: Callable[[Tensor, BatchView], Tensor],
 ) -> list[ViewGradient]:
     """The gradients of the mean loss of the batch with respect to the splats of each view.
 
@@ -52,6 +51,7 @@ def batch_gradients(
         gaussians: those of this process.
         batch: the views, the same in every process.
         runner: rasterizes, and runs the backward pass.
+        loss_of: the loss of an image (H, W, 3) of a view whose photo this process has.
     """
     views = rounds(batch, shards.size)
     found: list[tuple[Splats2D, BatchView]] = []
@@ -63,10 +63,9 @@ def batch_gradients(
         loss = None
         if blended is not None:
             own = group[shards.rank]
-            assert own.photo is not None
             with torch.enable_grad():  # `project` is outside: the optimiser computes its gradient
                 image = runner.rasterize(blended, own.camera, own.background)
-                loss = view_loss(image, own.photo, own.background, ssim_weight)
+                loss = loss_of(image, own)
         runner.backward(loss, share=1.0 / len(batch), last=number == len(views) - 1)
         shards.return_gradients(blended, splats, absolute=runner.abs_grad)
         found += zip(splats, group, strict=True)

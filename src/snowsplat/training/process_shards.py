@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -13,8 +13,6 @@ from snowsplat.ops.scratch import take_rows
 from snowsplat.ops.splats import COLORS, Splats2D, packed_width
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.shards import Shards, share
-
-T = TypeVar("T")
 
 
 class ProcessShards(Shards):
@@ -155,8 +153,8 @@ class ProcessShards(Shards):
     def any(self, flag: bool) -> bool:
         return bool(self.table(torch.tensor([flag], device=self._device)).any())
 
-    def of_first(self, value: T) -> T:
-        values: list[T] = [value]
+    def of_first(self, value: Any) -> Any:
+        values = [value]
         dist.broadcast_object_list(values, src=0, device=self._device)
         return values[0]
 

@@ -15,15 +15,13 @@ So a view is blended from the same rows in the same order, and the result is the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from typing import Any
 
 from torch import Tensor
 
 from snowsplat.ops.scratch import take_rows
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.gaussians import Gaussians
-
-T = TypeVar("T")
 
 
 class Shards:
@@ -108,7 +106,7 @@ class Shards:
         """Whether the flag is set in at least one process."""
         return flag
 
-    def of_first(self, value: T) -> T:
+    def of_first(self, value: Any) -> Any:
         """The value of process 0, in every process."""
         return value
 

@@ -96,7 +96,8 @@ class StepRunner:
         self._shards = shards
         self._nonfinite_rows = torch.zeros(len(PARAMETERS), dtype=torch.int32, device=device)
         self._own_views = -(-batch // shards.size)  # at most, of a step
-        self._losses: list[Tensor] = []  # of the views of this process in the present step
+        # Of the views of this process in the present step, until the read-back starts.
+        self._losses: list[Tensor] = []
         self._required = self.capacity.required
         self._valid: Tensor | None = None
         numbers = self._own_views + 2 + len(PARAMETERS)
@@ -148,6 +149,7 @@ class StepRunner:
         )
         valid = losses.isfinite().all() & (required <= instances).all() & ~rows.any()
         self._valid = valid.reshape(1)
+        self._losses, self._required = [], torch.zeros_like(self._required)
 
     def gradient(self, splats: Splats2D, camera: Camera, sh_degree: int) -> ViewGradient:
         """The gradient of a view, after the last backward pass of the step."""
@@ -174,7 +176,6 @@ class StepRunner:
             Diverged: a loss is not finite, or the update of the previous step was not.
         """
         while True:
-            self._losses, self._required = [], torch.zeros_like(self._required)
             optimize()
             # The complete step is queued. A GPU computes it while the CPU waits for the losses.
             values = self._readback.wait()

@@ -18,6 +18,7 @@ from snowsplat.training.config import TrainConfig
 from snowsplat.training.decay import Decay
 from snowsplat.training.finite import check_state
 from snowsplat.training.init import initial_gaussians, starts_at_random
+from snowsplat.training.losses import view_loss
 from snowsplat.training.near_limit import NearLimit
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
@@ -252,11 +253,16 @@ class Trainer:
             self._runner,
             self.shards,
             self.config.sh_degree_at(step),
-            self.config.ssim_weight,
+            self._loss,
         )
         for gradient in gradients:
             self._density.after_backward(step, self.gaussians, gradient)
         self._optimizer.step(self.gaussians, gradients, step)
+
+    def _loss(self, image: Tensor, view: BatchView) -> Tensor:
+        photo, background = view.photo, view.background
+        assert photo is not None
+        return view_loss(image, photo, background, self.config.ssim_weight)
 
     def evaluate(self) -> Evaluation:
         """Metrics of the test views in the current state. Black replaces a random background."""
