@@ -55,19 +55,19 @@ GROWTH = 1.3
 
 
 class StepRunner:
-    """Runs training steps: capacity, validity, read-back, repetition and `Diverged`.
+    """Runs training steps: capacity, validity, read-back, repetition and `Diverged`::
 
-    def optimize() -> None:
-        splats = project(gaussians, camera, sh_degree)
-        with torch.enable_grad():
-            image = runner.rasterize(splats, camera, background)
-            loss = view_loss(image, photo, background, ssim_weight)
-        runner.backward(loss)
-        gradient = runner.gradient(splats, camera, sh_degree)
-        density.after_backward(step, gaussians, gradient)
-        optimizer.step(gaussians, [gradient], step)
+        def optimize() -> None:
+            splats = project(gaussians, camera, sh_degree)
+            with torch.enable_grad():
+                image = runner.rasterize(splats, camera, background)
+                loss = view_loss(image, photo, background, ssim_weight)
+            runner.backward(loss)
+            gradient = runner.gradient(splats, camera, sh_degree)
+            density.after_backward(step, gaussians, gradient)
+            optimizer.step(gaussians, [gradient], step)
 
-    [loss] = runner.run(optimize, step, gaussians, [view])
+        [loss] = runner.run(optimize, step, gaussians, [view])
 
     With a batch of views, the forward and the backward pass run once for each view, and there is
     one gradient for each view; see `batch_gradients`.
