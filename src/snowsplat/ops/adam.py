@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from snowsplat.ops.check import check_tensor, variant
+from snowsplat.ops.check import check_ids, check_tensor, variant
 from snowsplat.ops.native import launch
 from snowsplat.ops.params import AdamStepParams, AdamTensor
 from snowsplat.ops.projection import camera_params, check_parameters
@@ -86,10 +86,7 @@ def adam_step(
     if packed_grad is not None:
         check_tensor("adam_step", "packed_grad", packed_grad, (len(ids), packed_width(3)), means)
         packed_grad = packed_grad.contiguous()
-    if ids.dtype != torch.int32 or ids.device != means.device:
-        raise ValueError(
-            f"adam_step: ids must be torch.int32 on {means.device}, got {ids.dtype} on {ids.device}"
-        )
+    check_ids("adam_step", ids, means)
     if nonfinite_rows is not None:
         fits = nonfinite_rows.shape == (len(PARAMETERS),) and nonfinite_rows.dtype == torch.int32
         if not (fits and nonfinite_rows.device == means.device and nonfinite_rows.is_contiguous()):

@@ -23,6 +23,14 @@ def check_tensor(
         raise ValueError(f"{op}: {name} must be on {like.device}, got {tensor.device}")
 
 
+def check_ids(op: str, ids: Tensor, like: Tensor) -> None:
+    """Raises ValueError unless `ids` is int32, on the device of `like`."""
+    if ids.dtype != torch.int32 or ids.device != like.device:
+        raise ValueError(
+            f"{op}: ids must be torch.int32 on {like.device}, got {ids.dtype} on {ids.device}"
+        )
+
+
 def check_float(op: str, name: str, tensor: Tensor) -> None:
     if tensor.dtype not in FLOATS:
         raise ValueError(f"{op}: {name} must be float32 or float64, got {tensor.dtype}")

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from snowsplat.ops import scratch
-from snowsplat.ops.check import check_float, check_size, check_tensor, variant
+from snowsplat.ops.check import check_float, check_ids, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
 from snowsplat.ops.params import (
     CameraParams,
@@ -103,7 +103,8 @@ def add_project_gradients(
     Args:
         params: the parameters of the Gaussians, as for `adam_step`.
         grads: tensors of the same names and shapes, contiguous; changed in place.
-        ids, packed_grad: `splats.ids` (M,), and `splats.packed.grad` (M, 16).
+        ids, packed_grad: `splats.ids` (M,), ascending, and `splats.packed.grad` (M, 16). On a GPU,
+            rows with id -1 may be present or removed.
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """
@@ -115,9 +116,10 @@ def add_project_gradients(
         check_tensor("add_project_gradients", f"grads[{name!r}]", grads[name], shape, tensor)
     shape = (len(ids), packed_width(3))
     check_tensor("add_project_gradients", "packed_grad", packed_grad, shape, means)
+    check_ids("add_project_gradients", ids, means)
     pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
     camera = camera_params("add_project_gradients", pose, width, height, fx, fy, cx, cy)
-    launch(
+    done = launch(
         variant("project_bwd", means),
         ProjectBackwardParams(
             n=len(ids),
@@ -129,6 +131,11 @@ def add_project_gradients(
             pose=None,
         ),
     )
+    if done < 0:
+        raise ValueError(
+            "add_project_gradients: on the CPU ids must be rows of the parameters; "
+            "remove the splats of id -1"
+        )
 
 
 def camera_params(

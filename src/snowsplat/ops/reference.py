@@ -222,6 +222,40 @@ def _half_extents(variances: Tensor, opacities: Tensor) -> Tensor:
     return (2 * torch.log(opacities / ALPHA_MIN)[:, None] * variances).sqrt()
 
 
+@torch.no_grad()
+def add_project_gradients(
+    params: Mapping[str, Tensor],
+    grads: Mapping[str, Tensor],
+    ids: Tensor,
+    packed_grad: Tensor,
+    cam_from_world: Tensor,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sh_degree: int,
+) -> None:
+    """Propagates the gradient of splats through `project`, and adds the result to ``grads``.
+
+    Args:
+        params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of
+            `project`.
+        grads: tensors of the same names and shapes; changed in place.
+        ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns).
+    """
+    rows = ids.long()
+    with torch.enable_grad():
+        selected = [params[name].detach()[rows].requires_grad_() for name in PARAMETERS]
+        view = (cam_from_world.to(packed_grad), width, height, fx, fy, cx, cy, sh_degree)
+        splats, _ = _project_rows(selected, *view)
+        of_rows = torch.autograd.grad(splats.packed, selected, packed_grad)
+    for name, grad in zip(PARAMETERS, of_rows, strict=True):
+        grads[name][rows] += grad
+
+
 # -------------------------------------------------------------------------------------- rasterize
 
 
@@ -456,7 +490,7 @@ def adam_step(
     exp_avg: Mapping[str, Tensor],
     exp_avg_sq: Mapping[str, Tensor],
     ids: Tensor,
-    packed_grad: Tensor,
+    packed_grad: Tensor | None,
     cam_from_world: Tensor,
     *,
     width: int,
@@ -480,7 +514,8 @@ def adam_step(
         params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of
             `project`. If `.grad` is not None (from a regulariser), it is added to the gradient.
         exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
-        ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns).
+        ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns). If `packed_grad`
+            is None, the gradient is only `.grad`, and `ids` are the visible rows.
         lr: the learning rate of each parameter.
         step: the number of this step, from 1 on.
         visible_only: whether rows that are not in `ids` keep their values and moments. If False,
@@ -497,17 +532,26 @@ def adam_step(
     if valid is not None and not valid:
         return
     rows = ids.long()
-    with torch.enable_grad():
-        selected = [params[name].detach()[rows].requires_grad_() for name in PARAMETERS]
-        view = (cam_from_world.to(packed_grad), width, height, fx, fy, cx, cy, sh_degree)
-        splats, _ = _project_rows(selected, *view)
-        grads = torch.autograd.grad(splats.packed, selected, packed_grad)
+    grads = {name: torch.zeros_like(params[name]) for name in PARAMETERS}
+    if packed_grad is not None:
+        add_project_gradients(
+            params,
+            grads,
+            ids,
+            packed_grad,
+            cam_from_world,
+            width=width,
+            height=height,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            sh_degree=sh_degree,
+        )
 
     beta1, beta2 = betas
-    for i, (name, visible_grad) in enumerate(zip(PARAMETERS, grads, strict=True)):
+    for i, (name, grad) in enumerate(grads.items()):
         p = params[name]
-        grad = torch.zeros_like(p)
-        grad[rows] = visible_grad
         if p.grad is not None:
             grad += p.grad
         m = beta1 * exp_avg[name] + (1 - beta1) * grad

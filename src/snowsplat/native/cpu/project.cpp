@@ -1,5 +1,6 @@
 // project: the Gaussians that a camera sees (project_cull), their 2D splats (project_fwd), and the
 // gradients of the parameters and the pose from the gradients of the splats (project_bwd).
+#include <algorithm>
 #include <cstring>
 #include <vector>
 
@@ -105,10 +106,12 @@ SNOW_INLINE void add_rows(T* base, int64_t stride, const RowIndex<V::width>& row
   scatter_rows(base, stride, rows.row, rows.count, columns, sum);
 }
 
+// If an id is negative, returns −1 and changes nothing: only a GPU creates such rows.
 template <class V, class T = typename V::Scalar>
 int64_t backward(const ProjectBackwardParams<T>& p) {
   constexpr int W = V::width;
   const int64_t n = p.n;
+  if (std::any_of(p.ids, p.ids + n, [](int32_t id) { return id < 0; })) return -1;
   const GaussianTensors<T>& tensors = p.gaussians;
   const GaussianGradients<T>& grads = p.grads;
   const int degree = int(tensors.sh_degree);
