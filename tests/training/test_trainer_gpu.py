@@ -89,12 +89,14 @@ def backward_by_hand(loss: Tensor) -> None:
     node.variable.grad = grads[0]
 
 
+@pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize("deterministic", [False, True])
 @every_density_control
 def test_a_step_waits_for_nothing_and_mixes_no_devices(
     dataset: Dataset,
     config: TrainConfig,
     deterministic: bool,
+    batch: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With fake tensors, which have a device but no values: reading one is an error."""
@@ -109,8 +111,8 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
     def launch(name: str, params: Params) -> int:
         return launch_by(record, name, params)
 
-    trainer = Trainer(dataset, config)
-    [view] = trainer._next_batch(1)
+    trainer = Trainer(dataset, replace(config, batch=batch))
+    view = trainer._next_batch(1)[0]
     assert view.photo is not None
     monkeypatch.setitem(LAUNCHERS, "cuda", launch)
     monkeypatch.setattr(Tensor, "backward", backward_by_hand)
@@ -136,13 +138,14 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
         )
         torch.use_deterministic_algorithms(deterministic)
         try:
-            trainer._optimize(1, [view])
+            trainer._optimize(1, [view] * batch)
         finally:
             torch.use_deterministic_algorithms(False)
     order = ["project_fwd", "tiles_", "rasterize_fwd", "photometric", "rasterize_bwd", "adam_"]
     places = [min(i for i, name in enumerate(seen) if part in name) for part in order]
     assert places == sorted(places), seen
     assert ("splats_reduce" in seen) == deterministic
+    assert seen.count("project_bwd") == (batch if batch > 1 else 0)
 
 
 @pytest.mark.gpu

@@ -106,7 +106,7 @@ def joined(device: torch.device) -> Iterator[Shards]:
     backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
     try:
         dist.init_process_group(backend, timeout=_TIMEOUT)
-        yield ProcessShards(device)
+        yield ProcessShards(device, local_count() if device.type == "cpu" else 1)
     except RuntimeError as error:
         if isinstance(error, dist.DistError) or "gloo" in str(error) or "onnection" in str(error):
             raise ProcessLost(_LOST) from None

@@ -67,7 +67,8 @@ class TrainConfig:
             never.
         stop_overfitting: whether the training ends earlier if the views between the photos become
             worse; see `overfitting`.
-        image_memory: bytes for decoded images; 0: half of the available memory.
+        image_memory: bytes for decoded images, in each process; 0: half of the available memory,
+            for all processes of the computer together.
         test_iterations: steps after which `Trainer.run` evaluates the test views.
         checkpoint_every: number of steps between two checkpoints; 0: none. The caller of
             `Trainer.run` writes them.

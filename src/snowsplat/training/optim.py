@@ -136,17 +136,20 @@ def _add_up(parameters: Mapping[str, Tensor], gradients: Sequence[ViewGradient])
     """Add the gradients of several views to ``.grad`` of the parameters.
 
     Returns:
-        The ids of the Gaussians that at least one of the views shows, ascending.
+        The ids of the Gaussians that at least one of the views shows, ascending. On a GPU there is
+        a row for each Gaussian, with -1 for the others: the CPU need not wait for their number.
     """
     sums = {}
     for name, parameter in parameters.items():
         sums[name] = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
         parameter.grad = sums[name]
     means = parameters["means"]
-    seen = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    # The index -1, an empty row, is the last element: it is no Gaussian.
+    seen = torch.zeros(len(means) + 1, dtype=torch.bool, device=means.device)
     for gradient in gradients:
         gradient.add_to(parameters, sums)
         ids = gradient.splats.ids
         assert ids is not None
-        seen[ids[ids >= 0].long()] = True
-    return torch.nonzero(seen)[:, 0].to(torch.int32)
+        seen[ids.long()] = True
+    rows = torch.arange(len(means), dtype=torch.int32, device=means.device)
+    return rows[seen[:-1]] if means.device.type == "cpu" else rows.where(seen[:-1], -1)

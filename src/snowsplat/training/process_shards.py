@@ -23,8 +23,9 @@ class ProcessShards(Shards):
             processes.
     """
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: torch.device, in_memory: int = 1) -> None:
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
+        self.in_memory = in_memory
         self.sent_bytes = 0
         self._device = device
         self._received: list[int] = []  # rows of the last exchange, for each sender

@@ -30,10 +30,12 @@ class Shards:
     Attributes:
         rank: the number of this process.
         size: the number of processes.
+        in_memory: the number of processes that use the memory of the device of this process.
     """
 
     rank = 0
     size = 1
+    in_memory = 1
 
     # Rows
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import ImageLoader, available_memory
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.batch import BatchView, batch_gradients
@@ -131,7 +131,8 @@ class Trainer:
         self._images = ImageLoader(
             dataset.train,
             background=fixed,
-            budget_bytes=config.image_memory or None,
+            budget_bytes=config.image_memory
+            or available_memory(self.device) // (2 * shards.in_memory),
             device=self.device,
         )
         # The Gaussians of a resumed training run are replaced by those of the state.
