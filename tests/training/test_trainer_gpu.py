@@ -75,9 +75,9 @@ def test_a_loss_that_is_not_finite_changes_nothing(
             assert torch.equal(tensor, before[name]), name
 
 
-def backward_by_hand(loss: Tensor) -> None:
+def backward_by_hand(loss: Tensor, gradient: Tensor | None = None) -> None:
     """`loss.backward()` along a chain, in this thread: autograd's GPU threads need a real GPU."""
-    node, grads = loss.grad_fn, [torch.ones_like(loss)]
+    node, grads = loss.grad_fn, [torch.ones_like(loss) if gradient is None else gradient]
     while "AccumulateGrad" not in type(node).__name__:
         by_us = getattr(node, "_forward_cls", None)
         found = node(*grads) if by_us is None else by_us.backward(node, *grads)

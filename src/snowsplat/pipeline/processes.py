@@ -7,6 +7,7 @@ operation that needs the others, it announces the operation; `follow` runs in th
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import socket
@@ -14,11 +15,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from tempfile import TemporaryFile
+from typing import IO, TYPE_CHECKING
 
 from snowsplat.util.errors import UserError
 
@@ -35,10 +37,12 @@ if TYPE_CHECKING:
 _TIMEOUT = timedelta(hours=2)
 # After one process has ended, the others have this time to end by themselves.
 _GRACE_SECONDS = 5.0
-_LOST = (
-    "lost the connection to another process of the training, which has ended; rerun the command "
-    "with --resume to continue from the last checkpoint"
-)
+_CONTINUE = "rerun the command with --resume to continue from the last checkpoint"
+_LOST = f"lost the connection to another process of the training, which has ended; {_CONTINUE}"
+# Processes that `launch` has started end with this exit code when they lose the connection: they
+# leave it to `launch` to report the process that was the first to end.
+_LAUNCHED = "SNOWSPLAT_LAUNCHED"
+_LOST_CODE = 75  # EX_TEMPFAIL of sysexits.h
 
 
 class ProcessLost(UserError):
@@ -109,6 +113,8 @@ def joined(device: torch.device) -> Iterator[Shards]:
         yield ProcessShards(device, local_count() if device.type == "cpu" else 1)
     except RuntimeError as error:
         if isinstance(error, dist.DistError) or "gloo" in str(error) or "onnection" in str(error):
+            if _LAUNCHED in os.environ:
+                raise SystemExit(_LOST_CODE) from None
             raise ProcessLost(_LOST) from None
         raise
     finally:
@@ -173,39 +179,72 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
         "MASTER_PORT": str(port),
         "WORLD_SIZE": str(processes),
         "LOCAL_WORLD_SIZE": str(processes),
+        _LAUNCHED: "1",
     }
     if sys.platform == "linux":
         shared["GLOO_SOCKET_IFNAME"] = "lo"
-    running = []
-    for rank in range(processes):
-        environment = os.environ | shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
-        quiet = None if rank == 0 else subprocess.DEVNULL
-        running.append(subprocess.Popen(command, env=environment, stdout=quiet, stderr=quiet))
-    try:
-        return _wait(running)
-    finally:
-        for process in running:
-            process.kill()
-            process.wait()
+    with ExitStack() as files:
+        running, errors = [], []
+        for rank in range(processes):
+            environment = os.environ | shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
+            output = None if rank == 0 else subprocess.DEVNULL
+            error = None if rank == 0 else files.enter_context(TemporaryFile())
+            errors.append(error)
+            running.append(subprocess.Popen(command, env=environment, stdout=output, stderr=error))
+        try:
+            failed = _wait(running)
+        finally:
+            for process in running:
+                process.kill()
+                process.wait()
+        return _exit_code(running, failed, errors)
 
 
-def _wait(running: Sequence[subprocess.Popen[bytes]]) -> int:
-    """Wait until all processes have ended, or one of them has failed; returns the exit code."""
+def _wait(running: Sequence[subprocess.Popen[bytes]]) -> int | None:
+    """Wait until all processes have ended, or a while after one of them has failed.
+
+    Returns:
+        The first process that has failed, except for those that lost the connection to it.
+    """
     # Ctrl-C reaches the processes, too. They save the scene and end.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    deadline = math.inf
+    failed: int | None = None
     try:
-        deadline = float("inf")
-        while any(process.poll() is None for process in running):
-            if any(process.poll() for process in running):  # ended with an error
+        while True:
+            codes = [process.poll() for process in running]
+            if any(codes):
                 deadline = min(deadline, time.monotonic() + _GRACE_SECONDS)
-            if time.monotonic() > deadline:
-                break
+            first = [rank for rank, code in enumerate(codes) if code not in (None, 0, _LOST_CODE)]
+            if failed is None and first:
+                failed = first[0]
+            if None not in codes or time.monotonic() > deadline:
+                return failed
             time.sleep(0.05)
     finally:
         signal.signal(signal.SIGINT, before)
-    for rank, process in enumerate(running):
-        if rank > 0 and (process.returncode or 0) < 0:
-            name = signal.Signals(-process.returncode).name
-            print(f"snowsplat: process {rank} was ended by {name}", file=sys.stderr)
-    codes = [process.returncode for process in running if process.returncode]
-    return running[0].returncode or (abs(codes[0]) if codes else 0)
+
+
+def _exit_code(
+    running: Sequence[subprocess.Popen[bytes]],
+    failed: int | None,
+    errors: Sequence[IO[bytes] | None],
+) -> int:
+    """The exit code of `launch`. Prints one line if process 0 has not reported the failure."""
+    lost = any(process.returncode == _LOST_CODE for process in running)
+    if failed is None:
+        if lost:
+            print(f"snowsplat: {_LOST}", file=sys.stderr)
+        return 2 if lost else 0
+    code = running[failed].returncode
+    if failed == 0 and code > 0:
+        return code
+    what = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+    error = errors[failed]
+    if error is not None and code > 0:
+        error.seek(0)
+        last = error.read().decode(errors="replace").strip().splitlines()[-1:]
+        what += f" ({''.join(last)})"
+    line = f"process {failed} {what}, so the training has stopped; {_CONTINUE}"
+    print(f"snowsplat: {line}", file=sys.stderr)
+    return 2

@@ -134,7 +134,7 @@ class StepRunner:
         if last:
             self._start_readback()
         if loss is not None:
-            (loss if share == 1.0 else share * loss).backward()
+            loss.backward(None if share == 1.0 else torch.full_like(loss, share))
 
     def _start_readback(self) -> None:
         device = self._nonfinite_rows.device
