@@ -114,7 +114,7 @@ SNOW_INLINE void backward(const ProjectBackwardParams<T>& p) {
   add_columns<3>(tile + kDcColumn, 3, id_of, 3, grads.sh_dc);
   if (degree > 0)
     add_columns<kRestBatch>(tile, sh_columns(degree), id_of, 3 * tensors.sh_rest_rows,
-                              grads.sh_rest);
+                            grads.sh_rest);
   if (!p.pose) return;
 
   // The sums are computed in double and in a fixed order: each thread sums a quarter of the rows,
