@@ -133,8 +133,8 @@ def _sent(shards: Shards) -> int:
     return shards.sent_bytes if isinstance(shards, ProcessShards) else 0
 
 
-def measure(size: str, batch: int, count: int, folder: Path) -> list[dict[str, float]]:
-    """The results of all processes."""
+def ranks(command: list[str], count: int) -> list[str]:
+    """Run a command in ``count`` processes that are joined; the last line of output of each."""
     shared = {
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": str(29500 + os.getpid() % 1000 + count),
@@ -142,18 +142,31 @@ def measure(size: str, batch: int, count: int, folder: Path) -> list[dict[str, f
         "LOCAL_WORLD_SIZE": str(count),
         "GLOO_SOCKET_IFNAME": "lo",
     }
-    flags = ["--size", size, "--batch", str(batch), "--worker", str(folder)]
     running = [
         subprocess.Popen(
-            [sys.executable, __file__, *flags],
+            command,
             env=os.environ | shared | {"RANK": str(rank)},
             stdout=subprocess.PIPE,
             text=True,
         )
         for rank in range(count)
     ]
-    results = [json.loads(process.communicate()[0].splitlines()[-1]) for process in running]
-    return sorted(results, key=lambda result: result["rank"])
+    return [process.communicate()[0].splitlines()[-1] for process in running]
+
+
+def measure(size: str, batch: int, count: int, folder: Path) -> list[dict[str, float]]:
+    """The results of all processes, for photos from `write_photos`."""
+    flags = ["--size", size, "--batch", str(batch), "--worker", str(folder)]
+    return [json.loads(line) for line in ranks([sys.executable, __file__, *flags], count)]
+
+
+def write_photos(folder: Path, size: str, batch: int) -> None:
+    """Photos of the size of a workload: smooth noise."""
+    _, width, height = SIZES[size]
+    random = np.random.default_rng(0)
+    for i in range(batch):
+        small = random.integers(0, 256, (height // 8, width // 8, 3), np.uint8)
+        Image.fromarray(small).resize((width, height)).save(folder / f"{i}.png")
 
 
 def main() -> None:
@@ -166,13 +179,9 @@ def main() -> None:
     if flags.worker is not None:
         work(flags.size, flags.batch, flags.worker)
         return
-    _, width, height = SIZES[flags.size]
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        random = np.random.default_rng(0)
-        for i in range(flags.batch):
-            small = random.integers(0, 256, (height // 8, width // 8, 3), np.uint8)
-            Image.fromarray(small).resize((width, height)).save(folder / f"{i}.png")
+        write_photos(folder, flags.size, flags.batch)
         print("processes  Gaussians each  state MB  peak MB  s/update  sent MB  model MB")
         for count in flags.processes:
             for each in measure(flags.size, flags.batch, count, folder):

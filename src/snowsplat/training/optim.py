@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
+from snowsplat.ops import scratch
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.shards import ALONE, Shards
@@ -141,8 +142,10 @@ def _add_up(parameters: Mapping[str, Tensor], gradients: Sequence[ViewGradient])
     """
     sums = {}
     for name, parameter in parameters.items():
-        sums[name] = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-        parameter.grad = sums[name]
+        if parameter.grad is None:
+            shape = tuple(parameter.shape)
+            parameter.grad = scratch.empty(shape, parameter.dtype, parameter.device).zero_()
+        sums[name] = parameter.grad
     means = parameters["means"]
     # The index -1, an empty row, is the last element: it is no Gaussian.
     seen = torch.zeros(len(means) + 1, dtype=torch.bool, device=means.device)

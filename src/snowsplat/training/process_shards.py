@@ -9,6 +9,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from snowsplat.ops import scratch
 from snowsplat.ops.scratch import take_rows
 from snowsplat.ops.splats import COLORS, Splats2D, packed_width
 from snowsplat.scene.gaussians import Gaussians
@@ -90,7 +91,7 @@ class ProcessShards(Shards):
             width = rows[0:1].numel() if len(rows) else rows.new_empty(1, *rows.shape[1:]).numel()
             out = rows.new_empty(sum(received), width)
             inputs = take_rows(rows, send).reshape(len(send), width)
-            _all_to_all(out, inputs, received, sizes)
+            dist.all_to_all_single(out, inputs, received, sizes)
             result = torch.empty_like(out)
             result[place] = out
             return result.reshape(len(result), *rows.shape[1:])
@@ -104,14 +105,18 @@ class ProcessShards(Shards):
         sizes = [len(view) for view in splats] + [0] * (self.size - len(splats))
         counts = self.table(torch.tensor(sizes, device=self._device))
         self._received = counts[:, self.rank].tolist()
-        sent = torch.cat([view.packed.detach()[:, :columns] for view in splats])
-        rows = sent.new_empty(sum(self._received), columns)
-        _all_to_all(rows, sent, self._received, sizes)
+        sent = self._rows_like(splats[0].packed, sum(sizes), columns)
+        parts = sent.split(sizes[: len(splats)])
+        for view, part in zip(splats, parts, strict=True):
+            part.copy_(view.packed.detach()[:, :columns])
+        rows = self._rows_like(sent, sum(self._received), columns)
+        dist.all_to_all_single(rows, sent, self._received, sizes)
         self._count(sizes, columns)
         if self.rank >= len(splats):
             return None
-        packed = rows.new_zeros(len(rows), packed_width(splats[0].channels))
+        packed = self._rows_like(rows, len(rows), packed_width(splats[0].channels))
         packed[:, :columns] = rows
+        packed[:, columns:] = 0.0
         return Splats2D(packed, None, splats[0].channels)
 
     def return_gradients(
@@ -119,22 +124,30 @@ class ProcessShards(Shards):
     ) -> None:
         columns = COLORS + splats[0].channels
         width = columns + 2 * absolute
-        sent = splats[0].packed.new_empty(0, width)
+        sent = self._rows_like(splats[0].packed, 0 if blended is None else len(blended), width)
         if blended is not None:
             assert blended.packed.grad is not None
-            sent = blended.packed.grad[:, :columns]
-            if blended.abs_grad is not None:
-                sent = torch.cat([sent, blended.abs_grad], dim=1)
+            sent[:, :columns] = blended.packed.grad[:, :columns]
+            if absolute:
+                assert blended.abs_grad is not None
+                sent[:, columns:] = blended.abs_grad
         sizes = [len(view) for view in splats]
-        rows = sent.new_empty(sum(sizes), width)
+        rows = self._rows_like(sent, sum(sizes), width)
         sizes += [0] * (self.size - len(splats))
-        _all_to_all(rows, sent.contiguous(), sizes, self._received)
+        dist.all_to_all_single(rows, sent, sizes, self._received)
         self._count(self._received, width)
         for view, part in zip(splats, rows.split(sizes[: len(splats)]), strict=True):
-            view.packed.grad = torch.zeros_like(view.packed)
-            view.packed.grad[:, :columns] = part[:, :columns]
+            grad = self._rows_like(rows, *view.packed.shape)
+            grad[:, :columns] = part[:, :columns]
+            grad[:, columns:] = 0.0
+            view.packed.grad = grad
             if absolute:
                 view.abs_grad = part[:, columns:].contiguous()
+
+    @staticmethod
+    def _rows_like(like: Tensor, rows: int, columns: int) -> Tensor:
+        """Uninitialised memory, which every step uses again."""
+        return scratch.empty((rows, columns), like.dtype, like.device)
 
     def _count(self, rows: list[int], columns: int) -> None:
         to_others = sum(rows) - rows[self.rank]
@@ -200,8 +213,3 @@ class ProcessShards(Shards):
                     dist.recv(part, src=rank)
             whole[name] = torch.cat(parts)
         return whole
-
-
-def _all_to_all(out: Tensor, sent: Tensor, received: list[int], sizes: list[int]) -> None:
-    """Send ``sizes[i]`` rows to process i, and receive ``received[i]`` rows from it."""
-    dist.all_to_all_single(out, sent.contiguous(), received, sizes)
