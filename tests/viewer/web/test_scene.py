@@ -6,6 +6,7 @@ import math
 import re
 import time
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.scene.render import render
+from snowsplat.viewer.web.page import FILM_SECONDS
 from snowsplat.viewer.web.scene import ready, site
 from snowsplat.viewer.web.server import StaticServer
 
@@ -52,7 +54,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_the_initial_view_is_the_first_camera(trained):
-    gaussians, start = ready(trained.gaussians, trained.cameras)
+    gaussians, start, _ = ready(trained.gaussians, trained.cameras)
     camera = trained.cameras[0]
     # World z was up. The scale is unchanged, as the distances are usual ones.
     turned = transform(trained.gaussians, _similarity(1.0, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
@@ -78,14 +80,14 @@ def test_scenes_of_unusual_scale_are_rescaled(trained, scale):
         Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy, change.apply_to_poses(c.cam_from_world))
         for c in trained.cameras
     ]
-    gaussians, start = ready(odd, cameras)
+    gaussians, start, _ = ready(odd, cameras)
     assert math.dist(start.position, start.target) == pytest.approx(3.0, abs=1e-3)
     ours = picture(trained.gaussians, wide(trained.cameras[0], start))
     assert psnr(picture(gaussians, camera_of(start)), ours) > 40
 
 
 def test_an_upright_scene_is_unchanged(trained):
-    upright, _ = ready(trained.gaussians, trained.cameras)
+    upright, _, _ = ready(trained.gaussians, trained.cameras)
     change = _similarity(1.0, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     cameras = [
         Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy, change.apply_to_poses(c.cam_from_world))
@@ -99,7 +101,7 @@ def test_empty_space_in_front_of_the_camera(trained):
     away = torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64)
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     camera = Camera(96, 72, 90.0, 90.0, 48.0, 36.0, look_at(away, 2 * away, up))
-    _, start = ready(trained.gaussians, [camera])
+    _, start, _ = ready(trained.gaussians, [camera])
     assert all(map(math.isfinite, (*start.position, *start.target, start.fov)))
 
 
@@ -123,7 +125,7 @@ def test_the_page_and_its_policy(trained):
 
 @pytest.mark.browser
 def test_a_real_browser_shows_our_render(trained, tmp_path):
-    gaussians, start = ready(trained.gaussians, trained.cameras)
+    gaussians, start, _ = ready(trained.gaussians, trained.cameras)
     ours = picture(gaussians, camera_of(start))
     files, headers = site("scene", trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
     with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
@@ -139,14 +141,40 @@ def test_a_real_browser_shows_our_render(trained, tmp_path):
 
 
 def with_controls(browser: Browser, server: StaticServer, before: np.ndarray) -> None:
-    """A second viewer at the same time, with its controls; dragging rotates the scene."""
+    """A second viewer at the same time, with its controls.
+
+    It begins in orbit. Dragging rotates the scene. The film follows the photos; dragging ends it,
+    and the viewer is in orbit again.
+    """
+    mode = "window.sse.viewer.state.cameraMode"
     page: Page = browser.open(f"{server.url}?webgl")
     page.wait_for(LOADED, 60)
+    assert page.evaluate(mode) == "orbit"
     still = page.screenshot().astype(float)
     assert psnr(still, before) > 12  # except for the controls
     page.drag(WIDTH / 2, HEIGHT / 2, WIDTH / 2 + 120, HEIGHT / 2 + 20)
-    soon(page, lambda shown: psnr(shown, still) < 22)
+    turned = soon(page, lambda shown: psnr(shown, still) < 22)
+    page.evaluate(f"window.sse.viewer.seek({FILM_SECONDS / 2})")
+    assert page.evaluate(mode) == "anim"
+    soon(page, lambda shown: psnr(shown, turned) < 22)
+    page.drag(WIDTH / 2, HEIGHT / 2, WIDTH / 2 + 120, HEIGHT / 2 + 20)
+    page.wait_for(f"{mode} === 'orbit'", 30)
     assert not page.errors
+
+
+def test_the_film_follows_the_photos(trained):
+    """It is a smooth path near the cameras."""
+    _, _, film = ready(trained.gaussians, trained.cameras)
+    moved, _, alone = ready(trained.gaussians, trained.cameras[:1] * 3)
+    assert alone == []  # all photos from one place
+    assert len(moved) == len(trained.gaussians)
+    assert len(film) == 121
+    extent = max(math.dist(a.position, b.position) for a in film for b in film[::20])
+    steps = [math.dist(a.position, b.position) for a, b in pairwise(film)]
+    assert max(steps) < 0.1 * extent
+    places = [camera.position.tolist() for camera in trained.cameras]
+    for view in film:
+        assert min(math.dist(view.position, (x, -z, y)) for x, y, z in places) < 0.3 * extent
 
 
 def soon(page: Page, fits: Callable[[np.ndarray], bool]) -> np.ndarray:

@@ -7,6 +7,7 @@ embedded as a compressed PLY file in base64. Pages are written, but cannot be re
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from pathlib import Path
 
 from snowsplat.formats import GaussianArrays
@@ -42,8 +43,15 @@ _SCENE = """        <script type="text/plain" id="scene">{scene}</script>
         </script>"""
 
 
-def write_html(path: Path | str, gaussians: Gaussians, start: InitialView | None = None) -> None:
+def write_html(
+    path: Path | str,
+    gaussians: Gaussians,
+    start: InitialView | None = None,
+    film: Sequence[InitialView] = (),
+) -> None:
     """Write the page atomically. Its first view is ``start``; default: an overview of the scene.
+
+    The animation of the page is ``film``; see `page.settings`.
 
     Raises:
         UserError: no Gaussians, or too many for one page.
@@ -61,7 +69,7 @@ def write_html(path: Path | str, gaussians: Gaussians, start: InitialView | None
     encoded = base64.b64encode(scene).decode("ascii")
     background = (0.0, 0.0, 0.0)
     bootstrap = {
-        "settings": settings(start or overview(gaussians), background),
+        "settings": settings(start or overview(gaussians), background, film),
         "contentFilename": "scene.compressed.ply",
     }
     write_text(path, whole_page(path.stem, bootstrap, _SCENE.format(scene=encoded)))

@@ -20,8 +20,18 @@ from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 
 _FOLDER = Path(__file__).parents[2] / "_viewer"  # of the package
+#: Duration of the animation of the page.
+FILM_SECONDS = 20.0
 _STYLESHEET = '<link rel="stylesheet" href="./index.css" />'
 _IMPORT = "import { createViewer } from './index.js';"
+_CREATE = "createViewer({ container: document.body, settings, ...options });"
+# Visitors begin in orbit around what the photos show. The viewer itself would begin in its
+# animation; there, dragging the mouse would change to the fly mode in scenes around the visitor.
+_IN_ORBIT = """createViewer({ container: document.body, settings, ...options }).then((viewer) => {
+                window.sse.viewer = viewer;
+                const orbit = () => viewer.resetCamera();
+                viewer.state.loaded ? orbit() : viewer.events.once('loaded:changed', orbit);
+            });"""
 # Event handlers in the HTML that the script creates: event.stopPropagation() of two buttons.
 _HANDLER = re.compile(r' on[a-z]+=\\"([^"\\]*)\\"')
 _INLINE_SCRIPT = re.compile(r'<script(?: type="module")?>(.*?)</script>', re.DOTALL)
@@ -41,8 +51,15 @@ def asset(name: str) -> str:
         ) from None
 
 
-def settings(start: InitialView, background: Sequence[float]) -> dict[str, Any]:
-    """The viewer's settings: its initial view, and a background colour in 0..1."""
+def settings(
+    start: InitialView, background: Sequence[float], film: Sequence[InitialView] = ()
+) -> dict[str, Any]:
+    """The viewer's settings: its initial view, and a background colour in 0..1.
+
+    Args:
+        film: views at equal distances in time, `FILM_SECONDS` in total: the animation of the page.
+            If there are none, the viewer uses an animation of its own.
+    """
     off = {"enabled": False}
     return {
         "version": 2,
@@ -56,7 +73,7 @@ def settings(start: InitialView, background: Sequence[float]) -> dict[str, Any]:
             "vignette": {**off, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
             "fringing": {**off, "intensity": 0.5},
         },
-        "animTracks": [],
+        "animTracks": [_track(film)] if film else [],
         "cameras": [
             {
                 "initial": {
@@ -67,7 +84,27 @@ def settings(start: InitialView, background: Sequence[float]) -> dict[str, Any]:
             }
         ],
         "annotations": [],
-        "startMode": "default",
+        "startMode": "animTrack" if film else "default",
+    }
+
+
+def _track(film: Sequence[InitialView]) -> dict[str, Any]:
+    times = [i * FILM_SECONDS / (len(film) - 1) for i in range(len(film))]
+    return {
+        "name": "film",
+        "duration": FILM_SECONDS,
+        "frameRate": 1,  # times are in seconds
+        "loopMode": "pingpong",
+        "interpolation": "spline",
+        "smoothness": 1,
+        "keyframes": {
+            "times": times,
+            "values": {
+                "position": [x for view in film for x in _turned(view.position)],
+                "target": [x for view in film for x in _turned(view.target)],
+                "fov": [view.fov for view in film],
+            },
+        },
     }
 
 
@@ -88,6 +125,7 @@ def page(title: str, bootstrap: Mapping[str, Any]) -> str:
     # An empty icon; otherwise browsers would request one.
     text = _replaced(text, '<base href="" />', '<link rel="icon" href="data:," />')
     # No animation until the user moves the camera or presses Play.
+    text = _replaced(text, _CREATE, _IN_ORBIT)
     text = _replaced(text, "noanim: url.searchParams.has('noanim')", "noanim: true")
     slot = re.compile(r'(<script type="application/json" id="sse-bootstrap">)\s*null\s*(</script>)')
     parts = slot.split(text)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,10 +20,13 @@ from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.initial_view import InitialView, overview, view_of_camera
 from snowsplat.scene.orientation import VIEWING_DISTANCE, up_direction
 from snowsplat.scene.render import render
+from snowsplat.trajectory.follow import training_path
+from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.page import asset, content_policy, page, settings
 from snowsplat.viewer.web.server import ServedFile
 
 _SCENE = "scene.compressed.ply"
+_KEYFRAMES = 121  # of the film; the viewer interpolates between them
 _LEVEL_ENOUGH = math.radians(3)  # a smaller tilt of the horizon is not visible
 _TOO_LARGE = 3.0  # maximum factor between the distances of the scene and the usual ones
 
@@ -33,8 +38,8 @@ def site(
 
     The initial view is the first of ``cameras``; without cameras, an overview of the scene.
     """
-    gaussians, start = ready(gaussians, cameras)
-    bootstrap = {"settings": settings(start, background), "contentUrl": f"./{_SCENE}"}
+    gaussians, start, film = ready(gaussians, cameras)
+    bootstrap = {"settings": settings(start, background, film), "contentUrl": f"./{_SCENE}"}
     index = page(title, bootstrap)
     files = {
         "": ServedFile(index.encode(), "text/html; charset=utf-8"),
@@ -50,23 +55,49 @@ def site(
     return files, {"Content-Security-Policy": policy}
 
 
-def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[Gaussians, InitialView]:
-    """The scene in a frame that suits the viewer, and the initial view in that frame.
+class ReadyScene(NamedTuple):
+    """A scene in a frame that suits the viewer.
+
+    Attributes:
+        start: the initial view.
+        film: views along the path of the photographer, at equal distances in time; empty if there
+            is no such path.
+    """
+
+    gaussians: Gaussians
+    start: InitialView
+    film: list[InitialView]
+
+
+def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> ReadyScene:
+    """The scene in a frame that suits the viewer, and views in that frame.
 
     In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
     direction, or distances very different from `VIEWING_DISTANCE`, the scene is rotated and scaled.
     Otherwise it is unchanged.
     """
     if not cameras:
-        return gaussians, overview(gaussians)
+        return ReadyScene(gaussians, overview(gaussians), [])
     depth = _depth_ahead(gaussians, cameras[0])
     change = _viewing_frame(cameras, depth)
-    if change is None:
-        return gaussians, view_of_camera(cameras[0], depth)
-    first = cameras[0]
-    pose = change.apply_to_poses(first.cam_from_world)
-    moved = Camera(first.width, first.height, first.fx, first.fy, first.cx, first.cy, pose)
-    return transform(gaussians, change), view_of_camera(moved, change.scale * depth)
+    if change is not None:
+        gaussians = transform(gaussians, change)
+        depth *= change.scale
+        cameras = [
+            replace(camera, cam_from_world=change.apply_to_poses(camera.cam_from_world))
+            for camera in cameras
+        ]
+    return ReadyScene(gaussians, view_of_camera(cameras[0], depth), _film(cameras, depth))
+
+
+def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
+    """The path of the photographer; see `trajectory.training_path`."""
+    in_order = [f"{number:08}" for number in range(len(cameras))]
+    try:
+        path = training_path(cameras, in_order, _KEYFRAMES, depth)
+    except UserError:  # all cameras are at the same place
+        return []
+    return [view_of_camera(camera, depth) for camera in path]
 
 
 def _viewing_frame(cameras: Sequence[Camera], depth: float) -> Similarity | None:
