@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.lift_refine import refine_photo
     from snowsplat.pipeline.make import MakeOptions, make
     from snowsplat.pipeline.observer import Observer
+    from snowsplat.pipeline.publish import PublishOptions, publish
     from snowsplat.pipeline.render import render_images
     from snowsplat.pipeline.scene_files import write_gaussians
     from snowsplat.pipeline.scene_source import load_trained
@@ -84,6 +85,8 @@ _MODULES = {
     "load_trained": "pipeline.scene_source",
     "make": "pipeline.make",
     "make_globe": "pipeline.globe",
+    "PublishOptions": "pipeline.publish",
+    "publish": "pipeline.publish",
     "read_gaussians": "formats",
     "recipe": "training.recipes",
     "refine_photo": "pipeline.lift_refine",
@@ -108,6 +111,7 @@ __all__ = [
     "MakeOptions",
     "Observer",
     "Points",
+    "PublishOptions",
     "TrainConfig",
     "TrainOptions",
     "Trainer",
@@ -127,6 +131,7 @@ __all__ = [
     "load_trained",
     "make",
     "make_globe",
+    "publish",
     "read_gaussians",
     "recipe",
     "refine_photo",

@@ -37,6 +37,7 @@ SUBCOMMANDS = {
     "convert": "Write a scene in another file format; crop, decimate, transform or merge scenes.",
     "lift": "Make a scene from one photo and its depth map.",
     "image": "Approximate a photo by 2D Gaussians, or render such an approximation.",
+    "publish": "Write a static web site that shows a scene.",
     "globe": "Put a scene into a snow globe: a web page, and a video.",
     "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }
@@ -57,6 +58,7 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: makes a 3D scene from ph
   snowsplat convert SCENE [MORE …] FILE   another format; crop, decimate, merge
   snowsplat lift PHOTO --depth MAP -o OUT one photo and its depth -> a scene
   snowsplat image PHOTO -o OUT            a photo as 1000 Gaussians
+  snowsplat publish SCENE -o FOLDER       a web site, for any host
   snowsplat globe SCENE                   a snow globe, as a web page
   snowsplat info PATH                     describe a file or a folder
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.scene_source import load_viewable
+from snowsplat.pipeline.scene_source import load_viewable, scene_name
 from snowsplat.pipeline.videos import VideoSize
 from snowsplat.util.errors import SettingError, UserError
 
@@ -121,7 +121,7 @@ def make_globe(
     from snowsplat.globe.video import GlobeVideo
 
     arrangement = arrange(source.gaussians, source.cameras, options.gaussians)
-    name = options.name or _name(scene)[:_LONGEST_NAME]
+    name = options.name or scene_name(scene)[:_LONGEST_NAME]
     write_page(target, arrangement, name)
     if video is not None:
         width, height = options.video_size
@@ -148,10 +148,4 @@ def _write(video: GlobeVideo, file: Path, observer: Observer) -> None:
 def _default_page(scene: Path) -> Path:
     if scene.is_dir():
         return scene / "globe.html"
-    return scene.with_name(f"{_name(scene)}_globe.html")
-
-
-def _name(scene: Path) -> str:
-    """The name of a scene: that of its folder, or of its file without suffixes."""
-    scene = scene.resolve()
-    return scene.name.split(".")[0] or scene.name
+    return scene.with_name(f"{scene_name(scene)}_globe.html")

@@ -171,3 +171,9 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
         folder = folder_around(path)
     background = folder.settings()[1] if folder.is_output_folder() else (0.0, 0.0, 0.0)
     return ViewableScene(file, gaussians, cameras_of(folder), background)
+
+
+def scene_name(scene: Path) -> str:
+    """The name of a scene: that of its folder, or of its file without suffixes."""
+    scene = scene.resolve()
+    return scene.name.split(".")[0] or scene.name

@@ -113,17 +113,21 @@ def _turned(point: tuple[float, float, float]) -> list[float]:
     return [-x, -y, z]
 
 
-def page(title: str, bootstrap: Mapping[str, Any]) -> str:
+def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "") -> str:
     """The page; its stylesheet and script are the separate files index.css and index.js.
 
-    ``bootstrap`` has the viewer's keys: settings, contentUrl, contentFilename.
+    ``bootstrap`` has the viewer's keys: settings, contentUrl, contentFilename, posterUrl. ``head``
+    and ``body`` are HTML for the ends of these elements.
     """
     text = asset("index.html")
     text = _replaced(
         text, "<title>SuperSplat Viewer</title>", f"<title>{html.escape(title)}</title>"
     )
     # An empty icon; otherwise browsers would request one.
-    text = _replaced(text, '<base href="" />', '<link rel="icon" href="data:," />')
+    icon = '<link rel="icon" href="data:," />'
+    text = _replaced(text, '<base href="" />', f"{icon}\n        {head}" if head else icon)
+    if body:
+        text = _replaced(text, "    </body>", f"{body}\n    </body>")
     # No animation until the user moves the camera or presses Play.
     text = _replaced(text, _CREATE, _IN_ORBIT)
     text = _replaced(text, "noanim: url.searchParams.has('noanim')", "noanim: true")
@@ -143,10 +147,9 @@ def whole_page(title: str, bootstrap: Mapping[str, Any], body: str) -> str:
     # The HTML parser would interpret these as markup. The files of the viewer do not contain them.
     assert "</style" not in css.lower()
     assert not re.search(r"</script|<!--|<script", script, re.IGNORECASE)
-    text = page(title, bootstrap)
+    text = page(title, bootstrap, body=body)
     text = _replaced(text, _STYLESHEET, f"<style>\n{css}</style>")
     text = _replaced(text, _IMPORT, script)
-    text = _replaced(text, "    </body>", f"{body}\n    </body>")
     policy = html.escape(content_policy(text, "blob: data:"))
     head = f"""<meta charset="UTF-8" />
         <meta http-equiv="Content-Security-Policy" content="{policy}" />

@@ -1,0 +1,63 @@
+"""`snowsplat publish`: a static web site that shows a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from snowsplat.cli.flags import flag, switch
+from snowsplat.util.errors import UserError
+
+
+@dataclass
+class Publish:
+    """Write a static web site that shows a scene.
+
+    Examples:
+      snowsplat publish out/garden -o site
+      snowsplat publish garden.spz -o site --title "Our garden" --licence "CC0"
+      snowsplat publish out/garden -o site --url https://example.org/garden
+
+    Notes:
+      Any web host can serve the folder; nothing has to run there. The page loads
+      nothing from other sites. Browsers do not open it from disk: to look at it,
+      run python -m http.server -d site. Over https, browsers with a headset also
+      offer VR and AR.
+    """
+
+    scene: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
+    """A scene file of any format, or the output folder of train or make."""
+    output: Annotated[Path | None, flag("FOLDER", "-o")] = None
+    """A new or an empty folder for the web site."""
+    title: Annotated[str | None, flag("TEXT", default="the name of the scene")] = None
+    """The name of the scene on the page."""
+    licence: Annotated[str, flag("TEXT", default="not stated")] = ""
+    """The licence of the scene."""
+    url: Annotated[str, flag("URL", default="not known")] = ""
+    """The address of the folder on the web, for the picture in previews of links."""
+    overwrite: Annotated[bool, switch()] = False
+    """Replace a web site in FOLDER."""
+    iteration: Annotated[int | None, flag("N", default="the last step")] = None
+    """If OUT contains several scenes, the step after which the scene was saved."""
+    threads: Annotated[int | None, flag("N", default="all cores")] = None
+    """Number of CPU threads."""
+
+    def run(self) -> int:
+        """Returns the exit code, 0."""
+        if self.scene is None:
+            raise UserError("publish needs a scene; use a file or the output folder of a training")
+        if self.output is None:
+            raise UserError("publish needs a folder; add -o FOLDER")
+        from snowsplat.pipeline.publish import PublishOptions, publish
+
+        result = publish(
+            *(self.scene, self.output, PublishOptions(self.title, self.licence, self.url)),
+            iteration=self.iteration,
+            overwrite=self.overwrite,
+            threads=self.threads,
+        )
+        print(f"{result.folder}: {result.gaussians:,} Gaussians, {result.bytes / 1e6:.1f} MB")
+        return 0

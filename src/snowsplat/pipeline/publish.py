@@ -1,0 +1,99 @@
+"""`publish`: a static web site that shows a scene."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.scene_source import load_viewable, scene_name
+from snowsplat.util.errors import SettingError, UserError
+
+
+@dataclass(frozen=True)
+class PublishOptions:
+    """Options of a published scene.
+
+    Attributes:
+        title: the name on the page; None: that of the scene.
+        licence: the licence of the scene, such as "CC BY 4.0".
+        url: the address of the folder on the web. Services that show a preview of a link need it.
+
+    Raises:
+        UserError: the address is not one.
+    """
+
+    title: str | None = None
+    licence: str = ""
+    url: str = ""
+
+    def __post_init__(self) -> None:
+        if self.url and not re.fullmatch(r"https?://[^\s\"<>?#]+", self.url):
+            raise SettingError("url", f"{self.url} is no address; use e.g. https://host/garden/")
+
+
+@dataclass(frozen=True)
+class PublishResult:
+    """A web site.
+
+    Attributes:
+        gaussians: the number of Gaussians of the scene.
+        bytes: the size of all files.
+    """
+
+    folder: Path
+    gaussians: int
+    bytes: int
+
+
+def publish(
+    scene: Path | str,
+    folder: Path | str,
+    options: PublishOptions | None = None,
+    *,
+    iteration: int | None = None,
+    overwrite: bool = False,
+    threads: int | None = None,
+) -> PublishResult:
+    """Write a static web site that shows a scene: a page, the viewer, the scene, and a picture.
+
+    Args:
+        scene: the output folder of a training run, or a scene file of any format.
+        folder: a new or an empty folder.
+        options: what the page says.
+        iteration: an iteration of an output folder; default: the last one.
+        overwrite: whether to replace a web site in ``folder``.
+        threads: number of CPU threads; None: all cores.
+
+    Raises:
+        UserError: the scene is missing, damaged or has no Gaussians; ``folder`` contains other
+            files, or a web site that is not to be overwritten.
+        OSError: a file cannot be written.
+    """
+    options, scene, folder = options or PublishOptions(), Path(scene), Path(folder)
+    if folder.exists():
+        _check_free(folder, overwrite)
+    Compute("cpu", threads).apply()
+    source = load_viewable(scene, iteration)
+    if not len(source.gaussians):
+        raise UserError(f"{source.file}: contains no Gaussians; there is nothing to see")
+
+    from snowsplat.viewer.web.publication import Description, write_site
+
+    url = options.url and options.url.rstrip("/") + "/"
+    about = Description(options.title or scene_name(scene), options.licence, url)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_site(folder, source.gaussians, source.cameras, source.background, about)
+    size = sum(file.stat().st_size for file in folder.iterdir())
+    return PublishResult(folder, len(source.gaussians), size)
+
+
+def _check_free(folder: Path, overwrite: bool) -> None:
+    if not folder.is_dir():
+        raise UserError(f"{folder}: is a file; use a folder for the output")
+    names = {entry.name for entry in folder.iterdir()}
+    if names and not {"index.html", "scene.sog"} <= names:
+        raise UserError(f"{folder}: contains other files; use a new or an empty folder")
+    if names and not overwrite:
+        raise UserError(f"{folder}: already contains a web site; use `overwrite` to replace it")

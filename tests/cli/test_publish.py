@@ -1,0 +1,117 @@
+"""`snowsplat publish`: the files of the web site, the page in a browser, and its errors."""
+
+import functools
+import http.server
+import re
+import threading
+from html import unescape
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.scene.gaussians import Gaussians
+
+from ..browser import Browser
+
+FILES = ["index.css", "index.html", "index.js", "poster.jpg", "scene.sog", "viewer-licence.txt"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A file without cameras: a dense box of small Gaussians in random colours."""
+    path = tmp_path_factory.mktemp("publish") / "box.ply"
+    box = torch.tensor([[-0.3, -0.6, -0.3], [0.3, 0.0, 0.3]])
+    write_gaussians(path, Gaussians.random_in_bounds(box, 1500, torch.Generator(), 1, 0.9))
+    return path
+
+
+@pytest.fixture(scope="module")
+def site(scene, tmp_path_factory):
+    """The site, written by Python."""
+    from snowsplat import PublishOptions, publish
+
+    folder = tmp_path_factory.mktemp("published") / "site"
+    options = PublishOptions("A <box>", "CC BY 4.0", "https://example.org/box")
+    result = publish(scene, folder, options)
+    assert result.gaussians == 1500
+    assert result.bytes == sum(file.stat().st_size for file in folder.iterdir())
+    return folder
+
+
+def test_files(site, scene):
+    assert sorted(file.name for file in site.iterdir()) == FILES
+    assert len(read_gaussians(site / "scene.sog")) == 1500
+    poster = np.asarray(Image.open(site / "poster.jpg"))
+    assert poster.shape == (630, 1200, 3)
+    assert poster[:, 560:640].std() > 20  # the box is in the middle, before a black background
+    assert poster[:, :40].max() < 20
+
+
+def test_page(site):
+    text = (site / "index.html").read_text(encoding="utf-8")
+    tags = dict(re.findall(r'<meta property="([^"]+)" content="([^"]*)"', text))
+    assert unescape(tags["og:title"]) == "A <box>"
+    assert tags["og:image"] == "https://example.org/box/poster.jpg"
+    assert tags["og:url"] == "https://example.org/box/"
+    assert re.search(r"A scene in 3D: 1,500 Gaussians · \d{4}-\d\d-\d\d · CC BY", text)
+    assert "A <box>" not in text
+    # The policy is before everything that it restricts, and allows only this site.
+    (policy,) = re.findall(r'Content-Security-Policy" content="(.*?)"', text)
+    assert text.index("Content-Security-Policy") < min(text.index("<script"), text.index("<link"))
+    assert "http" not in policy
+    assert "default-src" in policy
+
+
+@pytest.mark.browser
+def test_a_static_server_is_enough(site):
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(site))
+    handler.log_message = lambda *_: None  # type: ignore[attr-defined]
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        own = f"http://127.0.0.1:{server.server_address[1]}/"
+        with Browser(480, 360) as browser:
+            page = browser.open(f"{own}?webgl")
+            page.wait_for("!!window.app", 60)
+            about = page.evaluate("document.querySelector('.about').innerText")
+            above = "document.elementFromPoint(30, 20)"
+            page.evaluate("document.querySelector('.about').style.pointerEvents = 'auto'")
+            assert page.evaluate(f"!!{above}.closest('.about')")  # nothing covers it
+            assert not page.errors
+            assert all(url.startswith((own, f"blob:{own[:-1]}")) for url in page.requests)
+        server.shutdown()
+    assert about.startswith("A <box>")
+    assert "1,500 Gaussians" in about
+
+
+def test_overwrite(run, refused, scene, tmp_path):
+    folder = tmp_path / "a" / "site"
+    result = run("publish", scene, "-o", folder)
+    assert result.code == 0, result.err
+    assert f"{folder}: 1,500 Gaussians" in result.out
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    assert "<title>box</title>" in text
+    assert 'og:image" content="poster.jpg"' in text
+    assert "og:url" not in text
+    assert "--overwrite" in refused("publish", scene, "-o", folder)
+    assert run("publish", scene, "-o", folder, "--overwrite", "--title", "B").code == 0
+    assert "<title>B</title>" in (folder / "index.html").read_text(encoding="utf-8")
+
+
+def test_errors(refused, scene, tmp_path):
+    assert "needs a scene" in refused("publish")
+    assert "add -o FOLDER" in refused("publish", scene)
+    assert "no such file" in refused("publish", tmp_path / "absent.ply", "-o", tmp_path / "a")
+    assert "is a file" in refused("publish", scene, "-o", scene)
+    assert "contains other files" in refused("publish", scene, "-o", scene.parent)
+    site = ("publish", scene, "-o", tmp_path / "a")
+    assert "--url: example.org is no address" in refused(*site, "--url", "example.org")
+    assert "`iteration`" not in refused(*site, "--iteration", 3)
+    empty = tmp_path / "empty.ply"
+    box = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    nothing = Gaussians.random_in_bounds(box, 1, torch.Generator()).select(torch.zeros(0).long())
+    write_gaussians(empty, nothing)
+    assert "contains no Gaussians" in refused("publish", empty, "-o", tmp_path / "b")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.ply"]
