@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from snowsplat.formats import read_gaussians
     from snowsplat.image.fit import FitOptions
     from snowsplat.lift.lift import LiftOptions
+    from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
     from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.convert import Edits, convert
     from snowsplat.pipeline.describe import describe
@@ -85,6 +86,8 @@ _MODULES = {
     "load_trained": "pipeline.scene_source",
     "make": "pipeline.make",
     "make_globe": "pipeline.globe",
+    "BenchmarkOptions": "pipeline.benchmark.run",
+    "benchmark": "pipeline.benchmark.run",
     "PublishOptions": "pipeline.publish",
     "publish": "pipeline.publish",
     "read_gaussians": "formats",
@@ -98,6 +101,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "BenchmarkOptions",
     "Camera",
     "Compute",
     "Dataset",
@@ -120,6 +124,7 @@ __all__ = [
     "VideoOptions",
     "View",
     "__version__",
+    "benchmark",
     "convert",
     "decode_image",
     "describe",

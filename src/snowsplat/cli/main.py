@@ -39,6 +39,7 @@ SUBCOMMANDS = {
     "image": "Approximate a photo by 2D Gaussians, or render such an approximation.",
     "publish": "Write a static web site that shows a scene.",
     "globe": "Put a scene into a snow globe: a web page, and a video.",
+    "benchmark": "Train and evaluate all scenes of a folder by the protocol of the papers.",
     "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }
 
@@ -60,6 +61,7 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: makes a 3D scene from ph
   snowsplat image PHOTO -o OUT            a photo as 1000 Gaussians
   snowsplat publish SCENE -o FOLDER       a web site, for any host
   snowsplat globe SCENE                   a snow globe, as a web page
+  snowsplat benchmark FOLDER -o OUT       all scenes of a folder, and a table
   snowsplat info PATH                     describe a file or a folder
 
 A dataset is a folder of photos with their camera poses.

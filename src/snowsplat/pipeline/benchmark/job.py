@@ -1,0 +1,233 @@
+"""One scene of a benchmark: training and evaluation, in a process of its own.
+
+The process has its own peak memory, and if it fails, the other scenes are not affected.
+"""
+
+from __future__ import annotations
+
+import _thread
+import json
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from snowsplat.pipeline.benchmark.claims import claimed
+from snowsplat.pipeline.checkpoint_meta import Recipe
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import write_json
+from snowsplat.util.safe_json import from_json, read_json
+
+if TYPE_CHECKING:
+    from snowsplat.evaluation.metrics import Evaluation
+    from snowsplat.pipeline.scene_source import TrainedScene
+
+#: A file in the output folder of a scene.
+RESULT = "benchmark.json"
+#: The exit code if another process trains the scene.
+TAKEN = 75
+# A process whose benchmark was killed ends within this time.
+_WAIT_SECONDS = 15.0
+#: A picture of the view with the lowest PSNR: the photo, and its rendering to the right.
+WORST = "worst.jpg"
+_SIDE = 480  # pixels of the longer side of an image in it
+_CHECKPOINT_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """A scene and how to train it; see `TrainOptions`. Paths are absolute."""
+
+    scene: str
+    dataset: str
+    output: str
+    recipe: Recipe
+    settings: dict[str, Any] = field(default_factory=dict)
+    resolution: int | None = None
+    hold_out: int = 8
+    lpips: str | None = None
+
+    @property
+    def result(self) -> Path:
+        return Path(self.output) / RESULT
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """The result of a scene.
+
+    Attributes:
+        job: the settings with which it was made.
+        lpips: None if no weights were given.
+        seconds: duration of the training, including interrupted runs.
+        memory: peak memory of the process in bytes.
+        photos: number of training photos, and of test photos.
+        size: width and height of the first test photo.
+        machine: the processor or GPU.
+    """
+
+    job: Job
+    psnr: float
+    ssim: float
+    lpips: float | None
+    gaussians: int
+    seconds: float
+    memory: int
+    photos: tuple[int, int]
+    size: tuple[int, int]
+    worst: str
+    machine: str
+
+    @staticmethod
+    def read(job: Job) -> SceneResult | None:
+        """The result of an earlier run, if there is one.
+
+        Raises:
+            UserError: it is damaged, or was made with other settings.
+        """
+        if not job.result.is_file():
+            return None
+        try:
+            result = from_json(SceneResult, read_json(job.result))
+        except ValueError as error:
+            raise UserError(f"{job.result}: is damaged ({error}); remove it") from None
+        if {**asdict(result.job), "dataset": ""} != {**asdict(job), "dataset": ""}:
+            raise UserError(
+                f"{job.result}: was made with other settings; use another output folder, or remove "
+                f"{job.output}"
+            )
+        return result
+
+
+def run(job: Job, device: str | None, threads: int | None) -> bool:
+    """Run the job in a new process; False if another process has claimed the scene.
+
+    Raises:
+        UserError: it failed; the message is its last line.
+    """
+    request = json.dumps({"job": asdict(job), "device": device, "threads": threads})
+    command = [sys.executable, "-m", "snowsplat.pipeline.benchmark.job"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stderr=pipe, text=True) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        process.stdin.write(request + "\n")
+        process.stdin.flush()  # it stays open: its end tells that this process has ended
+        lines = process.stderr.read().strip().splitlines()
+        code = process.wait()
+    if code not in (0, TAKEN):
+        last = (lines or [f"ended with exit code {code}"])[-1]
+        raise UserError(f"{job.scene}: {last.removeprefix('snowsplat: ')}")
+    return code == 0
+
+
+def work(job: Job, device: str | None, threads: int | None) -> None:
+    """Train and evaluate in this process, and write the result."""
+    from snowsplat.evaluation.lpips import Lpips
+    from snowsplat.pipeline.compute import Compute
+    from snowsplat.pipeline.evaluate import evaluate
+    from snowsplat.pipeline.output_folder import OutputFolder
+    from snowsplat.pipeline.scene_source import load_trained
+    from snowsplat.pipeline.train import TrainOptions, resume, train
+    from snowsplat.util.machine import processor_name
+    from snowsplat.util.process_memory import peak_bytes
+
+    lpips = None if job.lpips is None else Lpips.load(Path(job.lpips))
+    compute = Compute(device, threads)
+    options = TrainOptions(
+        recipe=job.recipe,
+        settings=job.settings,
+        resolution=job.resolution,
+        hold_out=job.hold_out,
+        checkpoint_seconds=_CHECKPOINT_SECONDS,
+        compute=compute,
+    )
+    output = Path(job.output)
+    begin = time.monotonic()
+    if OutputFolder(output).is_output_folder():
+        trained_now = resume(output, options, dataset=job.dataset)
+    else:
+        trained_now = train(job.dataset, output, options)
+    seconds = time.monotonic() - begin + _seconds_of_steps(output) - trained_now.seconds
+    memory = peak_bytes()
+    trained = load_trained(output, dataset=job.dataset, compute=compute)
+    evaluation = evaluate(trained, lpips=lpips)
+    worst = _write_worst(trained, evaluation, output / WORST)
+    dataset, first = trained.dataset, trained.dataset.test[0].camera
+    result = SceneResult(
+        job,
+        evaluation.psnr,
+        evaluation.ssim,
+        evaluation.lpips,
+        len(trained.gaussians),
+        seconds,
+        memory,
+        (len(dataset.train), len(dataset.test)),
+        (first.width, first.height),
+        worst,
+        processor_name(),
+    )
+    write_json(job.result, asdict(result))
+
+
+def _seconds_of_steps(output: Path) -> float:
+    """The duration of the steps of all runs."""
+    history = read_json(output / "history.json")
+    return float(sum(stretch["seconds"] for stretch in history["stretches"]))
+
+
+def _write_worst(trained: TrainedScene, evaluation: Evaluation, file: Path) -> str:
+    """Write the picture `WORST`; returns the name of the view."""
+    import numpy as np
+    import torch
+    from PIL import Image
+
+    from snowsplat.data import ImageLoader
+    from snowsplat.scene.render import render
+    from snowsplat.util.files import atomic_path
+
+    worst = min(evaluation.views, key=lambda view: view.psnr)
+    [view] = [view for view in trained.dataset.test if view.name == worst.name]
+    device = trained.gaussians.means.device
+    color = torch.tensor(trained.background, device=device)
+    with ImageLoader([view], background=trained.background) as loader, torch.no_grad():
+        photo = loader.get(view).rgb.cpu().numpy()
+        image = render(trained.gaussians, view.camera.to(device), color).image
+    rendered = image.clamp(0, 1).mul(255).round().to(torch.uint8).cpu().numpy()
+    both = Image.fromarray(np.concatenate([photo, rendered], axis=1))
+    both.thumbnail((2 * _SIDE, _SIDE))
+    with atomic_path(file) as temporary:
+        both.save(temporary, "JPEG", quality=85)
+    return worst.name
+
+
+def _end_with_parent() -> None:
+    """Stop when the process that called `run` has ended: then another one may take the scene."""
+    sys.stdin.read()
+    _thread.interrupt_main()
+
+
+def main() -> int:
+    """Returns the exit code."""
+    request = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    job = from_json(Job, request["job"])
+    try:
+        with claimed(Path(f"{job.output}.claim"), _WAIT_SECONDS) as is_ours:
+            if not is_ours:
+                return TAKEN
+            if SceneResult.read(job) is None:
+                work(job, request["device"], request["threads"])
+    except UserError as error:
+        print(f"snowsplat: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

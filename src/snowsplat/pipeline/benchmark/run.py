@@ -1,0 +1,181 @@
+"""`benchmark`: trains and evaluates all scenes of a folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
+from snowsplat.pipeline.benchmark.report import BenchmarkReport, write_report
+from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
+from snowsplat.pipeline.checkpoint_meta import Recipe
+from snowsplat.util.errors import SettingError, UserError
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions:
+    """Options of a benchmark.
+
+    Attributes:
+        suite: a name of `suites.SUITES`; None: that to which all scenes belong, or "custom".
+        scenes: only these scenes; empty: all.
+        recipe: the recipe of the training.
+        settings: changed settings, see `TrainOptions`.
+        resolution: replaces that of the suite; see `TrainOptions`.
+        lpips: a file of weights, see `snowsplat.evaluation.lpips`; None: LPIPS is not measured.
+        jobs: number of scenes that are trained at the same time. They share the CPU threads; with
+            GPUs, job i uses GPU i.
+        device: "cpu" or "cuda"; None: GPUs if there are any.
+
+    Raises:
+        UserError: an unknown suite, or fewer than 1 job.
+    """
+
+    suite: str | None = None
+    scenes: tuple[str, ...] = ()
+    recipe: Recipe = "default"
+    settings: dict[str, Any] = field(default_factory=dict)
+    resolution: int | None = None
+    lpips: Path | None = None
+    jobs: int = 1
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.suite is not None and self.suite not in SUITES:
+            raise SettingError("suite", f"{self.suite} is unknown; use {', '.join(SUITES)}")
+        if self.jobs < 1:
+            raise SettingError("jobs", f"{self.jobs} is too small; use at least 1")
+
+
+def benchmark(
+    folder: Path | str,
+    output: Path | str,
+    options: BenchmarkOptions | None = None,
+    *,
+    on_line: Callable[[str], None] = lambda line: None,
+) -> BenchmarkReport:
+    """Train and evaluate all scenes of a folder, by the protocol of a benchmark suite.
+
+    Each scene has a folder in ``output``. Scenes that are finished are not repeated, and scenes
+    that were interrupted continue from their last checkpoint. Several computers may call this at
+    the same time with the same folders: each trains the scenes that no other one trains.
+
+    Args:
+        folder: contains one folder for each scene, see `snowsplat.data.load_dataset`.
+        output: a folder for the scenes and tables. It is created if it does not exist.
+        on_line: receives lines of information.
+
+    Returns:
+        The results, also written as results.json, results.csv, results.tex and index.html.
+
+    Raises:
+        UserError: no scenes, unusable options, or results that were made with other settings.
+        KeyboardInterrupt: Ctrl-C; the same call continues.
+    """
+    folder, output, options = Path(folder), Path(output), options or BenchmarkOptions()
+    datasets = find_scenes(folder, options.scenes)
+    name = options.suite or suite_of(path.name for path in datasets)
+    jobs = [_job(path, output / path.name, name, options) for path in datasets]
+    finished = {job.scene for job in jobs if SceneResult.read(job) is not None}
+    if options.lpips is not None and not options.lpips.is_file():
+        raise SettingError("lpips", f"{options.lpips}: no such file")
+    output.mkdir(parents=True, exist_ok=True)
+    on_line(f"{SUITES[name].title}: {len(jobs)} scenes, {len(finished)} finished")
+    waiting = [job for job in jobs if job.scene not in finished]
+    failures = _run_all(waiting, options, on_line)
+    results = [result for job in jobs if (result := SceneResult.read(job)) is not None]
+    report = BenchmarkReport(name, results, failures)
+    write_report(output, report)
+    return report
+
+
+def find_scenes(folder: Path, only: Sequence[str] = ()) -> list[Path]:
+    """The folders of scenes in ``folder``.
+
+    Raises:
+        UserError: there are none, or one of ``only`` is missing.
+    """
+    from snowsplat.data.transforms_json import find_transforms
+
+    def is_dataset(path: Path) -> bool:
+        return (path / "sparse").is_dir() or bool(find_transforms(path))
+
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder")
+    found = {path.name: path for path in sorted(folder.iterdir()) if is_dataset(path)}
+    missing = [name for name in only if name not in found]
+    if missing:
+        raise UserError(f"{folder}: contains no dataset {missing[0]}")
+    if not found:
+        hint = "; it is a dataset itself, use the folder above" if is_dataset(folder) else ""
+        raise UserError(f"{folder}: contains no folders of datasets{hint}")
+    return [found[name] for name in only] or list(found.values())
+
+
+def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> Job:
+    suite = SUITES[name]
+    return Job(
+        dataset.name,
+        str(dataset.absolute()),
+        str(output.absolute()),
+        options.recipe,
+        {**suite.settings, **options.settings},
+        options.resolution or suite.resolutions.get(dataset.name),
+        suite.hold_out,
+        None if options.lpips is None else str(options.lpips.absolute()),
+    )
+
+
+def _run_all(
+    jobs: Sequence[Job], options: BenchmarkOptions, on_line: Callable[[str], None]
+) -> dict[str, str]:
+    """Run the jobs that nobody else runs; returns the errors, by scene."""
+    devices = _devices(options)
+    threads = None if options.jobs == 1 else max(1, (os.cpu_count() or 1) // options.jobs)
+    failures: dict[str, str] = {}
+    stopped = False
+
+    def work(job: Job) -> None:
+        if stopped:
+            return
+        device = devices.pop()
+        try:
+            if not run(job, device, threads):
+                on_line(f"{job.scene}: another process trains it")
+                return
+        except UserError as error:
+            failures[job.scene] = str(error)
+            on_line(str(error))
+            return
+        finally:
+            devices.append(device)
+        result = SceneResult.read(job)
+        assert result is not None
+        on_line(
+            f"{job.scene}: {result.psnr:.2f} dB, SSIM {result.ssim:.4f}, "
+            f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s"
+        )
+
+    with ThreadPoolExecutor(options.jobs) as pool:
+        running = [pool.submit(work, job) for job in jobs]
+        try:
+            for each in running:
+                each.result()
+        except KeyboardInterrupt:  # the processes get it, too, and save a checkpoint
+            stopped = True
+            raise
+    return failures
+
+
+def _devices(options: BenchmarkOptions) -> list[str | None]:
+    """The device of each job."""
+    import torch
+
+    count = torch.cuda.device_count() if options.device in (None, "cuda") else 0
+    if count == 0:
+        return [options.device] * options.jobs
+    return [f"cuda:{number % count}" for number in range(options.jobs)]
