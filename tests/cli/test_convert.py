@@ -10,11 +10,14 @@ import pytest
 import torch
 
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
+from snowsplat.pipeline.convert import Edits
+from snowsplat.pipeline.decimate import file_size
 from snowsplat.scene import edit
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.scene.geometry import look_at
+from snowsplat.scene.simplify import simplify
 
 WRITTEN = [f.suffixes[0] for f in FORMATS if f.write]
 READ_BACK = [f for f in FORMATS if f.write and f.read]
@@ -64,17 +67,39 @@ def test_without_edits_the_file_is_the_same(run, ply, tmp_path):
 
 def test_edits_and_their_order(run, ply, tmp_path):
     flags = ("--crop", -1, -1, -1, 1, 0.5, 1, "--rotate", 0, 0, 90, "--scale", 2)
-    flags += ("--translate", 10, 0, -1, "--decimate", "50%", "--sh-degree", 1)
+    flags += ("--translate", 10, 0, -1, "--sh-degree", 1, "--decimate", "50%")
     result = run("convert", ply, tmp_path / "b.ply", *flags)
     assert result.code == 0, result.err
     before, after = read_gaussians(ply), read_gaussians(tmp_path / "b.ply")
     inside = edit.crop(before, torch.tensor([[-1, -1, -1], [1, 0.5, 1]]))
     assert len(after) == round(len(inside) / 2) > 20
     assert after.sh_degree == 1
-    x, y, z = edit.decimate(inside, len(after)).means.T
     # A quarter turn about z takes x to y, and y to -x.
+    turned = edit.transform(
+        inside, Edits(rotate=(0, 0, 90), scale=2, translate=(10, 0, -1)).transform()
+    )
+    x, y, z = inside.means.T
     expected = 2 * torch.stack([-y, x, z], 1) + torch.tensor([10, 0, -1])
-    torch.testing.assert_close(after.means, expected)
+    torch.testing.assert_close(turned.means, expected)
+    smaller = simplify(edit.with_sh_degree(turned, 1), len(after))
+    torch.testing.assert_close(after.means, smaller.means)
+    torch.testing.assert_close(after.sh_rest, smaller.sh_rest)
+
+
+def test_the_size_of_the_file(run, refused, ply, tmp_path):
+    for name, size in (("b.ply", "20KB"), ("b.spz", "4 kb"), ("b.sog", "0.024MB")):
+        result = run("convert", ply, tmp_path / name, "--decimate", size)
+        assert result.code == 0, result.err
+        limit = file_size(size)
+        assert 0.8 * limit < (tmp_path / name).stat().st_size <= limit
+    assert "no scene fits into 1,000 bytes" in refused(
+        "convert", ply, tmp_path / "c.ply", "--decimate", "1KB"
+    )
+    assert sorted(path.name for path in tmp_path.iterdir() if path != ply) == [
+        "b.ply",
+        "b.sog",
+        "b.spz",
+    ]
 
 
 def test_rotations_are_about_x_then_y_then_z(run, tmp_path):

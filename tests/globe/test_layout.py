@@ -121,12 +121,9 @@ def test_a_file_without_cameras():
     assert tower[:, 1].min() < FLOOR - 0.3
 
 
-def test_the_most_important_gaussians_are_used():
-    scene = table()
-    scene.opacity_logits[1500:3000] = -3.0
-    result = arrange(scene, cameras(), 1500).gaussians
+def test_many_gaussians_are_merged():
+    result = arrange(table(), cameras(), 1500).gaussians
     assert len(result) == 1500
-    assert result.opacities.min() > 0.1
     importance = result.opacities.log() + result.log_scales.amax(1)
     assert (importance.diff() <= 1e-6).all()
 

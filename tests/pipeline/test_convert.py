@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.pipeline.convert import Edits, convert, gaussians_to_keep
+from snowsplat.pipeline.convert import Edits, convert
+from snowsplat.pipeline.decimate import file_size, gaussians_to_keep
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
 
@@ -15,6 +16,11 @@ def test_number_of_gaussians_to_keep():
     ]
     with pytest.raises(UserError):
         gaussians_to_keep("¾", 400)
+
+
+def test_size_of_a_file():
+    sizes = [file_size(text) for text in ("10MB", "0.5 gb", "800kB", "800", "50%", 7, None)]
+    assert sizes == [10_000_000, 500_000_000, 800_000, None, None, None, None]
 
 
 def test_invalid_edits():
@@ -45,6 +51,6 @@ def test_two_scenes_are_merged(tmp_path):
     assert format.name == "PLY"
     both = read_gaussians(tmp_path / "b.ply")
     assert len(both) == 5
-    assert set(both.means[:, 0].tolist()) <= {1.0, 4.0, 7.0}
+    torch.testing.assert_close(both.means[:, 0].unique(), torch.tensor([1.0, 4.0, 7.0]))
     with pytest.raises(UserError, match="exists; use `overwrite`"):
         convert(tmp_path / "a.ply", tmp_path / "b.ply")

@@ -1,4 +1,4 @@
-"""Editing: transformed scenes look the same; crop, decimate and merge select the right rows."""
+"""Editing: transformed scenes look the same; crop and merge select the right rows."""
 
 import math
 
@@ -106,18 +106,6 @@ def test_crop():
     inside = ((gaussians.means >= box[0]) & (gaussians.means <= box[1])).all(1)
     assert 0 < len(kept) == int(inside.sum()) < 500
     torch.testing.assert_close(kept.sh_rest, gaussians.sh_rest[inside])
-
-
-def test_decimate_keeps_large_and_opaque_gaussians():
-    gaussians = random_gaussians(100, 2)
-    gaussians.opacity_logits[:] = -3.0
-    gaussians.opacity_logits[[7, 50]] = 3.0
-    gaussians.log_scales[[7, 50]] = 0.0
-    kept = edit.decimate(gaussians, 2)
-    torch.testing.assert_close(kept.means, gaussians.means[[7, 50]])
-    assert len(edit.decimate(gaussians, 0)) == 0
-    assert edit.decimate(gaussians, 100) is gaussians
-    assert edit.decimate(gaussians, 1000) is gaussians
 
 
 def test_merge_raises_the_degree():

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.errors import UserError
 
 Vector = tuple[float, float, float]
@@ -21,7 +22,8 @@ class Convert:
 
     Examples:
       snowsplat convert out/garden garden.spz
-      snowsplat convert garden.ply for_the_web.sog --sh-degree 1 --decimate 50%
+      snowsplat convert garden.ply for_the_web.sog --sh-degree 1 --decimate 10MB
+      snowsplat convert out/garden small.ply --decimate 50% --refine garden
       snowsplat convert garden.ply table.glb --crop -1 -1 -1 1 0.5 1 --rotate 0 90 0
       snowsplat convert house.ply tree.spz both.ply
 
@@ -36,8 +38,8 @@ class Convert:
 
     Notes:
       If there are several scenes, they are merged first. Then the edits are
-      applied in this order: --crop, --rotate, --scale, --translate, --decimate,
-      --sh-degree. Coordinates are in the frame of PLY files: x right, y down, z
+      applied in this order: --crop, --rotate, --scale, --translate, --sh-degree,
+      --decimate. Coordinates are in the frame of PLY files: x right, y down, z
       forward.
     """
 
@@ -48,8 +50,10 @@ class Convert:
     """Reduce the spherical harmonics (view-dependent colour) to this degree, 0 to 3."""
     crop: Annotated[Box | None, flag("X0 Y0 Z0 X1 Y1 Z1", default="all")] = None
     """Keep only the Gaussians whose centres are in this box."""
-    decimate: Annotated[str | None, flag("N|P%", default="all")] = None
-    """Number or percentage of Gaussians to keep. The largest and most opaque ones are kept."""
+    decimate: Annotated[str | None, flag("N|P%|SIZE", default="all")] = None
+    """Number or percentage of Gaussians, or the size of FILE, e.g. 10MB. Neighbours are merged."""
+    refine: Annotated[Path | None, flag("DATASET")] = None
+    """With --decimate: train the result for a moment on the photos of the scene."""
     rotate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)
     """Rotate by these angles in degrees, first about x, then about y, then about z."""
     scale: Annotated[float, flag("F", default="1")] = 1.0
@@ -74,7 +78,15 @@ class Convert:
             decimate=self.decimate,
             sh_degree=self.sh_degree,
         )
-        format = convert(sources, target, edits, overwrite=self.overwrite)
+        with TerminalObserver() as observer:
+            format = convert(
+                sources,
+                target,
+                edits,
+                dataset=self.refine,
+                overwrite=self.overwrite,
+                observer=observer,
+            )
         written = f"{target.stat().st_size:,} bytes of {format.name}"
         print(f"{target}: {written}; lost in this format: {format.loses}")
         return 0

@@ -15,10 +15,11 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.globe.dimensions import FLOOR, FLOOR_RADIUS
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.edit import decimate, transform
+from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.scene.initial_view import overview
+from snowsplat.scene.simplify import simplify
 from snowsplat.trajectory.focus import (
     DEFAULT_UP,
     focus_of,
@@ -98,7 +99,7 @@ def arrange(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> Arra
         raise UserError(
             "no Gaussians are left near the middle of the scene; look at it with snowsplat view"
         )
-    inside = decimate(inside, count)
+    inside = simplify(inside, count)
     importance = inside.opacities.log() + inside.log_scales.amax(1)
     order = importance.argsort(descending=True, stable=True)
     return Arrangement(inside.select(order), _surrounded(frame, cameras))

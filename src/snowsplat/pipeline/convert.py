@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from snowsplat.formats import Format
+from snowsplat.pipeline.decimate import file_size, gaussians_to_keep, write_within
+from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
 from snowsplat.pipeline.scene_source import cameras_of, folder_around, scene_file
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
+from snowsplat.scene.simplify import simplify
 from snowsplat.util.errors import SettingError, UserError
 
 Vector = tuple[float, float, float]
@@ -33,9 +36,9 @@ class Edits:
         rotate: angles in degrees of the rotations about x, then about y, then about z.
         scale: scale by this factor about the origin.
         translate: translate by this offset.
-        decimate: number of Gaussians to keep, or a percentage such as "50%". The largest and most
-            opaque Gaussians are kept.
         sh_degree: reduce the spherical harmonics to this degree, 0 to 3.
+        decimate: the number of Gaussians, a percentage such as "50%", or the size of the file such
+            as "10MB". Neighbours are merged, see `simplify`.
 
     Raises:
         UserError: a value out of its range.
@@ -45,8 +48,8 @@ class Edits:
     rotate: Vector = (0.0, 0.0, 0.0)
     scale: float = 1.0
     translate: Vector = (0.0, 0.0, 0.0)
-    decimate: int | str | None = None
     sh_degree: int | None = None
+    decimate: int | str | None = None
 
     def __post_init__(self) -> None:
         if self.sh_degree is not None and not 0 <= self.sh_degree <= 3:
@@ -59,11 +62,11 @@ class Edits:
             low > high for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
         ):
             raise SettingError("crop", "the corners are swapped; give the lower corner first")
-        if self.decimate is not None:
+        if self.decimate is not None and file_size(self.decimate) is None:
             gaussians_to_keep(self.decimate, 0)
 
     def apply(self, scene: Gaussians) -> Gaussians:
-        """The edited scene; ``scene`` is unchanged.
+        """The edited scene; ``scene`` is unchanged. A size in ``decimate`` is left to `convert`.
 
         Raises:
             UserError: no Gaussian is in the box.
@@ -76,10 +79,10 @@ class Edits:
         transform = self.transform()
         if transform:
             scene = edit.transform(scene, transform)
-        if self.decimate is not None:
-            scene = edit.decimate(scene, gaussians_to_keep(self.decimate, len(scene)))
         if self.sh_degree is not None:
             scene = edit.with_sh_degree(scene, self.sh_degree)
+        if self.decimate is not None and file_size(self.decimate) is None:
+            scene = simplify(scene, gaussians_to_keep(self.decimate, len(scene)))
         return scene
 
     def transform(self) -> Similarity | None:
@@ -100,7 +103,9 @@ def convert(
     target: Path | str,
     edits: Edits | None = None,
     *,
+    dataset: Path | str | None = None,
     overwrite: bool = False,
+    observer: Observer = SILENT,
 ) -> Format:
     """Merge scenes, edit the result, and write it to ``target``.
 
@@ -108,6 +113,7 @@ def convert(
         sources: scene files of any format, or output folders, whose last scene is used.
         target: the file to write; its suffix selects the format.
         edits: changes to the merged scene; default: none.
+        dataset: with ``decimate``: train the result for a moment on the photos of this dataset.
         overwrite: replace ``target``.
 
     Returns:
@@ -125,12 +131,33 @@ def convert(
     format = format_for_writing(target)
     given = [sources] if isinstance(sources, Path | str) else sources
     files = [scene_file(Path(source)) for source in given]
+    refined = None if dataset is None else _refinement(edits, files[0], Path(dataset), observer)
     scene = edits.apply(edit.merge([read_gaussians(file) for file in files]))
+    size = file_size(edits.decimate)
+    write = write_gaussians
     if format.name == "HTML" and len(files) == 1 and edits.transform() is None:
-        _write_page(target, scene, files[0])
+        write = partial(_write_page, source=files[0])
+    if size is not None:
+        write_within(size, target, scene, write, refined)
     else:
-        write_gaussians(target, scene)
+        write(target, refined(scene) if refined else scene)
     return format
+
+
+def _refinement(
+    edits: Edits, scene: Path, dataset: Path, observer: Observer
+) -> Callable[[Gaussians], Gaussians]:
+    """`refine` on the photos of a dataset. Raises: UserError: they do not show the edited scene."""
+    if edits.decimate is None:
+        raise SettingError("refine", "is for decimated scenes; set `decimate` as well")
+    if edits.crop or edits.transform():
+        raise SettingError(
+            "refine", "the photos show the whole scene in its place; crop and transform it later"
+        )
+    from snowsplat.pipeline.refine import photos_of, refine
+
+    photos, background = photos_of(scene, dataset)
+    return partial(refine, dataset=photos, background=background, observer=observer)
 
 
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
@@ -139,21 +166,3 @@ def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
     from snowsplat.viewer.web.scene import ready
 
     write_html(target, *ready(scene, cameras_of(folder_around(source))))
-
-
-def gaussians_to_keep(decimate: int | str, count: int) -> int:
-    """How many of ``count`` Gaussians ``decimate`` keeps.
-
-    Args:
-        decimate: a number such as 5000 or "5000", or a percentage such as "50%".
-
-    Raises:
-        UserError: ``decimate`` is neither.
-    """
-    text = str(decimate)
-    if re.fullmatch(r"\d+", text):
-        return int(text)
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)%", text)
-    if not match or float(match[1]) > 100:
-        raise SettingError("decimate", f"{text!r} is not valid; use a number, or 0% to 100%")
-    return round(count * float(match[1]) / 100)

@@ -1,4 +1,4 @@
-"""Editing a scene: transform, crop, decimate, merge. The input Gaussians are not modified."""
+"""Editing a scene: transform, crop, merge. The input Gaussians are not modified."""
 
 from __future__ import annotations
 
@@ -70,20 +70,6 @@ def crop(gaussians: Gaussians, box: Tensor) -> Gaussians:
     """
     low, high = box.to(gaussians.means.dtype)
     return gaussians.select(((gaussians.means >= low) & (gaussians.means <= high)).all(1))
-
-
-def decimate(gaussians: Gaussians, count: int) -> Gaussians:
-    """The ``count`` most important Gaussians, or all if there are fewer, in their old order.
-
-    The importance is opacity × largest standard deviation. On three trained scenes it preserved
-    more PSNR than opacity alone, and than opacity × area, opacity × volume and powers of these.
-    """
-    if count >= len(gaussians):
-        return gaussians
-    size = gaussians.log_scales.amax(1)
-    importance = torch.nn.functional.logsigmoid(gaussians.opacity_logits) + size
-    order = importance.argsort(descending=True, stable=True)
-    return gaussians.select(order[:count].sort().values)
 
 
 def merge(parts: Sequence[Gaussians]) -> Gaussians:
