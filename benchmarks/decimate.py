@@ -2,8 +2,8 @@
 
     python benchmarks/decimate.py out/fox out/fern --images pictures
 
-Each OUT is the output folder of a training with --eval, whose held-out photos are compared. PlayCanvas'
-converter is a program for Node: `npm ci --prefix tests/node` installs it.
+Each OUT is the output folder of a training with --eval, whose held-out photos are compared. The
+converter of PlayCanvas is a program for Node: `npm ci --prefix tests/node` installs it.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from snowsplat.data import Dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.image_files import write_png
@@ -49,14 +49,46 @@ def by_playcanvas(scene: Path, count: int) -> Gaussians | None:
         return read_gaussians(target)
 
 
-def ways(
-    scene: Path, whole: Gaussians, dataset: Dataset, background: str, count: int
-) -> Iterator[tuple[str, Callable[[], Gaussians | None]]]:
-    """The name and the function of each way to ``count`` Gaussians."""
-    yield "dropped", lambda: dropped(whole, count)
-    yield "PlayCanvas", lambda: by_playcanvas(scene, count)
-    yield "merged", lambda: simplify(whole, count)
-    yield "merged, refined", lambda: refine(simplify(whole, count), dataset, background)
+@dataclass
+class Scene:
+    """A trained scene, and the photos that measure what becomes of it."""
+
+    folder: Path
+    images: Path | None  # Where a held-out view of each row is written.
+
+    def __post_init__(self) -> None:
+        self.file = scene_file(self.folder)
+        self.whole = read_gaussians(self.file)
+        photos = Path(folder_around(self.file).settings()[0].path)
+        self.dataset, self.background = photos_of(self.file, photos)
+
+    def ways(self, count: int) -> dict[str, Callable[[], Gaussians | None]]:
+        """The name and the function of each way to ``count`` Gaussians."""
+        return {
+            "dropped": lambda: dropped(self.whole, count),
+            "PlayCanvas": lambda: by_playcanvas(self.file, count),
+            "merged": lambda: simplify(self.whole, count),
+            "merged, refined": lambda: refine(
+                simplify(self.whole, count), self.dataset, self.background
+            ),
+        }
+
+    def print_row(self, name: str, gaussians: Gaussians, seconds: float = 0.0) -> None:
+        color = torch.full((3,), float(self.background == "white"))
+        result = evaluate_views(gaussians, self.dataset.test, background=color.tolist())
+        taken = f"{seconds:.1f}" if seconds else ""
+        row = (self.folder.name, f"{len(gaussians):,}", name)
+        print(
+            "|",
+            " | ".join((*row, f"{result.psnr:.2f}", f"{result.ssim:.3f}", taken)),
+            "|",
+            flush=True,
+        )
+        if self.images:
+            image = render(gaussians, self.dataset.test[0].camera, color).image
+            self.images.mkdir(parents=True, exist_ok=True)
+            pixels = (image.clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+            write_png(self.images / f"{self.folder.name}_{len(gaussians)}_{name}.png", pixels)
 
 
 def main() -> None:
@@ -69,31 +101,14 @@ def main() -> None:
     arguments = parser.parse_args()
     print("| scene | Gaussians | | PSNR | SSIM | seconds |\n|---|---|---|---|---|---|")
     for folder in arguments.folders:
-        scene = scene_file(folder)
-        whole = read_gaussians(scene)
-        path = Path(folder_around(scene).settings()[0].path)
-        dataset, background = photos_of(scene, path)
-        color = torch.full((3,), float(background == "white"))
-
-        def show(name: str, gaussians: Gaussians, seconds: float = 0.0) -> None:
-            result = evaluate_views(gaussians, dataset.test, background=color.tolist())
-            taken = f"{seconds:.1f}" if seconds else ""
-            row = (folder.name, f"{len(gaussians):,}", name)
-            values = (f"{result.psnr:.2f}", f"{result.ssim:.3f}", taken)
-            print("|", " | ".join((*row, *values)), "|", flush=True)
-            if arguments.images:
-                image = render(gaussians, dataset.test[0].camera, color).image
-                arguments.images.mkdir(parents=True, exist_ok=True)
-                pixels = (image.clamp(0.0, 1.0) * 255.0).round().byte().numpy()
-                write_png(arguments.images / f"{folder.name}_{len(gaussians)}_{name}.png", pixels)
-
-        show("whole", whole)
+        scene = Scene(folder, arguments.images)
+        scene.print_row("whole", scene.whole)
         for share in arguments.shares:
-            for name, way in ways(scene, whole, dataset, background, round(share * len(whole))):
+            for name, way in scene.ways(round(share * len(scene.whole))).items():
                 started = time.perf_counter()
                 smaller = way()
                 if smaller is not None:
-                    show(name, smaller, time.perf_counter() - started)
+                    scene.print_row(name, smaller, time.perf_counter() - started)
 
 
 if __name__ == "__main__":
