@@ -105,7 +105,7 @@ class Step:
 
     @torch.no_grad()
     def queue(self) -> None:
-        batch = [BatchView(self.view, self.camera, self.photo, self.background)]
+        batch = [BatchView(0, self.view, self.camera, self.photo, self.background)]
         self.trainer._optimize(STEP, batch)
 
     def run(self) -> float:

@@ -122,7 +122,7 @@ def work(size: str, batch: int, folder: Path) -> None:
 
 def _rows(trainer: Trainer, views: list[View], shards: Shards) -> np.ndarray:
     """(N, V): the number of splats of each process in each view of the next batch."""
-    order = trainer._order[: len(views)]
+    order = trainer._queue.order[: len(views)]
     if not order:
         order = list(range(len(views)))
     counts = [len(project(trainer.gaussians, trainer._cameras[i])) for i in order]

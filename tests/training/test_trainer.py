@@ -20,6 +20,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
 from snowsplat.training import checkpoint
+from snowsplat.training.background import Background
 from snowsplat.training.config import TrainConfig, changed
 from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
@@ -326,7 +327,7 @@ def test_a_dataset_without_points_starts_from_random_points(dataset):
 
 def test_every_view_once_an_epoch(dataset, monkeypatch):
     trainer = Trainer(dataset, CALM)
-    seen = [trainer._next_batch(1)[0].camera.position for _ in range(1, 15)]
+    seen = [trainer._queue.take(0, 1)[0].camera.position for _ in range(1, 15)]
     positions = torch.stack(seen)
     for epoch in (positions[:7], positions[7:]):
         assert len(epoch.unique(dim=0)) == 7
@@ -352,8 +353,7 @@ def test_photos_are_decoded_ahead_in_order_at_the_resolution_of_their_step(datas
     monkeypatch.setattr(trainer._images, "prefetch", recorded_prefetch)
     monkeypatch.setattr(trainer._images, "get", recorded_get)
     for step in range(1, 15):
-        trainer.step = step - 1
-        trainer._next_batch(step)
+        trainer._queue.take(step - 1, step)
     assert calls == [1, 4, 6, 9, 13]
 
 
@@ -380,12 +380,11 @@ def test_a_fixed_background_is_put_behind_transparent_photos_once(dataset, tmp_p
     Image.new("RGBA", (WIDTH, HEIGHT), (200, 100, 0, 0)).save(tmp_path / "a.png")
     source = ImageSource(tmp_path / "a.png", WIDTH, HEIGHT)
     alone = replace(dataset, train=[replace(dataset.train[0], image=source)])
-    photo = Trainer(alone, replace(CALM, background="white"))._next_batch(1)[0].photo
+    photo = Trainer(alone, replace(CALM, background="white"))._queue.take(0, 1)[0].photo
     assert photo.alpha is None
     assert (photo.rgb == 255).all()
-    assert (
-        Trainer(alone, replace(CALM, background="random"))._next_batch(1)[0].photo.alpha is not None
-    )
+    random = Trainer(alone, replace(CALM, background="random"))
+    assert random._queue.take(0, 1)[0].photo.alpha is not None
 
 
 def test_the_cap_by_the_size_of_the_photos_uses_their_median(dataset):
@@ -417,10 +416,10 @@ def test_cameras_and_random_backgrounds_are_on_the_device(dataset, monkeypatch):
         Camera, "to", lambda self, device: devices.append(device) or to(self, device)
     )
     cpu = torch.device("cpu")
-    trainer = Trainer(dataset, BUSY, device=cpu)
+    Trainer(dataset, BUSY, device=cpu)
     assert devices == 7 * [cpu]
-    trainer.device = torch.device("meta")
-    assert trainer._next_background().device.type == "meta"
+    background = Background("random", torch.Generator(), torch.device("meta"))
+    assert background.draw().device.type == "meta"
 
 
 def test_a_step_without_evaluation_reports_no_metrics():

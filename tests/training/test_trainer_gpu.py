@@ -65,7 +65,7 @@ def test_a_loss_that_is_not_finite_changes_nothing(
     monkeypatch.setitem(LAUNCHERS, "cpu", launcher("emulated"))
     trainer = with_capacity(Trainer(dataset, BUSY), 100_000)
     trainer.step_once()
-    trainer._background = torch.full((3,), torch.nan)
+    monkeypatch.setattr(trainer._background, "draw", lambda: torch.full((3,), torch.nan))
     before = {name: tensor.clone() for name, tensor in trainer.state_tensors().items()}
     with pytest.raises(Diverged, match="step 2, photo .*: the loss is nan"):
         trainer.step_once()
@@ -112,7 +112,7 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
         return launch_by(record, name, params)
 
     trainer = Trainer(dataset, replace(config, batch=batch))
-    view = trainer._next_batch(1)[0]
+    view = trainer._queue.take(0, 1)[0]
     assert view.photo is not None
     monkeypatch.setitem(LAUNCHERS, "cuda", launch)
     monkeypatch.setattr(Tensor, "backward", backward_by_hand)

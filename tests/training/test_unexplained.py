@@ -227,14 +227,14 @@ def test_the_check_changes_no_bit_if_all_poses_are_right(right):
 @pytest.mark.slow
 def test_a_view_with_a_wrong_pose_is_not_used_after_the_check(wrong, monkeypatch):
     trainer, used = Trainer(wrong, CONFIG), []
-    next_batch = trainer._next_batch
+    take = trainer._queue.take
 
-    def recorded(step):
-        chosen = next_batch(step)
+    def recorded(after, step):
+        chosen = take(after, step)
         used.append((step, chosen[0].view.name))
         return chosen
 
-    monkeypatch.setattr(trainer, "_next_batch", recorded)
+    monkeypatch.setattr(trainer._queue, "take", recorded)
     trainer.run(until=100)
     assert trainer.left_out == ()  # it is decided before step 101
     trainer.run()
@@ -264,7 +264,7 @@ def test_the_decision_is_made_once(wrong):
     trainer = Trainer(wrong, CONFIG)
     trainer.run(until=101)
     assert trainer.left_out == (WRONG,)
-    trainer.left_out = ()
+    trainer._queue.left_out = ()
     trainer.run(until=110)
     assert trainer.left_out == ()
 

@@ -23,9 +23,11 @@ from snowsplat.training.view_gradient import ViewGradient
 class BatchView:
     """A view of a batch, at the resolution of the step.
 
-    ``photo`` is None if another process blends this view.
+    ``index`` is that of the view in the training views of the dataset. ``photo`` is None if another
+    process blends this view.
     """
 
+    index: int
     view: View
     camera: Camera
     photo: LoadedImage | None

@@ -47,29 +47,34 @@ def check_finite(what: str, tensors: Mapping[str, Tensor], advice: str) -> None:
         raise UserError(f"{what}: non-finite values in {listed(found)}; {advice}")
 
 
-def check_state(own: Mapping[str, Tensor], given: Mapping[str, Tensor], views: int) -> None:
+def check_state(
+    rows: Mapping[str, Tensor],
+    common: Mapping[str, Tensor],
+    given: Mapping[str, Tensor],
+    views: int,
+) -> None:
     """Check that a trainer can load a state.
 
     Args:
-        own: the state of the trainer, from `Trainer.state_tensors`.
+        rows: the part of the state of the trainer with one row for each Gaussian.
+        common: the other part. Only ``order`` and ``left_out`` may have another size.
         given: the state to load.
         views: number of training views of the trainer.
 
     Raises:
         UserError: the state has another density control, SH degree or dataset, or is not finite.
     """
+    own = {**rows, **common}
     fits = own.keys() == given.keys() and all(
         (mine.dtype, mine.ndim, mine.shape[1:]) == (other.dtype, other.ndim, other.shape[1:])
         for mine, other in ((own[name], given[name]) for name in own)
     )
     # The kernels take one number of rows for all tensors of Gaussians.
-    others = ("random.", "step", "order", "checked", "left_out", "overfitting.")
-    rows = {len(t) for name, t in given.items() if not name.startswith(others) and t.ndim}
-    fits = fits and len(rows) == 1
+    fits = fits and len({len(given[name]) for name in rows}) == 1
     fits = fits and all(
-        own[name].shape == given[name].shape
-        for name in own
-        if name.startswith(("random.", "overfitting."))
+        common[name].shape == given[name].shape
+        for name in common
+        if name not in ("order", "left_out")
     )
     every = set(range(views))
     if fits and "left_out" in given:

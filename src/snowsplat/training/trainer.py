@@ -13,6 +13,7 @@ from snowsplat.data.dataset import Dataset
 from snowsplat.data.image_loader import ImageLoader, available_memory
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.background import Background
 from snowsplat.training.batch import BatchView, batch_gradients
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.decay import Decay
@@ -28,20 +29,14 @@ from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.unexplained import unexplained_views
+from snowsplat.training.view_queue import ViewQueue
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import interrupts_between_steps, single_threaded
-
-#: The order of the views is drawn at least this number of steps in advance, so that other threads
-#: can decode their photos before they are needed.
-LOOKAHEAD = 16
 
 #: There is one random generator for each kind of random choice, so that additional choices of one
 #: kind do not change the others. The names are part of the checkpoint format. The index of a name
 #: determines the seed of its generator, so the order must not change.
 GENERATORS = ("start", "views", "background", "density")
-
-#: Background colours by name; "random" is drawn in each step.
-FIXED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -76,8 +71,6 @@ class Trainer:
 
     Attributes:
         gaussians: the scene after ``step`` steps, on ``device``.
-        left_out: indices of the training views that are not used any more, because the scene does
-            not explain them; see ``TrainConfig.leave_out_after``.
         within_step: True during a step. It stays True if an error or a second Ctrl-C interrupts a
             step: the state is then inconsistent and must not be saved.
     """
@@ -117,23 +110,26 @@ class Trainer:
         self._render = sharded_render(shards)
         self.step = 0
         self.within_step = False
-        self.left_out: tuple[int, ...] = ()
         self._checked = False  # whether `left_out` is decided
         self._generators = {
             name: torch.Generator().manual_seed(4 * config.seed + i)
             for i, name in enumerate(GENERATORS)
         }
-        self._order: list[int] = []  # indices of the views of the next steps
-        fixed = FIXED_BACKGROUNDS.get(config.background)
         self.device = device or torch.device("cpu")
         self._cameras = [view.camera.to(self.device) for view in dataset.train]
-        self._background = None if fixed is None else torch.tensor(fixed, device=self.device)
+        self._background = Background(
+            config.background, self._generators["background"], self.device
+        )
         self._images = ImageLoader(
             dataset.train,
-            background=fixed,
+            background=self._background.fixed,
             budget_bytes=config.image_memory
             or available_memory(self.device) // (2 * shards.in_memory),
             device=self.device,
+        )
+        self._queue = ViewQueue(
+            *(dataset.train, self._cameras, self._images, self._background, self._downscale),
+            *(self._generators["views"], config.batch, shards),
         )
         # The Gaussians of a resumed training run are replaced by those of the state.
         start = config if state is None else replace(config, init="points")
@@ -168,7 +164,7 @@ class Trainer:
         points = None if dataset.points is None else dataset.points.xyz
         self._near_limit = NearLimit(config.near_limit, self._cameras, points, self.schedule)
         self._overfitting = OverfittingCheck(
-            *(dataset, self._images, self.schedule, self._evaluation_background(), self._render)
+            *(dataset, self._images, self.schedule, self._background.evaluation, self._render)
         )
         self._runner = StepRunner(
             *(len(self.gaussians), self.device, config.density.abs_grad, config.batch, shards)
@@ -180,6 +176,13 @@ class Trainer:
     def total(self) -> int:
         """The number of Gaussians of all processes."""
         return self.shards.total(len(self.gaussians))
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """Indices of the training views that are not used any more, because the scene does not
+        explain them; see ``TrainConfig.leave_out_after``.
+        """
+        return self._queue.left_out
 
     @property
     def overfitting(self) -> Overfitting | None:
@@ -234,7 +237,7 @@ class Trainer:
                 self._decay.after_step(self.step, self.gaussians)
                 self._scale_limit.after_step(self.step, self.gaussians)
             step = min(self.step + self.config.batch, self.schedule.iterations)
-            batch = self._next_batch(step)
+            batch = self._queue.take(self.step, step)
             losses = self._runner.run(
                 lambda: self._optimize(step, batch),
                 step,
@@ -267,73 +270,30 @@ class Trainer:
 
     def evaluate(self) -> Evaluation:
         """Metrics of the test views in the current state. Black replaces a random background."""
-        background = self._evaluation_background().tolist()
+        background = self._background.evaluation.tolist()
         with single_threaded():
             return evaluate_views(
                 self.gaussians, self.dataset.test, background=background, render=self._render
             )
-
-    def _next_batch(self, step: int) -> list[BatchView]:
-        """The next views in random order, at the resolution of the step that ends with them."""
-        downscale = self._downscale(step)
-        ahead = max(LOOKAHEAD, self.config.batch)
-        if len(self._order) <= ahead:
-            while len(self._order) <= ahead:
-                count = len(self.dataset.train)
-                order = torch.randperm(count, generator=self._generators["views"]).tolist()
-                self._order += [i for i in order if i not in self.left_out]
-            self._prefetch(downscale)
-        elif downscale != self._downscale(self.step):
-            self._prefetch(downscale)
-        batch = []
-        for position in range(step - self.step):
-            i = self._order.pop(0)
-            view, camera = self.dataset.train[i], self._cameras[i].downscaled(downscale)
-            own = position % self.shards.size == self.shards.rank
-            photo = self._images.get(view, downscale) if own else None
-            batch.append(BatchView(view, camera, photo, self._next_background()))
-        return batch
 
     def _leave_out_unexplained(self) -> None:
         """Decide once, after the step of ``leave_out_after``, which views are used from now on."""
         after = self.config.leave_out_after
         if self._checked or not after or self.step < self.schedule.step_of(after):
             return
-        self.left_out = unexplained_views(
+        left_out = unexplained_views(
             self.gaussians,
             self.dataset.train,
             self._images,
-            background=self._evaluation_background(),
+            background=self._background.evaluation,
             sh_degree=self.config.sh_degree_at(self.step),
             render=self._render,
         )
         self._checked = True
-        if self.left_out:
-            self._order = [i for i in self._order if i not in self.left_out]
-        self._prefetch(self._downscale(self.step + 1))
-
-    def _evaluation_background(self) -> Tensor:
-        """(3,) on the device: the background colour; black replaces a random one."""
-        black = torch.zeros(3, device=self.device)
-        return black if self._background is None else self._background
-
-    def _next_background(self) -> Tensor:
-        """The background colour, (3,) on the device: the fixed colour, or a random one."""
-        if self._background is not None:
-            return self._background
-        color = torch.rand(3, generator=self._generators["background"])
-        return color.to(self.device, non_blocking=True)
+        self._queue.leave_out(left_out, self.step)
 
     def _downscale(self, step: int) -> int:
         return self.config.downscale_at(step, self.schedule)
-
-    def _prefetch(self, downscale: int) -> None:
-        own = [
-            self.dataset.train[i]
-            for position, i in enumerate(self._order)
-            if position % self.config.batch % self.shards.size == self.shards.rank
-        ]
-        self._images.prefetch(own, downscale)
 
     def state_tensors(self) -> dict[str, Tensor]:
         """The state on which the next steps depend, besides dataset, configuration and schedule.
@@ -355,7 +315,7 @@ class Trainer:
     def _common_tensors(self) -> dict[str, Tensor]:
         """The other part of the state, which is the same in all processes."""
         tensors = {f"random.{name}": g.get_state() for name, g in self._generators.items()}
-        order = torch.tensor(self._order, dtype=torch.int64)
+        order = torch.tensor(self._queue.order, dtype=torch.int64)
         tensors |= {"step": torch.tensor(self.step), "order": order}
         if self.config.leave_out_after:  # otherwise, as in earlier versions of the format
             tensors["checked"] = torch.tensor(self._checked)
@@ -373,7 +333,7 @@ class Trainer:
                 finite.
         """
         own = self._shard_tensors()
-        check_state(own | self._common_tensors(), tensors, len(self.dataset.train))
+        check_state(own, self._common_tensors(), tensors, len(self.dataset.train))
         tensors = tensors | {name: self.shards.own_rows(tensors[name]) for name in own}
 
         def part(prefix: str) -> dict[str, Tensor]:
@@ -394,8 +354,7 @@ class Trainer:
         self.within_step = False
         if self.config.leave_out_after:
             self._checked = bool(tensors["checked"])
-            self.left_out = tuple(tensors["left_out"].tolist())
+            self._queue.left_out = tuple(tensors["left_out"].tolist())
         if self.config.stop_overfitting:
             self._overfitting.load_state(part("overfitting."))
-        self._order = tensors["order"].tolist()
-        self._prefetch(self._downscale(self.step + 1))
+        self._queue.continue_with(tensors["order"].tolist(), self.step)

@@ -164,7 +164,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "near, far = [*beside.tolist(), 1.0], [*beyond.tolist(), 0.0, 0.0]",
     ): "the last factor is never used",
     (
-        "training/trainer.py",
+        "training/view_queue.py",
         "LOOKAHEAD = 16",
         "LOOKAHEAD = 17",
     ): "how far ahead photos are decoded; their order is the same",
