@@ -32,13 +32,15 @@ Write = Callable[[Path, GaussianArrays], None]
 
 
 def rows() -> list[tuple[str, str, Write, Read | None]]:
-    """Name, suffix, writer and reader of each format that can be written, and of SPZ version 4."""
+    """Name, suffix, writer and reader of each format, and of all versions of SPZ."""
     found: list[tuple[str, str, Write, Read | None]] = []
     for format in FORMATS:
         if format.write is not None:
             found.append((format.name, format.suffixes[0], format.write, format.read))
         if format.name == "SPZ":
-            found.append(("SPZ 4", ".spz", lambda p, g: write_spz(p, g, version=4), read_spz))
+            for version in (2, 4):
+                write = partial(write_spz, version=version)
+                found.append((f"SPZ {version}", ".spz", write, read_spz))
     return found
 
 

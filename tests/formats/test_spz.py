@@ -10,8 +10,9 @@ import zstandard
 
 from snowsplat.formats import format_for_reading, read_gaussians, write_gaussians
 from snowsplat.formats.gaussian_arrays import GaussianArrays
-from snowsplat.formats.spz import write_spz
+from snowsplat.formats.spz import spz_version, write_spz
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.geometry import rotation_from_quat
 
 
 def head(version: int, count: int, degree: int, bits: int = 12, flags: int = 0, streams: int = 0):
@@ -73,6 +74,21 @@ def test_version_2_has_three_bytes_of_rotation_and_may_be_uncompressed(tmp_path)
         check_the_one(read)
 
 
+def test_rotations_written_in_three_bytes(tmp_path, make_scene):
+    scene = make_scene(1, 0)
+    # (0.8 i + 0.6 j) i = −0.8 − 0.6 k, and −q is the same rotation as q. In the frame of the file,
+    # z has the other sign.
+    scene.quats[0] = torch.tensor([0.0, 0.8, 0.6, 0.0])
+    write_spz(tmp_path / "a.spz", GaussianArrays.from_gaussians(scene), 2)
+    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert data[4] == 2
+    assert len(data) == 16 + 9 + 1 + 3 + 3 + 3
+    assert list(data[-3:]) == [128, 128, round(127.5 - 127.5 * 0.6)]
+    expected = torch.tensor([0.8, 0.0, 0.0, 0.6])
+    read = read_gaussians(tmp_path / "a.spz").rotations[0]
+    torch.testing.assert_close(read, expected, rtol=0, atol=0.005)
+
+
 def test_three_bytes_of_rotation_determine_w(tmp_path):
     q = bytes([204, 128, 127])  # x is 0.6, so w is 0.8; y and z are nearly 0
     body = head(2, 1, 1) + b"".join([*COLUMNS[:4], q, COLUMNS[5]])
@@ -123,7 +139,7 @@ def test_written_bytes(tmp_path, version):
     check_the_one(read_gaussians(path))
 
 
-@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("version", [2, 3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 257])
 def test_round_trip_is_as_precise_as_the_bytes_allow(
@@ -133,11 +149,17 @@ def test_round_trip_is_as_precise_as_the_bytes_allow(
     write_spz(tmp_path / "a.spz", GaussianArrays.from_gaussians(scene), version)
     read = read_gaussians(tmp_path / "a.spz")
     assert read.sh_degree == degree
+    assert spz_version(tmp_path / "a.spz") == str(version)
     torch.testing.assert_close(read.means, scene.means, rtol=0, atol=0.51 / 4096)
     torch.testing.assert_close(
         read.log_scales, scene.log_scales.clamp(-10, 5.94), rtol=0, atol=0.51 / 16
     )
-    assert rotation_error(read, scene) < 0.004
+    if version > 2:
+        assert rotation_error(read, scene) < 0.004
+    else:  # the axes of a Gaussian are the same, but two may point to the other side
+        a, b = rotation_from_quat(read.rotations), rotation_from_quat(scene.rotations)
+        cosines = a.transpose(1, 2) @ b
+        torch.testing.assert_close(cosines.abs(), torch.eye(3).expand(n, 3, 3), rtol=0, atol=0.02)
     torch.testing.assert_close(read.opacities, scene.opacities, rtol=0, atol=0.51 / 255)
     torch.testing.assert_close(
         read.sh_dc, scene.sh_dc.clamp(-127.5 / 38.25, 127.5 / 38.25), rtol=0, atol=0.51 / 38.25
@@ -252,11 +274,11 @@ def test_damage_is_reported(tmp_path, make_scene, one_line):
     assert "not an .spz file" in one_line(path)
     path.write_bytes(gzip.compress(head(7, 1, 1) + b"".join(COLUMNS)))
     assert "version 7" in one_line(path)
-    for version in (3, 4):
+    for version in (2, 3, 4):
         write_spz(path, GaussianArrays.from_gaussians(make_scene(50, 1)), version)
         data = path.read_bytes()
         for size in (*range(4, 140, 5), len(data) - 1):
             path.write_bytes(data[:size])
             one_line(path)
-    with pytest.raises(ValueError, match="version 2"):
-        write_spz(path, GaussianArrays.from_gaussians(make_scene(1)), 2)
+    with pytest.raises(ValueError, match="version 1"):
+        write_spz(path, GaussianArrays.from_gaussians(make_scene(1)), 1)

@@ -59,7 +59,7 @@ def assert_same(a: Gaussians, b: Gaussians) -> None:
     assert ((a.rotations * b.rotations).sum(1).abs() > 1 - 1e-6).all()
 
 
-@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("version", [2, 3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_niantics_reader_agrees_with_ours_on_our_files(
     tmp_path, make_scene, reference, version, degree

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats.spz import spz_version
 from snowsplat.pipeline.convert import Edits, convert
 from snowsplat.pipeline.decimate import file_size, gaussians_to_keep
 from snowsplat.scene.gaussians import Gaussians
@@ -54,3 +55,24 @@ def test_two_scenes_are_merged(tmp_path):
     torch.testing.assert_close(both.means[:, 0].unique(), torch.tensor([1.0, 4.0, 7.0]))
     with pytest.raises(UserError, match="exists; use `overwrite`"):
         convert(tmp_path / "a.ply", tmp_path / "b.ply")
+
+
+def test_versions_of_spz(tmp_path):
+    zeros = torch.zeros(3, 1, 3)
+    scene = Gaussians(
+        zeros[:, 0], zeros[:, 0], torch.ones(3, 4), zeros[:, 0, 0], zeros, zeros[:, :0]
+    )
+    write_gaussians(tmp_path / "a.ply", scene)
+    for given, written in ((None, "3"), (2, "2"), (3, "3"), (4, "4")):
+        path = tmp_path / f"{given}.spz"
+        convert(tmp_path / "a.ply", path, spz_version=given)
+        assert spz_version(path) == written
+        assert len(read_gaussians(path)) == 3
+    edits = Edits(decimate="10KB")
+    convert(tmp_path / "a.ply", tmp_path / "small.spz", edits, spz_version=2)
+    assert spz_version(tmp_path / "small.spz") == "2"
+    for name, version, message in (("b.spz", 1, "1 cannot"), ("b.sog", 2, "b.sog is SOG")):
+        with pytest.raises(SettingError, match=message) as error:
+            convert(tmp_path / "a.ply", tmp_path / name, spz_version=version)
+        assert error.value.setting == "spz_version"
+        assert not (tmp_path / name).exists()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -22,6 +22,7 @@ class Convert:
 
     Examples:
       snowsplat convert out/garden garden.spz
+      snowsplat convert garden.ply old.spz --spz-version 2
       snowsplat convert garden.ply for_the_web.sog --sh-degree 1 --decimate 10MB
       snowsplat convert out/garden small.ply --decimate 50% --refine garden
       snowsplat convert garden.ply table.glb --crop -1 -1 -1 1 0.5 1 --rotate 0 90 0
@@ -30,7 +31,8 @@ class Convert:
     The suffix of FILE selects the format:
       .ply              lossless; read by every program for Gaussian splats
       .compressed.ply   1/4 of the size of .ply; for SuperSplat
-      .spz              1/8 of the size; for the programs of Niantic and many others
+      .spz              1/8 of the size; for the programs of Niantic and many others.
+                        Older viewers need --spz-version 2
       .sog              1/10 of the size; for the web viewers of PlayCanvas
       .glb              glTF; lossless except for rounding
       .splat            1/8 of the size; no view-dependent colour
@@ -60,6 +62,9 @@ class Convert:
     """Scale by this factor about the origin."""
     translate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)
     """Translate by this offset."""
+    spz_version: Annotated[Literal[2, 3, 4] | None, flag("{2,3,4}", default="3")] = None
+    """Version of an .spz file: 2 for older viewers, with coarser rotations; 4 for the newest
+    viewers, faster to load."""
     overwrite: Annotated[bool, switch()] = False
     """Replace FILE if it exists already."""
 
@@ -84,6 +89,7 @@ class Convert:
                 target,
                 edits,
                 dataset=self.refine,
+                spz_version=self.spz_version,
                 overwrite=self.overwrite,
                 observer=observer,
             )

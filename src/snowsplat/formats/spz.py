@@ -39,14 +39,22 @@ from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
-__all__ = ["is_spz", "read_spz", "spz_version", "write_spz"]
+__all__ = ["WRITTEN_VERSIONS", "is_spz", "read_spz", "spz_version", "write_spz"]
 
 logger = logging.getLogger(__name__)
+
+#: The versions that `write_spz` can write.
+WRITTEN_VERSIONS = (2, 3, 4)
 
 #: The type of an extension that selects the frame by a number. 0 is the default frame, n is the
 #: n-th frame of `_FRAMES`. Larger numbers have the y and z axes swapped and are not supported.
 _FRAME_EXTENSION = 0xADBE0003
 _FRAMES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
+# The signs of a quaternion wxyz times 1, i, j and k. The entries of the n-th product are in the
+# order 0 ^ n, 1 ^ n, 2 ^ n, 3 ^ n.
+_HALF_TURNS = np.array(
+    [[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]], dtype=np.float32
+)
 _COLOR_STEP = 0.15 * 255
 # SH bytes are rounded to multiples of these (degree 1, higher degrees), so that they compress
 # better. Niantic's implementation uses 8 and 16, which lower the PSNR of a trained scene by more
@@ -148,14 +156,15 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     """Write a scene, atomically.
 
     Args:
-        version: 3, which all readers support, or 4, which is smaller and faster to read and write.
+        version: 3; 2 for readers that are older, with rotations of 3 bytes; or 4, which is smaller
+            and faster to read and write, but which older readers do not know.
 
     Raises:
-        ValueError: ``version`` is not 3 or 4.
+        ValueError: ``version`` is not in `WRITTEN_VERSIONS`.
         OSError: the folder is missing or not writable, or the disk is full.
     """
-    if version not in (3, 4):
-        raise ValueError(f"version {version} of .spz cannot be written; use 3 or 4")
+    if version not in WRITTEN_VERSIONS:
+        raise ValueError(f"version {version} of .spz cannot be written; use 2, 3 or 4")
     path = Path(path)
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.packable(path, gaussians)
     means, quats, sh_rest = flip_axes(means, quats, sh_rest, UP_BACK)
@@ -165,7 +174,7 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
         packing.opacity_bytes(opacity_logits),
         packing.to_bytes(127.5 + _COLOR_STEP * sh_dc),
         packing.to_bytes(16 * (log_scales + 10)),
-        _pack_rotations(quats),
+        _pack_rotations(quats) if version > 2 else _pack_rotations_in_3_bytes(quats),
         _pack_sh(sh_rest),
     ]
     degree = SH_REST_COUNTS.index(sh_rest.shape[1])
@@ -213,6 +222,17 @@ def _pack_rotations(quats: np.ndarray) -> np.ndarray:
     for i, shift in enumerate((20, 10, 0)):
         words |= parts[:, i] << np.uint32(shift)
     return words.astype("<u4")
+
+
+def _pack_rotations_in_3_bytes(quats: np.ndarray) -> np.ndarray:
+    """Bytes (N, 3) of x, y, z. Readers compute w from them, which is precise only if w is large.
+
+    A Gaussian that is rotated by 180° about one of its axes remains the same. The product of its
+    quaternion and i, j or k is such a rotation, and moves the largest entry to w.
+    """
+    largest = np.abs(quats).argmax(1)
+    turned = np.take_along_axis(quats, np.arange(4) ^ largest[:, None], 1) * _HALF_TURNS[largest]
+    return packing.to_bytes(127.5 + 127.5 * np.where(turned[:, :1] < 0, -turned, turned)[:, 1:])
 
 
 def _pack_sh(sh_rest: np.ndarray) -> np.ndarray:

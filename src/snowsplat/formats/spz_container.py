@@ -163,7 +163,7 @@ def _unpack_streams(path: Path, data: bytes, header: Header) -> Contents:
 
 
 def pack(header: Header, columns: Sequence[bytes]) -> bytes:
-    """The content of a file of version 3 or 4."""
+    """The content of a file."""
     streams = [column for column in columns if column]
     count = len(streams) if header.version > 3 else 0
     head = _HEAD.pack(
@@ -175,7 +175,7 @@ def pack(header: Header, columns: Sequence[bytes]) -> bytes:
         header.flags,
         count,
     )
-    if header.version == 3:
+    if header.version < 4:
         packer = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, 31)
         return b"".join([packer.compress(part) for part in (head, *streams)]) + packer.flush()
     packed = [zstandard.ZstdCompressor(_ZSTD_LEVEL).compress(stream) for stream in streams]

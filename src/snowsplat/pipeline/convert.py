@@ -10,7 +10,8 @@ from pathlib import Path
 
 import torch
 
-from snowsplat.formats import Format
+from snowsplat.formats import Format, GaussianArrays
+from snowsplat.formats.spz import WRITTEN_VERSIONS, write_spz
 from snowsplat.pipeline.decimate import file_size, gaussians_to_keep, write_within
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
@@ -104,6 +105,7 @@ def convert(
     edits: Edits | None = None,
     *,
     dataset: Path | str | None = None,
+    spz_version: int | None = None,
     overwrite: bool = False,
     observer: Observer = SILENT,
 ) -> Format:
@@ -114,13 +116,15 @@ def convert(
         target: the file to write; its suffix selects the format.
         edits: changes to the merged scene; default: none.
         dataset: with ``decimate``: train the result for a moment on the photos of this dataset.
+        spz_version: the version of an .spz file, 2 to 4; default: 3.
         overwrite: replace ``target``.
 
     Returns:
         The format that was written.
 
     Raises:
-        UserError: a missing or damaged scene, an unknown format, or ``target`` exists.
+        UserError: a missing or damaged scene, an unknown format, ``target`` exists, or
+            ``spz_version`` is no version, or given for another format.
         OSError: ``target`` cannot be written.
     """
     target, edits = Path(target), edits or Edits()
@@ -129,12 +133,18 @@ def convert(
     if target.exists() and not overwrite:
         raise UserError(f"{target}: exists; use `overwrite` to replace it")
     format = format_for_writing(target)
+    if spz_version is not None and format.name != "SPZ":
+        raise SettingError("spz_version", f"is for .spz files, and {target.name} is {format.name}")
+    if spz_version is not None and spz_version not in WRITTEN_VERSIONS:
+        raise SettingError("spz_version", f"{spz_version} cannot be written; use 2, 3 or 4")
     given = [sources] if isinstance(sources, Path | str) else sources
     files = [scene_file(Path(source)) for source in given]
     refined = None if dataset is None else _refinement(edits, files[0], Path(dataset), observer)
     scene = edits.apply(edit.merge([read_gaussians(file) for file in files]))
     size = file_size(edits.decimate)
     write = write_gaussians
+    if spz_version is not None:
+        write = partial(_write_spz, version=spz_version)
     if format.name == "HTML" and len(files) == 1 and edits.transform() is None:
         write = partial(_write_page, source=files[0])
     if size is not None:
@@ -158,6 +168,10 @@ def _refinement(
 
     photos, background = photos_of(scene, dataset)
     return partial(refine, dataset=photos, background=background, observer=observer)
+
+
+def _write_spz(target: Path, scene: Gaussians, version: int) -> None:
+    write_spz(target, GaussianArrays.from_gaussians(scene), version)
 
 
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
