@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from snowsplat.lift.lift import LiftOptions
     from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
     from snowsplat.pipeline.compute import Compute
+    from snowsplat.pipeline.clean import clean
     from snowsplat.pipeline.convert import Edits, convert
     from snowsplat.pipeline.describe import describe
     from snowsplat.pipeline.evaluate import evaluate
@@ -82,6 +83,7 @@ _MODULES = {
     "evaluate_views": "evaluation.metrics",
     "fit_image": "pipeline.image",
     "load_dataset": "data",
+    "clean": "pipeline.clean",
     "lift_photo": "pipeline.lift",
     "load_trained": "pipeline.scene_source",
     "make": "pipeline.make",
@@ -125,6 +127,7 @@ __all__ = [
     "View",
     "__version__",
     "benchmark",
+    "clean",
     "convert",
     "decode_image",
     "describe",

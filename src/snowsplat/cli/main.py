@@ -35,6 +35,7 @@ SUBCOMMANDS = {
     "view": "Show a finished scene in the browser.",
     "watch": "Show an ongoing or finished training run in the browser, with its photos.",
     "convert": "Write a scene in another file format; crop, decimate, transform or merge scenes.",
+    "clean": "Remove floaters: Gaussians that hang in front of the surfaces.",
     "lift": "Make a scene from one photo and its depth map.",
     "image": "Approximate a photo by 2D Gaussians, or render such an approximation.",
     "publish": "Write a static web site that shows a scene.",
@@ -57,6 +58,7 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: makes a 3D scene from ph
   snowsplat view FILE|OUT                 show a finished scene in the browser
   snowsplat watch OUT                     show the training in the browser
   snowsplat convert SCENE [MORE …] FILE   another format; crop, decimate, merge
+  snowsplat clean SCENE FILE              the scene without floaters
   snowsplat lift PHOTO --depth MAP -o OUT one photo and its depth -> a scene
   snowsplat image PHOTO -o OUT            a photo as 1000 Gaussians
   snowsplat publish SCENE -o FOLDER       a web site, for any host

@@ -1,0 +1,62 @@
+"""`snowsplat clean`: a scene without floaters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from snowsplat.cli.flags import flag, switch
+from snowsplat.pipeline.compute import Compute
+from snowsplat.util.errors import UserError
+
+
+@dataclass
+class Clean:
+    """Remove floaters: Gaussians that hang in front of the surfaces.
+
+    Examples:
+      snowsplat clean out/garden garden.ply
+      snowsplat clean garden.spz cleaned.spz --dataset garden
+
+    Notes:
+      Gaussians that no photo shows are removed, too. Floaters are removed as long
+      as the PSNR of the held-out photos does not decrease. If no photos were held
+      out, that of the training photos is used. Without photos, Gaussians are only
+      removed if the renderings at their cameras hardly change.
+      The suffix of FILE selects the format, as for snowsplat convert.
+    """
+
+    scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
+    """The output folder of train or make, or a scene file of any format."""
+    target: Annotated[Path | None, tyro.conf.Positional, flag("FILE")] = None
+    """The file to write."""
+    dataset: Annotated[Path | None, flag("DATASET", "-s", default="as trained")] = None
+    """Folder of the dataset: for a scene file, or if it was moved after the training."""
+    overwrite: Annotated[bool, switch()] = False
+    """Replace FILE if it exists already."""
+    threads: Annotated[int | None, flag("N", default="all cores")] = None
+    """Number of CPU threads."""
+    device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
+    """Device to compute on."""
+
+    def run(self) -> int:
+        """Returns the exit code, 0."""
+        if self.scene is None or self.target is None:
+            raise UserError("clean needs a scene and the name of a file to write")
+        from snowsplat.pipeline.clean import clean
+
+        done = clean(
+            *(self.scene, self.target),
+            dataset=self.dataset,
+            overwrite=self.overwrite,
+            compute=Compute(self.device, self.threads),
+        )
+        before, after = done.psnr
+        print(
+            f"{self.target}: {done.before - done.after:,} of {done.before:,} Gaussians removed; "
+            f"PSNR of {done.compared} {before:.2f} dB before, {after:.2f} dB after"
+        )
+        return 0

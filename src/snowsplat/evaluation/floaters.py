@@ -1,0 +1,174 @@
+"""Floaters: Gaussians that hang in front of a surface, and Gaussians that no photo shows.
+
+The blending weight of a Gaussian in a pixel is w = T α, with the transmittance T in front of it. A
+Gaussian of a surface has its weight where the surface is: its depth is about that of the surface in
+the same pixels. A floater has its weight in front of a surface that other Gaussians form. Let z be
+the depth of a Gaussian in a view, and D(p) the depth of the surface in pixel p. Then
+
+    position = z · Σ w(p) / D(p)  /  Σ w(p)
+
+is about 1 on the surface and small in front of it; the sums are over the pixels in which there is a
+surface. They are gradients of a rendered image: that of Σ w(p) g(p) with respect to a colour.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.ops.splats import COLORS
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import project, render
+
+#: Longest side of the images in pixels. More pixels do not change what is in front of what.
+_SIDE = 400
+#: A pixel has a surface if the Gaussians that may form one cover this share of it.
+_COVERED = 0.5
+#: A Gaussian is in front of the surface of a view if its position is below this number.
+_IN_FRONT = 0.8
+#: The surface is found in this number of rounds: each ignores what was in front in the last one.
+_ROUNDS = 3
+#: A Gaussian is a floater if this share of its weight is in front.
+_SHARE = 0.5
+#: A Gaussian that covers less than this number of pixels in every view explains nothing.
+_PIXELS = 0.01
+#: Floaters are removed in this number of groups at first; at most this number of trials follows.
+_GROUPS, _TRIALS = 8, 40
+
+
+@dataclass
+class Coverage:
+    """What the views show of each of N Gaussians, in pixels of their reduced images.
+
+    Attributes:
+        weight: (N,) the sum of its blending weights, over the pixels of all views.
+        largest: (N,) the largest sum of a single view.
+        front: (N,) the part of ``weight`` of the views in which it is in front of a surface.
+        position: (N,) the weighted mean of its positions, see above; 1 where there is no surface.
+    """
+
+    weight: Tensor
+    largest: Tensor
+    front: Tensor
+    position: Tensor
+
+    @property
+    def floaters(self) -> Tensor:
+        """(N,) bool: the Gaussians that are mostly in front of a surface."""
+        return self.front > _SHARE * self.weight
+
+    @property
+    def useless(self) -> Tensor:
+        """(N,) bool: the Gaussians that no view shows."""
+        return self.largest < _PIXELS
+
+
+def coverage(gaussians: Gaussians, cameras: Sequence[Camera]) -> Coverage:
+    """Render each view, and find out which Gaussians it shows, and which are in front.
+
+    Args:
+        gaussians: N Gaussians.
+        cameras: those of the photos.
+    """
+    small = [_reduced(camera) for camera in cameras]
+    solid = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    found = _measure(gaussians, solid, small)
+    for _ in range(_ROUNDS - 1):
+        found = _measure(gaussians, ~found.floaters, small)
+    return found
+
+
+def _reduced(camera: Camera) -> Camera:
+    return camera.downscaled(max(1, round(max(camera.width, camera.height) / _SIDE)))
+
+
+def _measure(gaussians: Gaussians, solid: Tensor, cameras: Sequence[Camera]) -> Coverage:
+    """One round; the Gaussians ``solid`` (N,) form the surface."""
+    surface = gaussians.select(solid)
+    weight, largest, front, position = torch.zeros(4, len(gaussians), device=solid.device)
+    for camera in cameras:
+        ids, depth, sums = _weights(gaussians, surface, camera)
+        total, behind, inverse = sums.unbind(1)
+        # Where there is no surface, nothing can be in front of one.
+        place = torch.where(behind > 0.5 * total, depth * inverse / behind.clamp_min(1e-12), 1.0)
+        weight[ids] += total
+        largest[ids] = torch.maximum(largest[ids], total)
+        front[ids] += total * (place < _IN_FRONT)
+        position[ids] += total * place
+    return Coverage(weight, largest, front, position / weight.clamp_min(1e-12))
+
+
+def _weights(
+    gaussians: Gaussians, surface: Gaussians, camera: Camera
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The ids (M,) of the Gaussians in a view, their depths (M,), and three sums (M, 3).
+
+    The sums of their weights are over all pixels, over those with a surface, and over those, each
+    divided by the depth of the surface.
+    """
+    with torch.no_grad():
+        output = render(surface, camera, with_depth=True)
+        assert output.depth is not None
+        covered = (output.alpha > _COVERED) & (output.depth > 0.0)
+        inverse = torch.where(covered, output.alpha / output.depth.clamp_min(1e-12), 0.0)
+        splats = project(gaussians, camera)
+    splats.packed = splats.packed.detach().requires_grad_()
+    with torch.enable_grad():
+        image, _, _ = ops.rasterize(splats, camera.width, camera.height)
+        each = torch.stack([torch.ones_like(inverse), covered.to(inverse.dtype), inverse], dim=2)
+        (image * each).sum().backward()
+    assert splats.ids is not None
+    assert splats.packed.grad is not None
+    rows = splats.ids >= 0
+    return (
+        splats.ids[rows].long(),
+        splats.depths.detach()[rows],
+        splats.packed.grad[rows, COLORS : COLORS + 3],
+    )
+
+
+def clean(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    quality: Callable[[Gaussians], float],
+    enough: float = math.inf,
+) -> Gaussians:
+    """The Gaussians without those that explain nothing, and without floaters if that does no harm.
+
+    Floaters are removed in groups, those that are farthest in front first. A group is removed if
+    the quality of the rest is not lower than before, or at least ``enough``. Otherwise each half of
+    the group is tried.
+
+    Args:
+        gaussians: N Gaussians.
+        cameras: those of the photos with which the scene was trained.
+        quality: the larger, the better; for example the PSNR of held-out photos.
+        enough: see above.
+    """
+    found = coverage(gaussians, cameras)
+    kept = ~found.useless
+    floaters = (found.floaters & kept).nonzero()[:, 0]
+    floaters = floaters[found.position[floaters].argsort(stable=True)]
+    best = quality(gaussians.select(kept))
+    groups = list(floaters.tensor_split(_GROUPS))
+    for _ in range(_TRIALS):
+        while groups and not len(groups[0]):
+            del groups[0]
+        if not groups:
+            break
+        group = groups.pop(0)
+        kept[group] = False
+        rest = quality(gaussians.select(kept))
+        if rest >= min(best, enough):
+            best = rest
+            continue
+        kept[group] = True
+        if len(group) > 1:
+            groups[:0] = group.tensor_split(2)
+    return gaussians.select(kept)

@@ -1,0 +1,175 @@
+"""`clean`: a scene without floaters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.scene_files import format_for_writing, write_gaussians
+from snowsplat.pipeline.scene_source import Color, folder_around, load_viewable
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from snowsplat.data import Dataset
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
+
+#: At most this number of photos is compared, evenly chosen.
+_VIEWS = 24
+#: The PSNR of the training photos may fall by this number of dB, and that of the renderings of the
+#: whole scene to the second number: the difference is not visible.
+_LOST, _SAME = 0.02, 40.0
+#: The PSNR of identical renderings.
+_SAME_IMAGE = 100.0
+
+_Item = TypeVar("_Item")
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """What `clean` has done.
+
+    Attributes:
+        before, after: the numbers of Gaussians.
+        compared: what was compared with the renderings, such as "7 held-out photos".
+        psnr: of these, in dB, before and after.
+    """
+
+    before: int
+    after: int
+    compared: str
+    psnr: tuple[float, float]
+
+
+def clean(
+    scene: Path | str,
+    target: Path | str,
+    *,
+    dataset: Path | str | None = None,
+    overwrite: bool = False,
+    compute: Compute | None = None,
+) -> Cleaned:
+    """Remove Gaussians that hang in front of the surfaces, and those that no photo shows.
+
+    Floaters are removed as long as the PSNR of the held-out photos does not decrease. If no photos
+    were held out, that of the training photos is used; without photos, the renderings of the whole
+    scene take their place.
+
+    Args:
+        scene: the output folder of a training run, or a scene file.
+        target: the file to write; its suffix selects the format.
+        dataset: the photos of the scene; default: those of the training, if they are still there.
+        overwrite: replace ``target``.
+        compute: the device; default: a GPU if there is one.
+
+    Raises:
+        UserError: a missing or damaged scene or dataset; the cameras are unknown; ``target``
+            exists, or has an unknown suffix.
+        OSError: ``target`` cannot be written.
+    """
+    scene, target = Path(scene), Path(target)
+    if target.exists() and not overwrite:
+        raise UserError(f"{target}: exists; use `overwrite` to replace it")
+    format_for_writing(target)
+    device = (compute or Compute()).apply()
+    source = load_viewable(scene)
+    photos = _photos(source.file, None if dataset is None else Path(dataset))
+    cameras = source.cameras
+    if photos is not None and not cameras:
+        cameras = [view.camera for view in photos.train]
+    if not cameras:
+        raise UserError(
+            f"{scene}: the cameras are unknown, because it is in no output folder; set `dataset`"
+        )
+    import torch
+
+    from snowsplat.evaluation.floaters import clean as without_floaters
+    from snowsplat.util.process import single_threaded
+
+    gaussians = source.gaussians.to(device)
+    cameras = [camera.to(device) for camera in cameras]
+    with single_threaded():
+        judge = _judge(gaussians, cameras, photos, source.background)
+        before = judge.psnr(gaussians)
+        cleaned = without_floaters(gaussians, cameras, judge.psnr, judge.enough(before))
+        after = judge.psnr(cleaned)
+    write_gaussians(target, cleaned.to(torch.device("cpu")))
+    return Cleaned(len(gaussians), len(cleaned), judge.compared, (before, after))
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Decides whether Gaussians may be removed: see `floaters.clean`."""
+
+    compared: str
+    psnr: Callable[[Gaussians], float]
+    enough: Callable[[float], float]
+
+
+def _judge(
+    gaussians: Gaussians, cameras: Sequence[Camera], photos: Dataset | None, background: Color
+) -> _Judge:
+    if photos is None:
+        return _judge_of_renderings(gaussians, cameras, background)
+    from snowsplat.evaluation.metrics import evaluate_views
+
+    held_out = bool(photos.test)
+    views = _evenly(photos.test or photos.train)
+
+    def psnr(scene: Gaussians) -> float:
+        return evaluate_views(scene, views, background=background).psnr
+
+    if held_out:
+        return _Judge(f"{len(views)} held-out photos", psnr, lambda before: math.inf)
+    return _Judge(f"{len(views)} training photos", psnr, lambda before: before - _LOST)
+
+
+def _judge_of_renderings(
+    gaussians: Gaussians, cameras: Sequence[Camera], background: Color
+) -> _Judge:
+    import torch
+
+    from snowsplat.evaluation.metrics import compare
+    from snowsplat.scene.render import render
+
+    color = torch.tensor(background, device=gaussians.means.device)
+    chosen = _evenly(cameras)
+
+    def images(scene: Gaussians) -> list[Tensor]:
+        return [render(scene, camera, color).image.clamp(0.0, 1.0) for camera in chosen]
+
+    whole = images(gaussians)
+
+    def psnr(scene: Gaussians) -> float:
+        pairs = zip(images(scene), whole, strict=True)
+        return sum(min(compare(a, b).psnr, _SAME_IMAGE) for a, b in pairs) / len(whole)
+
+    return _Judge(f"renderings of {len(chosen)} cameras", psnr, lambda before: _SAME)
+
+
+def _photos(scene: Path, dataset: Path | None) -> Dataset | None:
+    """The photos of a scene; None: they are unknown, or not there any more.
+
+    Raises:
+        UserError: ``dataset`` is not a dataset.
+    """
+    from snowsplat.pipeline.refine import photos_of
+
+    if dataset is None:
+        folder = folder_around(scene)
+        if not folder.scenes():
+            return None
+        dataset = Path(folder.settings()[0].path)
+        if not dataset.is_dir():
+            return None
+    return photos_of(scene, dataset)[0]
+
+
+def _evenly(items: Sequence[_Item]) -> Sequence[_Item]:
+    return items[:: math.ceil(len(items) / _VIEWS)]

@@ -1,0 +1,73 @@
+"""`clean` removes a floater from a trained scene, in each of its three situations."""
+
+import shutil
+
+import pytest
+import torch
+
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.pipeline.clean import clean
+from snowsplat.pipeline.scene_source import load_trained
+from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.errors import UserError
+
+
+def with_floater(gaussians: Gaussians, position: torch.Tensor) -> Gaussians:
+    """The Gaussians and a small red one, half transparent."""
+    floater = gaussians.select(torch.tensor([0])).map(torch.clone)
+    floater.means[0] = position.float()
+    floater.log_scales[:] = -3.0
+    floater.opacity_logits[:] = 0.0
+    floater.sh_dc[:] = torch.tensor([4.0, -2.0, -2.0])
+    floater.sh_rest[:] = 0.0
+    return gaussians.append(floater)
+
+
+@pytest.fixture
+def trained(dataset, tmp_path):
+    """An output folder whose scene has a floater before the first held-out camera."""
+    options = TrainOptions(hold_out=4, settings={"iterations": 150, "visible_only": False})
+    out = tmp_path / "out"
+    train(dataset, out, options)
+    scene = load_trained(out)
+    camera = scene.dataset.test[0].camera
+    ahead = camera.position + 0.8 * camera.cam_from_world[2, :3]
+    file = out / "point_cloud/iteration_150/point_cloud.ply"
+    write_gaussians(file, with_floater(scene.gaussians, ahead))
+    return out, ahead
+
+
+def nearest(path, position: torch.Tensor) -> float:
+    return float((read_gaussians(path).means - position.float()).norm(dim=1).min())
+
+
+def test_held_out_photos_decide(trained, tmp_path):
+    out, ahead = trained
+    done = clean(out, tmp_path / "clean.ply")
+    assert "held-out" in done.compared
+    assert nearest(tmp_path / "clean.ply", ahead) > 0.01
+    assert done.after < done.before
+    assert done.psnr[1] > done.psnr[0]
+    with pytest.raises(UserError, match="exists"):
+        clean(out, tmp_path / "clean.ply")
+
+
+def test_a_scene_file_needs_its_dataset(trained, dataset, tmp_path):
+    out, ahead = trained
+    alone = tmp_path / "alone.ply"
+    shutil.copyfile(out / "point_cloud/iteration_150/point_cloud.ply", alone)
+    with pytest.raises(UserError, match="cameras are unknown"):
+        clean(alone, tmp_path / "clean.spz")
+    done = clean(alone, tmp_path / "clean.spz", dataset=dataset)
+    assert "training" in done.compared
+    assert done.psnr[1] >= done.psnr[0] - 0.03
+    assert nearest(tmp_path / "clean.spz", ahead) > 0.01
+
+
+def test_without_photos_the_images_stay(trained, dataset, tmp_path):
+    out, _ = trained
+    dataset.rename(tmp_path / "moved")
+    done = clean(out, tmp_path / "clean.ply")
+    assert "renderings" in done.compared
+    assert done.psnr[1] >= 40.0
