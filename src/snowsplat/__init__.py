@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from snowsplat.image.fit import FitOptions
     from snowsplat.lift.lift import LiftOptions
     from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
-    from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.clean import clean
+    from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.convert import Edits, convert
     from snowsplat.pipeline.describe import describe
     from snowsplat.pipeline.evaluate import evaluate
