@@ -41,6 +41,7 @@ SUBCOMMANDS = {
     "publish": "Write a static web site that shows a scene.",
     "globe": "Put a scene into a snow globe: a web page, and a video.",
     "benchmark": "Train and evaluate all scenes of a folder by the protocol of the papers.",
+    "blocks": "Train a scene that is larger than the memory, in blocks that are merged.",
     "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
 }
 
@@ -64,6 +65,7 @@ DESCRIPTION = """3D Gaussian Splatting on any computer: makes a 3D scene from ph
   snowsplat publish SCENE -o FOLDER       a web site, for any host
   snowsplat globe SCENE                   a snow globe, as a web page
   snowsplat benchmark FOLDER -o OUT       all scenes of a folder, and a table
+  snowsplat blocks plan DATASET -o OUT    a scene larger than the memory, in blocks
   snowsplat info PATH                     describe a file or a folder
 
 A dataset is a folder of photos with their camera poses.

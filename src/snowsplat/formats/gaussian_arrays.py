@@ -50,8 +50,8 @@ class GaussianArrays(NamedTuple):
 
         return Gaussians(*(torch.from_numpy(array) for array in self))
 
-    def select(self, index: np.ndarray) -> GaussianArrays:
-        """The rows ``index``: (M,) integers in any order, or an (N,) bool mask."""
+    def select(self, index: np.ndarray | slice) -> GaussianArrays:
+        """The rows ``index``: (M,) integers in any order, an (N,) bool mask, or a slice."""
         return GaussianArrays(*(array[index] for array in self))
 
     def finite_rows(self) -> np.ndarray:

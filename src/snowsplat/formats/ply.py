@@ -7,6 +7,7 @@ length. f_rest is channel-major: all K coefficients of red, then of green, then 
 of `GaussianArrays` is (N, K, 3)). Lower degrees have fewer f_rest properties.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -96,18 +97,44 @@ def write_ply(path: Path | str, gaussians: GaussianArrays) -> None:
     Raises:
         OSError: the folder is missing or not writable, or the disk is full.
     """
+    write_ply_parts(path, len(gaussians.means), gaussians.sh_rest.shape[1], [gaussians])
+
+
+def write_ply_parts(
+    path: Path | str, count: int, rest: int, parts: Iterable[GaussianArrays]
+) -> None:
+    """`write_ply` for a scene that does not fit into the memory: its parts one after the other.
+
+    Args:
+        count: number of Gaussians of all parts.
+        rest: K, the number of SH coefficients beyond the constant one; parts may have fewer.
+
+    Raises:
+        OSError: see `write_ply`.
+    """
+    names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), "opacity", *_SCALES, *_QUATS]
+    written = 0
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(header(count, [("float", name) for name in names]))
+        for part in parts:
+            for start in range(0, len(part.means), _WRITE_ROWS):
+                rows = part.select(slice(start, start + _WRITE_ROWS))
+                file.write(_table(rows, rest).tobytes())
+            written += len(part.means)
+        assert written == count
+
+
+def _table(gaussians: GaussianArrays, rest: int) -> np.ndarray:
+    """(N, columns) the rows of the file; SH coefficients that are missing are zeros."""
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = gaussians
     n, k = sh_rest.shape[:2]
-    names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(k), "opacity", *_SCALES, *_QUATS]
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(header(n, [("float", name) for name in names]))
-        for start in range(0, n, _WRITE_ROWS):
-            part = slice(start, start + _WRITE_ROWS)
-            rows = np.zeros((len(means[part]), len(names)), "<f4")
-            rows[:, 0:3] = means[part]
-            rows[:, 6:9] = sh_dc[part, 0]
-            rows[:, 9 : 9 + 3 * k] = sh_rest[part].transpose(0, 2, 1).reshape(len(rows), 3 * k)
-            rows[:, -8] = opacity_logits[part]
-            rows[:, -7:-4] = log_scales[part]
-            rows[:, -4:] = quats[part]
-            file.write(rows.tobytes())
+    rows = np.zeros((n, 17 + 3 * rest), "<f4")
+    rows[:, 0:3] = means
+    rows[:, 6:9] = sh_dc[:, 0]
+    by_channel = rows[:, 9 : 9 + 3 * rest].reshape(n, 3, rest)
+    by_channel[..., :k] = sh_rest.transpose(0, 2, 1)
+    rows[:, 9 : 9 + 3 * rest] = by_channel.reshape(n, 3 * rest)
+    rows[:, -8] = opacity_logits
+    rows[:, -7:-4] = log_scales
+    rows[:, -4:] = quats
+    return rows

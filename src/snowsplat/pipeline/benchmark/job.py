@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.pipeline.benchmark.claims import claimed
 from snowsplat.pipeline.checkpoint_meta import Recipe
+from snowsplat.util.claims import claimed
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, read_json

@@ -1,0 +1,79 @@
+"""Writes a part of a dataset as a dataset of its own, with links to the photos."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.dataset import Points, PosedImage
+from snowsplat.scene.geometry import quat_from_rotation
+
+
+def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Points | None) -> None:
+    """Write a COLMAP model of some views and points, and link their photos, masks and depth maps.
+
+    The links are relative symbolic links; without the permission to create them, hard links; on
+    another drive, copies. So any program that reads COLMAP models can train it, and ``cp -rL`` or
+    ``rsync -L`` copies it to another computer.
+
+    Args:
+        folder: replaced if it exists.
+        posed: the images in their original size and, optionally, the same ones from the folders
+            ``images_2`` ….
+        points: with colours; None: the model has no points.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    cameras: dict[ColmapCamera, int] = {}
+    images = []
+    for image in posed:
+        name = _file_name(image)
+        if image.divided > 1:
+            _link(image.path, folder / f"images_{image.divided}" / name)
+            continue
+        camera = image.camera
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+        colmap = ColmapCamera("PINHOLE", camera.width, camera.height, intrinsics)
+        number = cameras.setdefault(colmap, len(cameras) + 1)
+        pose = camera.cam_from_world.double()
+        quat = quat_from_rotation(pose[:, :3]).tolist()
+        images.append(ColmapImage(name, number, (*quat, *pose[:, 3].tolist())))
+        _link(image.path, folder / "images" / name)
+        if image.mask is not None:
+            _link(image.mask, folder / "masks" / f"{name}.png")
+        if image.depth is not None:
+            _link(image.depth, folder / "depths" / f"{name}{image.depth.suffix}")
+    nothing = np.zeros((0, 3))
+    write_model(
+        folder / "sparse" / "0",
+        {number: camera for camera, number in cameras.items()},
+        images,
+        nothing if points is None else points.xyz.numpy(),
+        nothing.astype(np.uint8) if points is None else points.rgb.numpy(),
+    )
+
+
+def _file_name(image: PosedImage) -> str:
+    """The name of a photo in the model: that of the view, with the suffix of its file."""
+    suffix = image.path.suffix
+    return image.name if image.name.endswith(suffix) else image.name + suffix
+
+
+def _link(file: Path, link: Path) -> None:
+    link.parent.mkdir(parents=True, exist_ok=True)
+    file = file.resolve()
+    with suppress(OSError, ValueError):  # ValueError: another drive of Windows
+        os.symlink(os.path.relpath(file, link.parent.resolve()), link)
+        return
+    try:
+        os.link(file, link)
+    except OSError:
+        shutil.copyfile(file, link)

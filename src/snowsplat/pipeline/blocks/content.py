@@ -1,0 +1,127 @@
+"""The photos and the points of each block.
+
+As in VastGaussian (Lin et al. 2024, arXiv:2402.17427), a block is trained with the photos that
+were taken in its expanded cell, and with those that show it. So that its Gaussians do not have to
+explain what the photos show outside of it, it is also trained with points from there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.ops import neighbours
+from snowsplat.pipeline.blocks.cells import Cell, cut, extent, ground_axes
+from snowsplat.scene.geometry import transform_points
+
+Axes = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+# A photo belongs to a block if at least this share of what it shows is in the cell.
+_SHOWN = 0.25
+# Points that are projected to find out what photos show.
+_SAMPLE = 20_000
+# Largest spacing of points in a photo, relative to their depth. Single points are farther apart.
+_WIDEST = 0.1
+# Photos of a block that are tested for whether they show a point outside of it.
+_TESTED_VIEWS = 200
+# Points outside of the expanded cell, as a share of those inside.
+_OUTSIDE = 1.0
+# Additional photos, spread over the rest of the scene, as a share of the others.
+_FAR_VIEWS = 0.0
+
+
+@dataclass(frozen=True)
+class BlockContent:
+    """A block.
+
+    Attributes:
+        views: training photos of the whole dataset.
+        points: points of the dataset; None if it has none.
+        share: of the Gaussians of the whole scene, those that the training of the block needs,
+            including those outside of its cell.
+    """
+
+    cell: Cell
+    views: list[View]
+    points: Points | None
+    share: float
+
+
+def block_content(dataset: Dataset, count: int, margin: float) -> tuple[Axes, list[BlockContent]]:
+    """Cut a dataset into ``count`` blocks.
+
+    The views of a block are those whose cameras are in the cell, expanded by ``margin`` times its
+    size, and those of whose points at least a quarter are in the cell. The points are those in the
+    expanded cell, and a random selection, half as many, of others that these views show.
+
+    Returns:
+        the axes of the ground plane, and the blocks in the order of `cut`.
+    """
+    views = dataset.train
+    positions = torch.stack([view.camera.position for view in views]).to(torch.float64)
+    axes = ground_axes(positions)
+    points = dataset.points
+    xyz = torch.zeros(0, 3, dtype=torch.float64) if points is None else points.xyz.double()
+    generator = torch.Generator().manual_seed(0)
+    sample = xyz[torch.randperm(len(xyz), generator=generator)[:_SAMPLE]]
+    cameras, ground = positions @ axes.T, xyz @ axes.T
+    cells = cut(cameras, ground, count)
+    shown = _shown(views, sample, cells, sample @ axes.T)
+    blocks = []
+    for number, cell in enumerate(cells):
+        inside = torch.cat([cameras[cell.contains(cameras)], ground[cell.contains(ground)]])
+        border = [margin * side for side in extent(inside)]
+        used = cell.contains(cameras, border) | (shown[:, number] >= _SHOWN)
+        far = (~used).nonzero()[:, 0]
+        count = min(len(far), round(_FAR_VIEWS * int(used.sum())))
+        used[far[torch.linspace(0, len(far) - 1, count).long()]] = True
+        own = [view for view, is_used in zip(views, used.tolist(), strict=True) if is_used]
+        if points is None:
+            blocks.append(BlockContent(cell, own, None, len(own) / len(views)))
+            continue
+        kept = cell.contains(ground, border)
+        others = (~kept).nonzero()[:, 0]
+        others = others[_visible(own, xyz[others])]
+        chosen = torch.randperm(len(others), generator=generator)
+        kept[others[chosen[: round(_OUTSIDE * int(kept.sum()))]]] = True
+        selected = Points(points.xyz[kept], points.rgb[kept])
+        blocks.append(BlockContent(cell, own, selected, len(selected) / len(xyz)))
+    first, second = (tuple(axis) for axis in axes.tolist())
+    return (first, second), blocks
+
+
+def _shown(views: list[View], xyz: Tensor, cells: list[Cell], ground: Tensor) -> Tensor:
+    """(V, B): the share of what each view shows that is in each cell.
+
+    A point stands for the part of a surface around it. Its area in the image is proportional to the
+    squared distance to the next points, divided by the squared depth. Occlusion is not considered.
+    """
+    spacing = neighbours(xyz)[:, -1].clamp(max=1e30) if len(xyz) else xyz.new_zeros(0)
+    members = torch.stack([cell.contains(ground) for cell in cells], 1).to(torch.float64)
+    rows = []
+    for view in views:
+        depth, visible = _projected(view, xyz)
+        angle = spacing / torch.where(visible, depth, 1.0)
+        weights = angle.clamp(max=_WIDEST).square() * visible
+        rows.append(weights @ members / weights.sum().clamp(min=1e-300))
+    return torch.stack(rows)
+
+
+def _visible(views: list[View], xyz: Tensor) -> Tensor:
+    """(P,) bool: whether a view has a point in its image; of many views, some are tested."""
+    step = -(-len(views) // _TESTED_VIEWS)
+    seen = torch.zeros(len(xyz), dtype=torch.bool)
+    for view in views[::step]:
+        seen |= _projected(view, xyz)[1]
+    return seen
+
+
+def _projected(view: View, xyz: Tensor) -> tuple[Tensor, Tensor]:
+    """Depths (P,) of points in a view, and whether they are in its image."""
+    camera = view.camera
+    x, y, z = transform_points(camera.cam_from_world.to(torch.float64), xyz).unbind(1)
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return z, (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)

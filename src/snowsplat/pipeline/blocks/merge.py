@@ -1,0 +1,93 @@
+"""`merge_blocks`: joins the scenes of the blocks. Its memory is that of one block."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from snowsplat.formats import GaussianArrays
+from snowsplat.formats.ply import read_ply, write_ply_parts
+from snowsplat.pipeline.blocks.cells import Cell
+from snowsplat.pipeline.blocks.plan import Plan
+from snowsplat.pipeline.blocks.train import is_finished, scene_folder
+from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
+
+
+@dataclass(frozen=True)
+class Merged:
+    """A merged scene.
+
+    Attributes:
+        gaussians: their number in each block, without those outside of its cell.
+        trained: their number in each block, with those.
+    """
+
+    scene: Path
+    gaussians: tuple[int, ...]
+    trained: tuple[int, ...]
+
+
+def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged:
+    """Write the scene of all blocks to the output folder ``folder``.
+
+    Of each block, it contains the Gaussians whose means are in the cell of the block. Every point
+    is in exactly one cell, so there are neither gaps nor duplicates. The blocks are read one after
+    the other.
+
+    Args:
+        output: a PLY file that also gets the scene; it is replaced if it exists.
+
+    Raises:
+        UserError: no plan, or a block that is not trained; ``output`` is not a PLY file.
+        OSError: a file cannot be written.
+    """
+    folder = Path(folder)
+    plan = Plan.read(folder)
+    if output is not None and Path(output).suffix.lower() != ".ply":
+        raise UserError(
+            f"{output}: blocks are merged into a PLY file; use snowsplat convert {folder} "
+            f"{output} afterwards"
+        )
+    steps: set[int] = set()
+    files = []
+    for number, block in enumerate(plan.blocks, 1):
+        out = scene_folder(folder, block)
+        if not is_finished(out):
+            raise UserError(
+                f"{block.name}: not trained; run snowsplat blocks train {folder} `block` {number}"
+            )
+        steps.add(out.scenes()[-1])
+        files.append(out.scene_path(out.scenes()[-1]))
+    parts = [_own(plan, block.cell, file) for block, file in zip(plan.blocks, files, strict=True)]
+    counts, trained, rest = [], [], 0
+    for part in parts:
+        all_of_block, own = part()
+        counts.append(len(own.means))
+        trained.append(all_of_block)
+        rest = max(rest, own.sh_rest.shape[1])
+    if not sum(counts):
+        raise UserError(f"{folder}: no Gaussian is in the cell of its block; train more steps")
+    scene = OutputFolder(folder).scene_path(max(steps))
+    scene.parent.mkdir(parents=True, exist_ok=True)
+    write_ply_parts(scene, sum(counts), rest, (part()[1] for part in parts))
+    if output is not None:
+        with atomic_path(output) as temporary:
+            shutil.copyfile(scene, temporary)
+    return Merged(scene, tuple(counts), tuple(trained))
+
+
+def _own(plan: Plan, cell: Cell, file: Path) -> Callable[[], tuple[int, GaussianArrays]]:
+    """Reads a block: the number of its Gaussians, and those in its cell."""
+
+    def read() -> tuple[int, GaussianArrays]:
+        import torch
+
+        gaussians = read_ply(file)
+        ground = plan.ground(torch.from_numpy(gaussians.means))
+        return len(ground), gaussians.select(cell.contains(ground).numpy())
+
+    return read

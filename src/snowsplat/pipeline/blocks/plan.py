@@ -1,0 +1,216 @@
+"""`plan_blocks`: cuts a dataset into blocks, and writes what the training of each block reads.
+
+FOLDER/plan.json          the cells, and how all blocks are trained
+FOLDER/block_01/dataset   an ordinary dataset: a COLMAP model, and links to the photos
+FOLDER/block_01/scene     the output folder of its training
+FOLDER/config.json …      FOLDER is also the output folder of the merged scene
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from snowsplat._version import __version__
+from snowsplat.pipeline.blocks.cells import Cell
+from snowsplat.pipeline.checkpoint_meta import Recipe
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
+from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.files import write_json
+from snowsplat.util.safe_json import from_json, read_json
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+PLAN = "plan.json"
+#: More blocks than this are a mistake.
+MOST_BLOCKS = 10_000
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block.
+
+    Attributes:
+        name: "block_01", …; the name of its folder.
+        cell: its part of the ground plane. The merged scene contains its Gaussians in this part.
+        views: number of training photos.
+        points: number of points.
+        max_gaussians: limit of the training, with the Gaussians outside of the cell; 0: none.
+    """
+
+    name: str
+    cell: Cell
+    views: int
+    points: int
+    max_gaussians: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The content of `plan.json`.
+
+    Attributes:
+        dataset: how the whole dataset is read.
+        recipe: the recipe of all blocks.
+        settings: changed settings of all blocks, see `TrainOptions`.
+        axes: the two axes of the ground plane, unit vectors in the world frame.
+        margin: the margin by which cells are expanded, as a share of their size.
+    """
+
+    dataset: DatasetSettings
+    recipe: Recipe
+    settings: dict[str, Any]
+    axes: tuple[tuple[float, float, float], tuple[float, float, float]]
+    margin: float
+    blocks: list[Block]
+
+    @staticmethod
+    def read(folder: Path) -> Plan:
+        """The plan in a folder.
+
+        Raises:
+            UserError: there is none, it is unfinished, or it is damaged.
+        """
+        file = folder / PLAN
+        if not file.is_file():
+            raise UserError(f"{folder}: contains no {PLAN}; run snowsplat blocks plan first")
+        try:
+            content = read_json(file)
+            content.pop("snowsplat")
+            plan = from_json(Plan, content)
+        except (ValueError, KeyError, AttributeError, TypeError):
+            raise UserError(f"{file}: damaged; run snowsplat blocks plan in a new folder") from None
+        if not plan.blocks:
+            raise UserError(f"{file}: the plan is unfinished; run snowsplat blocks plan again")
+        return plan
+
+    def write(self, folder: Path) -> None:
+        write_json(folder / PLAN, {"snowsplat": __version__} | asdict(self))
+
+    def ground(self, positions: Tensor) -> Tensor:
+        """Positions (N, 3) in the world frame -> (N, 2) float64 in the ground plane."""
+        import torch
+
+        axes = torch.tensor(self.axes, dtype=torch.float64)
+        return positions.to(torch.float64) @ axes.T
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of `plan_blocks`. None selects the value of the recipe or of `load_dataset`.
+
+    Attributes:
+        blocks: their number.
+        margin: a block is trained with the photos and points of its cell, expanded on each side by
+            this share of its size.
+        recipe: the recipe of all blocks.
+        settings: changed settings, see `TrainOptions`. ``max_gaussians`` is the number of the whole
+            scene, which the blocks share.
+        images, resolution, hold_out, test_list: see `TrainOptions`. Photos that are held out are in
+            no block.
+
+    Raises:
+        UserError: a value out of its range.
+    """
+
+    blocks: int = 4
+    margin: float = 0.2
+    recipe: Recipe = "default"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    images: str | None = None
+    resolution: int | None = None
+    hold_out: int | None = None
+    test_list: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.blocks <= MOST_BLOCKS:
+            raise SettingError("blocks", f"{self.blocks} is out of range; use 2 or more")
+        if not 0.0 <= self.margin <= 10.0:
+            raise SettingError("margin", f"{self.margin:g} is out of range; use e.g. 0.2")
+
+
+def plan_blocks(
+    dataset: Path | str,
+    folder: Path | str,
+    options: PlanOptions | None = None,
+    *,
+    observer: Observer = SILENT,
+) -> Plan:
+    """Cut a dataset into blocks. See `block_content` for the photos and points of a block.
+
+    Args:
+        dataset: see `snowsplat.data.load_dataset`.
+        folder: a new or an empty folder for the plan, the blocks and the merged scene.
+
+    Raises:
+        UserError: an unusable dataset or setting; more blocks than photos; ``folder`` contains a
+            plan or other files.
+        OSError: a file cannot be written.
+    """
+    from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
+    from snowsplat.pipeline.blocks.content import block_content
+    from snowsplat.pipeline.train import TrainOptions
+    from snowsplat.training.recipes import recipe
+
+    options, folder = options or PlanOptions(), Path(folder)
+    _check_free(folder)
+    config = recipe(options.recipe, **options.settings)
+    train_options = TrainOptions(
+        images=options.images,
+        resolution=options.resolution,
+        hold_out=options.hold_out,
+        test_list=options.test_list,
+    )
+    settings = train_options.dataset_settings(dataset)
+    files = settings.read_files()
+    whole = files.dataset(settings.resolution)
+    if options.blocks > len(whole.train):
+        raise SettingError(
+            "blocks", f"{options.blocks} is too large; there are {len(whole.train)} training photos"
+        )
+    posed = [image for image, _, _ in files.images]
+    if any(image.divided > 1 for image in posed):
+        original = replace(settings, resolution=-1).read_files()
+        posed += [image for image, _, _ in original.images]
+    axes, contents = block_content(whole, options.blocks, options.margin)
+    sizes = sorted(view.camera.width * view.camera.height for view in whole.train)
+    config = config.capped(sizes[len(sizes) // 2], len(sizes))
+    plan = Plan(settings, options.recipe, dict(options.settings), axes, options.margin, [])
+    folder.mkdir(parents=True, exist_ok=True)
+    plan.write(folder)  # without blocks: it is unfinished
+    blocks = []
+    report = observer.begin("blocks")
+    for number, content in enumerate(contents, 1):
+        name = f"block_{number:0{len(str(options.blocks)) if options.blocks > 99 else 2}d}"
+        report(number - 1, len(contents), name)
+        names = {view.name for view in content.views}
+        own = [image for image in posed if image.name in names]
+        write_block_dataset(folder / name / "dataset", own, content.points)
+        limit = round(config.density.max_gaussians * content.share)
+        points = 0 if content.points is None else len(content.points)
+        blocks.append(Block(name, content.cell, len(content.views), points, limit))
+    OutputFolder(folder).describe(whole, settings, config)
+    plan = replace(plan, blocks=blocks)
+    plan.write(folder)
+    return plan
+
+
+def _check_free(folder: Path) -> None:
+    """Raise `UserError` if ``folder`` contains anything but an unfinished plan."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise UserError(f"{folder}: is a file; use a folder")
+    if not any(folder.iterdir()):
+        return
+    try:
+        unfinished = read_json(folder / PLAN)["blocks"] == []
+    except (OSError, ValueError, KeyError, TypeError):
+        unfinished = False
+    if not unfinished:
+        what = "a plan" if (folder / PLAN).is_file() else "other files"
+        raise UserError(f"{folder}: already contains {what}; use a new folder, or remove it")

@@ -1,0 +1,114 @@
+"""`train_blocks`: trains the blocks that are not finished, on one or several computers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.blocks.plan import Block, Plan
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.util.claims import claimed
+from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.safe_json import read_json
+
+if TYPE_CHECKING:
+    from snowsplat.pipeline.training_run import TrainResult
+
+_CHECKPOINT_SECONDS = 60.0
+
+
+def scene_folder(folder: Path, block: Block) -> OutputFolder:
+    """The output folder of the training of a block."""
+    return OutputFolder(folder / block.name / "scene")
+
+
+def is_finished(out: OutputFolder) -> bool:
+    """Whether a training run in an output folder has reached its last step.
+
+    Raises:
+        UserError: its settings are damaged.
+    """
+    scenes = out.scenes()
+    if not scenes:
+        return False
+    try:
+        iterations = int(read_json(out.path / "config.json")["training"]["iterations"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UserError(f"{out.path / 'config.json'}: damaged; remove {out.path}") from None
+    return scenes[-1] >= iterations
+
+
+def train_blocks(
+    folder: Path | str,
+    only: Sequence[int] = (),
+    *,
+    compute: Compute | None = None,
+    memory: int | str | None = None,
+    observer: Observer = SILENT,
+    on_block: Callable[[str], None] = lambda line: None,
+) -> list[TrainResult]:
+    """Train the blocks of a plan, in this order, except those that are finished.
+
+    A block whose training was interrupted continues from its last checkpoint. Several computers may
+    call this at the same time with the same folder: each trains blocks that no other one trains.
+
+    Args:
+        only: numbers of blocks, from 1; empty: all.
+        memory: limit for each block, see `TrainOptions`.
+        on_block: receives a line about each block.
+
+    Returns:
+        The results of the blocks that were trained now.
+
+    Raises:
+        UserError: there is no plan or no such block; see also `snowsplat.pipeline.train.train`.
+        TrainingStopped: Ctrl-C. A checkpoint is saved, and the same call continues.
+        KeyboardInterrupt: Ctrl-C before the first step of a block.
+    """
+    folder = Path(folder)
+    plan = Plan.read(folder)
+    for number in only:
+        if not 1 <= number <= len(plan.blocks):
+            raise SettingError("block", f"{number} does not exist; use 1 to {len(plan.blocks)}")
+    results = []
+    for number, block in enumerate(plan.blocks, 1):
+        if only and number not in only:
+            continue
+        out = scene_folder(folder, block)
+        if is_finished(out):
+            on_block(f"{block.name}: finished")
+            continue
+        with claimed(folder / block.name / "train.claim") as is_ours:
+            if not is_ours:
+                on_block(f"{block.name}: another process trains it")
+            elif not is_finished(out):  # by another process, a moment ago
+                on_block(f"{block.name}: {block.views} photos, {block.points:,} points")
+                results.append(_train(folder, plan, block, compute or Compute(), memory, observer))
+    return results
+
+
+def _train(
+    folder: Path,
+    plan: Plan,
+    block: Block,
+    compute: Compute,
+    memory: int | str | None,
+    observer: Observer,
+) -> TrainResult:
+    from snowsplat.pipeline.train import TrainOptions, resume, train
+
+    dataset, out = folder / block.name / "dataset", scene_folder(folder, block)
+    options = TrainOptions(
+        recipe=plan.recipe,
+        settings={**plan.settings, "max_gaussians": block.max_gaussians},
+        resolution=plan.dataset.resolution,
+        memory=memory,
+        checkpoint_seconds=_CHECKPOINT_SECONDS,
+        compute=compute,
+    )
+    if out.is_output_folder():
+        return resume(out.path, options, dataset=dataset, observer=observer)
+    return train(dataset, out.path, options, observer=observer)
