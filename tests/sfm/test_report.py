@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+from snowsplat.data.colmap import read_model, read_points, write_model
 from snowsplat.scene.geometry import look_at
 from snowsplat.sfm.report import write_report
 
@@ -37,8 +38,10 @@ def dataset(tmp_path_factory, model_of) -> Path:
     model_of(poses, points, [camera], NAMES).write(root / "sparse" / "0")
     for name in NAMES:
         (root / "images" / name).parent.mkdir(parents=True, exist_ok=True)
-        mode = "RGBA" if name.endswith("png") else "RGB"
-        Image.new(mode, (160, 120), (90, 120, 40, 128)[: len(mode)]).save(root / "images" / name)
+        image = Image.effect_noise((160, 120), 60.0).convert("RGB")
+        if name.endswith("png"):
+            image.putalpha(128)
+        image.save(root / "images" / name)
     return root
 
 
@@ -138,6 +141,33 @@ def test_thumbnails_are_small_images(dataset):
             assert decoded.format == "JPEG"
             assert decoded.height == 110
     assert (dataset / "capture_report.html").stat().st_size < 600_000
+
+
+def test_photos_with_problems_are_shown(dataset):
+    assert "may be better" not in visible_text(write_report(dataset, facts()))
+    good = (dataset / "images" / NAMES[0]).read_bytes()
+    Image.new("RGB", (160, 120), (9, 12, 4)).save(dataset / "images" / NAMES[0])
+    try:
+        page = write_report(dataset, facts())
+    finally:
+        (dataset / "images" / NAMES[0]).write_bytes(good)
+    assert f"1 of {len(NAMES)} photos may be better" in visible_text(page)
+    assert "is too dark; use more light" in visible_text(page)
+
+
+def test_gaps_are_numbered_in_the_drawing(dataset, tmp_path):
+    """The cameras of the dataset surround the subject. Without some of them there is a gap."""
+    assert "numbered places" not in visible_text(write_report(dataset, facts()))
+    gap = tmp_path / "gap"
+    model = read_model(dataset / "sparse" / "0")
+    kept = [image for i, image in enumerate(model.images) if not 8 <= i < 14]
+    points = read_points(dataset / "sparse" / "0")
+    write_model(gap / "sparse" / "0", model.cameras, kept, points.xyz.numpy(), points.rgb.numpy())
+    page = write_report(gap, facts())
+    words = visible_text(page)
+    assert "Take 3 more photos from the numbered places" in words
+    assert "1 to 3no photo shows the subject from here" in words
+    assert page.read_text().count('fill="#7cc7ff"') == 2 * 3  # in both drawings
 
 
 def test_problems_are_reported(dataset):

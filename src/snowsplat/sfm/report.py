@@ -6,6 +6,7 @@ import json
 import math
 import shlex
 from collections.abc import Iterable, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
+from snowsplat.sfm.more_photos import Advice, advice
+from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
@@ -33,6 +36,7 @@ _STYLE = """
 svg.map { width: 100%; height: auto; display: block; }
 .strip { display: flex; gap: 6px; overflow-x: auto; padding-bottom: 8px; }
 .strip img { height: 110px; border-radius: 4px; display: block; }
+td img { height: 74px; border-radius: 4px; display: block; }
 """
 
 
@@ -48,10 +52,15 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     """
     photos = _photos_with_poses(dataset, facts)
     name = _name(facts["inputs"])
+    points = read_points(dataset / "sparse" / "0")
+    xyz = np.empty((0, 3)) if points is None else points.xyz.numpy().astype(np.float64)
+    rgb = np.empty((0, 3), np.uint8) if points is None else points.rgb.numpy()
+    more = advice(photos, xyz)
     body = [
         _headline(name, facts),
         _cards(facts),
-        _maps(dataset, photos),
+        _your_photos(dataset, [photo.name for photo in photos], facts, more),
+        _maps(photos, xyz, rgb, more.places),
         _strip(dataset, [photo.name for photo in photos]),
         _lenses(facts["sfm"]["cameras"], facts["undistorted"]),
         _left_out(facts),
@@ -116,14 +125,68 @@ def _cards(facts: dict[str, Any]) -> str:
     return cards(figures)
 
 
-def _maps(dataset: Path, photos: Sequence[PlacedPhoto]) -> str:
-    points = read_points(dataset / "sparse" / "0")
-    xyz = np.empty((0, 3)) if points is None else points.xyz.numpy().astype(np.float64)
-    rgb = np.empty((0, 3), np.uint8) if points is None else points.rgb.numpy()
+def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], more: Advice) -> str:
+    """What was wrong, and what to do better, for the person who took the photos."""
+    lines = []
+    bad = problems(dataset / "images", names)
+    without = len(facts["sfm"]["unregistered"]) + len(facts["gathered"]["skipped"])
+    if not bad and not without:
+        lines.append("<p>All photos are sharp, well exposed, and have a pose.</p>")
+    if bad:
+        count = f"{len(bad)} of {len(names)} photos"
+        lines.append(
+            f"<p>{count} may be better. Take them again, or leave them out if others show the same."
+            f"</p>\n{_bad_photos(dataset, bad)}"
+        )
+    if without:
+        lines.append(f"<p>{without} photos were not used; the reasons are below.</p>")
+    lines += _more_photos(more)
+    return "<h2>Your photos</h2>\n" + "\n".join(lines)
+
+
+def _bad_photos(dataset: Path, bad: dict[str, str]) -> str:
+    rows = [
+        [picture(_thumbnail(dataset / "images" / name), name), text(name), text(problem)]
+        for name, problem in list(bad.items())[:_MAX_THUMBNAILS]
+    ]
+    rest = "" if len(bad) <= _MAX_THUMBNAILS else f", and {len(bad) - _MAX_THUMBNAILS:,} more"
+    names = ", ".join(list(bad)[_MAX_THUMBNAILS:_MAX_UNUSED])
+    others = f'<p class="soft">{text(names)}{rest}.</p>' if rest else ""
+    return table(["", "photo", "what is wrong"], rows, "names") + others
+
+
+def _more_photos(more: Advice) -> list[str]:
+    lines = []
+    if more.seldom:
+        lines.append(
+            f"<p>{100 * more.seldom:.0f}% of the points are in at most three photos. There, the "
+            "scene will look right only from the places of these photos.</p>"
+        )
+    if len(more.places):
+        count = len(more.places)
+        photos = "a photo" if count == 1 else f"{count} more photos"
+        numbers = iter(range(1, count + 1))
+        reasons = []
+        for reason, same in groupby(more.reasons):
+            first, *rest = [next(numbers) for _ in same]
+            which = f"{first} to {rest[-1]}" if rest else str(first)
+            reasons.append([which, text(reason)])
+        lines.append(
+            f"<p>Take {photos} from the numbered places in the drawing from above:</p>\n"
+            f"{table([], reasons)}"
+        )
+    return lines
+
+
+def _maps(
+    photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray, marks: np.ndarray
+) -> str:
     captions = (
         "From above. Orange: the cameras; white: the first camera.",
         "From the side.",
     )
+    if len(marks):
+        captions = (captions[0] + " Numbers: places for more photos.", captions[1])
     if any(photo.sequence is not None for photo in photos):
         captions = (captions[0] + " Blue: the path of the video.", captions[1])
     # Side by side, both drawings have the same scale: flex-grow is proportional to the width.
@@ -131,7 +194,7 @@ def _maps(dataset: Path, photos: Sequence[PlacedPhoto]) -> str:
         f'<figure style="flex:{drawing.width} 1 {drawing.width // 2}px;'
         f'max-width:{2 * drawing.width}px">{drawing.svg}'
         f"<figcaption>{caption}</figcaption></figure>"
-        for drawing, caption in zip(draw_scene(photos, xyz, rgb), captions, strict=True)
+        for drawing, caption in zip(draw_scene(photos, xyz, rgb, marks), captions, strict=True)
     )
     return f'<h2>Cameras and points</h2>\n<div class="maps">{figures}</div>'
 

@@ -52,6 +52,7 @@ class _Projection:
     down: np.ndarray  # (3,) world direction that points down in the drawing
 
 
+_NO_MARKS = np.empty((0, 3))
 _Project = Callable[[np.ndarray], np.ndarray]  # (n, 3) world to (n, 2) of the drawing
 
 _X, _Y, _Z = np.eye(3)
@@ -66,13 +67,19 @@ class Drawing:
     width: int
 
 
-def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) -> list[Drawing]:
+def draw_scene(
+    photos: Sequence[PlacedPhoto],
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    marks: np.ndarray = _NO_MARKS,
+) -> list[Drawing]:
     """One drawing for each projection, of points (P, 3) and their colours (P, 3) uint8.
 
-    All cameras are drawn. Points are drawn if they are near the cameras and not outliers.
+    All cameras are drawn, and numbered ``marks`` (K, 3). Points are drawn if they are near the
+    cameras and not outliers.
     """
     centres = np.array([photo.centre for photo in photos]).reshape(-1, 3)
-    low, high = _box(centres, xyz)
+    low, high = _box(np.concatenate([centres, marks]), xyz)
     inside = ((xyz >= low) & (xyz <= high)).all(axis=1)
     shown = np.flatnonzero(inside)
     # Random points, because evenly chosen ones could follow a pattern in the order of the points.
@@ -89,6 +96,7 @@ def draw_scene(photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray) 
             photos,
             xyz[shown],
             rgb[shown],
+            marks,
             (low + high) / 2,
             extent * scale,
             scale,
@@ -129,6 +137,7 @@ def _draw(
     photos: Sequence[PlacedPhoto],
     xyz: np.ndarray,
     rgb: np.ndarray,
+    marks: np.ndarray,
     middle: np.ndarray,
     extent: np.ndarray,
     scale: float,
@@ -157,7 +166,7 @@ def _draw(
             f'<path{first} d="M{a}L{b}L{c}L{d}ZM{a}L{eye}L{b}M{c}L{eye}L{d}">'
             f"<title>{escape(photo.name)}</title></path>"
         )
-    svg = "\n".join([*parts, "</g>", _scale_bar(height, scale), "</svg>"])
+    svg = "\n".join([*parts, "</g>", *_marks(project(marks)), _scale_bar(height, scale), "</svg>"])
     return Drawing(svg, round(width))
 
 
@@ -187,6 +196,16 @@ def _paths(photos: Sequence[PlacedPhoto], project: _Project) -> list[str]:
             f"<title>{escape(sequence)}</title></polyline>"
         )
     return lines
+
+
+def _marks(xy: np.ndarray) -> list[str]:
+    """Numbered discs, counted from 1."""
+    return [
+        f'<g><circle cx="{x:.1f}" cy="{y:.1f}" r="9" fill="#7cc7ff"/>'
+        f'<text x="{x:.1f}" y="{y + 4:.1f}" text-anchor="middle" fill="#14171b" font-size="12" '
+        f'font-weight="600" font-family="sans-serif">{number}</text></g>'
+        for number, (x, y) in enumerate(xy, 1)
+    ]
 
 
 def _scale_bar(height: float, scale: float) -> str:

@@ -15,11 +15,11 @@ SHARPNESS_SIDE = 640
 #: Longest side in pixels of the copies that are tested for content, and for camera motion.
 CONTENT_SIDE = 320
 
-# Longest side of a copy in pixels -> minimum of `_fine_detail` for this copy. An image with less is
+# Longest side of a copy in pixels -> minimum of `fine_detail` for this copy. An image with less is
 # unusable. The minima follow from photos of three real datasets (1000 to 1280 pixels), which were
 # blurred by Gaussian filters with a standard deviation of σ pixels and saved as JPEG with quality
 # 75 and 95. With pycolmap's SIFT, neighbouring photos have 21 to 107 inlier matches at σ = 8, 0 to
-# 20 at σ = 12, and none at σ = 16. `_fine_detail` is
+# 20 at σ = 12, and none at σ = 16. `fine_detail` is
 #          longest side      sharp        σ = 8        12           16           24 and 32
 #                   160    0.60 to 0.74  0.18 to 0.24  0.09 to 0.14  0.06 to 0.12  0.04 to 0.15
 #                    80    0.60 to 0.75  0.39 to 0.47  0.24 to 0.32  0.17 to 0.23  0.07 to 0.14
@@ -69,24 +69,29 @@ def why_unusable(grey: np.ndarray) -> str | None:
     low, high = np.quantile(grey, [0.005, 0.995])
     if high - low < _MIN_RANGE:
         return BLACK if high < 64 else WHITE if low > 191 else FLAT
-    blurred = any(_fine_detail(grey, side) < least for side, least in _MIN_DETAIL.items())
+    # Motion blur keeps the detail perpendicular to its direction: such an image is still usable.
+    blurred = any(max(fine_detail(grey, side)) < least for side, least in _MIN_DETAIL.items())
     return BLURRED if blurred else None
 
 
-def _fine_detail(grey: np.ndarray, side: int) -> float:
+def fine_detail(grey: np.ndarray, side: int) -> tuple[float, float]:
     """The share of the gradient energy, 0..1, that a blur at the scale of 1/``side`` removes.
 
     This share does not depend on the contrast. It hardly depends on the content, because images of
     real scenes have detail at all scales, unless defocus or motion blur removes it.
+
+    Returns:
+        The share of the vertical and that of the horizontal gradient.
     """
     small = grey_copy(Image.fromarray(grey), side).astype(np.float32)
     if min(small.shape) < 8:
-        return 1.0
+        return 1.0, 1.0
     blurred = (small[:-2] + 2 * small[1:-1] + small[2:]) / 4
     blurred = (blurred[:, :-2] + 2 * blurred[:, 1:-1] + blurred[:, 2:]) / 4
-    shares = []
-    for axis in (0, 1):
+
+    def share(axis: int) -> float:
         before = float((np.diff(small[1:-1, 1:-1], axis=axis) ** 2).mean())
         after = float((np.diff(blurred, axis=axis) ** 2).mean())
-        shares.append(1 - after / before if before > 0 else 0.0)
-    return max(shares)  # motion blur keeps the detail perpendicular to its direction
+        return 1 - after / before if before > 0 else 0.0
+
+    return share(0), share(1)
