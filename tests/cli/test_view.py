@@ -106,8 +106,9 @@ def test_with_a_public_host_it_prints_the_address_for_other_computers(served, ou
 
 
 def test_which_scene_and_which_cameras(served, out, tmp_path):
-    _, _, (title, gaussians, cameras, background) = served(out, "--iteration", 30)
-    assert title == "out - snowsplat"
+    _, _, (about, gaussians, cameras, background) = served(out, "--iteration", 30)
+    assert about.title == "out"
+    assert about.made is not None
     thirty = read_gaussians(out / "point_cloud/iteration_30/point_cloud.ply")
     assert gaussians.means.equal(thirty.means)
     assert len(cameras) == 9

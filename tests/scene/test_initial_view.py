@@ -8,7 +8,7 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.scene.initial_view import overview, view_of_camera
+from snowsplat.scene.initial_view import bound, overview, view_of_camera
 
 
 def test_view_of_a_camera():
@@ -21,11 +21,26 @@ def test_view_of_a_camera():
     assert view.fov == pytest.approx(90.0)  # of the longer side
 
 
-def test_a_usual_window_shows_the_complete_photo():
-    pose = torch.eye(3, 4, dtype=torch.float64)
-    for width, height, whole in ((300, 300, 1.6), (400, 300, 1.6), (480, 300, 1.6), (600, 300, 2)):
-        view = view_of_camera(Camera(width, height, 300.0, 300.0, 1.0, 1.0, pose), 2.0)
-        assert math.tan(math.radians(view.fov / 2)) == pytest.approx(0.5 * whole)
+@pytest.mark.parametrize("photo", [(300, 300), (600, 300), (300, 500)])
+@pytest.mark.parametrize("window", [(1920, 1080), (390, 844), (500, 500)])
+def test_a_window_shows_the_complete_photo(photo, window):
+    """And one of its sides is that of the photo."""
+    (width, height), pose = photo, torch.eye(3, 4, dtype=torch.float64)
+    seen = Camera(width, height, 400.0, 300.0, width / 2, height / 2, pose)
+    view = view_of_camera(seen, 2.0)
+    for shown in (view, view.with_aspect(view.aspect)):
+        camera = shown.camera(*window)
+        torch.testing.assert_close(camera.cam_from_world, pose)
+        # At the edge of the photo, relative to that of the window.
+        across = width / 400 / (window[0] / camera.fx)
+        down = height / 300 / (window[1] / camera.fy)
+        assert max(across, down) == pytest.approx(1)
+    wider = view.with_aspect(1.7).camera(*window)
+    assert wider.fx <= camera.fx * (1 + 1e-9)
+    same_shape = view.with_aspect(1.7).camera(1700, 1000)
+    assert max(width / 400 * same_shape.fx / 1700, height / 300 * same_shape.fy / 1000) == (
+        pytest.approx(1)
+    )
 
 
 def balls(means: torch.Tensor, opacity_logit: float = 3.0) -> Gaussians:
@@ -66,41 +81,41 @@ def row_along_x(last: float, count: int) -> torch.Tensor:
 
 
 def distance_that_shows(radius: float) -> float:
-    """The distance at which the shorter side shows ``radius``.
-
-    The field of view is 60° along the longer side, which is 1.6 times as long as the shorter.
-    """
-    return 1.6 * radius / math.tan(math.radians(30))
+    return 2.77 * radius
 
 
 @pytest.mark.parametrize(
-    ("means", "radius"),
-    [
-        # Distances 0, 0.1, 0.1, …, 2, 2: the radius of 95% is 1.9.
-        (row_along_x(2.0, 41), 1.9),
-        # With a background: half of the points are within 1.5, and 2.5 times that is shown.
-        (torch.cat([row_along_x(2.0, 41), row_along_x(1000.0, 2).repeat(10, 1)]), 3.75),
-    ],
-    ids=["object", "background"],
+    "far", [torch.zeros(0, 3), row_along_x(1000.0, 2).repeat(10, 1)], ids=["object", "background"]
 )
-def test_overview_contains_the_stated_radius(means: torch.Tensor, radius: float):
+def test_overview_contains_the_object(far: torch.Tensor):
+    """It is 2 long, and longer on one side of its median than on the other."""
     shift = torch.tensor([10.0, 20.0, 30.0])
+    heavy = row_along_x(0.5, 41) - torch.tensor([0.5, 0.0, 0.0])
+    body = torch.cat([heavy, row_along_x(1.0, 101)])
     hidden = balls(torch.full((100, 3), 77.0), opacity_logit=math.log(0.19 / 0.81))
-    seen = balls(means + shift, opacity_logit=math.log(0.21 / 0.79))
-    view = overview(Gaussians.cat([seen, hidden]))
-    assert view.fov == 60
-    assert view.target == pytest.approx((10, 20, 30), abs=1e-4)
+    means = torch.cat([body, far]) + shift
+    seen = balls(means, opacity_logit=math.log(0.21 / 0.79))
+    scene = Gaussians.cat([seen, hidden])
+    middle, radius = bound(scene)
+    assert middle.tolist() == pytest.approx([10, 20, 30], abs=0.1)
+    assert radius == pytest.approx(1, abs=0.1)
+    view = overview(scene)
+    assert view.target == pytest.approx(middle.tolist())
     distance = distance_that_shows(radius)
     length = math.hypot(0.35, 1)
-    expected = (10, 20 - distance * 0.35 / length, 30 - distance / length)
+    x, y, z = view.target
+    expected = (x, y - distance * 0.35 / length, z - distance / length)
     assert view.position == pytest.approx(expected, rel=1e-4)
+    # A sphere around the middle fits into a square window.
+    assert math.sin(math.radians(view.fov / 2)) == pytest.approx(radius / distance)
 
 
 def test_overview_of_a_scene_without_opaque_gaussians_shows_the_others():
     faint = balls(row_along_x(2.0, 41), opacity_logit=-5.0)
     broken = balls(torch.full((50, 3), float("inf")), opacity_logit=-5.0)
     view = overview(Gaussians.cat([faint, broken]))
-    assert math.dist(view.position, view.target) == pytest.approx(distance_that_shows(1.9))
+    distance = math.dist(view.position, view.target)
+    assert distance == pytest.approx(distance_that_shows(2.0), rel=0.03)
 
 
 def test_overview_without_an_extent():

@@ -52,14 +52,15 @@ class View:
             raise UserError("view needs a scene; add a file or the output folder of a training run")
         from snowsplat.pipeline.scene_source import load_viewable
         from snowsplat.viewer.hosts import ANY_HOST
+        from snowsplat.viewer.web.panel import Description, made_on
         from snowsplat.viewer.web.scene import site
         from snowsplat.viewer.web.server import StaticServer
 
         scene = load_viewable(self.path, self.iteration)
         if not len(scene.gaussians):
             raise UserError(f"{scene.file}: contains no Gaussians; there is nothing to see")
-        title = f"{self.path.resolve().name} - snowsplat"
-        files, headers = site(title, scene.gaussians, scene.cameras, scene.background)
+        about = Description(self.path.resolve().name, made=made_on(scene.file))
+        files, headers = site(about, scene.gaussians, scene.cameras, scene.background)
         with (
             interrupts() as interrupted,
             StaticServer(files, headers, self.host, self.port) as server,

@@ -177,6 +177,8 @@ def _write_spz(target: Path, scene: Gaussians, version: int) -> None:
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
     """Write an HTML page. Its initial view is the camera of a photo, if the cameras are known."""
     from snowsplat.viewer.web.html import write_html
+    from snowsplat.viewer.web.panel import Description, made_on
     from snowsplat.viewer.web.scene import ready
 
-    write_html(target, *ready(scene, cameras_of(folder_around(source))))
+    about = Description(target.stem, made=made_on(source))
+    write_html(target, ready(scene, cameras_of(folder_around(source))), about)

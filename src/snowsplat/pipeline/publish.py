@@ -79,12 +79,13 @@ def publish(
     if not len(source.gaussians):
         raise UserError(f"{source.file}: contains no Gaussians; there is nothing to see")
 
-    from snowsplat.viewer.web.publication import Description, write_site
+    from snowsplat.viewer.web.panel import Description, made_on
+    from snowsplat.viewer.web.publication import write_site
 
     url = options.url and options.url.rstrip("/") + "/"
-    about = Description(options.title or scene_name(scene), options.licence, url)
+    about = Description(options.title or scene_name(scene), options.licence, made_on(source.file))
     folder.mkdir(parents=True, exist_ok=True)
-    write_site(folder, source.gaussians, source.cameras, source.background, about)
+    write_site(folder, source.gaussians, source.cameras, source.background, about, url)
     size = sum(file.stat().st_size for file in folder.iterdir())
     return PublishResult(folder, len(source.gaussians), size)
 

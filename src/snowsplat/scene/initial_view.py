@@ -3,70 +3,107 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import look_at
 
-# The usual aspect ratio of a browser window.
-_WINDOW_ASPECT = 1.6
-# Field of view of `overview` along the longer side of the window, in degrees.
-_OVERVIEW_FOV = 60.0
-# The overview shows at most this many times the radius that contains half of the scene. What is
-# farther away is considered background.
+# Distance of the camera of `overview` from the middle, relative to the radius that it shows.
+_OVERVIEW_DISTANCE = 2.77
+# What is farther from the median than this many times the median distance is considered background.
 _BACKGROUND_RATIO = 2.5
+# The rest extends from the first of these quantiles to the second.
+_EXTENT = torch.tensor([0.02, 0.98], dtype=torch.float64)
 # Number of Gaussians that are used for medians and quantiles.
 _ROWS_SAMPLED = 100_000
 
 
 @dataclass(frozen=True)
 class InitialView:
-    """Position and target of a viewer's camera in the world frame. Up is −y."""
+    """Position and target of a viewer's camera in the world frame. Up is −y.
+
+    A window of any shape must show a rectangle around the target, such as that of a photo.
+
+    Attributes:
+        position: of the camera.
+        target: the viewer looks at this point and orbits it.
+        fov: the angle of the longer side of the rectangle, in degrees.
+        aspect: width / height of the rectangle.
+    """
 
     position: tuple[float, float, float]
-    target: tuple[float, float, float]  # the viewer looks at this point and orbits it
-    fov: float  # degrees, along the longer side of the window
+    target: tuple[float, float, float]
+    fov: float
+    aspect: float = 1.0
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The camera of a window of this size, in pixels, that shows the complete rectangle."""
+        across, down = self._tangents()
+        focal = 0.5 * min(width / across, height / down)
+        position, target, up = (
+            torch.tensor(point, dtype=torch.float64)
+            for point in (self.position, self.target, (0.0, -1.0, 0.0))
+        )
+        pose = look_at(position, target, up)
+        return Camera(width, height, focal, focal, width / 2, height / 2, pose)
+
+    def with_aspect(self, aspect: float) -> InitialView:
+        """The view of the smallest rectangle of this shape around the rectangle of this view."""
+        across, down = self._tangents()
+        longer = max(across, down * aspect) / min(aspect, 1.0)
+        return replace(self, fov=_degrees(longer), aspect=aspect)
+
+    def _tangents(self) -> tuple[float, float]:
+        """Half of the width and of the height, at a distance of 1."""
+        longer = math.tan(math.radians(self.fov / 2))
+        return longer * min(self.aspect, 1.0), longer / max(self.aspect, 1.0)
 
 
 def view_of_camera(camera: Camera, depth: float) -> InitialView:
-    """The view of a photo. The target is ``depth`` world units along the optical axis.
-
-    A window of the usual aspect ratio shows the complete photo if the photo is in landscape format.
-    For a portrait photo, the window shows only the middle part: to show the complete photo, the
-    view would have to be wider than the photo, and the photos may not cover the areas at its sides.
-    """
+    """The view of a photo. The target is ``depth`` world units along the optical axis."""
     pose = camera.world_from_cam
-    short, long = sorted((0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy))
-    fov = math.degrees(2.0 * math.atan(max(long, _WINDOW_ASPECT * short)))
-    return InitialView(_point(pose[:, 3]), _point(pose[:, 3] + depth * pose[:, 2]), fov)
+    across, down = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
+    fov = _degrees(max(across, down))
+    target = pose[:, 3] + depth * pose[:, 2]
+    return InitialView(_point(pose[:, 3]), _point(target), fov, across / down)
 
 
-def overview(gaussians: Gaussians) -> InitialView:
-    """A view of the middle of the scene from the front and slightly above; needs no cameras.
+def bound(gaussians: Gaussians) -> tuple[Tensor, float]:
+    """The middle (3,) and the radius of what a scene shows; needs no cameras.
 
-    The view contains 95% of the opaque Gaussians, unless half of them are much closer to the
-    middle. Then the distant ones are background, and the view shows the object in front of them.
+    The sphere contains 98% of the opaque Gaussians, except for those much farther from the median
+    than half of them: these are background, and the sphere contains the object in front of them.
     """
     means = gaussians.means.detach()
     finite = means.isfinite().all(1)
     solid = finite & (gaussians.opacities.detach() > 0.2)
     seen = means[solid if bool(solid.any()) else finite].double().cpu()
     seen = seen[:: -(-len(seen) // _ROWS_SAMPLED) or 1]
-    middle, radius = torch.zeros(3, dtype=torch.float64), 1.0
-    if len(seen):
-        middle = seen.median(0).values
-        half, most = (
-            (seen - middle).norm(dim=1).quantile(torch.tensor([0.5, 0.95]).double()).tolist()
-        )
-        radius = max(min(most, _BACKGROUND_RATIO * half), 1e-6)
-    # The radius must fit into the height of a window in landscape format.
-    distance = _WINDOW_ASPECT * radius / math.tan(math.radians(_OVERVIEW_FOV / 2))
+    if not len(seen):
+        return torch.zeros(3, dtype=torch.float64), 1.0
+    median = seen.median(0).values
+    distances = (seen - median).norm(dim=1)
+    near = seen[distances <= _BACKGROUND_RATIO * distances.median()]
+    middle = near.quantile(_EXTENT, dim=0).mean(0)
+    return middle, max(float((near - middle).norm(dim=1).quantile(_EXTENT[1])), 1e-6)
+
+
+def overview(gaussians: Gaussians) -> InitialView:
+    """A view of the `bound` of the scene from the front and slightly above; needs no cameras."""
+    middle, radius = bound(gaussians)
     direction = torch.tensor([0.0, -0.35, -1.0], dtype=torch.float64)
-    position = middle + distance * direction / direction.norm()
-    return InitialView(_point(position), _point(middle), _OVERVIEW_FOV)
+    position = middle + _OVERVIEW_DISTANCE * radius * direction / direction.norm()
+    fov = math.degrees(2 * math.asin(1 / _OVERVIEW_DISTANCE))
+    return InitialView(_point(position), _point(middle), fov)
+
+
+def _degrees(tangent: float) -> float:
+    """The angle of which half has this tangent."""
+    return math.degrees(2 * math.atan(tangent))
 
 
 def _point(values: Tensor) -> tuple[float, float, float]:

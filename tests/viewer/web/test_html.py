@@ -13,6 +13,7 @@ from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web import html
+from snowsplat.viewer.web.scene import ready
 
 from ...browser import Browser
 
@@ -31,7 +32,7 @@ def three_balls() -> Gaussians:
     )
 
 
-FRONT = InitialView((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), 60.0)
+FRONT = InitialView((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), 60.0, 400 / 300)
 
 
 def test_the_scene_is_embedded(tmp_path):
@@ -74,7 +75,7 @@ def test_scenes_without_a_page(tmp_path, monkeypatch):
 @pytest.mark.browser
 def test_a_real_browser_opens_it_from_disk(tmp_path):
     path = tmp_path / "scene.html"
-    html.write_html(path, three_balls(), FRONT)
+    html.write_html(path, ready(three_balls(), ())._replace(start=FRONT))
     with Browser(400, 300) as browser:
         page = browser.open(f"{path.as_uri()}?webgl&noui")
         page.wait_for("!!window.app", 60)

@@ -11,6 +11,7 @@ import pytest
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web import page as viewer_page
+from snowsplat.viewer.web import panel
 from snowsplat.viewer.web.page import asset, content_policy, page, settings, whole_page
 
 HOSTILE = "</script><script>alert(1)</script><!-- <script>"
@@ -25,7 +26,7 @@ def test_settings_are_in_the_viewers_frame():
     """The viewer rotates scenes by 180° about z."""
     made = settings(InitialView((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 50.0), (0.1, 0.2, 0.3))
     (camera,) = made["cameras"]
-    expected = {"position": [-1.0, -2.0, 3.0], "target": [-4.0, -5.0, 6.0], "fov": 50.0}
+    expected = {"position": [-1.0, -2.0, 3.0], "target": [-4.0, -5.0, 6.0], "fov": pytest.approx(50.0)}
     assert camera["initial"] == expected
     assert made["background"] == {"color": [0.1, 0.2, 0.3]}
 
@@ -41,6 +42,9 @@ def test_inserted_values_do_not_become_markup():
 def test_the_page_is_unchanged_except_for_inserted_values():
     theirs, ours = asset("index.html").splitlines(), page("scene", {}).splitlines()
     assert sum(line not in ours for line in theirs) <= 6
+    text = page("scene", {})
+    assert panel.script() in text
+    assert panel.style() in text
 
 
 def test_the_policy_has_a_hash_of_each_script():

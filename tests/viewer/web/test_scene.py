@@ -19,6 +19,7 @@ from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.scene.render import render
 from snowsplat.viewer.web.page import FILM_SECONDS
+from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import ready, site
 from snowsplat.viewer.web.server import StaticServer
 
@@ -29,13 +30,8 @@ LOADED = "!!window.app"  # the viewer sets it after its first complete frame
 
 
 def camera_of(start: InitialView) -> Camera:
-    """The viewer's camera in a landscape window: level, with −y up."""
-    position, target = (
-        torch.tensor(p, dtype=torch.float64) for p in (start.position, start.target)
-    )
-    pose = look_at(position, target, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
-    focal = 0.5 * WIDTH / math.tan(math.radians(start.fov / 2))
-    return Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, pose)
+    """The viewer's camera."""
+    return start.camera(WIDTH, HEIGHT)
 
 
 def wide(camera: Camera, start: InitialView) -> Camera:
@@ -54,7 +50,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_the_initial_view_is_the_first_camera(trained):
-    gaussians, start, _ = ready(trained.gaussians, trained.cameras)
+    gaussians, start, *_ = ready(trained.gaussians, trained.cameras)
     camera = trained.cameras[0]
     # World z was up. The scale is unchanged, as the distances are usual ones.
     turned = transform(trained.gaussians, _similarity(1.0, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
@@ -66,8 +62,7 @@ def test_the_initial_view_is_the_first_camera(trained):
     distance = math.dist(start.position, start.target)
     assert distance == pytest.approx(2.4, abs=0.3)
     assert math.dist(start.target, (0, 0, 0)) == pytest.approx(3 - distance, abs=0.05)
-    assert start.fov == pytest.approx(math.degrees(2 * math.atan(1.2 * 0.5 / 0.9)), abs=1e-6)
-    # The view shows the photo and a little more on both sides.
+    assert start.fov == pytest.approx(math.degrees(2 * math.atan(0.5 / 0.9)), abs=1e-6)
     ours = picture(trained.gaussians, wide(camera, start))
     assert psnr(picture(gaussians, camera_of(start)), ours) > 45
 
@@ -80,14 +75,14 @@ def test_scenes_of_unusual_scale_are_rescaled(trained, scale):
         Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy, change.apply_to_poses(c.cam_from_world))
         for c in trained.cameras
     ]
-    gaussians, start, _ = ready(odd, cameras)
+    gaussians, start, *_ = ready(odd, cameras)
     assert math.dist(start.position, start.target) == pytest.approx(3.0, abs=1e-3)
     ours = picture(trained.gaussians, wide(trained.cameras[0], start))
     assert psnr(picture(gaussians, camera_of(start)), ours) > 40
 
 
 def test_an_upright_scene_is_unchanged(trained):
-    upright, _, _ = ready(trained.gaussians, trained.cameras)
+    upright, *_ = ready(trained.gaussians, trained.cameras)
     change = _similarity(1.0, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     cameras = [
         Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy, change.apply_to_poses(c.cam_from_world))
@@ -101,15 +96,15 @@ def test_empty_space_in_front_of_the_camera(trained):
     away = torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64)
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     camera = Camera(96, 72, 90.0, 90.0, 48.0, 36.0, look_at(away, 2 * away, up))
-    _, start, _ = ready(trained.gaussians, [camera])
+    _, start, *_ = ready(trained.gaussians, [camera])
     assert all(map(math.isfinite, (*start.position, *start.target, start.fov)))
 
 
 def test_the_page_and_its_policy(trained):
-    files, headers = site("<b>&", trained.gaussians, trained.cameras, (1.0, 1.0, 1.0))
-    assert sorted(files) == ["", "index.css", "index.js", "scene.compressed.ply"]
+    files, headers = site(Description("<b>&"), trained.gaussians, trained.cameras, (1.0, 1.0, 1.0))
+    assert sorted(files) == ["", "index.css", "index.js", "scene.compressed.ply", "stops.webp"]
     page = files[""].content.decode()
-    assert "<title>&lt;b&gt;&amp;</title>" in page
+    assert "<title>&lt;b&gt;&amp; - snowsplat</title>" in page
     (bootstrap,) = re.findall(r'id="sse-bootstrap">(.*?)</script>', page)
     settings = json.loads(bootstrap)["settings"]
     assert settings["background"]["color"] == [1.0, 1.0, 1.0]
@@ -125,9 +120,9 @@ def test_the_page_and_its_policy(trained):
 
 @pytest.mark.browser
 def test_a_real_browser_shows_our_render(trained, tmp_path):
-    gaussians, start, _ = ready(trained.gaussians, trained.cameras)
+    gaussians, start, *_ = ready(trained.gaussians, trained.cameras)
     ours = picture(gaussians, camera_of(start))
-    files, headers = site("scene", trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
+    files, headers = site(Description("scene"), trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
     with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
@@ -164,8 +159,8 @@ def with_controls(browser: Browser, server: StaticServer, before: np.ndarray) ->
 
 def test_the_film_follows_the_photos(trained):
     """It is a smooth path near the cameras."""
-    _, _, film = ready(trained.gaussians, trained.cameras)
-    moved, _, alone = ready(trained.gaussians, trained.cameras[:1] * 3)
+    film = ready(trained.gaussians, trained.cameras).film
+    moved, _, alone, *_ = ready(trained.gaussians, trained.cameras[:1] * 3)
     assert alone == []  # all photos from one place
     assert len(moved) == len(trained.gaussians)
     assert len(film) == 121

@@ -7,16 +7,15 @@ embedded as a compressed PLY file in base64. Pages are written, but cannot be re
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 from pathlib import Path
 
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.compressed_ply import encode_compressed_ply
-from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.initial_view import InitialView, overview
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_text
-from snowsplat.viewer.web.page import settings, whole_page
+from snowsplat.viewer.web.page import whole_page
+from snowsplat.viewer.web.panel import Description
+from snowsplat.viewer.web.scene import ReadyScene
 
 #: Largest scene in bytes. Browsers support strings of about 500 million characters, and base64
 #: makes 4 characters of 3 bytes.
@@ -43,33 +42,32 @@ _SCENE = """        <script type="text/plain" id="scene">{scene}</script>
         </script>"""
 
 
-def write_html(
-    path: Path | str,
-    gaussians: Gaussians,
-    start: InitialView | None = None,
-    film: Sequence[InitialView] = (),
-) -> None:
-    """Write the page atomically. Its first view is ``start``; default: an overview of the scene.
-
-    The animation of the page is ``film``; see `page.settings`.
+def write_html(path: Path | str, scene: ReadyScene, about: Description | None = None) -> None:
+    """Write the page of a scene atomically; ``about`` is by default the name of the file.
 
     Raises:
         UserError: no Gaussians, or too many for one page.
         OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    if not len(gaussians):
+    about = about or Description(path.stem)
+    count = len(scene.gaussians)
+    if not count:
         raise UserError(f"{path}: the scene has no Gaussians; a page needs at least one")
-    scene = encode_compressed_ply(path, GaussianArrays.from_gaussians(gaussians))
-    if len(scene) > _LARGEST:
+    content = encode_compressed_ply(path, GaussianArrays.from_gaussians(scene.gaussians))
+    if len(content) > _LARGEST:
         raise UserError(
-            f"{path}: {len(gaussians):,} Gaussians are too many for one page; "
+            f"{path}: {count:,} Gaussians are too many for one page; "
             "decimate them, or drop SH degrees"
         )
-    encoded = base64.b64encode(scene).decode("ascii")
-    background = (0.0, 0.0, 0.0)
+    pictures = f"data:image/webp;base64,{_base64(scene.stops.pictures)}"
     bootstrap = {
-        "settings": settings(start or overview(gaussians), background, film),
+        "settings": scene.settings(),
         "contentFilename": "scene.compressed.ply",
+        "panel": scene.panel(about, pictures),
     }
-    write_text(path, whole_page(path.stem, bootstrap, _SCENE.format(scene=encoded)))
+    write_text(path, whole_page(about.title, bootstrap, _SCENE.format(scene=_base64(content))))
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")

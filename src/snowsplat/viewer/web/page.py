@@ -1,8 +1,8 @@
 """The page for finished scenes: the SuperSplat viewer of PlayCanvas, bundled with the package.
 
 The page is third-party (third_party/README.md names the version). Settings, the title and the
-initial view are inserted at the places that it provides. The viewer's y axis points up, so it
-rotates a scene by 180° about the z axis; `settings` rotates the initial view in the same way.
+initial view are inserted at the places that it provides, and the panel (panel.py) at the place
+where the page creates the viewer.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from typing import Any
 
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
+from snowsplat.viewer.web import panel
+from snowsplat.viewer.web.panel import view_numbers
 
 _FOLDER = Path(__file__).parents[2] / "_viewer"  # of the package
 #: Duration of the animation of the page.
@@ -25,13 +27,6 @@ FILM_SECONDS = 20.0
 _STYLESHEET = '<link rel="stylesheet" href="./index.css" />'
 _IMPORT = "import { createViewer } from './index.js';"
 _CREATE = "createViewer({ container: document.body, settings, ...options });"
-# Visitors begin in orbit around what the photos show. The viewer itself would begin in its
-# animation; there, dragging the mouse would change to the fly mode in scenes around the visitor.
-_IN_ORBIT = """createViewer({ container: document.body, settings, ...options }).then((viewer) => {
-                window.sse.viewer = viewer;
-                const orbit = () => viewer.resetCamera();
-                viewer.state.loaded ? orbit() : viewer.events.once('loaded:changed', orbit);
-            });"""
 # Event handlers in the HTML that the script creates: event.stopPropagation() of two buttons.
 _HANDLER = re.compile(r' on[a-z]+=\\"([^"\\]*)\\"')
 _INLINE_SCRIPT = re.compile(r'<script(?: type="module")?>(.*?)</script>', re.DOTALL)
@@ -61,6 +56,7 @@ def settings(
             If there are none, the viewer uses an animation of its own.
     """
     off = {"enabled": False}
+    first = view_numbers(start, start.aspect)
     return {
         "version": 2,
         "tonemapping": "none",  # colours are displayed as they were trained
@@ -73,23 +69,16 @@ def settings(
             "vignette": {**off, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
             "fringing": {**off, "intensity": 0.5},
         },
-        "animTracks": [_track(film)] if film else [],
-        "cameras": [
-            {
-                "initial": {
-                    "position": _turned(start.position),
-                    "target": _turned(start.target),
-                    "fov": start.fov,
-                }
-            }
-        ],
+        "animTracks": [_track(film, start.aspect)] if film else [],
+        "cameras": [{"initial": {"position": first[:3], "target": first[3:6], "fov": first[6]}}],
         "annotations": [],
         "startMode": "animTrack" if film else "default",
     }
 
 
-def _track(film: Sequence[InitialView]) -> dict[str, Any]:
+def _track(film: Sequence[InitialView], aspect: float) -> dict[str, Any]:
     times = [i * FILM_SECONDS / (len(film) - 1) for i in range(len(film))]
+    keys = [view_numbers(view, aspect) for view in film]
     return {
         "name": "film",
         "duration": FILM_SECONDS,
@@ -100,24 +89,19 @@ def _track(film: Sequence[InitialView]) -> dict[str, Any]:
         "keyframes": {
             "times": times,
             "values": {
-                "position": [x for view in film for x in _turned(view.position)],
-                "target": [x for view in film for x in _turned(view.target)],
-                "fov": [view.fov for view in film],
+                "position": [x for key in keys for x in key[:3]],
+                "target": [x for key in keys for x in key[3:6]],
+                "fov": [key[6] for key in keys],
             },
         },
     }
 
 
-def _turned(point: tuple[float, float, float]) -> list[float]:
-    x, y, z = point
-    return [-x, -y, z]
-
-
 def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "") -> str:
     """The page; its stylesheet and script are the separate files index.css and index.js.
 
-    ``bootstrap`` has the viewer's keys: settings, contentUrl, contentFilename, posterUrl. ``head``
-    and ``body`` are HTML for the ends of these elements.
+    ``bootstrap`` has the viewer's keys: settings, contentUrl, contentFilename, posterUrl; and
+    panel, see `panel.panel_settings`. ``head`` and ``body`` are HTML for these elements.
     """
     text = asset("index.html")
     text = _replaced(
@@ -126,10 +110,12 @@ def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "
     # An empty icon; otherwise browsers would request one.
     icon = '<link rel="icon" href="data:," />'
     text = _replaced(text, '<base href="" />', f"{icon}\n        {head}" if head else icon)
+    style = f"<style>\n{panel.style()}</style>"
+    text = _replaced(text, _STYLESHEET, f"{_STYLESHEET}\n        {style}")
     if body:
         text = _replaced(text, "    </body>", f"{body}\n    </body>")
-    # No animation until the user moves the camera or presses Play.
-    text = _replaced(text, _CREATE, _IN_ORBIT)
+    text = _replaced(text, _CREATE, f"{{\n{panel.script()}}}")  # a block: its names are its own
+    # No animation until the user presses Play.
     text = _replaced(text, "noanim: url.searchParams.has('noanim')", "noanim: true")
     slot = re.compile(r'(<script type="application/json" id="sse-bootstrap">)\s*null\s*(</script>)')
     parts = slot.split(text)

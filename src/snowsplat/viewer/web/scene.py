@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,33 +23,46 @@ from snowsplat.scene.render import render
 from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.page import asset, content_policy, page, settings
+from snowsplat.viewer.web.panel import Description, panel_settings
 from snowsplat.viewer.web.server import ServedFile
+from snowsplat.viewer.web.stops import Stops, stops_of
 
 _SCENE = "scene.compressed.ply"
+#: The file with the pictures of the stops.
+PICTURES = "stops.webp"
 _KEYFRAMES = 121  # of the film; the viewer interpolates between them
 _LEVEL_ENOUGH = math.radians(3)  # a smaller tilt of the horizon is not visible
 _TOO_LARGE = 3.0  # maximum factor between the distances of the scene and the usual ones
 
 
 def site(
-    title: str, gaussians: Gaussians, cameras: Sequence[Camera], background: Sequence[float]
+    about: Description,
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    background: Sequence[float],
 ) -> tuple[dict[str, ServedFile], dict[str, str]]:
     """The files of a page that shows a scene, by name, and the HTTP headers for them.
 
     The initial view is the first of ``cameras``; without cameras, an overview of the scene.
     """
-    gaussians, start, film = ready(gaussians, cameras)
-    bootstrap = {"settings": settings(start, background, film), "contentUrl": f"./{_SCENE}"}
-    index = page(title, bootstrap)
+    scene = ready(gaussians, cameras, background)
+    bootstrap = {
+        "settings": scene.settings(),
+        "contentUrl": f"./{_SCENE}",
+        "panel": scene.panel(about, f"./{PICTURES}"),
+    }
+    index = page(f"{about.title} - snowsplat", bootstrap)
     files = {
         "": ServedFile(index.encode(), "text/html; charset=utf-8"),
         "index.css": ServedFile(asset("index.css").encode(), "text/css; charset=utf-8"),
         "index.js": ServedFile(asset("index.js").encode(), "text/javascript; charset=utf-8"),
         _SCENE: ServedFile(
-            encode_compressed_ply(Path(_SCENE), GaussianArrays.from_gaussians(gaussians)),
+            encode_compressed_ply(Path(_SCENE), GaussianArrays.from_gaussians(scene.gaussians)),
             "application/octet-stream",
         ),
     }
+    if scene.stops.views:
+        files[PICTURES] = ServedFile(scene.stops.pictures, "image/webp")
     own = "'self'"
     policy = f"{content_policy(index, own)}; frame-ancestors 'none'"
     return files, {"Content-Security-Policy": policy}
@@ -62,14 +75,32 @@ class ReadyScene(NamedTuple):
         start: the initial view.
         film: views along the path of the photographer, at equal distances in time; empty if there
             is no such path.
+        stops: views of some of the photos, and the subject of the scene.
+        background: red, green, blue in 0..1.
     """
 
     gaussians: Gaussians
     start: InitialView
     film: list[InitialView]
+    stops: Stops
+    background: Sequence[float]
+
+    def settings(self) -> dict[str, Any]:
+        """The settings of the viewer."""
+        return settings(self.start, self.background, self.film)
+
+    def panel(self, about: Description, pictures: str) -> dict[str, Any]:
+        """What the panel shows; ``pictures`` is the address of the pictures of the stops."""
+        subject = self.stops.middle.tolist(), self.stops.radius
+        count = len(self.gaussians)
+        return panel_settings(about, count, self.start, subject, self.stops.views, pictures)
 
 
-def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> ReadyScene:
+def ready(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+) -> ReadyScene:
     """The scene in a frame that suits the viewer, and views in that frame.
 
     In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
@@ -77,7 +108,8 @@ def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> ReadyScene:
     Otherwise it is unchanged.
     """
     if not cameras:
-        return ReadyScene(gaussians, overview(gaussians), [])
+        stops = stops_of(gaussians, (), 1.0, background)
+        return ReadyScene(gaussians, overview(gaussians), [], stops, background)
     depth = _depth_ahead(gaussians, cameras[0])
     change = _viewing_frame(cameras, depth)
     if change is not None:
@@ -87,7 +119,8 @@ def ready(gaussians: Gaussians, cameras: Sequence[Camera]) -> ReadyScene:
             replace(camera, cam_from_world=change.apply_to_poses(camera.cam_from_world))
             for camera in cameras
         ]
-    return ReadyScene(gaussians, view_of_camera(cameras[0], depth), _film(cameras, depth))
+    stops = stops_of(gaussians, cameras, depth, background)
+    return ReadyScene(gaussians, stops.views[0], _film(cameras, depth), stops, background)
 
 
 def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:

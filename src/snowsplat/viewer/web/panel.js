@@ -1,0 +1,167 @@
+// The panel of the page. `options` and `settings` are those of the viewer. A view is an array:
+// position, target, field of view. The field of view is the angle of the longer side of a rectangle
+// of the shape `aspect`; the window shows all of it, whatever its own shape.
+const scene = JSON.parse(document.getElementById('sse-bootstrap').textContent).panel;
+const { aspect, start, stops } = scene;
+
+/** Half of the width and of the height of what the window shows at a distance of 1. */
+const shownBy = (fov, { width, height }) => {
+    const longer = Math.tan((fov * Math.PI) / 360);
+    const half = Math.max(longer / Math.max(aspect, 1), (longer * Math.min(aspect, 1) * height) / width);
+    return [(half * width) / height, half];
+};
+
+const addView = ([x, y, z, u, v, w, fov]) => ({ position: [x, y, z], target: [u, v, w], fov });
+
+/** The view in the address of the page; undefined if there is none. */
+const linkedView = () => {
+    const numbers = /[#&]view=([^&]*)/.exec(location.hash)?.[1].split(',').map(Number);
+    const valid =
+        numbers?.length === 7 &&
+        numbers.every(Number.isFinite) &&
+        numbers[6] > 1 && numbers[6] < 170 &&
+        Math.hypot(numbers[0] - numbers[3], numbers[1] - numbers[4], numbers[2] - numbers[5]) > 0;
+    return valid ? numbers : undefined;
+};
+
+const element = (name, properties, ...children) => {
+    const made = Object.assign(document.createElement(name), properties);
+    made.append(...children);
+    return made;
+};
+
+settings.cameras[0].initial = addView(linkedView() ?? start);
+createViewer({ container: document.body, settings, ...options }).then((viewer) => {
+    window.sse.viewer = viewer;
+    const { app, state, events, annotations } = viewer;
+    const { camera } = app.root.findByName('camera');
+    const { canvas } = app.graphicsDevice;
+    const [subject, radius] = [scene.subject.slice(0, 3), scene.subject[3]];
+
+    // The viewer sets the field of view before each frame, once the scene is loaded.
+    let fov = start[6];
+    let fitted = 0;
+    app.on('update', () => {
+        if (app.xr.active) return;
+        if (camera.fov !== fitted) fov = camera.fov;
+        const longest = Math.max(...shownBy(fov, canvas));
+        camera.fov = fitted = (Math.atan(longest) * 360) / Math.PI;
+    });
+
+    // In a window of another shape, what is beside a photo may be in no photo. So it fades to the
+    // background until the visitor moves the camera.
+    const matte = element('div', { className: 'snow-matte' });
+    const fitMatte = () => {
+        const { clientWidth, clientHeight } = canvas;
+        const share = (clientWidth / clientHeight) / aspect;
+        const [side, inner] = share > 1 ? ['right', 1 / share] : ['bottom', share];
+        const color = `rgb(${settings.background.color.map((c) => 255 * c).join(' ')} / `;
+        const percent = (fromMiddle) => `${50 + 50 * fromMiddle}%`;
+        const fade = (to) =>
+            `linear-gradient(to ${to}, ${color}0) 50%, ${color}0) ${percent(inner)}, ${color}1) ${percent(inner + 0.2)})`;
+        matte.style.background = `${fade(side)}, ${fade(side === 'right' ? 'left' : 'top')}`;
+    };
+    const showMatte = (shown) => matte.classList.toggle('snow-clear', !shown || !stops.length);
+    canvas.after(matte);
+    new ResizeObserver(fitMatte).observe(canvas);
+
+    /** Move to a view, in orbit around its target; `isPhoto`: that of a photo. */
+    const flyTo = (view, isPhoto = false) => {
+        const { position, target, fov } = addView(view);
+        annotations[0] = { position: target, camera: { initial: { position, target, fov } } };
+        viewer.selectAnnotation(0);
+        annotations.length = 0;
+        state.selectedAnnotation = null;
+        showMatte(isPhoto);
+    };
+
+    const presentView = () => {
+        const { x, y, z } = camera.entity.getPosition();
+        const ahead = camera.entity.forward;
+        const distance = (subject[0] - x) * ahead.x + (subject[1] - y) * ahead.y + (subject[2] - z) * ahead.z;
+        const far = Math.max(distance, 0.1 * radius);
+        return [x, y, z, x + far * ahead.x, y + far * ahead.y, z + far * ahead.z, fov];
+    };
+
+    /** The subject from the present direction, whole and large. */
+    const subjectView = () => {
+        const { x, y, z } = camera.entity.forward;
+        const distance = radius / Math.sin(Math.atan(Math.min(...shownBy(start[6], canvas))));
+        const [u, v, w] = subject;
+        return [u - distance * x, v - distance * y, w - distance * z, u, v, w, start[6]];
+    };
+
+    const begin = () => {
+        // In orbit; the viewer itself would begin in its animation.
+        viewer.resetCamera();
+        showMatte(!linkedView());
+        // These follow the viewer's own handlers.
+        events.on('inputEvent', (name) => {
+            if (name === 'frame') flyTo(subjectView());
+            if (name === 'reset' && state.cameraMode === 'orbit') flyTo(start, true);
+        });
+        events.on('cameraMode:changed', (mode) => showMatte(mode === 'anim'));
+        for (const name of ['pointerdown', 'wheel']) canvas.addEventListener(name, () => showMatte(false));
+        window.addEventListener('hashchange', () => {
+            const view = linkedView();
+            if (view) flyTo(view);
+        });
+    };
+    state.loaded ? begin() : events.once('loaded:changed', begin);
+
+    if (!options.ui) return;
+    const toggle = (label, content) => {
+        const button = element('button', { type: 'button', textContent: label, ariaExpanded: 'false' });
+        button.onclick = () => {
+            content.hidden = !content.hidden;
+            button.ariaExpanded = String(!content.hidden);
+        };
+        content.hidden = true;
+        return button;
+    };
+
+    const copied = element('span', { className: 'snow-copied', role: 'status' });
+    const link = element('button', { type: 'button', textContent: 'Copy link', title: 'A link to the present view' });
+    link.onclick = async () => {
+        const view = presentView().map((number) => Number(number.toPrecision(6)));
+        history.replaceState(null, '', `#view=${view}`);
+        const done = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
+        copied.textContent = done ? 'Copied' : 'It is in the address bar';
+        setTimeout(() => { copied.textContent = ''; }, 3000);
+    };
+
+    const strip = element('div', { className: 'snow-stops' });
+    const photos = toggle('Photos', strip);
+    stops.forEach((view, i) => {
+        const stop = element('button', { type: 'button', ariaLabel: `Photo ${i + 1} of ${stops.length}` });
+        stop.style.backgroundImage = `url("${scene.pictures}")`;
+        stop.style.backgroundPositionX = `${stops.length > 1 ? (100 * i) / (stops.length - 1) : 0}%`;
+        stop.style.backgroundSize = `${100 * stops.length}% 100%`;
+        stop.style.aspectRatio = aspect;
+        stop.onclick = () => {
+            strip.querySelector('[aria-current]')?.removeAttribute('aria-current');
+            stop.ariaCurrent = 'true';
+            flyTo(view, true);
+        };
+        strip.append(stop);
+    });
+
+    const panel = element(
+        'section',
+        { className: 'snow-panel', ariaLabel: 'Scene' },
+        element(
+            'div',
+            { className: 'snow-card' },
+            element('h1', { textContent: scene.title }),
+            element('p', { textContent: scene.facts }),
+            element('div', { className: 'snow-buttons' }, ...(stops.length ? [photos] : []), link, copied)
+        ),
+        strip
+    );
+    // Keys for the buttons of the panel are not for the camera.
+    panel.addEventListener('keydown', (event) => {
+        if ([' ', 'Enter'].includes(event.key)) event.stopPropagation();
+    });
+    events.on('controlsHidden:changed', (hidden) => panel.classList.toggle('snow-faded', hidden && strip.hidden));
+    document.querySelector('.sse-viewer').append(panel);
+});

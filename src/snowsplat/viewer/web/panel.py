@@ -1,0 +1,92 @@
+"""The panel of the page: what the viewer does not show itself.
+
+It names the scene, has the stops along the path of the photos, and makes links to the present view.
+Its script also fits what a view must show into the window, and frames the subject. Style sheet and
+script are `panel.css` and `panel.js`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from snowsplat.scene.initial_view import InitialView
+
+_FOLDER = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a page says about its scene.
+
+    Attributes:
+        title: the name of the scene.
+        licence: the licence of the scene, such as "CC BY 4.0"; "" if it is not stated.
+        made: the day on which the scene was made; None if it is not known.
+    """
+
+    title: str
+    licence: str = ""
+    made: date | None = None
+
+    def facts(self, gaussians: int) -> str:
+        """The facts in one line: number of Gaussians, date, licence."""
+        made = self.made.isoformat() if self.made else ""
+        return " · ".join(filter(None, (f"{gaussians:,} Gaussians", made, self.licence)))
+
+
+def made_on(file: Path) -> date:
+    """The day on which a scene file was written."""
+    return date.fromtimestamp(file.stat().st_mtime)
+
+
+def view_numbers(view: InitialView, aspect: float) -> list[float]:
+    """A view as the viewer and the script store it: position, target, field of view.
+
+    The viewer's y axis points up, so it rotates scenes by 180° about the z axis. ``aspect`` is that
+    of all views of a page; see `InitialView.with_aspect`.
+    """
+    (x, y, z), (u, v, w) = view.position, view.target
+    return [-x, -y, z, -u, -v, w, view.with_aspect(aspect).fov]
+
+
+def panel_settings(
+    about: Description,
+    gaussians: int,
+    start: InitialView,
+    subject: tuple[Sequence[float], float],
+    stops: Sequence[InitialView],
+    pictures: str,
+) -> dict[str, Any]:
+    """What the script needs.
+
+    Args:
+        gaussians: their number.
+        start: the initial view of the page.
+        subject: middle and radius of what Frame shows.
+        stops: the views of the stops.
+        pictures: the address of the image with the pictures of the stops.
+    """
+    (x, y, z), radius = subject
+    return {
+        "title": about.title,
+        "facts": about.facts(gaussians),
+        "aspect": start.aspect,
+        "start": view_numbers(start, start.aspect),
+        "subject": [-x, -y, z, radius],
+        "stops": [view_numbers(stop, start.aspect) for stop in stops],
+        "pictures": pictures,
+    }
+
+
+def script() -> str:
+    """The script of the panel, which also creates the viewer."""
+    return (_FOLDER / "panel.js").read_text(encoding="utf-8")
+
+
+def style() -> str:
+    """The style sheet of the panel."""
+    return (_FOLDER / "panel.css").read_text(encoding="utf-8")

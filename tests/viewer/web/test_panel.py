@@ -1,0 +1,148 @@
+"""The panel of the page, in a real browser: stops, links to views, Frame, windows of any shape."""
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+from snowsplat.viewer.web.html import write_html
+from snowsplat.viewer.web.panel import Description, view_numbers
+from snowsplat.viewer.web.scene import ReadyScene, ready
+
+from ...browser import Browser, Page
+
+ENTITY = "window.sse.viewer.app.root.findByName('camera')"
+POSE = f"(e => [e.getPosition(), e.forward].flatMap(v => [v.x, v.y, v.z]))({ENTITY})"
+MODE = "window.sse.viewer.state.cameraMode"
+
+
+@pytest.fixture(scope="module")
+def scene(trained) -> ReadyScene:
+    return ready(trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def file(scene, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("panel") / "balls.html"
+    write_html(path, scene, Description("Balls <&>", "CC0", date(2026, 11, 24)))
+    return path
+
+
+@contextmanager
+def opened(file: Path, width: int, height: int, link: str = "") -> Iterator[Page]:
+    with Browser(width, height) as browser:
+        page = browser.open(f"{file.as_uri()}?webgl{link}")
+        page.wait_for("!!window.app", 60)
+        yield page
+        assert not page.errors
+        assert all(url.startswith(("file://", "blob:null/", "data:")) for url in page.requests)
+
+
+def pose_of(view: list[float]) -> list[float]:
+    """Position and direction of a view in the viewer's frame."""
+    position, target = view[:3], view[3:6]
+    distance = math.dist(position, target)
+    return [*position, *((b - a) / distance for a, b in zip(position, target, strict=True))]
+
+
+def wait_for_pose(page: Page, expected: list[float]) -> None:
+    near = f"{POSE}.every((x, i) => Math.abs(x - {json.dumps(expected)}[i]) < 5e-3)"
+    try:
+        page.wait_for(near, 30)
+    except Exception:
+        raise AssertionError(f"{page.evaluate(POSE)} is not {expected}") from None
+
+
+def click(page: Page, text: str) -> None:
+    buttons = "[...document.querySelectorAll('.snow-panel button')]"
+    page.evaluate(f"{buttons}.find(b => b.textContent === '{text}').click()")
+
+
+def press(page: Page, key: str) -> None:
+    for kind in ("keyDown", "keyUp"):
+        page.call("Input.dispatchKeyEvent", type=kind, key=key, code=f"Key{key.upper()}", text=key)
+
+
+@pytest.mark.browser
+def test_the_panel(file, scene):
+    start, stops = (
+        [view_numbers(view, scene.start.aspect) for view in views]
+        for views in ([scene.start], scene.stops.views)
+    )
+    with opened(file, 480, 360) as page:
+        text = page.evaluate("document.querySelector('.snow-card').innerText")
+        assert text.startswith("Balls <&>")
+        assert f"{len(scene.gaussians):,} Gaussians · 2026-11-24 · CC0" in text
+        wait_for_pose(page, pose_of(start[0]))
+        # Stops: their pictures are shown on demand; a click moves to the view.
+        strip = "document.querySelector('.snow-stops')"
+        assert page.evaluate(f"{strip}.offsetParent === null")
+        click(page, "Photos")
+        assert page.evaluate(f"{strip}.children.length") == len(stops) == 12
+        loaded = (
+            f"new Promise(done => {{ const i = new Image(); i.onload = () => done(i.naturalWidth);"
+            f"i.src = /url\\(\"(.*)\"\\)/.exec({strip}.children[3].style.backgroundImage)[1] }})"
+        )
+        assert page.evaluate(loaded) == 12 * round(128 * 96 / 72)
+        page.evaluate(f"{strip}.children[3].click()")
+        wait_for_pose(page, pose_of(stops[3]))
+        clear = "document.querySelector('.snow-matte').classList.contains('snow-clear')"
+        assert not page.evaluate(clear)
+        page.drag(100, 280, 180, 290)
+        assert page.evaluate(clear)
+        assert page.evaluate(MODE) == "orbit"
+        # Frame: the camera looks at the subject, which fits into the window.
+        press(page, "f")
+        x, y, z = scene.stops.middle.tolist()
+        to_subject = (
+            f"(e => {{ const p = e.getPosition(), f = e.forward; const d = [{-x} - p.x, {-y} - p.y, "
+            f"{z} - p.z]; const n = Math.hypot(...d); return [n, (d[0] * f.x + d[1] * f.y + "
+            f"d[2] * f.z) / n]; }})({ENTITY})"
+        )
+        tangent = math.tan(math.radians(scene.start.fov / 2)) * 3 / 4
+        distance = scene.stops.radius / math.sin(math.atan(tangent))
+        page.wait_for(f"{to_subject}[1] > 0.9999", 30)
+        page.wait_for(f"Math.abs({to_subject}[0] - {distance}) < 0.01 * {distance}", 30)
+        # A link to this view.
+        click(page, "Copy link")
+        link = page.wait_for("location.hash", 10)
+        shown = page.evaluate(POSE)
+        press(page, "r")
+        wait_for_pose(page, pose_of(start[0]))
+    with opened(file, 300, 400, link) as page:
+        wait_for_pose(page, shown)
+        # Another link in the same tab.
+        page.evaluate(f"location.hash = '#view={','.join(map(str, stops[5]))}'")
+        wait_for_pose(page, pose_of(stops[5]))
+        press(page, "r")
+        wait_for_pose(page, pose_of(start[0]))
+
+
+@pytest.mark.browser
+def test_links_that_are_no_views(file, scene):
+    start = pose_of(view_numbers(scene.start, scene.start.aspect))
+    with opened(file, 300, 300, "#view=1,2,3") as page:
+        for link in ("#", "#view=1,1,1,1,1,1,50", "#view=a,b,c,d,e,f,g", "#view=0,0,0,1,1,1,0"):
+            wait_for_pose(page, start)
+            page.evaluate(f"location.hash = '{link}'")
+        wait_for_pose(page, start)
+
+
+@pytest.mark.browser
+def test_windows_of_any_shape_show_the_complete_photo(file, scene):
+    """Also if the shape changes, as that of a phone that is turned."""
+    component = f"{ENTITY}.camera"
+    with opened(file, 480, 360) as page:
+        for width, height in ((600, 300), (300, 600), (480, 360)):
+            size = {"width": width, "height": height}
+            page.call(
+                "Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False
+            )
+            camera = scene.start.camera(width, height)
+            fov = math.degrees(2 * math.atan(max(width, height) / 2 / camera.fx))
+            page.wait_for(f"Math.abs({component}.fov - {fov}) < 0.01", 30)
+            assert page.evaluate(f"{component}.horizontalFov") == (width > height)
