@@ -26,7 +26,11 @@ def test_settings_are_in_the_viewers_frame():
     """The viewer rotates scenes by 180° about z."""
     made = settings(InitialView((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 50.0), (0.1, 0.2, 0.3))
     (camera,) = made["cameras"]
-    expected = {"position": [-1.0, -2.0, 3.0], "target": [-4.0, -5.0, 6.0], "fov": pytest.approx(50.0)}
+    expected = {
+        "position": [-1.0, -2.0, 3.0],
+        "target": [-4.0, -5.0, 6.0],
+        "fov": pytest.approx(50.0),
+    }
     assert camera["initial"] == expected
     assert made["background"] == {"color": [0.1, 0.2, 0.3]}
 

@@ -85,7 +85,7 @@ def test_the_panel(file, scene):
         assert page.evaluate(f"{strip}.children.length") == len(stops) == 12
         loaded = (
             f"new Promise(done => {{ const i = new Image(); i.onload = () => done(i.naturalWidth);"
-            f"i.src = /url\\(\"(.*)\"\\)/.exec({strip}.children[3].style.backgroundImage)[1] }})"
+            f'i.src = /url\\("(.*)"\\)/.exec({strip}.children[3].style.backgroundImage)[1] }})'
         )
         assert page.evaluate(loaded) == 12 * round(128 * 96 / 72)
         page.evaluate(f"{strip}.children[3].click()")
@@ -99,9 +99,9 @@ def test_the_panel(file, scene):
         press(page, "f")
         x, y, z = scene.stops.middle.tolist()
         to_subject = (
-            f"(e => {{ const p = e.getPosition(), f = e.forward; const d = [{-x} - p.x, {-y} - p.y, "
-            f"{z} - p.z]; const n = Math.hypot(...d); return [n, (d[0] * f.x + d[1] * f.y + "
-            f"d[2] * f.z) / n]; }})({ENTITY})"
+            f"(e => {{ const p = e.getPosition(), f = e.forward;"
+            f"const d = [{-x} - p.x, {-y} - p.y, {z} - p.z], n = Math.hypot(...d);"
+            f"return [n, (d[0] * f.x + d[1] * f.y + d[2] * f.z) / n]; }})({ENTITY})"
         )
         tangent = math.tan(math.radians(scene.start.fov / 2)) * 3 / 4
         distance = scene.stops.radius / math.sin(math.atan(tangent))
@@ -110,7 +110,7 @@ def test_the_panel(file, scene):
         # A link to this view.
         click(page, "Copy link")
         link = page.wait_for("location.hash", 10)
-        shown = page.evaluate(POSE)
+        shown = pose_of([float(number) for number in link.removeprefix("#view=").split(",")])
         press(page, "r")
         wait_for_pose(page, pose_of(start[0]))
     with opened(file, 300, 400, link) as page:

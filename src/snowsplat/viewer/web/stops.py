@@ -19,14 +19,14 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import transform_points
 from snowsplat.scene.initial_view import InitialView, bound, view_of_camera
 from snowsplat.scene.render import render
-from snowsplat.trajectory.focus import focus_of
+from snowsplat.trajectory.focus import focus_of, positions_of
 
 #: Largest number of stops; the pictures of so many fit on a small page.
 MOST = 24
 #: Height of a picture in pixels. It is displayed at half of that on a usual screen.
 HEIGHT = 128
-# The subject is around the focus of the cameras. Its sphere contains this share of what the middle
-# parts of the photos show, of this size relative to a photo. The rest is mostly background.
+# The subject is around the focus of the cameras, closer to it than these. Its sphere contains this
+# share of what the middle parts of the photos show, of this size relative to a photo.
 _MIDDLE = 0.6
 _SHARE = 0.9
 
@@ -65,8 +65,9 @@ def stops_of(
     width = max(1, round(HEIGHT * views[0].aspect))
     looks = [_look(gaussians, view.camera(width, HEIGHT), background) for view in views]
     middle = focus_of(cameras, depth)
-    seen = torch.cat([points for _, points in looks])
-    radius = float((seen - middle).norm(dim=1).quantile(_SHARE)) if len(seen) else depth
+    distances = (torch.cat([points for _, points in looks]) - middle).norm(dim=1)
+    distances = distances[distances < (positions_of(cameras) - middle).norm(dim=1).median()]
+    radius = float(distances.quantile(_SHARE)) if len(distances) else depth
     return Stops(views, _side_by_side([picture for picture, _ in looks]), middle, max(radius, 1e-6))
 
 
