@@ -27,6 +27,7 @@ class Convert:
       snowsplat convert out/garden small.ply --decimate 50% --refine garden
       snowsplat convert garden.ply table.glb --crop -1 -1 -1 1 0.5 1 --rotate 0 90 0
       snowsplat convert house.ply tree.spz both.ply
+      snowsplat convert out/town town_levels/lod-meta.json
 
     The suffix of FILE selects the format:
       .ply              lossless; read by every program for Gaussian splats
@@ -37,6 +38,9 @@ class Convert:
       .glb              glTF; lossless except for rounding
       .splat            1/8 of the size; no view-dependent colour
       .html             a web page that contains the scene and a viewer
+      lod-meta.json     a folder with levels of detail, for large scenes on the
+                        web: viewers load first a coarse level, then what they
+                        show; for the web viewers of PlayCanvas
 
     Notes:
       If there are several scenes, they are merged first. Then the edits are
@@ -46,8 +50,8 @@ class Convert:
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE [MORE …] FILE")] = ()
-    """One or more scenes, followed by the file to write. A scene is a file of any format, or an
-    output folder, of which the last scene is used."""
+    """One or more scenes, followed by the file to write. A scene is a file of any format, an output
+    folder, of which the last scene is used, or a folder with a lod-meta.json."""
     sh_degree: Annotated[int | None, flag("N", default="that of the scene")] = None
     """Reduce the spherical harmonics (view-dependent colour) to this degree, 0 to 3."""
     crop: Annotated[Box | None, flag("X0 Y0 Z0 X1 Y1 Z1", default="all")] = None
@@ -93,6 +97,6 @@ class Convert:
                 overwrite=self.overwrite,
                 observer=observer,
             )
-        written = f"{target.stat().st_size:,} bytes of {format.name}"
+        written = f"{format.size(target):,} bytes of {format.name}"
         print(f"{target}: {written}; lost in this format: {format.loses}")
         return 0

@@ -71,6 +71,11 @@ def _video(written: dict[str, Any]) -> list[str]:
     return [f"{files}: {written['frames']} frames {width}x{height}"]
 
 
+def _levels(written: dict[str, Any]) -> list[str]:
+    counts = " > ".join(f"{count:,}" for count in written["gaussians"])
+    return [f"{counts} Gaussians, {written['bytes'] / 1e6:,.1f} MB"]
+
+
 def _listed(lines: list[str]) -> list[str]:
     more = len(lines) - _NAMED
     return lines[:_NAMED] + ([f"and {more} more, see capture_report.html"] if more > 0 else [])
@@ -85,4 +90,5 @@ _LINES: dict[str, Callable[[dict[str, Any]], list[str]]] = {
     "scene": _scene,
     "pictures": _pictures,
     "video": _video,
+    "levels": _levels,
 }

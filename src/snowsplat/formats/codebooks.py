@@ -105,12 +105,18 @@ def _kmeans(rows: np.ndarray, count: int, random: np.random.Generator) -> np.nda
 
 def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """(N,) index of the nearest centre, computed in chunks to bound the memory."""
-    half_norms = 0.5 * (centres * centres).sum(1)
+    # The products of NumPy use all processors, for matrices that are too small for it. Those of
+    # torch use as many threads as the caller has set.
+    import torch
+
+    half_norms = torch.from_numpy(0.5 * (centres * centres).sum(1))
+    transposed = torch.from_numpy(np.ascontiguousarray(centres.T))
     label = np.empty(len(rows), np.int64)
     step = max(1, _CHUNK // len(centres))
     for start in range(0, len(rows), step):
-        part = slice(start, start + step)
-        label[part] = (rows[part] @ centres.T - half_norms).argmax(1)
+        part = torch.from_numpy(np.ascontiguousarray(rows[start : start + step]))
+        scores = torch.addmm(half_norms, part, transposed, beta=-1)
+        label[start : start + step] = scores.argmax(1).numpy()
     return label
 
 

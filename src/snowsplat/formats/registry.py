@@ -18,6 +18,8 @@ from snowsplat.formats.compressed_ply import (
 from snowsplat.formats.gaussian_arrays import GaussianArrays
 from snowsplat.formats.gltf import is_glb, read_glb, write_glb
 from snowsplat.formats.ksplat import read_ksplat
+from snowsplat.formats.lod import INDEX, LEVELS, is_lod, lod_bytes, read_lod
+from snowsplat.formats.lod_writer import write_lod
 from snowsplat.formats.ply import is_ply, read_ply, write_ply
 from snowsplat.formats.sog import is_sog, read_sog, sog_version, write_sog
 from snowsplat.formats.splat import read_splat, write_splat
@@ -40,6 +42,7 @@ class Format:
         write: None for a format that cannot be written.
         loses: a description, for users, of the data that a scene loses in this format.
         version: the version of a file that ``recognises`` accepts, if the format has several.
+        bytes: the size of a scene; None: that of its file, the only one.
     """
 
     name: str
@@ -49,6 +52,11 @@ class Format:
     write: Callable[[Path, GaussianArrays], None] | None
     loses: str
     version: Callable[[Path], str] | None = None
+    bytes: Callable[[Path], int] | None = None
+
+    def size(self, path: Path) -> int:
+        """The bytes of an existing scene, with all files that belong to it."""
+        return self.bytes(path) if self.bytes else path.stat().st_size
 
 
 #: ``recognises`` is called in this order: special formats are before general ones.
@@ -86,6 +94,15 @@ FORMATS: list[Format] = [
         write_sog,
         "precision: positions have 16 bits, all other values 8; SH are rows of a palette",
         sog_version,
+    ),
+    Format(
+        LEVELS,
+        (INDEX,),
+        is_lod,
+        read_lod,
+        write_lod,
+        "precision, as in SOG: positions have 16 bits, all other values 8; SH are rows of a palette",
+        bytes=lod_bytes,
     ),
     Format(
         "glTF",

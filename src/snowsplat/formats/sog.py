@@ -32,7 +32,7 @@ from PIL import Image
 
 from snowsplat.formats import packing
 from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
-from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.gaussian_arrays import GaussianArrays, skip_nonfinite
 from snowsplat.formats.sog_container import Bundle, Damaged
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -52,7 +52,6 @@ def is_sog(head: bytes) -> bool:
     )
 
 
-@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
 def read_sog(path: Path | str) -> GaussianArrays:
     """Read a zip file, or the `meta.json` of a folder, of version 1 or 2.
 
@@ -60,6 +59,12 @@ def read_sog(path: Path | str) -> GaussianArrays:
         UserError: the file cannot be read, is damaged, or declares an implausible number of
             Gaussians.
     """
+    return skip_nonfinite(Path(path), read_stored(path))
+
+
+@np.errstate(all="ignore")
+def read_stored(path: Path | str) -> GaussianArrays:
+    """The same as `read_sog`, but with the Gaussians that are not finite, in their stored order."""
     path = Path(path)
     try:
         with Bundle(path) as files:
@@ -68,7 +73,20 @@ def read_sog(path: Path | str) -> GaussianArrays:
             arrays = _decode(files, layout)
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
-    return decoded(path, *arrays)
+    return GaussianArrays(*(np.array(array, np.float32) for array in arrays))
+
+
+def sog_files(path: Path) -> list[Path]:
+    """The files of a scene: the zip file, or `meta.json` and the images beside it.
+
+    Raises:
+        UserError: the file cannot be read or is damaged.
+    """
+    try:
+        with Bundle(path) as files:
+            return [path, *files.beside(_layout(files.meta()).files.values())]
+    except Damaged as error:
+        raise UserError(f"{path}: {error}; copy or export it again") from None
 
 
 def sog_version(path: Path) -> str:
@@ -193,12 +211,24 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
     """
     path = Path(path)
     packable = packing.packable(path, gaussians)
-    order = packing.spatial_order(packable.means)
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packable.select(order)
-    n = len(means)
-    if n > (_SIDE_LIMIT - 3) ** 2:
-        raise UserError(f"{path}: {n} Gaussians are too many for SOG; write .ply or .spz")
+    if len(packable.means) > (_SIDE_LIMIT - 3) ** 2:
+        count = len(packable.means)
+        raise UserError(f"{path}: {count} Gaussians are too many for SOG; write .ply or .spz")
+    members = encode_sog(packable.select(packing.spatial_order(packable.means)))
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
+        # Not compressed again, because WebP is compressed. ZipInfo has a fixed date, so that equal
+        # scenes result in equal files.
+        for name, content in members.items():
+            bundle.writestr(zipfile.ZipInfo(name), content)
 
+
+def encode_sog(gaussians: GaussianArrays) -> dict[str, bytes]:
+    """The members of a scene of version 2 by name; `meta.json` is the first one.
+
+    The Gaussians keep their order. They must be finite, with unit quaternions (`packing.packable`).
+    """
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = gaussians
+    n = len(means)
     logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = (logs.min(0), logs.max(0)) if n else (np.zeros(3), np.zeros(3))
     steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
@@ -237,12 +267,8 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
             "codebook": levels.tolist(),
             **_files_entry("shN_centroids", "shN_labels"),
         }
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
-        # Not compressed again, because WebP is compressed. ZipInfo has a fixed date, so that equal
-        # scenes result in equal files.
-        bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
-        for name, pixels in images.items():
-            bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
+    encoded = {f"{name}.webp": _webp(pixels) for name, pixels in images.items()}
+    return {"meta.json": json.dumps(meta).encode(), **encoded}
 
 
 def _palette_size(count: int) -> int:

@@ -87,10 +87,13 @@ class Bundle:
 
     def bytes_with(self, names: Iterable[str]) -> int:
         """Number of bytes of these members of a folder; for a zip file, the size of the file."""
+        return self.size + sum(path.stat().st_size for path in self.beside(names))
+
+    def beside(self, names: Iterable[str]) -> list[Path]:
+        """The files of these members of a folder, as far as they exist; none for a zip file."""
         if self._zip is not None:
-            return self.size
-        found = [path for path in {self._beside(name) for name in names} if is_file(path)]
-        return self.size + sum(path.stat().st_size for path in found)
+            return []
+        return [path for path in sorted({self._beside(name) for name in names}) if is_file(path)]
 
     def _beside(self, name: str) -> Path:
         if not name or Path(name).name != name:

@@ -11,8 +11,10 @@ from pathlib import Path
 import torch
 
 from snowsplat.formats import Format, GaussianArrays
+from snowsplat.formats.lod import LEVELS
 from snowsplat.formats.spz import WRITTEN_VERSIONS, write_spz
 from snowsplat.pipeline.decimate import file_size, gaussians_to_keep, write_within
+from snowsplat.pipeline.levels import write_levels
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
 from snowsplat.pipeline.scene_source import cameras_of, folder_around, scene_file
@@ -113,7 +115,8 @@ def convert(
 
     Args:
         sources: scene files of any format, or output folders, whose last scene is used.
-        target: the file to write; its suffix selects the format.
+        target: the file to write; its suffix selects the format. FOLDER/lod-meta.json stands for
+            levels of detail in this folder.
         edits: changes to the merged scene; default: none.
         dataset: with ``decimate``: train the result for a moment on the photos of this dataset.
         spz_version: the version of an .spz file, 2 to 4; default: 3.
@@ -137,16 +140,20 @@ def convert(
         raise SettingError("spz_version", f"is for .spz files, and {target.name} is {format.name}")
     if spz_version is not None and spz_version not in WRITTEN_VERSIONS:
         raise SettingError("spz_version", f"{spz_version} cannot be written; use 2, 3 or 4")
+    size = file_size(edits.decimate)
+    if format.name == LEVELS and size is not None:
+        raise SettingError("decimate", "a size is that of one file; use a number or a share")
     given = [sources] if isinstance(sources, Path | str) else sources
     files = [scene_file(Path(source)) for source in given]
     refined = None if dataset is None else _refinement(edits, files[0], Path(dataset), observer)
     scene = edits.apply(edit.merge([read_gaussians(file) for file in files]))
-    size = file_size(edits.decimate)
     write = write_gaussians
     if spz_version is not None:
         write = partial(_write_spz, version=spz_version)
     if format.name == "HTML" and len(files) == 1 and edits.transform() is None:
         write = partial(_write_page, source=files[0])
+    if format.name == LEVELS:
+        write = partial(write_levels, observer=observer)
     if size is not None:
         write_within(size, target, scene, write, refined)
     else:

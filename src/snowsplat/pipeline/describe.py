@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from snowsplat.formats.lod import INDEX, LEVELS
 from snowsplat.pipeline.output_folder import OutputFolder
 from snowsplat.pipeline.scene_source import training_folder
 from snowsplat.util.errors import UserError
@@ -23,7 +24,8 @@ def describe(path: Path | str) -> dict[str, Any]:
 
     The key "kind" has one of these values; the other keys depend on it:
 
-    - "scene": format, number of Gaussians, bounds, and percentiles of opacity and scale.
+    - "scene": format, number of Gaussians, bounds, and percentiles of opacity and scale. ``path``
+      may also be a folder with a `lod-meta.json`.
     - "point cloud": number of points, bounds.
     - "checkpoint": step, configuration, shapes of the tensors. The checksums are verified.
     - "output folder": dataset, scenes, checkpoints, metrics, and a description of the last scene.
@@ -41,6 +43,8 @@ def describe(path: Path | str) -> dict[str, Any]:
         raise UserError(f"{path}: no such file or folder")
     if path.suffix == ".safetensors":
         return _checkpoint(path)
+    if (path / INDEX).is_file():
+        path = path / INDEX
     if path.is_file():
         from snowsplat.pipeline.scene_files import format_for_reading
 
@@ -59,10 +63,13 @@ def describe(path: Path | str) -> dict[str, Any]:
 
 def _scene(path: Path, format: Format) -> dict[str, Any]:
     from snowsplat.formats import ply
+    from snowsplat.formats.lod import read_index
     from snowsplat.pipeline.scene_files import read_arrays
     from snowsplat.util.ply import open_table
 
-    facts: dict[str, Any] = {"file": str(path), "bytes": path.stat().st_size}
+    facts: dict[str, Any] = {"file": str(path), "bytes": format.size(path)}
+    if format.name == LEVELS:
+        facts["gaussians_per_level"] = read_index(path).counts()
     if format.name == "PLY":
         table = open_table(path)
         facts["encoding"] = table.format

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output_folder import SCENE, OutputFolder
 from snowsplat.util.errors import UserError
@@ -89,13 +90,17 @@ def training_folder(path: Path) -> OutputFolder:
 
 
 def scene_file(path: Path) -> Path:
-    """``path`` itself if it is a file, or the last scene in the output folder ``path``.
+    """``path`` itself if it is a file, or the scene in the folder ``path``.
+
+    That is its levels of detail if it has a `lod-meta.json`, else the last scene of the training.
 
     Raises:
         UserError: a folder without a scene.
     """
     if not path.is_dir():
         return path
+    if (path / INDEX).is_file():
+        return path / INDEX
     folder = training_folder(path)
     scenes = folder.scenes()
     if not scenes:
@@ -147,7 +152,7 @@ class ViewableScene:
 
 
 def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableScene:
-    """Load a scene file of any format, or a scene of an output folder.
+    """Load a scene file of any format, levels of detail, or a scene of an output folder.
 
     Args:
         iteration: an iteration of an output folder; default: the last one.
@@ -160,6 +165,8 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
     path = Path(path)
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
+    if (path / INDEX).is_file():
+        path = path / INDEX
     if path.is_dir():
         folder = training_folder(path)
         found, gaussians = folder.read_scene(iteration)
