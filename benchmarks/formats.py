@@ -24,7 +24,7 @@ import torch
 from snowsplat import Gaussians, View, load_dataset, read_gaussians
 from snowsplat.evaluation.metrics import evaluate_views, psnr
 from snowsplat.formats.spz import read_spz, write_spz
-from snowsplat.pipeline.scene_files import FORMATS, GaussianArrays
+from snowsplat.pipeline.scene_files import FORMATS, GaussianArrays, format_for_reading
 from snowsplat.scene.render import render
 
 Read = Callable[[Path], GaussianArrays]
@@ -96,11 +96,11 @@ def main() -> None:
             line = f"{name:<16}{seconds(partial(write, path, large), arguments.repeats):>9.3f}"
             if read is None:
                 write(path, arrays)
-                print(f"{line}{'-':>9}{path.stat().st_size / len(scene):>9.1f}")
+                print(f"{line}{'-':>9}{format_for_reading(path).size(path) / len(scene):>9.1f}")
                 continue
             line += f"{seconds(partial(read, path), arguments.repeats):>9.3f}"
             write(path, arrays)
-            line += f"{path.stat().st_size / len(scene):>9.1f}"
+            line += f"{format_for_reading(path).size(path) / len(scene):>9.1f}"
             if views:
                 again = read(path).to_gaussians()
                 images = [render(again, view.camera).image for view in views]

@@ -65,7 +65,9 @@ def field(scene: Gaussians, count: int) -> Gaussians:
 
 def camera_of(start: InitialView, width: int = WIDTH, height: int = HEIGHT) -> Camera:
     """The camera of the viewer in a window of this size."""
-    position, target = (torch.tensor(p, dtype=torch.float64) for p in (start.position, start.target))
+    position, target = (
+        torch.tensor(p, dtype=torch.float64) for p in (start.position, start.target)
+    )
     pose = look_at(position, target, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
     focal = 0.5 * width / math.tan(math.radians(start.fov / 2))
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)

@@ -68,9 +68,10 @@ def damaged(data: bytes, changes: list[tuple[bool, float, str, int, int]]) -> by
 @given(changes=changes)
 def test_any_format(tmp_path, make_scene, survives, format, changes):
     path = tmp_path / f"a{format.suffixes[0]}"
-    seed = tmp_path / f"seed{format.suffixes[0]}"
+    seed = tmp_path / "seed"
     if not seed.exists():
-        write_gaussians(seed, make_scene(20, 1))
+        write_gaussians(path, make_scene(20, 1))
+        seed.write_bytes(path.read_bytes())
     path.write_bytes(damaged(seed.read_bytes(), changes))
     survives(path)
 
@@ -101,6 +102,7 @@ def test_spz_of_version_4(tmp_path, make_scene, survives, changes):
 @pytest.mark.parametrize("format", [f for f in FORMATS if f.read], ids=lambda format: format.name)
 def test_empty_files_and_noise(tmp_path, survives, format):
     path = tmp_path / f"a{format.suffixes[0]}"
+    path.parent.mkdir(exist_ok=True)
     for data in (b"", b"\0", bytes(5000), bytes(range(256)) * 20):
         path.write_bytes(data)
         survives(path)

@@ -31,7 +31,7 @@ def one() -> Gaussians:
 def test_no_suffix_belongs_to_two_formats():
     suffixes = [suffix for format in FORMATS for suffix in format.suffixes]
     assert len(suffixes) == len(set(suffixes))
-    assert all(s.startswith(".") and s == s.lower() for s in suffixes)
+    assert all(s[0] in "./" and s == s.lower() for s in suffixes)
     assert len({format.name for format in FORMATS}) == len(FORMATS)
 
 
@@ -45,7 +45,8 @@ def test_a_format_is_registered_once():
 )
 def test_the_suffix_selects_the_format_and_the_file_is_read_as_such(tmp_path, format):
     for suffix in format.suffixes:
-        path = tmp_path / f"A scene{suffix.upper()}"
+        # Viewers know a complete name only in lower case.
+        path = tmp_path / f"A scene{suffix if suffix[0] == '/' else suffix.upper()}"
         assert format_for_writing(path) is format
         write_gaussians(path, one())
         assert format_for_reading(path) is format
@@ -56,12 +57,11 @@ def test_the_suffix_selects_the_format_and_the_file_is_read_as_such(tmp_path, fo
     "format", [f for f in FORMATS if f.write and f.recognises], ids=lambda format: format.name
 )
 def test_the_content_has_priority_over_the_suffix(tmp_path, format):
-    path = tmp_path / f"scene{format.suffixes[0]}"
+    path = tmp_path / f"a{format.suffixes[0]}"
     write_gaussians(path, one())
     for other in ("scene", "scene.splat", "scene.ply", "scene.glb.spz"):
         renamed = tmp_path / other
-        if renamed != path:
-            renamed.write_bytes(path.read_bytes())
+        renamed.write_bytes(path.read_bytes())
         assert format_for_reading(renamed) is format
 
 

@@ -31,6 +31,8 @@ from snowsplat.data.decode import read_header as read_image_header
 from snowsplat.data.points_ply import read_points, write_points
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import FORMATS, GaussianArrays, read_gaussians, write_gaussians
+from snowsplat.formats.lod import INDEX, LEVELS
+from snowsplat.formats.lod_writer import LodSizes, write_lod
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import unpack
 from snowsplat.pipeline.describe import describe
@@ -196,6 +198,11 @@ def _sog_part(member: str) -> Reader:
 def _sog_folder(folder: Path) -> None:
     for name, data in _sog_members().items():
         (folder / name).write_bytes(data)
+
+
+def _make_levels(folder: Path) -> None:
+    sizes = LodSizes(leaf=10, file=20, coarsest=8)
+    write_lod(folder / INDEX, GaussianArrays.from_gaussians(make_scene(30, 1)), sizes=sizes)
 
 
 def _glb_json(data: bytes) -> bytes:
@@ -477,13 +484,18 @@ def _make_points(folder: Path) -> None:
 
 
 READERS: tuple[Reader, ...] = (
-    *(_scene(f"a{format.suffixes[0]}") for format in FORMATS if format.read and format.write),
+    *(
+        _scene(f"a{format.suffixes[0]}")
+        for format in FORMATS
+        if format.read and format.write and format.name != LEVELS
+    ),
     Reader("scene a.ply, ASCII", "a.ply", _ascii_ply, _reads("a.ply")),
     *(_ksplat(level) for level in (0, 1, 2)),
     *(_spz(f"scene spz {version}", version) for version in (1, 2, 3, 4)),
     _spz("scene spz 3, in gzip", 3, gzip.compress),
     *(_sog_part(member) for member in ("meta.json", "means_l.webp", "shN_centroids.webp")),
     Reader("scene sog, a folder", "meta.json", _sog_folder, _reads("meta.json"), json=True),
+    Reader("levels of detail", INDEX, _make_levels, _reads(INDEX), json=True),
     Reader("scene glb, its JSON", "a.glb", _make_glb_json, _reads("a.glb"), True, _glb_json),
     Reader("points a.ply", "a.ply", _make_points, lambda folder: read_points(folder / "a.ply")),
     *(_dataset("colmap-bin", f"sparse/0/{part}.bin") for part in ("cameras", "images", "points3D")),

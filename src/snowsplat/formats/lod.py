@@ -188,5 +188,5 @@ def _joined(parts: list[GaussianArrays]) -> GaussianArrays:
         return GaussianArrays.empty()
     most = max(part.sh_rest.shape[1] for part in parts)
     rest = [np.pad(p.sh_rest, ((0, 0), (0, most - p.sh_rest.shape[1]), (0, 0))) for p in parts]
-    same = [np.concatenate(arrays) for arrays in list(zip(*parts, strict=True))[:-1]]
-    return GaussianArrays(*same, np.concatenate(rest))
+    padded = [part._replace(sh_rest=each) for part, each in zip(parts, rest, strict=True)]
+    return GaussianArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))

@@ -36,6 +36,7 @@ _FACTOR = 4  # between the numbers of Gaussians of two levels
 # Each thread needs memory for one file.
 _MOST_THREADS = 4
 _SAMPLE = 4096  # Gaussians from which the shape of a box is estimated
+_LARGEST = 80.0  # logarithm of a scale; a larger one is not finite in the browser
 _FOLDER = "levels"
 _FOLDERS = re.compile(rf"{_FOLDER}(_\d+)?")
 
@@ -56,7 +57,7 @@ class LodSizes:
 
     def levels(self, count: int) -> int:
         """The number of levels of a scene with ``count`` Gaussians."""
-        return 1 + max(0, math.ceil(math.log(count / self.coarsest, _FACTOR)))
+        return 1 + math.ceil(math.log(max(1.0, count / self.coarsest), _FACTOR))
 
 
 def write_lod(
@@ -75,15 +76,15 @@ def write_lod(
         report: called with the number of finished files, of all files, and the word "files".
 
     Raises:
-        UserError: ``path`` has another name, or there are no Gaussians.
+        UserError: ``path`` has another name.
         OSError: a file cannot be written.
     """
     path, sizes = Path(path), sizes or LodSizes()
     if path.name != INDEX:
-        raise UserError(f"{path}: viewers find levels of detail by their name; write FOLDER/{INDEX}")
+        raise UserError(
+            f"{path}: viewers find levels of detail by their name; write FOLDER/{INDEX}"
+        )
     packable = packing.packable(path, gaussians)
-    if not len(packable.means):
-        raise UserError(f"{path}: the scene has no Gaussians; levels of detail need at least one")
     levels = sizes.levels(len(packable.means))
     tree = _Node.around(packable.means, np.arange(len(packable.means)), sizes.leaf)
     leaves = list(tree.leaves())
@@ -153,7 +154,7 @@ class _Node:
 
     def __init__(self, rows: np.ndarray | None, children: tuple[_Node, ...]) -> None:
         self.rows, self.children = rows, children
-        self.bound = np.array([[np.inf] * 3, [-np.inf] * 3])
+        self.bound = np.zeros((2, 3))
         self.runs: list[dict[str, int]] = []
 
     @classmethod
@@ -179,9 +180,9 @@ class _Node:
     def entry(self) -> dict[str, Any]:
         """The entry of the index."""
         children = [child.entry() for child in self.children]
-        for child in self.children:
-            self.bound[0] = np.minimum(self.bound[0], child.bound[0])
-            self.bound[1] = np.maximum(self.bound[1], child.bound[1])
+        if children:
+            corners = np.stack([child.bound for child in self.children], 1)
+            self.bound[:] = corners[0].min(0), corners[1].max(0)
         low, high = ([float(f"{x:.7g}") for x in corner] for corner in self.bound)
         bound = {"bound": {"min": low, "max": high}}
         if children:
@@ -221,7 +222,9 @@ class _Writer:
                 done += 1
                 self._report(done, total, "files")
             for level, files in enumerate(plan[1:], 1):
-                parts = {id(leaf): own[level - 1] for leaf, own in zip(leaves, coarser, strict=True)}
+                parts = {
+                    id(leaf): own[level - 1] for leaf, own in zip(leaves, coarser, strict=True)
+                }
                 jobs = [(name, [parts[id(leaf)] for leaf in members]) for name, members in files]
                 for _ in pool.map(self._store, *zip(*jobs, strict=True)):
                     done += 1
@@ -263,9 +266,9 @@ class _Writer:
         for gaussians in found:
             arrays = GaussianArrays.from_gaussians(gaussians)
             levels.append(arrays.select(packing.spatial_order(arrays.means)))
-            reach = _reach(levels[-1])
-            leaf.bound[0] = np.minimum(leaf.bound[0], (levels[-1].means - reach).min(0))
-            leaf.bound[1] = np.maximum(leaf.bound[1], (levels[-1].means + reach).max(0))
+        corners = np.concatenate([_corners(each) for each in levels], 1)
+        if corners.size:
+            leaf.bound[:] = corners[0].min(0), corners[1].max(0)
         return levels
 
     def _store(self, name: str, parts: Sequence[GaussianArrays]) -> None:
@@ -278,9 +281,9 @@ class _Writer:
                 temporary.write_bytes(content)
 
 
-def _reach(gaussians: GaussianArrays) -> np.ndarray:
-    """(N, 3) half the size of the box around each ellipsoid of one standard deviation."""
-    w, x, y, z = packing.unit_quats(gaussians.quats).T
+def _corners(gaussians: GaussianArrays) -> np.ndarray:
+    """(2, N, 3) the boxes around the ellipsoids of one standard deviation."""
+    w, x, y, z = gaussians.quats.astype(np.float64).T
     rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -288,5 +291,6 @@ def _reach(gaussians: GaussianArrays) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    axes = rotation * np.exp(gaussians.log_scales).T  # [i, j, n]: entry i of axis j
-    return np.sqrt((axes * axes).sum(1)).T
+    scales = np.exp(np.minimum(gaussians.log_scales, _LARGEST).astype(np.float64))
+    reach = np.sqrt(np.square(rotation * scales.T).sum(1)).T  # rotation[i, j]: entry i of axis j
+    return np.stack([gaussians.means - reach, gaussians.means + reach])

@@ -35,7 +35,8 @@ class Format:
 
     Attributes:
         name: the name for users.
-        suffixes: lower case with their dots, as in ".compressed.ply"; the longest match counts.
+        suffixes: lower case with their dots, as in ".compressed.ply"; the longest match counts. One
+            that begins with "/" is a complete name, of a file that describes its folder.
         recognises: whether a file with these first 16,384 bytes (fewer if it is shorter) has this
             format; None for a format without a signature.
         read: None for a format that cannot be read.
@@ -97,11 +98,11 @@ FORMATS: list[Format] = [
     ),
     Format(
         LEVELS,
-        (INDEX,),
+        (f"/{INDEX}",),
         is_lod,
         read_lod,
         write_lod,
-        "precision, as in SOG: positions have 16 bits, all other values 8; SH are rows of a palette",
+        "precision: positions have 16 bits, all other values 8; SH are rows of palettes",
         bytes=lod_bytes,
     ),
     Format(
@@ -184,7 +185,7 @@ def format_for_writing(path: Path | str) -> Format:
 
 
 def _by_suffix(path: Path, formats: Sequence[Format]) -> Format | None:
-    name = path.name.lower()
+    name = f"/{path.name.lower()}"
     matching = [(len(s), f) for f in formats for s in f.suffixes if name.endswith(s)]
     return max(matching, key=lambda pair: pair[0])[1] if matching else None
 

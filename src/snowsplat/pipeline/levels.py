@@ -17,7 +17,7 @@ def write_levels(path: Path, gaussians: Gaussians, observer: Observer = SILENT) 
     """Write FOLDER/lod-meta.json; the observer gets the stage "levels".
 
     Raises:
-        UserError: there are no Gaussians.
+        UserError: ``path`` has another name.
         OSError: a file cannot be written.
     """
     start = time.monotonic()
