@@ -63,6 +63,9 @@ nitpick_ignore_regex = [
     # names in docstrings that no page describes: they are shown as code
     ("py:obj", ".*"),
     # types of Python and of libraries, private types, and names of literals
-    ("py:class", r"(torch|np|numpy|collections|typing|contextlib|os|pathlib)\..*|Path|Tensor"),
+    (
+        "py:class",
+        r"(torch|np|numpy|collections|datetime|typing|contextlib|os|pathlib)\..*|Path|Tensor",
+    ),
     ("py:class", r".*\._\w+|Color|Depth|Split"),
 ]

@@ -41,7 +41,7 @@ def views_of(dataset: Dataset, photo=None) -> list[UnseenView]:
     with ImageLoader(dataset.train) as images:
         if photo is not None:
             get = images.get
-            images.get = lambda view: photo(get(view))  # type: ignore[method-assign]
+            images.get = lambda view, downscale: photo(get(view, downscale))  # type: ignore[method-assign]
         return unseen_views(dataset.train, dataset.points.xyz, images, BLACK)
 
 

@@ -42,6 +42,12 @@ class ConfigFlags:
     """Whether the training ends earlier if the views between the photos become worse. This happens
     in long training runs with few photos. The dataset needs points."""
 
+    exposure: Annotated[
+        Literal["auto", "on", "off"] | None, flag("{auto,on,off}", default=RECIPE)
+    ] = None
+    """Whether to learn a gain for each photo and colour channel, for photos with different
+    exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
+
     sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
     """Degree of the spherical harmonics (view-dependent colour). A lower degree needs less
     memory."""

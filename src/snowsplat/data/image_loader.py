@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import torch
 
@@ -23,6 +24,22 @@ from snowsplat.data.decode import ImageSource, LoadedImage, box_downscale, load_
 DECODERS = min(4, os.cpu_count() or 1)
 
 _Key = tuple[ImageSource, ImageSource | None, int]  # image, mask, downscale factor
+
+
+class Photos(Protocol):
+    """What loads the photos of views: an `ImageLoader`, or a changed version of its photos."""
+
+    @property
+    def budget_bytes(self) -> int:
+        """Memory for decoded images."""
+        ...
+
+    def prefetch(self, order: Iterable[View], downscale: int | None = None) -> None:
+        """See `ImageLoader.prefetch`."""
+
+    def get(self, view: View, downscale: int | None = None) -> LoadedImage:
+        """See `ImageLoader.get`."""
+        ...
 
 
 class ImageLoader:

@@ -291,6 +291,8 @@ class _Job:
     ) -> TrainResult:
         from snowsplat.pipeline.training_run import TrainingRun
 
+        if trainer.exposure.reason:
+            self.observer.note(trainer.exposure.reason)
         self.observer.note(str(memory))
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(

@@ -14,6 +14,7 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
+from snowsplat.training.exposure import Exposure
 from snowsplat.training.shards import Shards
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.view_gradient import ViewGradient
@@ -45,6 +46,7 @@ def batch_gradients(
     runner: StepRunner,
     shards: Shards,
     sh_degree: int,
+    exposure: Exposure,
     loss_of: Callable[[Tensor, BatchView], Tensor],
 ) -> list[ViewGradient]:
     """The gradients of the mean loss of the batch with respect to the splats of each view.
@@ -53,6 +55,7 @@ def batch_gradients(
         gaussians: those of this process.
         batch: the views, the same in every process.
         runner: rasterizes, and runs the backward pass.
+        exposure: the exposures of the photos.
         loss_of: the loss of an image (H, W, 3) of a view whose photo this process has.
     """
     views = rounds(batch, shards.size)
@@ -65,10 +68,13 @@ def batch_gradients(
         loss = None
         if blended is not None:
             own = group[shards.rank]
+            exposure.apply(blended, own.index)
             with torch.enable_grad():  # `project` is outside: the optimiser computes its gradient
                 image = runner.rasterize(blended, own.camera, own.background)
                 loss = loss_of(image, own)
         runner.backward(loss, share=1.0 / len(batch), last=number == len(views) - 1)
+        if blended is not None:
+            exposure.after_backward(blended)
         shards.return_gradients(blended, splats, absolute=runner.abs_grad)
         found += zip(splats, group, strict=True)
     return [runner.gradient(splats, each.camera, sh_degree) for splats, each in found]

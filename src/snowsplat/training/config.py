@@ -67,6 +67,8 @@ class TrainConfig:
             never.
         stop_overfitting: whether the training ends earlier if the views between the photos become
             worse; see `overfitting`.
+        exposure: whether a gain for each photo and channel is learnt, because the photos have
+            different exposures; see `exposure`. "auto": if they differ by 0.05 EV or more.
         image_memory: bytes for decoded images, in each process; 0: half of the available memory,
             for all processes of the computer together.
         test_iterations: steps after which `Trainer.run` evaluates the test views.
@@ -99,6 +101,7 @@ class TrainConfig:
     coarse_to_fine: tuple[When, When] = (0, 0)
     leave_out_after: When = 0
     stop_overfitting: bool = False
+    exposure: Literal["auto", "on", "off"] = "off"
     image_memory: int = 0
     test_iterations: tuple[int, ...] = (7_000, 30_000)
     checkpoint_every: int = 0

@@ -7,7 +7,7 @@ import math
 import torch
 
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
 from snowsplat.training.config import TrainConfig
@@ -32,7 +32,7 @@ def starts_at_random(dataset: Dataset, config: TrainConfig) -> bool:
 def initial_gaussians(
     dataset: Dataset,
     config: TrainConfig,
-    images: ImageLoader,
+    images: Photos,
     generator: torch.Generator,
     device: torch.device,
 ) -> Gaussians:
@@ -74,7 +74,7 @@ def _points_of(
     starts: tuple[str, ...],
     dataset: Dataset,
     config: TrainConfig,
-    images: ImageLoader,
+    images: Photos,
     generator: torch.Generator,
 ) -> Points:
     count = 0 if starts == ("points",) else config.points_per_start

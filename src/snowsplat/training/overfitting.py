@@ -30,13 +30,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from snowsplat.data.dataset import Dataset, View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
+from snowsplat.training.point_colors import point_colors, point_pixels, sampled
 from snowsplat.training.starts.source_views import source_views
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.unseen_cameras import beside
@@ -94,7 +94,7 @@ class OverfittingCheck:
     def __init__(
         self,
         dataset: Dataset,
-        images: ImageLoader,
+        images: Photos,
         schedule: Schedule,
         background: Tensor,
         render: Renderer = render,
@@ -172,7 +172,7 @@ class OverfittingCheck:
 
 
 def unseen_views(
-    views: Sequence[View], points: Tensor, images: ImageLoader, background: Tensor
+    views: Sequence[View], points: Tensor, images: Photos, background: Tensor
 ) -> list[UnseenView]:
     """At most 12 unseen views with their points.
 
@@ -196,9 +196,9 @@ def unseen_views(
     unseen = []
     for i, j in pairs:
         camera = beside(cameras[i], cameras[j], _BESIDE)
-        first, known = _colors(views[i], images, points, background)
-        other, also_known = _colors(views[j], images, points, background)
-        pixels, inside = _pixels(camera, points)
+        first, known = point_colors(views[i], images, points, background)
+        other, also_known = point_colors(views[j], images, points, background)
+        pixels, inside = point_pixels(camera, points)
         same = (first - other).abs().amax(1) <= _SAME_COLOR
         chosen = known & also_known & inside & same
         unseen.append(UnseenView(camera, pixels[chosen], 0.5 * (first + other)[chosen]))
@@ -224,42 +224,8 @@ def estimated_psnr(
     total, count = 0.0, 0
     for view in unseen:
         image = render(gaussians, view.camera.to(device), background, sh_degree).image
-        found = _sampled(image.clamp(0.0, 1.0), view.pixels.to(device))
+        found = sampled(image.clamp(0.0, 1.0), view.pixels.to(device))
         error = (found - view.colors.to(device)).to(torch.float64).square().mean(1)
         total += float(error.clamp(max=_LARGEST_ERROR**2).sum())
         count += len(error)
     return -10.0 * math.log10(max(total / count, 10.0 ** (-_HIGHEST_PSNR / 10.0)))
-
-
-def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The pixel positions of the points, (P, 2) float32, and whether each is in the image, (P,)."""
-    pixel, depth = camera.project(points.to(torch.float64))
-    size = torch.tensor([camera.width, camera.height])
-    inside = (depth > 0.0) & (pixel >= 0.5).all(1) & (pixel <= size - 0.5).all(1)
-    return torch.where(inside[:, None], pixel, 0.5).to(torch.float32), inside
-
-
-def _colors(
-    view: View, images: ImageLoader, points: Tensor, background: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The colours of the points in a photo, (P, 3), and which of them are known, (P,) bool.
-
-    The colour is not known outside the image, at masked pixels and at transparent pixels.
-    """
-    photo = images.get(view).to(torch.device("cpu"))
-    pixels, known = _pixels(view.camera, points)
-    x, y = pixels.floor().to(torch.int64).unbind(1)
-    if photo.mask is not None:
-        known = known & photo.mask[y, x]
-    if photo.alpha is not None:
-        known = known & (photo.alpha[y, x] >= 128)
-    return _sampled(photo.over(background), pixels), known
-
-
-def _sampled(image: Tensor, pixels: Tensor) -> Tensor:
-    """(P, C): the image (H, W, C) at pixel positions (P, 2), with bilinear interpolation."""
-    height, width, _ = image.shape
-    size = torch.tensor([width, height], device=image.device)
-    grid = (2.0 * pixels / size - 1.0)[None, None]
-    planes = image.permute(2, 0, 1)[None]
-    return grid_sample(planes, grid, padding_mode="border", align_corners=False)[0, :, 0].T

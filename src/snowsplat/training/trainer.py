@@ -17,10 +17,12 @@ from snowsplat.training.background import Background
 from snowsplat.training.batch import BatchView, batch_gradients
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.decay import Decay
+from snowsplat.training.exposure import Exposure
 from snowsplat.training.finite import check_state
 from snowsplat.training.init import initial_gaussians, starts_at_random
 from snowsplat.training.losses import view_loss
 from snowsplat.training.near_limit import NearLimit
+from snowsplat.training.neutral_photos import NeutralPhotos
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
 from snowsplat.training.scale_limit import ScaleLimit
@@ -70,6 +72,7 @@ class Trainer:
     itself if the scene overfits.
 
     Attributes:
+        exposure: the gains of the training photos.
         gaussians: the scene after ``step`` steps, on ``device``.
         within_step: True during a step. It stays True if an error or a second Ctrl-C interrupts a
             step: the state is then inconsistent and must not be saved.
@@ -131,6 +134,11 @@ class Trainer:
             *(dataset.train, self._cameras, self._images, self._background, self._downscale),
             *(self._generators["views"], config.batch, shards),
         )
+        self.exposure = Exposure(
+            *(config.exposure, dataset, self._images, self.schedule, self.device, shards),
+            resumed=state is not None,
+        )
+        neutral = NeutralPhotos(self._images, dataset.train, self.exposure.start)
         # The Gaussians of a resumed training run are replaced by those of the state.
         start = config if state is None else replace(config, init="points")
         first = None
@@ -139,7 +147,7 @@ class Trainer:
                 first = initial.clone().to(self.device)
             elif shards.rank == 0:
                 first = initial_gaussians(
-                    dataset, start, self._images, self._generators["start"], self.device
+                    dataset, start, neutral, self._generators["start"], self.device
                 )
         self.gaussians = shards.scattered(first)
         self._optimizer = Adam(
@@ -164,7 +172,7 @@ class Trainer:
         points = None if dataset.points is None else dataset.points.xyz
         self._near_limit = NearLimit(config.near_limit, self._cameras, points, self.schedule)
         self._overfitting = OverfittingCheck(
-            *(dataset, self._images, self.schedule, self._background.evaluation, self._render)
+            *(dataset, neutral, self.schedule, self._background.evaluation, self._render)
         )
         self._runner = StepRunner(
             *(len(self.gaussians), self.device, config.density.abs_grad, config.batch, shards)
@@ -245,18 +253,21 @@ class Trainer:
                 [each.view for each in batch],
                 [each.photo for each in batch],
             )
+            self.exposure.after_step(step, [each.index for each in batch])
         self.step = step
         self.within_step = False
         return sum(losses) / len(losses)
 
     def _optimize(self, step: int, batch: Sequence[BatchView]) -> None:
         """Rasterize, compare with the photos, and update the Gaussians."""
+        self.exposure.begin_step()
         gradients = batch_gradients(
             self.gaussians,
             batch,
             self._runner,
             self.shards,
             self.config.sh_degree_at(step),
+            self.exposure,
             self._loss,
         )
         for gradient in gradients:
@@ -266,6 +277,7 @@ class Trainer:
     def _loss(self, image: Tensor, view: BatchView) -> Tensor:
         photo, background = view.photo, view.background
         assert photo is not None
+        image = self.exposure.clipped(image, photo, view.index)
         return view_loss(image, photo, background, self.config.ssim_weight)
 
     def evaluate(self) -> Evaluation:
@@ -320,9 +332,11 @@ class Trainer:
         if self.config.leave_out_after:  # otherwise, as in earlier versions of the format
             tensors["checked"] = torch.tensor(self._checked)
             tensors["left_out"] = torch.tensor(self.left_out, dtype=torch.int64)
+        parts = {"exposure": self.exposure.state_tensors()}
         if self.config.stop_overfitting:
-            state = self._overfitting.state_tensors()
-            tensors |= {f"overfitting.{name}": tensor for name, tensor in state.items()}
+            parts["overfitting"] = self._overfitting.state_tensors()
+        for part, state in parts.items():
+            tensors |= {f"{part}.{name}": tensor for name, tensor in state.items()}
         return tensors
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -355,6 +369,7 @@ class Trainer:
         if self.config.leave_out_after:
             self._checked = bool(tensors["checked"])
             self._queue.left_out = tuple(tensors["left_out"].tolist())
+        self.exposure.load_state(part("exposure."))
         if self.config.stop_overfitting:
             self._overfitting.load_state(part("overfitting."))
         self._queue.continue_with(tensors["order"].tolist(), self.step)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import torch
 
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.training.starts.carve import carved_points
 from snowsplat.training.starts.depth import depth_points
 from snowsplat.training.starts.map_views import map_pixels
@@ -30,11 +30,11 @@ __all__ = [
 
 #: dataset, its photos, maximum number of points, random generator on the CPU -> points in the world
 #: frame, on the CPU; there may be none.
-Start = Callable[[Dataset, ImageLoader, int, torch.Generator], Points]
+Start = Callable[[Dataset, Photos, int, torch.Generator], Points]
 
 
 def _dataset_points(
-    dataset: Dataset, images: ImageLoader, count: int, generator: torch.Generator
+    dataset: Dataset, images: Photos, count: int, generator: torch.Generator
 ) -> Points:
     """All points of the dataset: those of structure from motion."""
     if dataset.points is None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.photos import reduced_photo, usable_pixels
 
@@ -31,7 +31,7 @@ _LEAST_REMOVED, _ROUNDS = 0.002, 2 * _SIDE
 
 
 def carved_points(
-    dataset: Dataset, images: ImageLoader, count: int, generator: torch.Generator
+    dataset: Dataset, images: Photos, count: int, generator: torch.Generator
 ) -> Points:
     """At most ``count`` points on the surface of the photo hull, in the world frame.
 
@@ -73,7 +73,7 @@ class _Picture:
     transparent: Tensor | None  # (H, W) bool
 
     @staticmethod
-    def of(view: View, images: ImageLoader, middle: Tensor, size: float) -> _Picture:
+    def of(view: View, images: Photos, middle: Tensor, size: float) -> _Picture:
         camera = view.camera
         distance = max(float((camera.position.to(torch.float64) - middle).norm()), size)
         scale = min(1.0, _PIXELS * distance / (size * camera.fx))

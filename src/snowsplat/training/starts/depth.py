@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.depth_alignment import align
 from snowsplat.data.depth_file import DepthKind, read_depth_file, to_z
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.depth_map import DepthMap, map_size, photo_for_map
 from snowsplat.training.starts.fusion import fused_points
@@ -32,7 +32,7 @@ _KINDS: tuple[DepthKind, ...] = ("z", "distance", "disparity")
 
 
 def depth_points(
-    dataset: Dataset, images: ImageLoader, count: int, generator: torch.Generator
+    dataset: Dataset, images: Photos, count: int, generator: torch.Generator
 ) -> Points:
     """At most ``count`` points on the surfaces of the depth maps, in the world frame, on the CPU.
 
@@ -68,7 +68,7 @@ def depth_points(
     return fused_points(chosen, maps, images, count, generator)
 
 
-def _depth_map(view: View, images: ImageLoader, points: Tensor | None) -> DepthMap | None:
+def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | None:
     """The map of a view in world units; None without a map, or if it contradicts the points."""
     if view.depth is None:
         return None

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import transform_points
 from snowsplat.training.starts.photos import reduced_photo
@@ -41,6 +41,6 @@ def map_size(width: int, height: int) -> tuple[int, int]:
     return max(1, round(scale * width)), max(1, round(scale * height))
 
 
-def photo_for_map(view: View, images: ImageLoader) -> LoadedImage:
+def photo_for_map(view: View, images: Photos) -> LoadedImage:
     """The photo of a view at the size of its depth map, on the CPU."""
     return reduced_photo(view, images, *map_size(view.camera.width, view.camera.height))

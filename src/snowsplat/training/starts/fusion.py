@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Points
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.training.starts.depth_map import DepthMap, photo_for_map
 from snowsplat.training.starts.map_views import MapViews
 
@@ -25,7 +25,7 @@ _BISECTIONS = 12
 def fused_points(
     chosen: MapViews,
     maps: Sequence[DepthMap | None],
-    images: ImageLoader,
+    images: Photos,
     count: int,
     generator: torch.Generator,
 ) -> Points:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.training.starts.depth_map import map_size
 from snowsplat.training.starts.source_views import source_views
 
@@ -40,7 +40,7 @@ class MapViews:
     points: Tensor
 
 
-def choose_views(dataset: Dataset, images: ImageLoader, generator: torch.Generator) -> MapViews:
+def choose_views(dataset: Dataset, images: Photos, generator: torch.Generator) -> MapViews:
     """Choose the views that get a depth map: all training views, if memory permits."""
     cameras = [view.camera for view in dataset.train]
     pixels = sum(math.prod(map_size(camera.width, camera.height)) for camera in cameras)

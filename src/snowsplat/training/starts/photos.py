@@ -8,10 +8,10 @@ from torch.nn.functional import interpolate
 
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 
 
-def reduced_photo(view: View, images: ImageLoader, width: int, height: int) -> LoadedImage:
+def reduced_photo(view: View, images: Photos, width: int, height: int) -> LoadedImage:
     """The photo of a view at this size, which is not larger than the photo, on the CPU."""
     factor = next((f for f in (4, 2) if view.camera.width >= f * width), 1)
     photo = images.get(view, factor).to(torch.device("cpu"))

@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
 from snowsplat.training.starts.depth_map import DepthMap, photo_for_map
@@ -37,7 +37,7 @@ _LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
 
 
 def depth_maps(
-    views: Sequence[View], sources: Sequence[Sequence[int]], images: ImageLoader, points: Tensor
+    views: Sequence[View], sources: Sequence[Sequence[int]], images: Photos, points: Tensor
 ) -> list[DepthMap | None]:
     """The depth map of each view; None for views without source views or visible points.
 
@@ -63,7 +63,7 @@ class _Picture:
     usable: Tensor | None  # (H, W) bool: False for masked and transparent pixels
 
     @staticmethod
-    def of(view: View, images: ImageLoader) -> _Picture:
+    def of(view: View, images: Photos) -> _Picture:
         photo = photo_for_map(view, images)
         luminance = photo.rgb.to(torch.float32) @ _LUMINANCE / 255.0
         height, width = luminance.shape
@@ -71,7 +71,7 @@ class _Picture:
 
 
 def _depth_map(
-    view: View, source_views: list[View], images: ImageLoader, points: Tensor
+    view: View, source_views: list[View], images: Photos, points: Tensor
 ) -> DepthMap | None:
     span = _inverse_depths(view.camera, points)
     if span is None or not source_views:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from snowsplat.data.bounds import scene_bounds
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import transform_points
 from snowsplat.training.starts.photos import reduced_photo, usable_pixels
@@ -21,7 +21,7 @@ _NEAREST, _FARTHEST = 0.05, 3.0
 
 
 def random_points(
-    dataset: Dataset, images: ImageLoader, count: int, generator: torch.Generator
+    dataset: Dataset, images: Photos, count: int, generator: torch.Generator
 ) -> Points:
     """``count`` points at random positions in the union of the view frusta, in the world frame.
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.training.starts.fusion import fused_points
 from snowsplat.training.starts.map_views import choose_views
 from snowsplat.training.starts.plane_sweep import depth_maps
 
 
 def swept_points(
-    dataset: Dataset, images: ImageLoader, count: int, generator: torch.Generator
+    dataset: Dataset, images: Photos, count: int, generator: torch.Generator
 ) -> Points:
     """At most ``count`` points on the surfaces that several photos show, in the world frame, on the
     CPU.

@@ -1,0 +1,246 @@
+"""Exposures of photos: their estimate, the photos without them, and the gains that are learnt."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat import ops
+from snowsplat.data import load_dataset
+from snowsplat.data.dataset import Dataset
+from snowsplat.data.decode import LoadedImage
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.ops.splats import COLORS
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import project
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training import checkpoint
+from snowsplat.training.exposure import Exposure
+from snowsplat.training.exposure_start import GAMMA, exposure_start, log_gains
+from snowsplat.training.losses import view_loss
+from snowsplat.training.neutral_photos import NeutralPhotos
+from snowsplat.training.recipes import recipe
+from snowsplat.training.shards import ALONE
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.trainer import Trainer
+
+CPU = torch.device("cpu")
+CONFIG = recipe("default", iterations=80, init="points", max_gaussians=1500, sh_degree=0)
+CONFIG = replace(CONFIG, coarse_to_fine=(0, 0))
+
+
+def with_gains(folder: Path, gains: np.ndarray) -> Dataset:
+    """The toy dataset whose training photos are multiplied by exp(gains)."""
+    dataset = load_dataset(folder, hold_out=8)
+    for view, gain in zip(dataset.train, gains, strict=True):
+        values = np.asarray(Image.open(view.image.path)) * np.exp(gain)
+        Image.fromarray(np.rint(values.clip(0, 255)).astype(np.uint8)).save(view.image.path)
+    return load_dataset(folder, hold_out=8)
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory) -> Path:
+    return write_toy_dataset(
+        tmp_path_factory.mktemp("toy") / "clean", "colmap-bin", 12, 96, 72, n_points=800
+    )
+
+
+@pytest.fixture(scope="module")
+def gains() -> np.ndarray:
+    """(V, 3) log-gains with mean 0, without clipping."""
+    found = np.random.default_rng(0).uniform(-0.25, 0.25, (10, 3))
+    return found - found.mean(0)
+
+
+@pytest.fixture(scope="module")
+def degraded(clean: Path, gains: np.ndarray) -> Dataset:
+    folder = clean.with_name("degraded")
+    shutil.copytree(clean, folder)
+    return with_gains(folder, gains)
+
+
+def start_of(dataset: Dataset):
+    with ImageLoader(dataset.train) as images:
+        return exposure_start(dataset, images)
+
+
+# The estimate before the training
+
+
+def test_gains_from_colours_with_outliers():
+    generator = torch.Generator().manual_seed(1)
+    true = torch.randn(9, 3, generator=generator, dtype=torch.float64) * 0.3
+    true -= true.mean(0)
+    logs = torch.rand(1, 200, 3, generator=generator, dtype=torch.float64) - 2.0 + true[:, None]
+    logs += 0.02 * torch.randn(logs.shape, generator=generator, dtype=torch.float64)
+    unknown = torch.rand(9, 200, 1, generator=generator) < 0.4
+    hidden = torch.rand(9, 200, 1, generator=generator) < 0.25
+    logs = torch.where(hidden, logs + 0.8, logs)
+    logs = torch.where(unknown, torch.nan, logs)
+    assert (log_gains(logs) - true).abs().max() < 0.02
+
+
+def test_photos_with_too_few_points_have_no_gain():
+    logs = torch.zeros(3, 50, 3, dtype=torch.float64)
+    logs[2, 5:] = torch.nan
+    found = log_gains(logs)
+    assert found[:2].isfinite().all()
+    assert found[2].isnan().all()
+
+
+def test_the_exposures_of_a_dataset(clean, degraded, gains):
+    before, after = start_of(load_dataset(clean, hold_out=8)), start_of(degraded)
+    assert before.spread is not None
+    assert before.spread < 0.05
+    assert after.source == "points"
+    assert after.spread == pytest.approx(GAMMA / math.log(2) * gains.std(), rel=0.1)
+    assert np.abs(after.log_gains.numpy() - gains).max() < 0.05
+
+
+def test_exif_data_are_used_without_points(degraded, tmp_path):
+    views = []
+    for i, view in enumerate(degraded.train):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({0x829A: 0.01 * 2 ** (i % 2), 0x829D: 4.0, 0x8827: 100})
+        path = tmp_path / f"{i}.jpg"
+        Image.open(view.image.path).save(path, exif=exif)
+        views.append(replace(view, image=replace(view.image, path=path)))
+    found = start_of(replace(degraded, train=views, points=None))
+    assert (found.source, found.spread) == ("EXIF data", pytest.approx(0.5))
+    assert found.log_gains[:2, 0].tolist() == pytest.approx(
+        [-0.5 * math.log(2) / GAMMA, 0.5 * math.log(2) / GAMMA]
+    )
+    unknown = start_of(replace(degraded, points=None))
+    assert unknown.spread is None
+    assert not unknown.log_gains.any()
+
+
+def test_neutral_photos(clean, degraded, gains):
+    start = start_of(degraded)
+    view, original = degraded.train[3], load_dataset(clean, hold_out=8).train[3]
+    with ImageLoader([view]) as images:
+        neutral = NeutralPhotos(images, degraded.train, start.log_gains).get(view, 1).rgb
+        changed, expected = images.get(view).rgb, images.get(original).rgb
+    assert (neutral.float() - expected).abs().mean() < 3
+    assert (changed.float() - expected).abs().mean() > 10
+
+
+# The gains
+
+
+def initial(dataset: Dataset) -> Gaussians:
+    """One Gaussian for each point."""
+    return Trainer(dataset, replace(CONFIG, initial_opacity=0.7, exposure="off")).gaussians
+
+
+def exposure_of(setting: str, dataset: Dataset) -> Exposure:
+    with ImageLoader(dataset.train) as images:
+        schedule = Schedule(80)
+        return Exposure(setting, dataset, images, schedule, CPU, ALONE, resumed=False)
+
+
+def test_the_decision(clean, degraded):
+    same = load_dataset(clean, hold_out=8)
+    assert exposure_of("auto", degraded).active
+    assert "one gain for each photo and channel is learnt" in exposure_of("auto", degraded).reason
+    assert not exposure_of("auto", same).active
+    assert exposure_of("auto", same).reason.endswith(
+        "(standard deviation, from points); no gains are learnt"
+    )
+    assert exposure_of("on", same).active
+    off = exposure_of("off", degraded)
+    assert (off.active, off.reason, off.state_tensors()) == (False, "", {})
+    unknown = exposure_of("auto", replace(degraded, points=None))
+    assert "not known" in unknown.reason
+    assert not unknown.active
+
+
+def test_the_gradients_of_the_gains_and_of_the_splats(degraded):
+    """Against finite differences and a scene whose colours contain the gains."""
+    exposure, view = exposure_of("on", degraded), degraded.train[0]
+    with ImageLoader(degraded.train) as images:
+        photo = images.get(view)
+    scene = initial(degraded)
+    background = torch.tensor([0.3, 0.9, 0.6])
+
+    def loss(log_gain):
+        exposure.log_gains[0] = log_gain
+        exposure.begin_step()
+        splats = project(scene, view.camera, 0)
+        exposure.apply(splats, 0)
+        splats.packed.requires_grad_()
+        image, _, _ = ops.rasterize(splats, view.camera.width, view.camera.height, background)
+        return view_loss(image, photo, background, 0.2), splats
+
+    at = torch.tensor([0.1, -0.2, 0.05])
+    value, splats = loss(at)
+    value.backward()
+    expected = splats.packed.grad.clone()
+    expected[:, COLORS : COLORS + 3] *= at.exp()
+    exposure.after_backward(splats)
+    assert torch.allclose(splats.packed.grad, expected)
+    [gradient] = exposure._gradients
+    for c in range(3):
+        h = torch.zeros(3)
+        h[c] = 5e-3
+        higher, lower = (loss(at + sign * h)[0].item() for sign in (1, -1))
+        assert float(gradient[c]) == pytest.approx((higher - lower) / 1e-2, rel=0.02, abs=1e-4)
+
+
+def test_overexposed_pixels_count_only_if_the_image_is_darker(degraded):
+    exposure = exposure_of("on", degraded)
+    planes = torch.full((3, 4, 5), 200, dtype=torch.uint8)
+    planes[:, :2] = 255
+    image = torch.full((4, 5, 3), 1.5)
+    image[0] = 0.7
+    found = exposure.clipped(image, LoadedImage(planes), 0)
+    assert (found[0] == 0.7).all()
+    assert (found[1] == 1.0).all()
+    assert (found[2:] == 1.5).all()
+    dark = LoadedImage(planes.clamp(max=200))
+    assert exposure.clipped(image, dark, 1) is image
+
+
+@pytest.mark.slow
+def test_the_training_learns_the_gains(degraded, gains):
+    """They stay near the true gains, and the colours of the scene are neutral."""
+    trainer = Trainer(degraded, replace(CONFIG, iterations=300, exposure="on"))
+    trainer.run()
+    found = trainer.exposure.log_gains
+    assert found.mean(0).abs().max() < 1e-6
+    assert 0.0 < (found - trainer.exposure.start).abs().mean() < 0.03
+    assert np.corrcoef(found.flatten(), gains.flatten())[0, 1] > 0.98
+    without = Trainer(degraded, replace(CONFIG, iterations=300, exposure="off"))
+    without.run()
+    assert trainer.evaluate().psnr > without.evaluate().psnr + 1.0
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_a_resumed_run_has_the_same_bits(degraded, tmp_path, batch):
+    config = replace(CONFIG, iterations=30, exposure="auto", batch=batch, background="random")
+    whole, first = Trainer(degraded, config), Trainer(degraded, config)
+    whole.run()
+    first.run(until=15)
+    path = checkpoint.save(tmp_path, 15, first.state_tensors(), {})
+    second = Trainer(degraded, config, state=checkpoint.load(path).tensors)
+    assert second.exposure.active
+    second.run()
+    assert torch.equal(second.exposure.log_gains, whole.exposure.log_gains)
+    for name, tensor in whole.gaussians.parameters().items():
+        assert torch.equal(tensor, second.gaussians.parameters()[name]), name
+
+
+def test_no_bit_changes_if_the_exposures_are_equal(clean):
+    dataset = load_dataset(clean, hold_out=8)
+    auto, off = (Trainer(dataset, replace(CONFIG, exposure=s)) for s in ("auto", "off"))
+    auto.run()
+    off.run()
+    assert torch.equal(auto.gaussians.means, off.gaussians.means)
+    assert torch.equal(auto.gaussians.sh_dc, off.gaussians.sh_dc)
