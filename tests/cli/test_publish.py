@@ -97,6 +97,24 @@ def test_overwrite(run, refused, scene, tmp_path):
     assert "<title>B</title>" in (folder / "index.html").read_text(encoding="utf-8")
 
 
+def test_a_large_scene_is_published_in_levels(scene, tmp_path, monkeypatch):
+    from snowsplat.pipeline import publish as module
+
+    folder = tmp_path / "site"
+    module.publish(scene, folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_LARGE", 1000)
+        result = module.publish(scene, folder, overwrite=True)
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    assert result.bytes == sum(file.stat().st_size for file in files)
+    assert not (folder / "scene.sog").exists()
+    assert len(read_gaussians(folder / "lod-meta.json")) == 1500
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    assert '"contentUrl": "./lod-meta.json"' in page
+    module.publish(scene, folder, overwrite=True)
+    assert sorted(file.name for file in folder.iterdir()) == FILES
+
+
 def test_errors(refused, scene, tmp_path):
     assert "needs a scene" in refused("publish")
     assert "add -o FOLDER" in refused("publish", scene)

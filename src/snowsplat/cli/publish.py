@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.errors import UserError
 
 
@@ -22,6 +23,8 @@ class Publish:
       snowsplat publish out/garden -o site --url https://example.org/garden
 
     Notes:
+      A scene of more than 2 million Gaussians is written in levels of detail, of
+      which browsers load what they show.
       Any web host can serve the folder; nothing has to run there. The page loads
       nothing from other sites. Browsers do not open it from disk: to look at it,
       run python -m http.server -d site. Over https, browsers with a headset also
@@ -53,11 +56,13 @@ class Publish:
             raise UserError("publish needs a folder; add -o FOLDER")
         from snowsplat.pipeline.publish import PublishOptions, publish
 
-        result = publish(
-            *(self.scene, self.output, PublishOptions(self.title, self.licence, self.url)),
-            iteration=self.iteration,
-            overwrite=self.overwrite,
-            threads=self.threads,
-        )
+        with TerminalObserver() as observer:
+            result = publish(
+                *(self.scene, self.output, PublishOptions(self.title, self.licence, self.url)),
+                iteration=self.iteration,
+                overwrite=self.overwrite,
+                threads=self.threads,
+                observer=observer,
+            )
         print(f"{result.folder}: {result.gaussians:,} Gaussians, {result.bytes / 1e6:.1f} MB")
         return 0

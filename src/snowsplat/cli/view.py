@@ -16,6 +16,7 @@ from typing import Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.errors import UserError
 
 
@@ -33,10 +34,14 @@ class View:
       lists all controls. The initial view is that of the first training photo.
       By default, the page can be opened only on this computer. Its URL contains a
       secret token. Ctrl-C stops the viewer.
+      A folder with levels of detail (lod-meta.json, see convert) opens at once.
+      For other scenes of more than 4 million Gaussians, the levels are written
+      first, which takes minutes.
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
-    """A scene file of any format, or the output folder of train or make."""
+    """A scene file of any format, the output folder of train or make, or a folder with levels of
+    detail."""
     iteration: Annotated[int | None, flag("N", default="the last step")] = None
     """If OUT contains several scenes, the step after which the scene was saved."""
     host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this computer only")] = "127.0.0.1"
@@ -50,22 +55,17 @@ class View:
         """Returns the exit code: 0, also after Ctrl-C, the usual end."""
         if self.path is None:
             raise UserError("view needs a scene; add a file or the output folder of a training run")
-        from snowsplat.pipeline.scene_source import load_viewable
+        from snowsplat.pipeline.view import viewed_scene
         from snowsplat.viewer.hosts import ANY_HOST
-        from snowsplat.viewer.web.panel import Description, made_on
-        from snowsplat.viewer.web.scene import site
         from snowsplat.viewer.web.server import StaticServer
 
-        scene = load_viewable(self.path, self.iteration)
-        if not len(scene.gaussians):
-            raise UserError(f"{scene.file}: contains no Gaussians; there is nothing to see")
-        about = Description(self.path.resolve().name, made=made_on(scene.file))
-        files, headers = site(about, scene.gaussians, scene.cameras, scene.background)
         with (
+            TerminalObserver() as observer,
+            viewed_scene(self.path, self.iteration, observer) as scene,
             interrupts() as interrupted,
-            StaticServer(files, headers, self.host, self.port) as server,
+            StaticServer(scene.files, scene.headers, self.host, self.port) as server,
         ):
-            print(f"{scene.file}: {len(scene.gaussians):,} Gaussians")
+            print(f"{scene.file}: {scene.gaussians:,} Gaussians")
             print(server.url, flush=True)
             if self.host in ANY_HOST:
                 print(f"from other computers: {server.url_at(socket.gethostname())}", flush=True)

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.levels import write_levels
+from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.scene_source import load_viewable, scene_name
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
+
+#: Larger scenes are written in levels of detail. Phones show at most that many Gaussians at a time.
+_LARGE = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -55,8 +63,11 @@ def publish(
     iteration: int | None = None,
     overwrite: bool = False,
     threads: int | None = None,
+    observer: Observer = SILENT,
 ) -> PublishResult:
     """Write a static web site that shows a scene: a page, the viewer, the scene, and a picture.
+
+    A scene of more than 2 million Gaussians is written in levels of detail.
 
     Args:
         scene: the output folder of a training run, or a scene file of any format.
@@ -65,6 +76,7 @@ def publish(
         iteration: an iteration of an output folder; default: the last one.
         overwrite: whether to replace a web site in ``folder``.
         threads: number of CPU threads; None: all cores.
+        observer: gets the progress of levels of detail, the stage "levels".
 
     Raises:
         UserError: the scene is missing, damaged or has no Gaussians; ``folder`` contains other
@@ -85,16 +97,27 @@ def publish(
     url = options.url and options.url.rstrip("/") + "/"
     about = Description(options.title or scene_name(scene), options.licence, made_on(source.file))
     folder.mkdir(parents=True, exist_ok=True)
-    write_site(folder, source.gaussians, source.cameras, source.background, about, url)
-    size = sum(file.stat().st_size for file in folder.iterdir())
+    what = source.gaussians, source.cameras, source.background, about, url
+    if len(source.gaussians) <= _LARGE:
+        write_site(folder, *what)
+    else:
+        write_site(folder, *what, partial(_write_levels, observer))
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return PublishResult(folder, len(source.gaussians), size)
+
+
+def _write_levels(observer: Observer, folder: Path, gaussians: Gaussians) -> str:
+    """Write the levels of detail of a site, and remove the SOG file of an earlier one."""
+    write_levels(folder / INDEX, gaussians, observer)
+    (folder / "scene.sog").unlink(missing_ok=True)
+    return INDEX
 
 
 def _check_free(folder: Path, overwrite: bool) -> None:
     if not folder.is_dir():
         raise UserError(f"{folder}: is a file; use a folder for the output")
     names = {entry.name for entry in folder.iterdir()}
-    if names and not {"index.html", "scene.sog"} <= names:
+    if names and not ("index.html" in names and names & {"scene.sog", INDEX}):
         raise UserError(f"{folder}: contains other files; use a new or an empty folder")
     if names and not overwrite:
         raise UserError(f"{folder}: already contains a web site; use `overwrite` to replace it")

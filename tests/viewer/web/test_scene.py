@@ -7,11 +7,15 @@ import re
 import time
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from snowsplat.formats import GaussianArrays
+from snowsplat.formats.lod import INDEX, read_index
+from snowsplat.formats.lod_writer import LodSizes, write_lod
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
@@ -133,6 +137,37 @@ def test_a_real_browser_shows_our_render(trained, tmp_path):
         assert not page.errors
         assert all(url.startswith((server.url, f"blob:{server.url[:16]}")) for url in page.requests)
         with_controls(browser, server, shown)
+
+
+@pytest.mark.browser
+def test_a_real_browser_shows_levels_of_detail(trained, tmp_path):
+    """First the coarsest level, then the complete scene."""
+    gaussians, start, *_ = ready(trained.gaussians, trained.cameras)
+    ours = picture(gaussians, camera_of(start))
+
+    def levels(scene: Gaussians) -> Path:
+        write_lod(
+            tmp_path / INDEX,
+            GaussianArrays.from_gaussians(scene),
+            sizes=LodSizes(leaf=200, file=400, coarsest=300),
+        )
+        return tmp_path / INDEX
+
+    about = Description("scene")
+    files, headers = site(about, trained.gaussians, trained.cameras, (0.0, 0.0, 0.0), levels)
+    assert "scene.compressed.ply" not in files
+    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
+        page = browser.open(f"{server.url}?webgl&noui")
+        page.wait_for(LOADED, 60)
+        soon(page, lambda shown: psnr(shown, ours) > 29)
+        counts = read_index(tmp_path / INDEX).counts()
+        # Behind the camera, coarser levels are enough.
+        assert counts[0] // 2 < page.evaluate("window.app.stats.frame.gsplats") <= counts[0]
+        assert not page.errors
+        assert all(url.startswith((server.url, f"blob:{server.url[:16]}")) for url in page.requests)
+        loaded = [url.split("/")[-2] for url in page.requests if url.endswith("/meta.json")]
+        assert loaded[0].startswith(f"{len(counts) - 1}_")
+        assert {name[0] for name in loaded} >= {"0", str(len(counts) - 1)}
 
 
 def with_controls(browser: Browser, server: StaticServer, before: np.ndarray) -> None:

@@ -14,7 +14,7 @@ import pytest
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.hosts import is_own_host
 from snowsplat.viewer.web import server as static_server
-from snowsplat.viewer.web.server import ServedFile, StaticServer
+from snowsplat.viewer.web.server import FileOnDisk, ServedFile, StaticServer
 
 from .. import clients
 
@@ -115,6 +115,23 @@ def test_a_range_of_a_changed_file_returns_the_whole_file(server):
     assert (response.status, len(body)) == (200, 1 << 20)
     etag = response.headers["ETag"]
     assert ask(server, "scene.ply", Range="bytes=0-9", If_Range=etag)[0].status == 206
+
+
+def test_files_on_disk(tmp_path):
+    path = tmp_path / "levels.webp"
+    path.write_bytes(SCENE)
+    with StaticServer({"0_0/levels.webp": FileOnDisk(path, "image/webp")}, POLICY) as server:
+        response, body = ask(server, "0_0/levels.webp")
+        assert (response.status, response.getheader("Content-Type")) == (200, "image/webp")
+        assert body == SCENE
+        response, body = ask(server, "0_0/levels.webp", Range="bytes=700000-700009")
+        assert (response.status, body) == (206, SCENE[700_000:700_010])
+        etag = response.getheader("ETag")
+        assert ask(server, "0_0/levels.webp", If_None_Match=etag)[0].status == 304
+        assert ask(server, "0_0/../0_0/levels.webp")[0].status == 404
+        path.write_bytes(SCENE[:1000])  # the rest of the promised bytes cannot be sent
+        with pytest.raises(http.client.IncompleteRead):
+            ask(server, "0_0/levels.webp")
 
 
 def test_only_the_given_files_are_served(server):

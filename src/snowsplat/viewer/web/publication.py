@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import html
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 from PIL import Image
 
 from snowsplat.formats import GaussianArrays
+from snowsplat.formats.lod import INDEX
+from snowsplat.formats.lod_writer import remove_lod
 from snowsplat.formats.sog import write_sog
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
@@ -25,6 +27,13 @@ SCENE, POSTER = "scene.sog", "poster.jpg"
 POSTER_SIZE = (1200, 630)
 
 
+def write_one_file(folder: Path, gaussians: Gaussians) -> str:
+    """Write the scene as a SOG file, and remove levels of detail of an earlier site."""
+    write_sog(folder / SCENE, GaussianArrays.from_gaussians(gaussians))
+    remove_lod(folder / INDEX)
+    return SCENE
+
+
 def write_site(
     folder: Path,
     gaussians: Gaussians,
@@ -32,8 +41,9 @@ def write_site(
     background: Sequence[float],
     about: Description,
     url: str = "",
+    write_scene: Callable[[Path, Gaussians], str] = write_one_file,
 ) -> None:
-    """Write the page, its viewer, the scene in SOG format and a picture into a folder.
+    """Write the page, its viewer, the scene and a picture into a folder.
 
     Args:
         folder: it must exist. Files of an earlier site are replaced.
@@ -41,12 +51,13 @@ def write_site(
         background: red, green, blue in 0..1.
         url: the address of the folder on the web, which ends in "/"; "" if it is not known yet.
             Services that show a preview of a link need it to find the picture.
+        write_scene: writes the scene into the folder, and returns the name of the file to load.
 
     Raises:
         OSError: a file cannot be written.
     """
     scene = ready(gaussians, cameras, background)
-    write_sog(folder / SCENE, GaussianArrays.from_gaussians(scene.gaussians))
+    content = write_scene(folder, scene.gaussians)
     _write(folder / POSTER, _poster(scene))
     if scene.stops.views:
         _write(folder / PICTURES, scene.stops.pictures)
@@ -57,7 +68,7 @@ def write_site(
     write_text(folder / "viewer-licence.txt", asset("LICENSE"))
     bootstrap = {
         "settings": scene.settings(),
-        "contentUrl": f"./{SCENE}",
+        "contentUrl": f"./{content}",
         "posterUrl": f"./{POSTER}",
         "panel": scene.panel(about, f"./{PICTURES}"),
     }

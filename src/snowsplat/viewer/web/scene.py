@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import torch
 from torch import Tensor
 
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.compressed_ply import encode_compressed_ply
+from snowsplat.formats.lod import lod_files
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
@@ -24,10 +26,11 @@ from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.page import asset, content_policy, page, settings
 from snowsplat.viewer.web.panel import Description, panel_settings
-from snowsplat.viewer.web.server import ServedFile
+from snowsplat.viewer.web.server import FileOnDisk, Served, ServedFile
 from snowsplat.viewer.web.stops import Stops, stops_of
 
 _SCENE = "scene.compressed.ply"
+_TYPES = {".json": "application/json", ".webp": "image/webp"}
 #: The file with the pictures of the stops.
 PICTURES = "stops.webp"
 _KEYFRAMES = 121  # of the film; the viewer interpolates between them
@@ -40,32 +43,52 @@ def site(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     background: Sequence[float],
-) -> tuple[dict[str, ServedFile], dict[str, str]]:
+    levels: Callable[[Gaussians], Path] | None = None,
+    count: int | None = None,
+) -> tuple[dict[str, Served], dict[str, str]]:
     """The files of a page that shows a scene, by name, and the HTTP headers for them.
 
     The initial view is the first of ``cameras``; without cameras, an overview of the scene.
+
+    Args:
+        levels: returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
+            loads instead of the complete scene.
+        count: the number of Gaussians, if ``gaussians`` is only a coarse level.
     """
     scene = ready(gaussians, cameras, background)
+    content = _content(scene.gaussians, levels)
     bootstrap = {
         "settings": scene.settings(),
-        "contentUrl": f"./{_SCENE}",
-        "panel": scene.panel(about, f"./{PICTURES}"),
+        "contentUrl": f"./{next(iter(content))}",
+        "panel": scene.panel(about, f"./{PICTURES}", count),
     }
     index = page(f"{about.title} - snowsplat", bootstrap)
-    files = {
+    files: dict[str, Served] = {
         "": ServedFile(index.encode(), "text/html; charset=utf-8"),
         "index.css": ServedFile(asset("index.css").encode(), "text/css; charset=utf-8"),
         "index.js": ServedFile(asset("index.js").encode(), "text/javascript; charset=utf-8"),
-        _SCENE: ServedFile(
-            encode_compressed_ply(Path(_SCENE), GaussianArrays.from_gaussians(scene.gaussians)),
-            "application/octet-stream",
-        ),
+        **content,
     }
     if scene.stops.views:
         files[PICTURES] = ServedFile(scene.stops.pictures, "image/webp")
     own = "'self'"
     policy = f"{content_policy(index, own)}; frame-ancestors 'none'"
     return files, {"Content-Security-Policy": policy}
+
+
+def _content(gaussians: Gaussians, levels: Callable[[Gaussians], Path] | None) -> dict[str, Served]:
+    """What the page loads to show the Gaussians; the first file is the scene."""
+    if levels is None:
+        arrays = GaussianArrays.from_gaussians(gaussians)
+        scene = encode_compressed_ply(Path(_SCENE), arrays)
+        return {_SCENE: ServedFile(scene, "application/octet-stream")}
+    index = levels(gaussians)
+    return {
+        quote(file.relative_to(index.parent).as_posix()): FileOnDisk(
+            file, _TYPES.get(file.suffix, "application/octet-stream")
+        )
+        for file in lod_files(index)
+    }
 
 
 class ReadyScene(NamedTuple):
@@ -89,10 +112,13 @@ class ReadyScene(NamedTuple):
         """The settings of the viewer."""
         return settings(self.start, self.background, self.film)
 
-    def panel(self, about: Description, pictures: str) -> dict[str, Any]:
-        """What the panel shows; ``pictures`` is the address of the pictures of the stops."""
+    def panel(self, about: Description, pictures: str, count: int | None = None) -> dict[str, Any]:
+        """What the panel shows; ``pictures`` is the address of the pictures of the stops.
+
+        ``count``: of the Gaussians, if those here are only a coarse level.
+        """
         subject = self.stops.middle.tolist(), self.stops.radius
-        count = len(self.gaussians)
+        count = count or len(self.gaussians)
         return panel_settings(about, count, self.start, subject, self.stops.views, pictures)
 
 

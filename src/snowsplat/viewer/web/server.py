@@ -1,9 +1,9 @@
-"""A small web server for one page: a few files in memory, for one user.
+"""A small web server for one page: a few files in memory or on disk, for one user.
 
-It serves only the files that are passed to it: a requested name is looked up in a table, and no
-file is opened. The URL contains a secret token. Requests with an unknown Host header are rejected,
-so a page of another site cannot reach the server through the domain name of that site (DNS
-rebinding).
+It serves only the files that are passed to it: a requested name is looked up in a table, and is
+never used as a path. The URL contains a secret token. Requests with an unknown Host header are
+rejected, so a page of another site cannot reach the server through the domain name of that site
+(DNS rebinding).
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ import socketserver
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
+from pathlib import Path
 from typing import Any, cast
 
 from snowsplat.util.errors import SettingError
@@ -58,9 +59,48 @@ class ServedFile:
     content: bytes = field(repr=False)
     type: str
 
+    @property
+    def size(self) -> int:
+        return len(self.content)
+
     @cached_property
     def etag(self) -> str:
         return f'"{hashlib.sha256(self.content).hexdigest()[:32]}"'
+
+    def blocks(self, start: int, end: int) -> Iterator[memoryview]:
+        """The bytes from ``start`` to ``end`` in small blocks."""
+        content = memoryview(self.content)
+        for at in range(start, end, _BLOCK):
+            yield content[at : min(at + _BLOCK, end)]
+
+
+@dataclass(frozen=True)
+class FileOnDisk:
+    """A file that is read when it is requested; it must not change while it is served."""
+
+    path: Path
+    type: str
+
+    @cached_property
+    def size(self) -> int:
+        return self.path.stat().st_size
+
+    @cached_property
+    def etag(self) -> str:
+        return f'"{self.path.stat().st_mtime_ns:x}-{self.size:x}"'
+
+    def blocks(self, start: int, end: int) -> Iterator[bytes]:
+        """The same as `ServedFile.blocks`. Raises: ConnectionError: the file is shorter now."""
+        with open(self.path, "rb") as file:
+            file.seek(start)
+            for at in range(start, end, _BLOCK):
+                block = file.read(min(_BLOCK, end - at))
+                if len(block) < min(_BLOCK, end - at):
+                    raise ConnectionError(f"{self.path}: is shorter than before")
+                yield block
+
+
+Served = ServedFile | FileOnDisk
 
 
 class StaticServer:
@@ -75,7 +115,7 @@ class StaticServer:
 
     def __init__(
         self,
-        files: Mapping[str, ServedFile],
+        files: Mapping[str, Served],
         headers: Mapping[str, str],
         host: str = "127.0.0.1",
         port: int = 0,
@@ -124,7 +164,7 @@ class _Server(socketserver.ThreadingTCPServer):
     request_queue_size = 64
 
     prefix: str
-    files: dict[str, ServedFile]
+    files: dict[str, Served]
     headers: dict[str, str]
     host: str
 
@@ -288,7 +328,7 @@ class _Handler(BaseHTTPRequestHandler):
         if file.etag in (self.headers.get("If-None-Match") or ""):
             self._send_empty(HTTPStatus.NOT_MODIFIED, common)
             return
-        size = len(file.content)
+        size = file.size
         part = self._range(file)
         if part is None:
             status, start, end = HTTPStatus.OK, 0, size
@@ -302,9 +342,8 @@ class _Handler(BaseHTTPRequestHandler):
         common |= {"Content-Type": file.type, "Content-Length": str(end - start)}
         self._send_head(status, common)
         if with_body:
-            content = memoryview(file.content)
-            for at in range(start, end, _BLOCK):
-                self.wfile.write(content[at : min(at + _BLOCK, end)])
+            for block in file.blocks(start, end):
+                self.wfile.write(block)
 
     def _refusal(self) -> HTTPStatus | None:
         """The status with which a request is rejected; None accepts it."""
@@ -325,7 +364,7 @@ class _Handler(BaseHTTPRequestHandler):
             return HTTPStatus.FORBIDDEN
         return None
 
-    def _file(self) -> ServedFile | None:
+    def _file(self) -> Served | None:
         """The file at the requested path. The path is not decoded, because all names are ASCII."""
         path = self.path.partition("?")[0]
         prefix = self._web_server.prefix
@@ -334,7 +373,7 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         return self._web_server.files.get(name)
 
-    def _range(self, file: ServedFile) -> tuple[int, int] | None:
+    def _range(self, file: Served) -> tuple[int, int] | None:
         """The first requested byte, and the byte after the last; None: the complete file.
 
         A range outside of the file is empty. For multiple or malformed ranges, the complete file is
@@ -345,7 +384,7 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         if self.headers.get("If-Range", file.etag) != file.etag:
             return None
-        size = len(file.content)
+        size = file.size
         # int() rejects numbers with thousands of digits; 19 digits are past the end anyway.
         first, last = (int(digits[:19]) if digits else None for digits in match.groups())
         if first is None:

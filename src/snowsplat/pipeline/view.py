@@ -1,0 +1,100 @@
+"""`view`: the files of a page that shows a scene, in levels of detail if it is large."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from snowsplat.formats import format_for_reading
+from snowsplat.formats.lod import INDEX, LEVELS, read_index, read_lod
+from snowsplat.pipeline.levels import write_levels
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.scene_source import load_viewable
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.viewer.web.server import Served
+
+#: Larger scenes are shown in levels of detail. The viewer never draws more Gaussians at a time.
+_LARGE = 4_000_000
+
+
+@dataclass(frozen=True)
+class ViewedScene:
+    """The page of a scene.
+
+    Attributes:
+        file: the scene file.
+        gaussians: their number.
+        files: the files of the page, by name.
+        headers: HTTP headers of the page.
+    """
+
+    file: Path
+    gaussians: int
+    files: dict[str, Served]
+    headers: dict[str, str]
+
+
+@contextmanager
+def viewed_scene(
+    path: Path | str, iteration: int | None = None, observer: Observer = SILENT
+) -> Iterator[ViewedScene]:
+    """A context with the page of a scene; see `load_viewable`.
+
+    Of levels of detail, only the coarsest is read, so their page is ready at once. For other
+    scenes of more than 4 million Gaussians, levels of detail are written to a temporary folder,
+    which is removed at the end.
+
+    Raises:
+        UserError: the scene is missing or damaged, or has no Gaussians.
+    """
+    from snowsplat.viewer.web.panel import Description, made_on
+    from snowsplat.viewer.web.scene import site
+
+    path = Path(path)
+    title = path.resolve().name
+    index = _levels_in(path)
+    if index is not None:
+        if iteration is not None:
+            raise UserError("`iteration` selects a scene of an output folder; leave it out")
+        counts = read_index(index).counts()
+        coarse = read_lod(index, len(counts) - 1).to_gaussians()
+        _check(index, coarse)
+        about = Description(title, made=made_on(index))
+        page = site(about, coarse, [], (0.0, 0.0, 0.0), lambda _: index, counts[0])
+        yield ViewedScene(index, counts[0], *page)
+        return
+    scene = load_viewable(path, iteration)
+    _check(scene.file, scene.gaussians)
+    about = Description(title, made=made_on(scene.file))
+    what = about, scene.gaussians, scene.cameras, scene.background
+    if len(scene.gaussians) <= _LARGE:
+        yield ViewedScene(scene.file, len(scene.gaussians), *site(*what))
+        return
+    with TemporaryDirectory(prefix="snowsplat-levels-") as folder:
+
+        def levels(gaussians: Gaussians) -> Path:
+            target = Path(folder) / INDEX
+            write_levels(target, gaussians, observer)
+            observer.note(f"to keep them: snowsplat convert {path} FOLDER/{INDEX}")
+            return target
+
+        yield ViewedScene(scene.file, len(scene.gaussians), *site(*what, levels))
+
+
+def _levels_in(path: Path) -> Path | None:
+    """The index of levels of detail in a folder, or ``path`` itself if it is one."""
+    if (path / INDEX).is_file():
+        return path / INDEX
+    return path if path.is_file() and format_for_reading(path).name == LEVELS else None
+
+
+def _check(file: Path, gaussians: Gaussians) -> None:
+    if not len(gaussians):
+        raise UserError(f"{file}: contains no Gaussians; there is nothing to see")

@@ -1,0 +1,66 @@
+"""`viewed_scene`: which scenes are shown in levels of detail."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats.lod import INDEX, read_index
+from snowsplat.pipeline import view
+from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.view import viewed_scene
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.errors import UserError
+from snowsplat.viewer.web.server import FileOnDisk
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    gaussians = Gaussians.random_in_bounds(box, 500, torch.Generator().manual_seed(0), 1)
+    write_gaussians(tmp_path / "box.ply", gaussians)
+    return tmp_path / "box.ply"
+
+
+class Notes(Observer):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, line: str) -> None:
+        self.lines.append(line)
+
+
+def test_a_small_scene_is_one_file(scene):
+    with viewed_scene(scene) as viewed:
+        assert (viewed.file, viewed.gaussians) == (scene, 500)
+        assert "scene.compressed.ply" in viewed.files
+        assert INDEX not in viewed.files
+
+
+def test_a_large_scene_is_shown_in_levels_until_the_end(scene, monkeypatch):
+    monkeypatch.setattr(view, "_LARGE", 499)
+    notes = Notes()
+    with viewed_scene(scene, observer=notes) as viewed:
+        assert viewed.gaussians == 500
+        index = viewed.files[INDEX]
+        assert isinstance(index, FileOnDisk)
+        assert len(read_gaussians(index.path)) == 500
+        assert viewed.files["levels/0_0/means_l.webp"].type == "image/webp"
+        assert INDEX.encode() in viewed.files[""].content
+    assert not index.path.parent.exists()
+    (line,) = notes.lines
+    assert f"convert {scene} FOLDER/{INDEX}" in line
+
+
+def test_a_folder_with_levels_is_served_as_it_is(scene, tmp_path):
+    index = tmp_path / "my levels" / INDEX
+    write_gaussians(index, read_gaussians(scene))
+    for path in (index.parent, index):
+        with viewed_scene(path) as viewed:
+            assert (viewed.file, viewed.gaussians) == (index, read_index(index).counts()[0])
+            served = {file.path for file in viewed.files.values() if isinstance(file, FileOnDisk)}
+            assert served == {file for file in index.parent.rglob("*") if file.is_file()}
+    assert read_index(index).counts() == [500]
+    with pytest.raises(UserError, match="leave it out"), viewed_scene(index, 30):
+        pass
