@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from snowsplat.scene.geometry import look_at
-from snowsplat.scene.orientation import up_direction
+from snowsplat.scene.orientation import up_direction, up_of_surfaces
 
 UP = torch.nn.functional.normalize(torch.tensor([0.2, -0.9, 0.3], dtype=torch.float64), dim=0)
 
@@ -69,3 +69,34 @@ def test_the_result_is_the_most_likely_direction(sector):
         other = up + 1e-3 * (math.cos(angle) * across[0] + math.sin(angle) * across[1])
         assert cost(other / np.linalg.norm(other)) > cost(up)
     assert float(np.linalg.norm(up)) == pytest.approx(1)
+
+
+def surfaces(ground: int, random: int, up: torch.Tensor) -> np.ndarray:
+    """Normals of ``ground`` surfaces perpendicular to ``up``, with noise, and of random ones."""
+    generator = torch.Generator().manual_seed(0)
+    sign = torch.where(torch.rand(ground, 1, generator=generator) < 0.5, -1.0, 1.0)
+    level = sign * (up + 0.03 * torch.randn(ground, 3, generator=generator))
+    others = torch.randn(random, 3, generator=generator)
+    return torch.nn.functional.normalize(torch.cat([level, others]).double(), dim=1).numpy()
+
+
+@pytest.mark.parametrize("tilt", [0.0, 15.0, 35.0])
+def test_the_ground_implies_the_up_direction(tilt):
+    """A larger wall does not, because it is vertical."""
+    angle = math.radians(tilt)
+    up = torch.tensor([math.sin(angle), -math.cos(angle), 0.0])
+    wall = surfaces(1000, 0, torch.tensor([0.0, 0.0, 1.0]))
+    normals = np.concatenate([surfaces(500, 1500, up), wall])
+    found = up_of_surfaces(normals, np.ones(len(normals)))
+    assert found is not None
+    assert np.degrees(np.arccos(found @ up.numpy())) < 1
+    areas = np.ones(len(normals))
+    areas[:500] = 0.1  # now the ground is only a small part
+    assert up_of_surfaces(normals, areas) is None
+
+
+def test_surfaces_that_imply_no_up_direction():
+    assert up_of_surfaces(np.zeros((0, 3)), np.zeros(0)) is None
+    assert up_of_surfaces(surfaces(0, 3000, UP.float()), np.ones(3000)) is None
+    steep = surfaces(1000, 0, torch.tensor([math.sin(0.9), -math.cos(0.9), 0.0]))
+    assert up_of_surfaces(steep, np.ones(1000)) is None

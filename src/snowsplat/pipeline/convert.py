@@ -17,7 +17,7 @@ from snowsplat.pipeline.decimate import file_size, gaussians_to_keep, write_with
 from snowsplat.pipeline.levels import write_levels
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
-from snowsplat.pipeline.scene_source import cameras_of, folder_around, scene_file
+from snowsplat.pipeline.scene_source import background_of, cameras_of, folder_around, scene_file
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
@@ -182,10 +182,10 @@ def _write_spz(target: Path, scene: Gaussians, version: int) -> None:
 
 
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
-    """Write an HTML page. Its initial view is the camera of a photo, if the cameras are known."""
+    """Write an HTML page, with the cameras and the background of its training if they are known."""
     from snowsplat.viewer.web.html import write_html
     from snowsplat.viewer.web.panel import Description, made_on
     from snowsplat.viewer.web.scene import ready
 
-    about = Description(target.stem, made=made_on(source))
-    write_html(target, ready(scene, cameras_of(folder_around(source))), about)
+    folder, about = folder_around(source), Description(target.stem, made=made_on(source))
+    write_html(target, ready(scene, cameras_of(folder), background_of(folder)), about)

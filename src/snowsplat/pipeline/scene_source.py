@@ -136,6 +136,11 @@ def cameras_of(folder: OutputFolder) -> list[Camera]:
     return read_cameras(file)[1] if file.is_file() else []
 
 
+def background_of(folder: OutputFolder) -> Color:
+    """The background colour of the training in ``folder``; black if it is not stored."""
+    return folder.settings()[1] if folder.is_output_folder() else (0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class ViewableScene:
     """A scene for a viewer, from a file or an output folder; its photos are not needed.
@@ -176,8 +181,7 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
             raise UserError("`iteration` selects a scene of an output folder; leave it out")
         file, gaussians = path, read_gaussians(path)
         folder = folder_around(path)
-    background = folder.settings()[1] if folder.is_output_folder() else (0.0, 0.0, 0.0)
-    return ViewableScene(file, gaussians, cameras_of(folder), background)
+    return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))
 
 
 def scene_name(scene: Path) -> str:

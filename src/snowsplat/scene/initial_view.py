@@ -15,7 +15,7 @@ from snowsplat.scene.geometry import look_at
 # Distance of the camera of `overview` from the middle, relative to the radius that it shows.
 _OVERVIEW_DISTANCE = 2.77
 # What is farther from the median than this many times the median distance is considered background.
-_BACKGROUND_RATIO = 2.5
+_BACKGROUND_RATIO = 4.0
 # The rest extends from the first of these quantiles to the second.
 _EXTENT = torch.tensor([0.02, 0.98], dtype=torch.float64)
 # Number of Gaussians that are used for medians and quantiles.

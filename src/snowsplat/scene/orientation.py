@@ -1,4 +1,4 @@
-"""The up direction of a scene, estimated from its cameras, and the scale of an oriented scene."""
+"""The up direction of a scene, estimated from its cameras or its surfaces, and its usual scale."""
 
 from __future__ import annotations
 
@@ -16,6 +16,14 @@ VIEWING_DISTANCE = 3.0
 # are weak evidence. These are the assumed standard deviations.
 _ROLL = math.radians(3)
 _COMMON_PITCH = math.radians(30)
+# Largest angle between the up direction and the normals of surfaces parallel to the ground.
+_PARALLEL = math.radians(8)
+# Largest angle between the usual up direction and that of a scene without cameras.
+_LARGEST_TILT = math.radians(40)
+# The share of all surfaces that must be parallel to the ground, and their number (that of surfaces
+# of the same size with the same variance of the total area). Less may be by chance.
+_GROUND = 0.08
+_FEWEST = 150
 # Largest length of the mean of unit vectors that are considered to have no common direction.
 _NO_DIRECTION = 0.3
 
@@ -55,3 +63,39 @@ def up_direction(rotations: np.ndarray) -> np.ndarray:
     # chance. Then the sign of `up` comes from the viewing directions.
     looks_down = abs(upper @ up) < _NO_DIRECTION
     return -up if looks_down and forward @ up > 0 else up
+
+
+def up_of_surfaces(normals: np.ndarray, areas: np.ndarray) -> np.ndarray | None:
+    """The up direction of a scene without cameras: that of the ground, tables and ceilings.
+
+    It is the direction within `_LARGEST_TILT` of −y, the usual up direction of files, to which most
+    surfaces are perpendicular.
+
+    Args:
+        normals: (N, 3) unit vectors in the world frame; their signs are not used.
+        areas: (N,) of the surfaces, in any unit.
+
+    Returns:
+        (3,) unit vector in the world frame; None if there is no such direction.
+    """
+    total = float(areas.sum())
+    if total <= 0:
+        return None
+
+    def around(up: np.ndarray) -> np.ndarray:
+        """The areas of surfaces parallel to the ground, 0 for others."""
+        return np.where(np.abs(normals @ up) > math.cos(_PARALLEL), areas, 0.0)
+
+    # Directions at equal distances in the cone: a spiral of Fibonacci.
+    steps = np.arange(400) + 0.5
+    y = 1 - steps / len(steps) * (1 - math.cos(_LARGEST_TILT))
+    angle, radius = steps * math.pi * (1 + math.sqrt(5)), np.sqrt(1 - y * y)
+    cone = np.stack([radius * np.cos(angle), -y, radius * np.sin(angle)], axis=1)
+    up = max(cone, key=lambda direction: float(around(direction).sum()))
+    for _ in range(10):  # mean shift
+        mean = (np.sign(normals @ up) * around(up)) @ normals
+        up = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    ground = around(up)
+    area = float(ground.sum())
+    is_ground = area > _GROUND * total and area**2 > _FEWEST * float((ground**2).sum())
+    return up if is_ground and -up[1] > math.cos(_LARGEST_TILT) else None

@@ -146,3 +146,29 @@ def test_windows_of_any_shape_show_the_complete_photo(file, scene):
             fov = math.degrees(2 * math.atan(max(width, height) / 2 / camera.fx))
             page.wait_for(f"Math.abs({component}.fov - {fov}) < 0.01", 30)
             assert page.evaluate(f"{component}.horizontalFov") == (width > height)
+
+
+@pytest.mark.browser
+def test_a_click_on_every_control(file):
+    """Leaves no error in the console. The film is the last one; dragging ends it in orbit."""
+    with opened(file, 600, 400) as page:
+        shown = "[...document.querySelectorAll('.sse-viewer button')].filter(b => b.offsetParent)"
+        clicked = set()
+        while True:
+            # Buttons of panels are the last ones. A click on another button may hide them.
+            names = page.evaluate(f"{shown}.map(b => b.classList[0] || b.innerText || b.ariaLabel)")
+            new = [name for name in names if name not in clicked and name != "sse-play"]
+            if not new:
+                break
+            clicked.add(new[-1])
+            page.evaluate(f"{shown}[{names.index(new[-1])}].click()")
+        assert {"Photos", "Copy link", "Photo 12 of 12"} <= clicked
+        named = ("flyCamera", "settings", "frame", "reset", "controlsButton", "info", "infoClose")
+        assert {f"sse-{name}" for name in named} <= clicked
+        for key in "12ghfr":
+            press(page, key)
+        page.evaluate("document.querySelector('.sse-orbitCamera').click()")
+        page.evaluate("document.querySelector('.sse-play').click()")
+        assert page.evaluate(MODE) == "anim"
+        page.drag(100, 280, 180, 290)
+        page.wait_for(f"{MODE} === 'orbit'", 30)

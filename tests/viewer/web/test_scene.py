@@ -96,6 +96,24 @@ def test_an_upright_scene_is_unchanged(trained):
     assert ready(trained.gaussians, [])[0] is trained.gaussians
 
 
+def test_a_scene_without_cameras_is_levelled():
+    """A tilted floor of flat Gaussians; other Gaussians are round."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(600, 3, generator=generator) - 0.5
+    means[:300, 1] = 0.5
+    log_scales = torch.full((600, 3), -3.0)
+    log_scales[:300, 1] = -6.0
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(600, 1)
+    logits, colors = torch.full((600,), 3.0), torch.zeros(600, 1, 3)
+    level = Gaussians(means, log_scales, quats, logits, colors, torch.zeros(600, 0, 3))
+    assert ready(level, ()).gaussians is level
+    tilt = rotation_from_quat(torch.tensor([math.cos(0.25), 0.0, 0.0, math.sin(0.25)])).tolist()
+    back = ready(transform(level, _similarity(1.0, tilt)), ()).gaussians
+    floor = back.means[:300]
+    assert float((floor[:, 1] - floor[:, 1].mean()).abs().max()) < 0.02
+    assert float(floor[:, 1].mean()) > 0.4  # below
+
+
 def test_empty_space_in_front_of_the_camera(trained):
     away = torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64)
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.compressed_ply import encode_compressed_ply
@@ -18,9 +20,9 @@ from snowsplat.formats.lod import lod_files
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.initial_view import InitialView, overview, view_of_camera
-from snowsplat.scene.orientation import VIEWING_DISTANCE, up_direction
+from snowsplat.scene.geometry import Similarity, rotation_from_quat
+from snowsplat.scene.initial_view import InitialView, bound, overview, view_of_camera
+from snowsplat.scene.orientation import VIEWING_DISTANCE, up_direction, up_of_surfaces
 from snowsplat.scene.render import render
 from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
@@ -35,6 +37,7 @@ _TYPES = {".json": "application/json", ".webp": "image/webp"}
 PICTURES = "stops.webp"
 _KEYFRAMES = 121  # of the film; the viewer interpolates between them
 _LEVEL_ENOUGH = math.radians(3)  # a smaller tilt of the horizon is not visible
+_SURFACES = 20_000  # maximum number of surfaces that determine the up direction
 _TOO_LARGE = 3.0  # maximum factor between the distances of the scene and the usual ones
 
 
@@ -131,13 +134,17 @@ def ready(
 
     In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
     direction, or distances very different from `VIEWING_DISTANCE`, the scene is rotated and scaled.
-    Otherwise it is unchanged.
+    Without cameras, the surfaces may imply another up direction. Otherwise the scene is unchanged.
     """
     if not cameras:
+        up = up_of_surfaces(*_surfaces(gaussians))
+        level = None if up is None else _viewing_frame(up, VIEWING_DISTANCE)
+        gaussians = gaussians if level is None else transform(gaussians, level)
         stops = stops_of(gaussians, (), 1.0, background)
         return ReadyScene(gaussians, overview(gaussians), [], stops, background)
     depth = _depth_ahead(gaussians, cameras[0])
-    change = _viewing_frame(cameras, depth)
+    rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
+    change = _viewing_frame(up_direction(rotations.numpy()), depth)
     if change is not None:
         gaussians = transform(gaussians, change)
         depth *= change.scale
@@ -159,10 +166,9 @@ def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
     return [view_of_camera(camera, depth) for camera in path]
 
 
-def _viewing_frame(cameras: Sequence[Camera], depth: float) -> Similarity | None:
+def _viewing_frame(direction: np.ndarray, depth: float) -> Similarity | None:
     """Transform to a frame with −y up and usual distances; None if the scene has both."""
-    rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
-    up = torch.from_numpy(up_direction(rotations.numpy()))
+    up = torch.from_numpy(direction)
     rotation = _shortest_rotation(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
     tilt = math.acos(max(-1.0, min(1.0, -float(up[1]))))
     ratio = VIEWING_DISTANCE / depth
@@ -171,6 +177,22 @@ def _viewing_frame(cameras: Sequence[Camera], depth: float) -> Similarity | None
         return None
     turn = torch.eye(3, dtype=torch.float64) if is_level else rotation
     return Similarity(1.0 if is_near else ratio, turn, torch.zeros(3, dtype=torch.float64))
+
+
+def _surfaces(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (N, 3) and areas (N,) of the flat opaque Gaussians in the `bound` of a scene."""
+    middle, radius = bound(gaussians)
+    scales, axes = gaussians.log_scales.detach().double().sort(1)
+    inside = (gaussians.means.detach().double() - middle).norm(dim=1) < radius
+    flat = scales[:, 1] - scales[:, 0] > math.log(2)
+    rows = (inside & flat & (gaussians.opacities.detach() > 0.2)).nonzero()[:, 0]
+    rows = rows[:: -(-len(rows) // _SURFACES) or 1]
+    rotations = rotation_from_quat(normalize(gaussians.quats.detach()[rows].double(), dim=1))
+    normals = rotations.gather(2, axes[rows, :1, None].expand(-1, 3, 1))[:, :, 0]
+    areas = (scales[rows, 1] + scales[rows, 2]).exp()
+    if len(areas):  # a few may be huge
+        areas = areas.clamp_max(float(areas.quantile(0.9)))
+    return normals.numpy(), areas.numpy()
 
 
 def _shortest_rotation(source: Tensor, target: Tensor) -> Tensor:
