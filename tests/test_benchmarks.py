@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -13,6 +14,8 @@ import pytest
 import torch
 
 from snowsplat import Gaussians, load_dataset, ops, write_gaussians
+from snowsplat.cli.main import main
+from snowsplat.formats.lod import read_index
 from snowsplat.ops import native, reference
 from snowsplat.ops.cuda.launches import KERNELS, launch_by
 from snowsplat.ops.native import LAUNCHERS
@@ -803,3 +806,14 @@ def test_a_complete_run_writes_its_page(tmp_path, long):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["gpu.json", "gpu.log", "gpu.md"]
     running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
     assert f"time.sleep({LONG})" not in running
+
+
+def test_levels_of_detail(tmp_path):
+    out = tmp_path / "out"
+    dataset = write_toy_dataset(tmp_path / "toy", "colmap-bin", 6, 64, 48, n_points=400)
+    assert main(["train", str(dataset), "-o", str(out), "--iterations", "20", "--quiet"]) == 0
+    text = benchmark("lod.py", out, "--count", 3000, "--folder", tmp_path / "large", "--no-browser")
+    levels = re.findall(r"^ +(\d)  +([\d,]+)   ( *inf| *[\d.]+)", text, re.MULTILINE)
+    assert [level for level, *_ in levels] == ["0", "1", "2", "3"]
+    assert re.search(r"convert: \d+ s, \d+ s of processor time, at most \d\.\d\d GB", text)
+    assert read_index(tmp_path / "large/levels/lod-meta.json").counts() == [3000]

@@ -1,5 +1,7 @@
 """`viewed_scene`: which scenes are shown in levels of detail."""
 
+import json
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from snowsplat.pipeline import view
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.view import viewed_scene
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.initial_view import overview
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.server import FileOnDisk
 
@@ -51,6 +54,24 @@ def test_a_large_scene_is_shown_in_levels_until_the_end(scene, monkeypatch):
     assert not index.path.parent.exists()
     (line,) = notes.lines
     assert f"convert {scene} FOLDER/{INDEX}" in line
+
+
+def test_levels_are_not_turned(tmp_path):
+    """The page must not assume another frame than that of the files, as for a tilted floor."""
+    x, z = torch.rand(2, 500, generator=torch.Generator().manual_seed(0)) * 4 - 2
+    floor = Gaussians(
+        torch.stack([x + 5, 0.5 * x, z], 1),
+        torch.tensor([-3.0, -7.0, -3.0]).expand(500, 3).clone(),
+        torch.tensor([0.973, 0.0, 0.0, 0.230]).expand(500, 4).clone(),
+        torch.full((500,), 3.0),
+        torch.zeros(500, 1, 3),
+        torch.zeros(500, 0, 3),
+    )
+    write_gaussians(tmp_path / INDEX, floor)
+    with viewed_scene(tmp_path) as viewed:
+        (found,) = re.findall(rb'"initial": {"position": (\[.*?\])', viewed.files[""].content)
+    x, y, z = overview(floor).position
+    assert json.loads(found) == pytest.approx([-x, -y, z], abs=0.05)
 
 
 def test_a_folder_with_levels_is_served_as_it_is(scene, tmp_path):

@@ -56,9 +56,10 @@ def site(
     Args:
         levels: returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
             loads instead of the complete scene.
-        count: the number of Gaussians, if ``gaussians`` is only a coarse level.
+        count: the number of Gaussians, if ``gaussians`` is only a coarse level; then the frame
+            stays that of the levels.
     """
-    scene = ready(gaussians, cameras, background)
+    scene = ready(gaussians, cameras, background, in_place=count is not None)
     content = _content(scene.gaussians, levels)
     bootstrap = {
         "settings": scene.settings(),
@@ -129,15 +130,18 @@ def ready(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     background: Sequence[float] = (0.0, 0.0, 0.0),
+    *,
+    in_place: bool = False,
 ) -> ReadyScene:
     """The scene in a frame that suits the viewer, and views in that frame.
 
     In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
     direction, or distances very different from `VIEWING_DISTANCE`, the scene is rotated and scaled.
-    Without cameras, the surfaces may imply another up direction. Otherwise the scene is unchanged.
+    Without cameras, the surfaces may imply another up direction. Otherwise, or if the scene must
+    stay ``in_place`` (only without cameras), it is unchanged.
     """
     if not cameras:
-        up = up_of_surfaces(*_surfaces(gaussians))
+        up = None if in_place else up_of_surfaces(*_surfaces(gaussians))
         level = None if up is None else _viewing_frame(up, VIEWING_DISTANCE)
         gaussians = gaussians if level is None else transform(gaussians, level)
         stops = stops_of(gaussians, (), 1.0, background)
