@@ -227,6 +227,10 @@ def test_messages():
     click = {"type": "SceneNodeClickMessage", "name": "/photos/3", "instance_index": None}
     click |= {"ray_origin": [0, 0, 0], "ray_direction": [0, 0, 1.5], "screen_pos": [0.5, 0.5]}
     assert is_valid_message(msgspec.msgpack.encode({**click, "modifier": None, "owner": ""}))
+    command = {"type": "CommandTriggerMessage", "uuid": "a"}
+    assert is_valid_message(msgspec.msgpack.encode(command))
+    for bad in ({"uuid": 1}, {"uuid": "a" * 201}, {"label": "a"}):
+        assert not is_valid_message(msgspec.msgpack.encode(command | bad))
     for name in POSE:
         for bad in (float("nan"), "x", None, [], [1.0, 2.0], b"x", {}):
             sane = name in ("near", "far") and isinstance(bad, float)  # not used

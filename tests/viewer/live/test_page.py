@@ -258,6 +258,35 @@ def test_the_view_at_a_photo(page):
     drag(page, lambda: page.evaluate(nowhere))
 
 
+def type_key(page: Page, key: str, code: str) -> None:
+    for kind in ("keyDown", "keyUp"):
+        page.call("Input.dispatchKeyEvent", type=kind, key=key, code=code)
+
+
+def test_keys(page):
+    pause(page)
+    type_key(page, "n", "KeyN")
+    page.wait_for("document.body.innerText.includes('At view_01.png')")
+    at_photo = settled(page)
+    type_key(page, "p", "KeyP")
+    page.wait_for("/At view_0[^1].png/.test(document.body.innerText)")
+    wait(lambda: differ(scene(page), at_photo) > 1)
+    type_key(page, "f", "KeyF")  # the whole scene
+    page.wait_for("document.body.innerText.includes('click one to view the scene')")
+    framed = settled(page)
+    type_key(page, "r", "KeyR")
+    wait(lambda: differ(scene(page), framed) > 1)
+    scheme = "document.documentElement.dataset.mantineColorScheme"
+    assert page.evaluate(scheme) == "dark"
+    type_key(page, "l", "KeyL")
+    page.wait_for(f"{scheme} === 'light'")
+    type_key(page, "l", "KeyL")
+    page.wait_for(f"{scheme} === 'dark'")
+    paused = step_of(page)
+    type_key(page, " ", "Space")
+    wait(lambda: step_of(page) > paused)
+
+
 def test_views_are_stored_for_a_video(page, tmp_path):
     page.evaluate(
         "(() => { const make = URL.createObjectURL; URL.createObjectURL = "

@@ -12,6 +12,7 @@ requested are rendered, without a copy of the Gaussians. `viewer.NetworkViewer` 
     page.py         the controls of the page
     photos.py       the cameras of the photos: frustums in the scene, and views from their poses
     key_cameras.py  views that a user stores, for a video along them
+    shortcuts.py    keys and theme
     palette.py      colour maps
     viewer.py       combines these modules
     training.py     updates the viewer between the steps of a training run

@@ -6,7 +6,7 @@ that trains. Therefore `Guard.serve` starts viser's server with additional check
 - The Host and Origin headers of a request must be those of this server. If other machines can
   connect, the path must begin with a secret token.
 - The numbers of connections, page downloads and browsers are limited.
-- Messages must be of the three types that the page sends, with finite numbers. A connection that
+- Messages must be of the four types that the page sends, with finite numbers. A connection that
   sends more messages than a page can send is closed. If a client does not read the data that the
   server sends, the server reads no further messages of this client.
 - During training, the server may use at most a fifth of a processor core.
@@ -290,7 +290,14 @@ class _Click(msgspec.Struct, tag="SceneNodeClickMessage", forbid_unknown_fields=
         return [*self.ray_origin, *self.ray_direction, *self.screen_pos]
 
 
-_decoder = msgspec.msgpack.Decoder(_Camera | _Update | _Click)
+class _Command(msgspec.Struct, tag="CommandTriggerMessage", forbid_unknown_fields=True):
+    uuid: _Name
+
+    def numbers(self) -> list[object]:
+        return []
+
+
+_decoder = msgspec.msgpack.Decoder(_Camera | _Update | _Click | _Command)
 
 
 def is_valid_message(data: Data) -> bool:

@@ -30,7 +30,8 @@ _MODES: dict[str, Mode] = {
     "Error against the photo": "error",
 }
 _LEGENDS: dict[Mode, str] = {
-    "color": "Drag to rotate, right button to move, wheel to zoom.",
+    "color": "Drag to rotate, right button to move, wheel to zoom. Keys: F frames the scene, R "
+    "returns, N and P go to photos, L changes the theme.",
     "depth": "Yellow is near, violet is far.",
     "alpha": "White is opaque, black is empty.",
     "normals": "Red: right, green: up, blue: towards you; the shortest axis of each Gaussian.",
@@ -92,6 +93,8 @@ class TrainingPanel:
             self._loss = _plot(server, "Loss", "#4a7fe0")
             self._psnr = _plot(server, "PSNR (dB)", "#e08a2a")
         self._pause.on_click(in_server_thread(self._pause_clicked))
+        self._key = server.gui.add_command("Pause or resume the training", hotkey="space")
+        self._key.on_trigger(in_server_thread(self._pause_clicked))
         self._step.on_click(in_server_thread(self._step_clicked))
         self._share.on_update(in_server_thread(self._share_changed))
 
@@ -137,6 +140,7 @@ class TrainingPanel:
         def hide() -> None:
             for control in (self._pause, self._step, self._share):
                 control.visible = False
+            self._key.remove()
 
         call_in_server_thread(self._server, hide)
 
@@ -282,14 +286,17 @@ class Controls:
             in_server_thread(lambda: self._wipe_to(100 if self._flip.value == "Photo" else 0))
         )
         self._move.on_click(
-            in_server_thread(lambda: self._go(1 if self._move.value == "Next" else -1))
+            in_server_thread(lambda: self.step_photo(1 if self._move.value == "Next" else -1))
         )
 
     def _wipe_to(self, percent: int) -> None:
         self._wipe.value = percent  # type: ignore[misc]
         self._set_display(wipe=percent / 100.0)
 
-    def _go(self, by: int) -> None:
+    def step_photo(self, by: int) -> None:
+        """Go to the next photo, or with −1 to the previous one."""
+        if not self._photos.views:
+            return
         count = len(self._photos.views)
         now = self._photo_index if self._next is None else self._next
         self.go_to_photo(0 if now is None else (now + by) % count)

@@ -22,6 +22,7 @@ from snowsplat.viewer.live.photos import Photos, fitted_photo
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.server import start_server, stop_server
 from snowsplat.viewer.live.session import MOVE_SECONDS, RenderRequest, Session, Visitor
+from snowsplat.viewer.live.shortcuts import Shortcuts, set_theme
 
 _QUALITY = {"moving": 60, "still": 90, "idle": 90}  # of JPEG images
 _TICK = 0.02  # seconds between two checks for requested images
@@ -84,7 +85,7 @@ class NetworkViewer:
         self._bounds = dataset.bounds
         running = start_server(host, port, label)
         self.server, self.url, self.others = running.server, running.url, running.others
-        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        set_theme(self.server.gui, dark=True)
         self._photos = Photos(
             self.server,
             self.session,
@@ -113,6 +114,7 @@ class NetworkViewer:
         visitor = self.session.enter(client.client_id)
         controls = Controls(client, self.session, visitor, self._photos, self._bounds)
         KeyCameras(client, visitor)
+        Shortcuts(client, controls, self._bounds)
         self._browsers[client.client_id] = client, visitor, controls
         self._photos.begin()
 
