@@ -126,8 +126,11 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(240, 160), metavar=("W", "H"))
     parser.add_argument("--blocks", type=int, default=6)
     parser.add_argument("--gaussians", type=int, default=300_000, help="of the whole")
+    parser.add_argument(
+        "--block-gaussians", type=int, default=300_000, help="of the whole, shared by the blocks"
+    )
     parser.add_argument("--iterations", type=int, default=4000, help="of the whole")
-    parser.add_argument("--block-iterations", type=int, default=1500, help="of each block")
+    parser.add_argument("--block-iterations", type=int, default=1600, help="of each block")
     parser.add_argument("--frames", type=int, default=240, help="of the film")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -137,14 +140,20 @@ def main() -> None:
     dataset = options.dataset or out / "street"
     if not (dataset / "sparse").is_dir():
         write_street_dataset(dataset, options.photos, *options.size)
-    settings = {"max_gaussians": options.gaussians, "seed": options.seed}
-    whole_settings = settings | {"iterations": options.iterations}
+    whole_settings = {
+        "max_gaussians": options.gaussians,
+        "iterations": options.iterations,
+        "seed": options.seed,
+    }
     cost_of_whole = in_process(
         out / "whole.json", train_whole, dataset, out / "whole", whole_settings
     )
     folder = out / "blocks"
     if not (folder / "plan.json").is_file():
-        block_settings = settings | {"iterations": options.block_iterations}
+        block_settings = whole_settings | {
+            "max_gaussians": options.block_gaussians,
+            "iterations": options.block_iterations,
+        }
         plan_blocks(
             dataset, folder, PlanOptions(blocks=options.blocks, settings=block_settings, hold_out=8)
         )

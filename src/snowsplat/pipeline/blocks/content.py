@@ -15,9 +15,8 @@ from torch import Tensor
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.ops import neighbours
 from snowsplat.pipeline.blocks.cells import Cell, cut, extent, ground_axes
+from snowsplat.pipeline.blocks.plan import Axes
 from snowsplat.scene.geometry import transform_points
-
-Axes = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 # A photo belongs to a block if at least this share of what it shows is in the cell.
 _SHOWN = 0.25
