@@ -38,7 +38,6 @@ from snowsplat.trajectory.video import video_writer
 from snowsplat.util.files import write_json
 from snowsplat.util.process_memory import peak_bytes, reset_peak, resident_bytes
 
-FRAMES = 240
 WORST = 6
 
 
@@ -72,11 +71,11 @@ def in_process(file: Path, function: Callable[..., None], *arguments: Any) -> di
     return json.loads(file.read_text(encoding="utf-8"))
 
 
-def walk(length: float, camera: Camera) -> Iterator[Camera]:
+def walk(length: float, camera: Camera, frames: int) -> Iterator[Camera]:
     """A camera that moves along the street and looks ahead, to its left side."""
     yaw = math.radians(35)
-    for i in range(FRAMES):
-        x = length * (0.03 + 0.94 * i / (FRAMES - 1))
+    for i in range(frames):
+        x = length * (0.03 + 0.94 * i / (frames - 1))
         position = torch.tensor([x, -1.6, -1.0], dtype=torch.float64)
         gaze = torch.tensor([math.cos(yaw), -0.08, math.sin(yaw)], dtype=torch.float64)
         up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
@@ -91,12 +90,12 @@ def rendered(scene: TrainedScene, camera: Camera) -> np.ndarray:
     return image.clamp(0, 1).mul(255).round().to(torch.uint8).cpu().numpy()
 
 
-def write_film(file: Path, whole: TrainedScene, merged: TrainedScene) -> None:
+def write_film(file: Path, whole: TrainedScene, merged: TrainedScene, frames: int) -> None:
     """The whole above, the merged blocks below."""
     camera = whole.dataset.test[0].camera
     length = max(float(view.camera.position[0]) for view in whole.dataset.train)
     with video_writer(file, camera.width, 2 * camera.height, 24) as add:
-        for each in walk(length, camera):
+        for each in walk(length, camera, frames):
             add(np.concatenate([rendered(whole, each), rendered(merged, each)]))
 
 
@@ -127,8 +126,12 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(240, 160), metavar=("W", "H"))
     parser.add_argument("--blocks", type=int, default=6)
     parser.add_argument("--gaussians", type=int, default=300_000, help="of the whole")
+    parser.add_argument(
+        "--block-gaussians", type=int, default=300_000, help="of the whole, shared by the blocks"
+    )
     parser.add_argument("--iterations", type=int, default=4000, help="of the whole")
-    parser.add_argument("--block-iterations", type=int, default=1500, help="of each block")
+    parser.add_argument("--block-iterations", type=int, default=1600, help="of each block")
+    parser.add_argument("--frames", type=int, default=240, help="of the film")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
 
@@ -137,14 +140,20 @@ def main() -> None:
     dataset = options.dataset or out / "street"
     if not (dataset / "sparse").is_dir():
         write_street_dataset(dataset, options.photos, *options.size)
-    settings = {"max_gaussians": options.gaussians, "seed": options.seed}
-    whole_settings = settings | {"iterations": options.iterations}
+    whole_settings = {
+        "max_gaussians": options.gaussians,
+        "iterations": options.iterations,
+        "seed": options.seed,
+    }
     cost_of_whole = in_process(
         out / "whole.json", train_whole, dataset, out / "whole", whole_settings
     )
     folder = out / "blocks"
     if not (folder / "plan.json").is_file():
-        block_settings = settings | {"iterations": options.block_iterations}
+        block_settings = whole_settings | {
+            "max_gaussians": options.block_gaussians,
+            "iterations": options.block_iterations,
+        }
         plan_blocks(
             dataset, folder, PlanOptions(blocks=options.blocks, settings=block_settings, hold_out=8)
         )
@@ -189,7 +198,7 @@ def main() -> None:
     for name in worst:
         print(f"{name}: {of_merged[name].psnr - of_whole[name].psnr:+.2f} dB")
     write_pictures(out / "worst.png", [tests[name] for name in worst], whole, merged)
-    write_film(out / "film.mp4", whole, merged)
+    write_film(out / "film.mp4", whole, merged, options.frames)
     print(f"{out / 'worst.png'}: photo, whole, merged; {out / 'film.mp4'}: whole, merged")
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from snowsplat import Gaussians, load_dataset, ops, write_gaussians
 from snowsplat.cli.main import main
@@ -152,6 +153,24 @@ def test_a_wrong_dataset_is_a_one_line_error(tmp_path):
     assert run.returncode == 1
     assert run.stderr.startswith("train: ")
     assert len(run.stderr.splitlines()) == 1
+
+
+def test_a_street_in_blocks(tmp_path):
+    arguments = ["blocks.py", "--out", tmp_path, "--photos", 16, "--size", 48, 32, "--blocks", 2]
+    arguments += ["--gaussians", 500, "--iterations", 20, "--block-iterations", 20, "--frames", 4]
+    text = benchmark(*arguments)
+    whole, merged = (
+        [float(cell.replace(",", "")) for cell in line.split()[1:]]
+        for line in (line for line in text.splitlines() if line.startswith(("whole  ", "merged  ")))
+    )
+    assert whole[0] == merged[0] == 14  # every 8th of 16 is held out
+    assert whole[1] == 500
+    assert whole[2] > whole[3] > 0  # memory: with and without Python
+    assert 8 < whole[5] < 40
+    assert whole[5:] == merged[5:]
+    with Image.open(tmp_path / "worst.png") as pictures:
+        assert pictures.size == (3 * 48, 2 * 32)
+    assert (tmp_path / "film.mp4").stat().st_size > 500
 
 
 def test_formats(tmp_path):

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from snowsplat.image.fit import FitOptions
     from snowsplat.lift.lift import LiftOptions
     from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
+    from snowsplat.pipeline.blocks.merge import merge_blocks
+    from snowsplat.pipeline.blocks.plan import PlanOptions, plan_blocks
+    from snowsplat.pipeline.blocks.train import train_blocks
     from snowsplat.pipeline.clean import clean
     from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.convert import Edits, convert
@@ -90,7 +93,11 @@ _MODULES = {
     "make_globe": "pipeline.globe",
     "BenchmarkOptions": "pipeline.benchmark.run",
     "benchmark": "pipeline.benchmark.run",
+    "PlanOptions": "pipeline.blocks.plan",
     "PublishOptions": "pipeline.publish",
+    "merge_blocks": "pipeline.blocks.merge",
+    "plan_blocks": "pipeline.blocks.plan",
+    "train_blocks": "pipeline.blocks.train",
     "publish": "pipeline.publish",
     "read_gaussians": "formats",
     "recipe": "training.recipes",
@@ -116,6 +123,7 @@ __all__ = [
     "LiftResult",
     "MakeOptions",
     "Observer",
+    "PlanOptions",
     "Points",
     "PublishOptions",
     "TrainConfig",
@@ -139,6 +147,8 @@ __all__ = [
     "load_trained",
     "make",
     "make_globe",
+    "merge_blocks",
+    "plan_blocks",
     "publish",
     "read_gaussians",
     "recipe",
@@ -147,6 +157,7 @@ __all__ = [
     "render_video",
     "resume",
     "train",
+    "train_blocks",
     "write_gaussians",
 ]
 

@@ -43,7 +43,7 @@ class Blocks:
       the photos. blocks train trains those that are not finished; after Ctrl-C
       or a crash, the same command continues. Several computers with a shared
       folder can run it at the same time: each trains blocks that no other one
-      trains. The merged scene has no duplicates at the seams.
+      trains.
     """
 
     action: Annotated[

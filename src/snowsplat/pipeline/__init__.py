@@ -9,6 +9,7 @@
     image.py     approximates a photo by 2D Gaussians
     globe.py     puts a scene into a snow globe
     convert.py   merges, edits and converts scene files
+    blocks/      trains a scene that is larger than the memory, in blocks
     describe.py  describes the contents of a file or folder
     watch.py     shows the output folder of a training run in the browser
 

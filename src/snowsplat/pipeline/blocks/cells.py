@@ -25,19 +25,21 @@ class Cell:
     low: tuple[float | None, float | None] = (None, None)
     high: tuple[float | None, float | None] = (None, None)
 
-    def contains(self, ground: Tensor, margin: Sequence[float] = (0.0, 0.0)) -> Tensor:
+    def contains(self, ground: Tensor, margin: Sequence[float] | Tensor = (0.0, 0.0)) -> Tensor:
         """(N,) bool: the points (N, 2) of the plane that are in the cell.
 
         Args:
-            margin: distance by which the cell is expanded, for both directions.
+            margin: distance by which the cell is expanded, for both directions; or one for each
+                point, (N, 2).
         """
+        margins = torch.as_tensor(margin, dtype=torch.float64).expand(len(ground), 2)
         inside = torch.ones(len(ground), dtype=torch.bool)
         for axis in range(2):
             low, high = self.low[axis], self.high[axis]
             if low is not None:
-                inside &= ground[:, axis] >= low - margin[axis]
+                inside &= ground[:, axis] >= low - margins[:, axis]
             if high is not None:
-                inside &= ground[:, axis] < high + margin[axis]
+                inside &= ground[:, axis] < high + margins[:, axis]
         return inside
 
     def split(self, axis: int, at: float) -> tuple[Cell, Cell]:

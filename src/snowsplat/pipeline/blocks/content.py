@@ -15,9 +15,8 @@ from torch import Tensor
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.ops import neighbours
 from snowsplat.pipeline.blocks.cells import Cell, cut, extent, ground_axes
+from snowsplat.pipeline.blocks.plan import Axes
 from snowsplat.scene.geometry import transform_points
-
-Axes = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 # A photo belongs to a block if at least this share of what it shows is in the cell.
 _SHOWN = 0.25
@@ -28,9 +27,9 @@ _WIDEST = 0.1
 # Photos of a block that are tested for whether they show a point outside of it.
 _TESTED_VIEWS = 200
 # Points outside of the expanded cell, as a share of those inside.
-_OUTSIDE = 1.0
+_OUTSIDE = 0.25
 # Additional photos, spread over the rest of the scene, as a share of the others.
-_FAR_VIEWS = 0.0
+_FAR_VIEWS = 0.2
 
 
 @dataclass(frozen=True)
@@ -54,8 +53,10 @@ def block_content(dataset: Dataset, count: int, margin: float) -> tuple[Axes, li
     """Cut a dataset into ``count`` blocks.
 
     The views of a block are those whose cameras are in the cell, expanded by ``margin`` times its
-    size, and those of whose points at least a quarter are in the cell. The points are those in the
-    expanded cell, and a random selection, half as many, of others that these views show.
+    size; those of whose image at least a quarter shows the cell; and, a fifth as many, views that
+    are spread over the rest, because parts of the cell are seen only from afar, for example the sky
+    above it. The points are those in the expanded cell, and a random selection, a quarter as many,
+    of others that these views show.
 
     Returns:
         the axes of the ground plane, and the blocks in the order of `cut`.
@@ -76,8 +77,8 @@ def block_content(dataset: Dataset, count: int, margin: float) -> tuple[Axes, li
         border = [margin * side for side in extent(inside)]
         used = cell.contains(cameras, border) | (shown[:, number] >= _SHOWN)
         far = (~used).nonzero()[:, 0]
-        count = min(len(far), round(_FAR_VIEWS * int(used.sum())))
-        used[far[torch.linspace(0, len(far) - 1, count).long()]] = True
+        added = min(len(far), round(_FAR_VIEWS * int(used.sum())))
+        used[far[torch.linspace(0, len(far) - 1, added).long()]] = True
         own = [view for view, is_used in zip(views, used.tolist(), strict=True) if is_used]
         if points is None:
             blocks.append(BlockContent(cell, own, None, len(own) / len(views)))

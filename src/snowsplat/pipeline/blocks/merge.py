@@ -7,14 +7,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.ply import read_ply, write_ply_parts
 from snowsplat.pipeline.blocks.cells import Cell
-from snowsplat.pipeline.blocks.plan import Plan
+from snowsplat.pipeline.blocks.plan import Axes, Plan
 from snowsplat.pipeline.blocks.train import is_finished, scene_folder
 from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
+
+# Large Gaussians on both sides of a border, such as those of the sky, need not be at the same place
+# in both blocks. Without those that reach across it, there are gaps.
+_REACH = 2.0
 
 
 @dataclass(frozen=True)
@@ -22,8 +31,8 @@ class Merged:
     """A merged scene.
 
     Attributes:
-        gaussians: their number in each block, without those outside of its cell.
-        trained: their number in each block, with those.
+        gaussians: their number of each block, without those outside of its cell.
+        trained: their number of each block, with those.
     """
 
     scene: Path
@@ -34,9 +43,8 @@ class Merged:
 def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged:
     """Write the scene of all blocks to the output folder ``folder``.
 
-    Of each block, it contains the Gaussians whose means are in the cell of the block. Every point
-    is in exactly one cell, so there are neither gaps nor duplicates. The blocks are read one after
-    the other.
+    Of each block, it contains the Gaussians whose means are in the cell of the block, or closer to
+    it than `_REACH` standard deviations. The blocks are read one after the other.
 
     Args:
         output: a PLY file that also gets the scene; it is replaced if it exists.
@@ -80,14 +88,21 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
     return Merged(scene, tuple(counts), tuple(trained))
 
 
+def _deviations(gaussians: Gaussians, axes: Axes) -> Tensor:
+    """(N, 2) standard deviations along the axes of the ground plane."""
+    rotations = rotation_from_quat(gaussians.quats)  # its columns are the axes of the Gaussian
+    along = torch.tensor(axes, dtype=rotations.dtype) @ rotations
+    return (along * gaussians.log_scales.exp()[:, None]).norm(dim=2).double()
+
+
 def _own(plan: Plan, cell: Cell, file: Path) -> Callable[[], tuple[int, GaussianArrays]]:
     """Reads a block: the number of its Gaussians, and those in its cell."""
 
     def read() -> tuple[int, GaussianArrays]:
-        import torch
-
-        gaussians = read_ply(file)
-        ground = plan.ground(torch.from_numpy(gaussians.means))
-        return len(ground), gaussians.select(cell.contains(ground).numpy())
+        arrays = read_ply(file)
+        gaussians = arrays.to_gaussians()
+        reach = _REACH * _deviations(gaussians, plan.axes)
+        own = cell.contains(plan.ground(gaussians.means), reach)
+        return len(gaussians), arrays.select(own.numpy())
 
     return read

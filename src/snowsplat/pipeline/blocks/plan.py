@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from snowsplat._version import __version__
 from snowsplat.pipeline.blocks.cells import Cell
 from snowsplat.pipeline.checkpoint_meta import Recipe
-from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
@@ -26,6 +25,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 PLAN = "plan.json"
+#: The two axes of the ground plane, unit vectors in the world frame.
+Axes = tuple[tuple[float, float, float], tuple[float, float, float]]
 #: More blocks than this are a mistake.
 MOST_BLOCKS = 10_000
 
@@ -57,14 +58,14 @@ class Plan:
         dataset: how the whole dataset is read.
         recipe: the recipe of all blocks.
         settings: changed settings of all blocks, see `TrainOptions`.
-        axes: the two axes of the ground plane, unit vectors in the world frame.
+        axes: those of the ground plane.
         margin: the margin by which cells are expanded, as a share of their size.
     """
 
     dataset: DatasetSettings
     recipe: Recipe
     settings: dict[str, Any]
-    axes: tuple[tuple[float, float, float], tuple[float, float, float]]
+    axes: Axes
     margin: float
     blocks: list[Block]
 
@@ -134,11 +135,7 @@ class PlanOptions:
 
 
 def plan_blocks(
-    dataset: Path | str,
-    folder: Path | str,
-    options: PlanOptions | None = None,
-    *,
-    observer: Observer = SILENT,
+    dataset: Path | str, folder: Path | str, options: PlanOptions | None = None
 ) -> Plan:
     """Cut a dataset into blocks. See `block_content` for the photos and points of a block.
 
@@ -182,17 +179,15 @@ def plan_blocks(
     plan = Plan(settings, options.recipe, dict(options.settings), axes, options.margin, [])
     folder.mkdir(parents=True, exist_ok=True)
     plan.write(folder)  # without blocks: it is unfinished
-    blocks = []
-    report = observer.begin("blocks")
+    limit, blocks, digits = config.density.max_gaussians, [], max(2, len(str(options.blocks)))
     for number, content in enumerate(contents, 1):
-        name = f"block_{number:0{len(str(options.blocks)) if options.blocks > 99 else 2}d}"
-        report(number - 1, len(contents), name)
+        name = f"block_{number:0{digits}d}"
         names = {view.name for view in content.views}
         own = [image for image in posed if image.name in names]
         write_block_dataset(folder / name / "dataset", own, content.points)
-        limit = round(config.density.max_gaussians * content.share)
+        own_limit = max(1, round(limit * content.share)) if limit else 0
         points = 0 if content.points is None else len(content.points)
-        blocks.append(Block(name, content.cell, len(content.views), points, limit))
+        blocks.append(Block(name, content.cell, len(content.views), points, own_limit))
     OutputFolder(folder).describe(whole, settings, config)
     plan = replace(plan, blocks=blocks)
     plan.write(folder)
