@@ -90,10 +90,18 @@ def test_views_without_visible_gaussians(tmp_path):
 
 
 def test_means_and_json():
-    evaluation = Evaluation([ViewMetrics("a", 20.0, 0.5, 0.25), ViewMetrics("b", 30.0, 0.75, 0.5)])
+    evaluation = Evaluation(
+        [ViewMetrics("a", 20.0, 0.5, 21.0, 0.25), ViewMetrics("b", 30.0, 0.75, 33.0, 0.5)]
+    )
     assert (evaluation.psnr, evaluation.ssim, evaluation.lpips) == (25.0, 0.625, 0.375)
     values = json.loads(json.dumps(evaluation.as_json()))
     assert values["psnr"] == 25.0
-    assert values["views"]["b"] == {"psnr": 30.0, "ssim": 0.75, "lpips": 0.5}
+    assert values["views"]["b"] == {
+        "psnr": 30.0,
+        "ssim": 0.75,
+        "psnr_aligned": 33.0,
+        "lpips": 0.5,
+    }
+    assert values["psnr_aligned"] == 27.0
     assert math.isnan(Evaluation([]).psnr)
     assert Evaluation([]).lpips is None

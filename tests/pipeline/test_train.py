@@ -49,6 +49,18 @@ def options(steps: int, **changes) -> TrainOptions:
     return TrainOptions(settings={"iterations": steps}, **changes)
 
 
+def test_learnt_exposures_are_written(dataset, tmp_path):
+    recorder, out = Recorder(), tmp_path / "out"
+    settings = {"iterations": 5, "exposure": "on"}
+    train(dataset, out, TrainOptions(settings=settings, hold_out=8), observer=recorder)
+    assert any(note.startswith("exposure: photos differ by ") for note in recorder.notes)
+    written = json.loads((out / "exposure.json").read_text())
+    names = [view.name for view in load.load_dataset(dataset, hold_out=8).train]
+    assert list(written["photos"]) == names
+    assert abs(sum(red for red, _, _ in written["photos"].values())) < 1e-4
+    assert "Exposures of the photos" in (out / "report.html").read_text(encoding="utf-8")
+
+
 def test_from_a_dataset_to_metrics_and_images_without_printing(dataset, tmp_path, capfd):
     recorder, out = Recorder(), tmp_path / "out"
     result = train(dataset, out, options(5, hold_out=8), observer=recorder)

@@ -25,7 +25,9 @@ class Evaluate(SceneFlags):
     Notes:
       The metrics of each view and their means are printed, and written to
       OUT/metrics.json. The values of renders are clamped to 0..1, but not rounded
-      to 8 bits.
+      to 8 bits. "aligned" is the PSNR after a gain and an offset of each channel of
+      the render were fitted to the photo, so that exposure and white balance of the
+      photo do not count.
 
     To create the file of weights for LPIPS, run this where lpips is installed:
       weights = lpips.LPIPS(net="vgg").state_dict()
@@ -49,11 +51,12 @@ class Evaluate(SceneFlags):
         network = None if self.lpips is None else Lpips.load(self.lpips)
         width = max(4, *(len(view.name) for view in views))
         heading = "LPIPS" if network is None else f"LPIPS ({network.name})"
-        print(f"{'view':{width}}   PSNR    SSIM   {heading}")
+        print(f"{'view':{width}}   PSNR    SSIM  aligned  {heading}")
 
         def show(figures: ViewMetrics | Evaluation, name: str) -> None:
+            aligned = f"{figures.psnr_aligned:6.3f}"
             lpips = "-" if figures.lpips is None else f"{figures.lpips:.4f}"
-            print(f"{name:{width}}  {figures.psnr:6.3f}  {figures.ssim:.4f}  {lpips}")
+            print(f"{name:{width}}  {figures.psnr:6.3f}  {figures.ssim:.4f}   {aligned}  {lpips}")
 
         evaluation = evaluate(
             scene,

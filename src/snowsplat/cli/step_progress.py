@@ -121,6 +121,7 @@ def held_out_line(step: int, evaluation: Evaluation) -> str:
     """Step, number of views, and the mean figures."""
     count = len(evaluation.views)
     figures = f"PSNR {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.3f}"
+    figures += f"  colour-aligned PSNR {evaluation.psnr_aligned:.2f} dB"
     if evaluation.lpips is not None:
         figures += f"  LPIPS {evaluation.lpips:.3f}"
     return f"step {step}: {count} views  {figures}"

@@ -5,6 +5,10 @@ The rendered image is clamped to 0..1, as for a screen or a file, but it is not 
 they are rounded. At 30 dB this costs less than 0.01 dB.) Transparent photos are composited over
 the background colour. If a view has a mask, PSNR ignores the masked pixels. SSIM and LPIPS treat
 them as equal in both images.
+
+The colour-aligned PSNR is measured after a gain and an offset of each channel of the image were
+fitted to the photo, see `color_alignment`. Thus it does not count that the photo has another
+exposure or white balance than the scene. It is listed beside the PSNR and never replaces it.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.data.dataset import View
 from snowsplat.data.image_loader import ImageLoader
+from snowsplat.evaluation.color_alignment import color_aligned
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
@@ -36,6 +41,7 @@ class ViewMetrics:
     name: str
     psnr: float  # dB; infinite for equal images
     ssim: float
+    psnr_aligned: float  # dB; colour-aligned
     lpips: float | None = None
 
 
@@ -60,6 +66,11 @@ class Evaluation:
         return _mean([view.ssim for view in self.views])
 
     @property
+    def psnr_aligned(self) -> float:
+        """Mean colour-aligned PSNR in dB."""
+        return _mean([view.psnr_aligned for view in self.views])
+
+    @property
     def lpips(self) -> float | None:
         """Mean LPIPS; None if it was not measured."""
         values = [view.lpips for view in self.views if view.lpips is not None]
@@ -70,7 +81,13 @@ class Evaluation:
         views = {view.name: asdict(view) for view in self.views}
         for metrics in views.values():
             del metrics["name"]
-        return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips, "views": views}
+        means = {
+            "psnr": self.psnr,
+            "ssim": self.ssim,
+            "psnr_aligned": self.psnr_aligned,
+            "lpips": self.lpips,
+        }
+        return {**means, "views": views}
 
 
 def _mean(values: list[float]) -> float:
@@ -118,6 +135,7 @@ def compare(
         name=name,
         psnr=psnr(image, target, mask),
         ssim=float(ops.ssim(image, target)),
+        psnr_aligned=psnr(color_aligned(image, target, mask), target, mask),
         lpips=None if lpips is None else lpips(image, target),
     )
 

@@ -50,7 +50,7 @@ _NAMESPACE_LIMIT = 1 << 20  # characters
 _STORED_WORDS = 4
 _SCENE = re.compile(r"iteration_(\d+)")
 _RESULTS = ("point_cloud", "checkpoints", "train", "test", "videos", "films")
-_REPORTS = ("metrics.json", "history.json", "report.html")
+_REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html")
 _FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
 
 
@@ -189,6 +189,10 @@ class OutputFolder:
         for folder in (self.path / "point_cloud").glob("iteration_*"):
             if not (folder / "point_cloud.ply").exists():
                 shutil.rmtree(folder, ignore_errors=True)
+
+    def write_exposure(self, exposures: dict[str, list[float]]) -> None:
+        """Write `exposure.json`: the exposure of each training photo in EV, for each channel."""
+        write_json(self.path / "exposure.json", {"unit": "EV", "photos": exposures})
 
     def discard(self) -> None:
         """Remove what `begin` wrote, if there is neither a scene nor a checkpoint."""

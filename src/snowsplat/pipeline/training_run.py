@@ -306,6 +306,8 @@ class TrainingRun:
             assert self.evaluation is not None
             self.out.write_metrics(step, "test", self.evaluation[1], self._left_out())
         self.history.write(self.out.history)
+        if self.trainer.exposure.active:
+            self.out.write_exposure(self._exposures())
         report = self._write_report(gaussians)
         time_used = None
         if self.budget is not None:
@@ -328,6 +330,11 @@ class TrainingRun:
         self.observer.trained(result)
         return result
 
+    def _exposures(self) -> dict[str, list[float]]:
+        """The exposure of each training photo in EV, by name: red, green, blue."""
+        names = (view.name for view in self.trainer.dataset.train)
+        return dict(zip(names, self.trainer.exposure.ev.tolist(), strict=True))
+
     def _write_report(self, gaussians: Gaussians) -> Path:
         from snowsplat.training.config import config_to_json
         from snowsplat.training.report import Trained, write_training_report
@@ -348,6 +355,7 @@ class TrainingRun:
                 history=self.history,
                 evaluation=None if self.evaluation is None else self.evaluation[1],
                 left_out=self._left_out(),
+                exposures=tuple(self.trainer.exposure.ev.mean(1).tolist()),
                 ended_early=self._ended_early(),
                 settings={
                     "recipe": self.recipe,

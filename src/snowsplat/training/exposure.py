@@ -18,6 +18,7 @@ Where a photo is overexposed, it only says that the image is at least as bright.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -27,7 +28,7 @@ from snowsplat.data.dataset import Dataset
 from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import Photos
 from snowsplat.ops.splats import COLORS, Splats2D
-from snowsplat.training.exposure_start import ExposureStart, exposure_start
+from snowsplat.training.exposure_start import GAMMA, ExposureStart, exposure_start
 from snowsplat.training.shards import Shards
 from snowsplat.training.step_schedule import Schedule
 
@@ -89,6 +90,12 @@ class Exposure:
         self._gain = torch.ones(3)  # of the present view
         self._gradients: list[Tensor] = []  # of the views of this process in the present step
         self._overexposed: dict[tuple[int, int], bool] = {}  # by view and height
+
+    @property
+    def ev(self) -> Tensor:
+        """(V, 3) on the CPU: the exposures in EV, relative to their mean; no rows if not learnt."""
+        rows = self.log_gains if self.active else self.log_gains[:0]
+        return GAMMA / math.log(2.0) * rows.cpu()
 
     def begin_step(self) -> None:
         """Forget the gradients of the last attempt."""

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import View
 from snowsplat.data.image_loader import ImageLoader
+from snowsplat.evaluation.color_alignment import color_fit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
 
@@ -104,20 +105,17 @@ def fitted(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> tuple[fl
         the image explains, 0 to 1. Both have their largest value for a photo of one colour, and
         if the mask leaves no pixel.
     """
-    if mask is None:
-        x, y = image.flatten(0, 1), photo.flatten(0, 1)
-    else:
-        x, y = image[mask], photo[mask]
-    if not len(y):
+    fit = color_fit(image, photo, mask)
+    if fit is None:
         return _HIGHEST_PSNR, 1.0
-    x, y = x.double(), y.double()
-    x, y = x - x.mean(0), y - y.mean(0)
-    gain = (x * y).sum(0) / x.square().sum(0).clamp_min(1e-12)
-    # A negative gain would invert the image.
-    rest = y - gain.clamp_min(0.0) * x
-    error, variance = torch.stack([rest.square().mean(), y.square().mean()]).tolist()
+    gain, offset = fit
+    rest, photo = photo.double() - gain * image.double() - offset, photo.double()
+    if mask is not None:
+        rest, photo = rest[mask], photo[mask]
+    variance = photo.flatten(0, -2).var(0, correction=0).mean()
+    error, variance = torch.stack([rest.square().mean(), variance]).tolist()
     psnr = -10.0 * math.log10(max(error, 10.0 ** (-_HIGHEST_PSNR / 10.0)))
-    return psnr, 1.0 - error / variance if variance > 0.0 else 1.0
+    return psnr, max(0.0, 1.0 - error / variance) if variance > 0.0 else 1.0
 
 
 def standing_out(

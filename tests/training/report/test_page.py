@@ -96,6 +96,14 @@ def test_the_page_contains_the_results(trained, tmp_path):
     assert all(content.count(view.name) >= 1 for view in evaluation.views)
 
 
+def test_the_exposures_of_the_photos(trained, tmp_path):
+    page = tmp_path / "report.html"
+    write_training_report(page, Trained(**trained, exposures=(0.5, -1.0, 0.5)))
+    titles = [e.text for e in ET.parse(page).iter("{http://www.w3.org/2000/svg}title")]
+    assert titles[-1] == "exposure, EV"
+    assert "Exposures of the photos" in words(page)
+
+
 def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path):
     dataset = trained["dataset"]
     without_test = type(dataset)(dataset.train, [], dataset.points, dataset.extent)

@@ -53,6 +53,7 @@ class Trained:
             evaluated.
         settings: the settings by name, as JSON values.
         left_out: names of the training views that the training has left out.
+        exposures: the learnt exposure of each training view in EV; empty if none is learnt.
         ended_early: why the training ended before its last planned step; None if it did not.
         peak_bytes: peak memory; 0 if unknown.
     """
@@ -66,6 +67,7 @@ class Trained:
     evaluation: Evaluation | None
     settings: dict[str, Any]
     left_out: tuple[str, ...] = ()
+    exposures: tuple[float, ...] = ()
     ended_early: str | None = None
     peak_bytes: int = 0
 
@@ -92,6 +94,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
             _ended_early(trained.ended_early),
             _left_out(trained.left_out),
             _curves(trained.history),
+            _exposures(trained.exposures),
             pictures.compared(trained.gaussians, views, evaluation, trained.background),
             _figures(evaluation, held_out),
             _settings(trained),
@@ -122,6 +125,7 @@ def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
     figures = [
         (f"{evaluation.psnr:.2f} dB", f"PSNR, {where}"),
         (f"{evaluation.ssim:.3f}", f"SSIM, {where}"),
+        (f"{evaluation.psnr_aligned:.2f} dB", f"colour-aligned PSNR, {where}"),
         (f"{len(trained.gaussians):,}", "Gaussians"),
         (f"{trained.step:,}", "steps"),
         (duration(trained.history.seconds), "of training"),
@@ -191,6 +195,24 @@ def _curves(history: History) -> str:
     return f'<h2>The training</h2>\n<div class="charts">{figures}</div>' if figures else ""
 
 
+def _exposures(exposures: tuple[float, ...]) -> str:
+    """The exposures of the training photos, in the order of their names."""
+    if not any(exposures):
+        return ""
+    drawing = charts.chart(
+        [(float(i), ev) for i, ev in enumerate(exposures, 1)],
+        x_label="training photo",
+        y_label="exposure, EV",
+        dots=True,
+        from_zero=False,
+    )
+    return (
+        "<h2>Exposures of the photos</h2>\n<p>In EV (factors of two of light), relative to their "
+        "mean, which is the exposure of the scene.</p>\n"
+        f'<div class="charts"><figure>{drawing}</figure></div>'
+    )
+
+
 def _figures(evaluation: Evaluation, held_out: bool) -> str:
     """The table of views. A bar shows the error of each view."""
     errors = [_rms(metrics.psnr) for metrics in evaluation.views]
@@ -200,6 +222,7 @@ def _figures(evaluation: Evaluation, held_out: bool) -> str:
             text(metrics.name),
             f"{metrics.psnr:.2f}&#160;dB",
             f"{metrics.ssim:.3f}",
+            f"{metrics.psnr_aligned:.2f}&#160;dB",
             f"{100 * error:.1f}%",
             bar(error / largest),
         ]
@@ -208,7 +231,7 @@ def _figures(evaluation: Evaluation, held_out: bool) -> str:
     more = len(evaluation.views) - _LISTED
     rest = f'<p class="soft">… and {more:,} more, see metrics.json.</p>' if more > 0 else ""
     which = "held-out" if held_out else "evaluated"
-    heads = ["photo", "PSNR", "SSIM", "RMS error", ""]
+    heads = ["photo", "PSNR", "SSIM", "colour-aligned PSNR", "RMS error", ""]
     return f"<h2>Each {which} photo</h2>\n{table(heads, rows)}{rest}"
 
 
