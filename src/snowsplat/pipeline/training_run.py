@@ -14,6 +14,7 @@ from snowsplat.pipeline.memory_use import MemoryUse
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.processes import Announcement
+from snowsplat.pipeline.refined_cameras import write_refined
 from snowsplat.pipeline.time_budget import TimeBudget
 from snowsplat.training.history import History
 from snowsplat.util.errors import UserError
@@ -50,6 +51,8 @@ class TrainResult:
             explain them; see ``TrainConfig.leave_out_after``.
         ended_early: the line about a training run that ends before its last planned step, because
             the scene overfits; otherwise None. See ``TrainConfig.stop_overfitting``.
+        poses: the line about the camera poses: how far they were refined, or that they are not
+            exact; None if there is nothing to say.
         time: the seconds that were used, including earlier runs, and the time budget in seconds;
             None without a time budget.
     """
@@ -65,6 +68,7 @@ class TrainResult:
     evaluation: tuple[int, Evaluation] | None
     left_out: tuple[str, ...]
     ended_early: str | None
+    poses: str | None
     time: tuple[float, float] | None
 
 
@@ -245,6 +249,11 @@ class TrainingRun:
 
     def _write_scene(self, gaussians: Gaussians) -> Path:
         self._restore_folder()
+        poses = self.trainer.poses
+        if poses.on:
+            views = [*poses.views(), *poses.test_views()]
+            self.out.write_cameras(views)
+            write_refined(self.out.path, views, replace(self.settings, resolution=-1).load())
         return self.out.write_scene(self.trainer.step, gaussians)
 
     def _all_gaussians(self) -> Gaussians:
@@ -306,7 +315,8 @@ class TrainingRun:
             assert self.evaluation is not None
             self.out.write_metrics(step, "test", self.evaluation[1], self._left_out())
         self.history.write(self.out.history)
-        report = self._write_report(gaussians)
+        poses = self._about_poses(gaussians)
+        report = self._write_report(gaussians, poses)
         time_used = None
         if self.budget is not None:
             self.out.write_config(self.settings, replace(self.config, iterations=step))
@@ -323,12 +333,29 @@ class TrainingRun:
             evaluation=self.evaluation,
             left_out=self._left_out(),
             ended_early=self._ended_early(),
+            poses=poses,
             time=time_used,
         )
         self.observer.trained(result)
         return result
 
-    def _write_report(self, gaussians: Gaussians) -> Path:
+    def _about_poses(self, gaussians: Gaussians) -> str | None:
+        """The line about the camera poses; see `TrainResult.poses`."""
+        from snowsplat.training.misalignment import misalignment
+
+        trainer, poses = self.trainer, self.trainer.poses
+        if poses.on:
+            return str(poses.drift())
+        used = [v for i, v in enumerate(poses.views()) if i not in trainer.left_out]
+        pixels = misalignment(gaussians, used, self.out.settings()[1])
+        if pixels is None:
+            return None
+        return (
+            f"the photos are off by {pixels:.1f} pixels in the median: the camera poses are not "
+            "exact; try --refine-poses"
+        )
+
+    def _write_report(self, gaussians: Gaussians, about_poses: str | None) -> Path:
         from snowsplat.training.config import config_to_json
         from snowsplat.training.report import Trained, write_training_report
 
@@ -341,7 +368,11 @@ class TrainingRun:
             self.out.report,
             Trained(
                 name=out.resolve().name if out.is_absolute() else str(out),
-                dataset=self.trainer.dataset,
+                dataset=replace(
+                    self.trainer.dataset,
+                    train=self.trainer.poses.views(),
+                    test=self.trainer.poses.test_views(),
+                ),
                 gaussians=gaussians,
                 step=self.trainer.step,
                 background=self.out.settings()[1],
@@ -349,6 +380,7 @@ class TrainingRun:
                 evaluation=None if self.evaluation is None else self.evaluation[1],
                 left_out=self._left_out(),
                 ended_early=self._ended_early(),
+                poses=about_poses,
                 settings={
                     "recipe": self.recipe,
                     "capture": dataset,

@@ -54,6 +54,7 @@ class Trained:
         settings: the settings by name, as JSON values.
         left_out: names of the training views that the training has left out.
         ended_early: why the training ended before its last planned step; None if it did not.
+        poses: the line about the camera poses; None if there is nothing to say.
         peak_bytes: peak memory; 0 if unknown.
     """
 
@@ -67,6 +68,7 @@ class Trained:
     settings: dict[str, Any]
     left_out: tuple[str, ...] = ()
     ended_early: str | None = None
+    poses: str | None = None
     peak_bytes: int = 0
 
 
@@ -91,6 +93,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
             _cards(trained, evaluation, held_out),
             _ended_early(trained.ended_early),
             _left_out(trained.left_out),
+            _poses(trained.poses),
             _curves(trained.history),
             pictures.compared(trained.gaussians, views, evaluation, trained.background),
             _figures(evaluation, held_out),
@@ -131,6 +134,10 @@ def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
 
 def _ended_early(why: str | None) -> str:
     return "" if why is None else f"<p>The training {text(why)}.</p>"
+
+
+def _poses(line: str | None) -> str:
+    return "" if line is None else f"<p>{text(line[:1].upper() + line[1:])}.</p>"
 
 
 def _left_out(names: tuple[str, ...]) -> str:
