@@ -29,7 +29,14 @@ RUNS = [
         "exposure": "on",
         "transients": "on",
     },
-    {**DENSE, "batch": 3, "name": "mcmc-short", "densify_until": 100, "test_iterations": (50,)},
+    {
+        **DENSE,
+        "batch": 3,
+        "name": "mcmc-short",
+        "densify_until": 100,
+        "test_iterations": (50,),
+        "refine_poses": True,
+    },
     {
         **DENSE,
         "batch": 2,

@@ -80,6 +80,8 @@ class TerminalObserver(Observer):
         print(f"{result.report}: the report of the training")
         if result.evaluation is not None:
             print(held_out_line(*result.evaluation))
+        if result.poses is not None:
+            print(result.poses)
         if result.time is not None:
             spent, given = map(duration, result.time)
             print(f"{spent} in total, of {given}")

@@ -52,6 +52,11 @@ class JobFlags:
     feature_lr: Annotated[float | None, flag("F", default=RECIPE)] = None
     """Set --lr-sh-dc to F and --lr-sh-rest to F/20, as in the reference implementation."""
 
+    refine_poses: Annotated[bool, switch()] = False
+    """Optimise the poses and focal lengths of the photos together with the scene, if they are not
+    exact. The refined cameras are written to OUT/cameras.json and, as a COLMAP model, to
+    OUT/refined/sparse/0."""
+
     view: Annotated[bool, switch()] = False
     """Show the training in the browser: the scene, curves of loss and PSNR, and a button to pause.
     After the training, the page stays open until Ctrl-C."""
@@ -116,6 +121,8 @@ class TrainFlags(ConfigFlags, JobFlags):
 
     def _settings(self) -> dict[str, Any]:
         settings = self.config_settings()
+        if self.refine_poses:
+            settings["refine_poses"] = True
         if self.white_background and settings.setdefault("background", "white") != "white":
             raise UserError("-w and --background set different colours; use one of them")
         if self.feature_lr is not None:

@@ -91,9 +91,10 @@ struct ProjectBackwardParams {
   GaussianTensors<T> gaussians;
   CameraParams<T> camera;
   const T* grad_packed;        // (n, 16)
-  GaussianGradients<T> grads;  // in and out: the gradients are added
-  double* pose;  // out, (project_pose_blocks, 15) sums, which the caller adds; or null
-  SNOW_FIELDS(n, ids, gaussians, camera, grad_packed, grads, pose)
+  GaussianGradients<T> grads;  // in and out: the gradients are added; or all null
+  double* pose;     // out, (project_pose_blocks, 16) sums, which the caller adds; or null
+  double rounding;  // each term t of these sums is (t + rounding) - rounding, in double
+  SNOW_FIELDS(n, ids, gaussians, camera, grad_packed, grads, pose, rounding)
 };
 
 // ---- adam_step ----------------------------------------------------------------------------------

@@ -147,8 +147,9 @@ struct SplatGradient {  // with respect to the geometric columns of Splats2D
 };
 
 template <class Real>
-struct PoseGradient {  // with respect to cam_from_world, from one Gaussian
+struct PoseGradient {  // with respect to cam_from_world and log f, from one Gaussian
   Real rotation[9], translation[3];
+  Real log_focal;  // of fx and fy together
 };
 
 // `grad` receives the gradients of mean, log_scale, quat and opacity_logit. `pose` may be null.
@@ -227,6 +228,10 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
       pose->rotation[3 + k] += j11 * dT[3 + k];
       pose->rotation[6 + k] += j02 * dT[k] + j12 * dT[3 + k];
     }
+    // f multiplies the offset of the mean from the principal point, and J. If u is clamped, f u is
+    // constant, and so is this element of J.
+    pose->log_focal = d.mean2d[0] * fx * u + d.mean2d[1] * fy * v + dj00 * j00 + dj11 * j11 +
+                      select(free_x, dj02 * j02, zero) + select(free_y, dj12 * j12, zero);
   }
 
   // M = R S.

@@ -5,6 +5,7 @@ gradient of the splats to the parameters and updates them.
 """
 
 from snowsplat.ops.adam import adam_step
+from snowsplat.ops.camera_gradient import camera_gradient
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.devices import default_device, resolve_device
 from snowsplat.ops.native import get_num_threads, set_num_threads
@@ -22,6 +23,7 @@ __all__ = [
     "accumulate_screen_statistics",
     "adam_step",
     "add_project_gradients",
+    "camera_gradient",
     "count_blended",
     "default_device",
     "get_num_threads",

@@ -41,12 +41,12 @@ class GaussianTensors(Params):
 
 @dataclass(slots=True, kw_only=True)
 class GaussianGradients(Params):
-    means: Tensor
-    log_scales: Tensor
-    quats: Tensor
-    opacity_logits: Tensor
-    sh_dc: Tensor
-    sh_rest: Tensor
+    means: Tensor | None = None
+    log_scales: Tensor | None = None
+    quats: Tensor | None = None
+    opacity_logits: Tensor | None = None
+    sh_dc: Tensor | None = None
+    sh_rest: Tensor | None = None
 
 
 # ------------------------------------------------------------------------------------- project
@@ -78,6 +78,7 @@ class ProjectBackwardParams(Params):
     grad_packed: Tensor
     grads: GaussianGradients
     pose: Tensor | None
+    rounding: float = 0.0
 
 
 # ----------------------------------------------------------------------------------- adam_step

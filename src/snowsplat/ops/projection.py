@@ -124,7 +124,7 @@ def add_project_gradients(
         ProjectBackwardParams(
             n=len(ids),
             ids=ids,
-            gaussians=_gaussian_tensors(sh_degree, *(t.contiguous() for t in tensors.values())),
+            gaussians=gaussian_tensors(sh_degree, *(t.contiguous() for t in tensors.values())),
             camera=camera,
             grad_packed=packed_grad.contiguous(),
             grads=GaussianGradients(**{name: grads[name] for name in _NAMES}),
@@ -211,7 +211,7 @@ class _Project(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
         parameters = tuple(p.detach().contiguous() for p in parameters)
-        gaussians = _gaussian_tensors(sh_degree, *parameters)
+        gaussians = gaussian_tensors(sh_degree, *parameters)
         means = gaussians.means
         ids = scratch.empty((len(means),), torch.int32, means.device)
         rows = launch(
@@ -245,30 +245,33 @@ class _Project(torch.autograd.Function):
             ProjectBackwardParams(
                 n=len(ids),
                 ids=ids,
-                gaussians=_gaussian_tensors(ctx.sh_degree, *parameters),
+                gaussians=gaussian_tensors(ctx.sh_degree, *parameters),
                 camera=replace(ctx.camera, cam_from_world=cam_from_world),
                 grad_packed=grad_packed.contiguous(),
                 grads=GaussianGradients(**dict(zip(_NAMES, grads, strict=True))),
                 pose=pose,
             ),
         )
-        return None, None, _pose_grad(cam_from_world, pose), *grads
+        d_pose = None if pose is None else pose_gradient(sum_of_rows(pose), cam_from_world)
+        return None, None, d_pose, *grads
 
 
 _NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 
 
-def _gaussian_tensors(sh_degree: int, *parameters: Tensor) -> GaussianTensors:
+def gaussian_tensors(sh_degree: int, *parameters: Tensor) -> GaussianTensors:
     tensors = dict(zip(_NAMES, parameters, strict=True))
     return GaussianTensors(**tensors, sh_rest_rows=tensors["sh_rest"].shape[1], sh_degree=sh_degree)
 
 
-def _pose_grad(cam_from_world: Tensor, pose: Tensor | None) -> Tensor | None:
-    """The gradient (3, 4) from the kernel's sums: 9 for R, 3 for t, 3 for the centre c = −Rᵀ t."""
-    if pose is None:
-        return None
-    total = sum_of_rows(pose)
-    d_rotation, d_translation, d_centre = total[:9].view(3, 3), total[9:12], total[12:]
+def pose_gradient(sums: Tensor, cam_from_world: Tensor) -> Tensor:
+    """The gradient (3, 4) of a pose from the kernel's sums.
+
+    Args:
+        sums: (16,): 9 for R, 3 for t, 3 for the centre c = −Rᵀ t. The last one, for the focal
+            length, is not used.
+    """
+    d_rotation, d_translation, d_centre = sums[:9].view(3, 3), sums[9:12], sums[12:15]
     rotation, translation = cam_from_world[:, :3].double(), cam_from_world[:, 3].double()
     d_rotation = d_rotation - torch.outer(translation, d_centre)
     d_translation = d_translation - rotation @ d_centre

@@ -115,8 +115,8 @@ def _project_rows(
     cam_from_world: Tensor,
     width: int,
     height: int,
-    fx: float,
-    fy: float,
+    fx: float | Tensor,
+    fy: float | Tensor,
     cx: float,
     cy: float,
     sh_degree: int,
@@ -139,8 +139,8 @@ def _project_rows(
     # is unbounded far outside of the image, so x/z and y/z are clamped to the image and a margin
     # around it. (M, 2, 3)
     x_margin, y_margin = JACOBIAN_MARGIN * width, JACOBIAN_MARGIN * height
-    tx = (x / z).clamp(-(cx + x_margin) / fx, (width - cx + x_margin) / fx)
-    ty = (y / z).clamp(-(cy + y_margin) / fy, (height - cy + y_margin) / fy)
+    tx = (fx * x / z).clamp(-(cx + x_margin), width - cx + x_margin) / fx
+    ty = (fy * y / z).clamp(-(cy + y_margin), height - cy + y_margin) / fy
     zero = torch.zeros_like(z)
     J_rows = [fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z]
     J = torch.stack(J_rows, dim=1).reshape(-1, 2, 3)
@@ -254,6 +254,38 @@ def add_project_gradients(
         of_rows = torch.autograd.grad(splats.packed, selected, packed_grad)
     for name, grad in zip(PARAMETERS, of_rows, strict=True):
         grads[name][rows] += grad
+
+
+@torch.no_grad()
+def camera_gradient(
+    params: Mapping[str, Tensor],
+    ids: Tensor,
+    packed_grad: Tensor,
+    cam_from_world: Tensor,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sh_degree: int,
+) -> tuple[Tensor, Tensor]:
+    """Propagates the gradient of splats through `project` to the camera.
+
+    params, ids and packed_grad are those of `add_project_gradients`. Returns the gradients with
+    respect to `cam_from_world`, (3, 4), and to the logarithm of a factor of fx and fy, ().
+    """
+    pose = cam_from_world.to(packed_grad)
+    with torch.enable_grad():
+        pose = pose.clone().requires_grad_()
+        factor = pose.new_ones((), requires_grad=True)
+        selected = [params[name].detach()[ids.long()] for name in PARAMETERS]
+        view = (width, height, factor * fx, factor * fy, cx, cy, sh_degree)
+        splats, _ = _project_rows(selected, pose, *view)
+        # At the factor 1, the derivative by the factor is that by its logarithm.
+        d_pose, d_factor = torch.autograd.grad(splats.packed, (pose, factor), packed_grad)
+    return d_pose, d_factor
 
 
 # -------------------------------------------------------------------------------------- rasterize

@@ -1,7 +1,7 @@
 """`OutputFolder`: the files of a training run, in the layout of the reference implementation.
 
     OUT/cfg_args                                   settings, in the format of that implementation
-    OUT/cameras.json                               all cameras
+    OUT/cameras.json                               all cameras, refined if the training did so
     OUT/input.ply                                  the points that the training started from
     OUT/point_cloud/iteration_N/point_cloud.ply    the scene after N steps
     OUT/config.json                                *all settings
@@ -11,6 +11,7 @@
     OUT/report.html                                *a page about the training
     OUT/masks/NAME.png                             *masks of what moves, if something moves
     OUT/test/ours_N/renders, gt                    rendered images and photos; also train/
+    OUT/refined/sparse/0                           *a COLMAP model with refined cameras
     OUT/videos/                                    *rendered videos (films/ in earlier versions)
 
 The reference implementation does not write the entries marked *. Its folders are read too.
@@ -22,7 +23,7 @@ import argparse
 import ast
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -42,7 +43,7 @@ from snowsplat.util.safe_json import from_json, read_json
 if TYPE_CHECKING:
     from PIL import Image
 
-    from snowsplat.data import Dataset, DatasetFiles
+    from snowsplat.data import Dataset, DatasetFiles, View
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.config import TrainConfig
@@ -59,7 +60,7 @@ _NAMESPACE_LIMIT = 1 << 20  # characters
 # have three words, NAME = VALUE; one more word is stored to detect longer arguments.
 _STORED_WORDS = 4
 _SCENE = re.compile(r"iteration_(\d+)")
-_RESULTS = ("point_cloud", "checkpoints", "train", "test", "videos", "films", "masks")
+_RESULTS = ("point_cloud", "checkpoints", "refined", "train", "test", "videos", "films", "masks")
 _REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html")
 _FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
 
@@ -157,8 +158,6 @@ class OutputFolder:
 
     def describe(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
         """Write the files that are known before the first step: settings, cameras, points."""
-        from snowsplat.scene.camera_json import write_cameras
-
         self.path.mkdir(parents=True, exist_ok=True)
         self.write_config(settings, config)  # from now on, `is_output_folder` is true
         if dataset.points is not None:
@@ -166,7 +165,12 @@ class OutputFolder:
 
             points = dataset.points
             write_points(self.path / "input.ply", points.xyz.numpy(), points.rgb.numpy())
-        views = [*dataset.train, *dataset.test]
+        self.write_cameras([*dataset.train, *dataset.test])
+
+    def write_cameras(self, views: Sequence[View]) -> None:
+        """Write `cameras.json`."""
+        from snowsplat.scene.camera_json import write_cameras
+
         cameras = ((Path(view.name).stem, view.camera) for view in views)
         write_cameras(self.path / "cameras.json", cameras)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output_folder import SCENE, OutputFolder
+from snowsplat.pipeline.refined_cameras import with_refined
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -67,13 +68,16 @@ def load_trained(
 def load_dataset_of(
     folder: OutputFolder, dataset: Path | str | None = None, resolution: int | None = None
 ) -> tuple[Dataset, Color]:
-    """The dataset of the training in ``folder``, and its background colour; see `load_trained`."""
+    """The dataset of the training in ``folder``, and its background colour; see `load_trained`.
+
+    If the training has refined the cameras, they are those of the dataset.
+    """
     settings, background = folder.settings()
     if dataset is not None:
         settings = replace(settings, path=str(dataset))
     if resolution is not None:
         settings = replace(settings, resolution=resolution)
-    return settings.load(), background
+    return with_refined(folder.path, settings.load()), background
 
 
 def existing_folder(path: Path) -> OutputFolder:

@@ -14,6 +14,7 @@ from snowsplat.pipeline.memory_use import MemoryUse
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.processes import Announcement
+from snowsplat.pipeline.refined_cameras import write_refined
 from snowsplat.pipeline.time_budget import TimeBudget
 from snowsplat.training.history import History
 from snowsplat.util.errors import UserError
@@ -52,6 +53,8 @@ class TrainResult:
             ``TrainConfig.transients``.
         ended_early: the line about a training run that ends before its last planned step, because
             the scene overfits; otherwise None. See ``TrainConfig.stop_overfitting``.
+        poses: the line about the camera poses: how far they were refined, or that they are not
+            exact; None if there is nothing to say.
         time: the seconds that were used, including earlier runs, and the time budget in seconds;
             None without a time budget.
     """
@@ -68,6 +71,7 @@ class TrainResult:
     left_out: tuple[str, ...]
     moving: Mapping[str, float]
     ended_early: str | None
+    poses: str | None
     time: tuple[float, float] | None
 
 
@@ -257,6 +261,11 @@ class TrainingRun:
 
     def _write_scene(self, gaussians: Gaussians) -> Path:
         self._restore_folder()
+        poses = self.trainer.poses
+        if poses.on:
+            views = [*poses.views(), *poses.test_views()]
+            self.out.write_cameras(views)
+            write_refined(self.out.path, views, replace(self.settings, resolution=-1).load())
         return self.out.write_scene(self.trainer.step, gaussians)
 
     def _all_gaussians(self) -> Gaussians:
@@ -321,7 +330,8 @@ class TrainingRun:
         if self.trainer.exposure.active:
             self.out.write_exposure(self._exposures())
         self.out.write_masks(self.trainer.transients.pictures())
-        report = self._write_report(gaussians)
+        poses = self._about_poses(gaussians)
+        report = self._write_report(gaussians, poses)
         time_used = None
         if self.budget is not None:
             self.out.write_config(self.settings, replace(self.config, iterations=step))
@@ -339,6 +349,7 @@ class TrainingRun:
             left_out=self._left_out(),
             moving=self._moving(),
             ended_early=self._ended_early(),
+            poses=poses,
             time=time_used,
         )
         self.observer.trained(result)
@@ -349,7 +360,23 @@ class TrainingRun:
         names = (view.name for view in self.trainer.dataset.train)
         return dict(zip(names, self.trainer.exposure.ev.tolist(), strict=True))
 
-    def _write_report(self, gaussians: Gaussians) -> Path:
+    def _about_poses(self, gaussians: Gaussians) -> str | None:
+        """The line about the camera poses; see `TrainResult.poses`."""
+        from snowsplat.training.misalignment import misalignment
+
+        trainer, poses = self.trainer, self.trainer.poses
+        if poses.on:
+            return str(poses.drift())
+        used = [v for i, v in enumerate(poses.views()) if i not in trainer.left_out]
+        pixels = misalignment(gaussians, used, self.out.settings()[1])
+        if pixels is None:
+            return None
+        return (
+            f"the photos are off by {pixels:.1f} pixels in the median: the camera poses are not "
+            "exact; try --refine-poses"
+        )
+
+    def _write_report(self, gaussians: Gaussians, about_poses: str | None) -> Path:
         from snowsplat.training.config import config_to_json
         from snowsplat.training.report import Trained, write_training_report
 
@@ -362,7 +389,11 @@ class TrainingRun:
             self.out.report,
             Trained(
                 name=out.resolve().name if out.is_absolute() else str(out),
-                dataset=self.trainer.dataset,
+                dataset=replace(
+                    self.trainer.dataset,
+                    train=self.trainer.poses.views(),
+                    test=self.trainer.poses.test_views(),
+                ),
                 gaussians=gaussians,
                 step=self.trainer.step,
                 background=self.out.settings()[1],
@@ -372,6 +403,7 @@ class TrainingRun:
                 exposures=tuple(self.trainer.exposure.ev.mean(1).tolist()),
                 masks=self.trainer.transients.pictures(),
                 ended_early=self._ended_early(),
+                poses=about_poses,
                 settings={
                     "recipe": self.recipe,
                     "capture": dataset,

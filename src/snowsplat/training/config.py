@@ -73,6 +73,8 @@ class TrainConfig:
             worse; see `overfitting`.
         exposure: whether a gain for each photo and channel is learnt, because the photos have
             different exposures; see `exposure`. "auto": if they differ by 0.05 EV or more.
+        refine_poses: whether the poses and focal lengths of the training views are optimised,
+            too; see `pose_refinement`.
         image_memory: bytes for decoded images, in each process; 0: half of the available memory,
             for all processes of the computer together.
         test_iterations: steps after which `Trainer.run` evaluates the test views.
@@ -107,6 +109,7 @@ class TrainConfig:
     transients: TransientsMode = "off"
     stop_overfitting: bool = False
     exposure: Literal["auto", "on", "off"] = "off"
+    refine_poses: bool = False
     image_memory: int = 0
     test_iterations: tuple[int, ...] = (7_000, 30_000)
     checkpoint_every: int = 0

@@ -25,6 +25,7 @@ from snowsplat.training.near_limit import NearLimit
 from snowsplat.training.neutral_photos import NeutralPhotos
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
+from snowsplat.training.pose_refinement import PoseRefinement
 from snowsplat.training.scale_limit import ScaleLimit
 from snowsplat.training.sharded_render import sharded_render
 from snowsplat.training.shards import ALONE, Shards
@@ -75,6 +76,7 @@ class Trainer:
     Attributes:
         exposure: the gains of the training photos.
         gaussians: the scene after ``step`` steps, on ``device``.
+        poses: the cameras of the views, which are refined if ``TrainConfig.refine_poses`` is set.
         transients: the masks of what moves; see ``TrainConfig.transients``.
         within_step: True during a step. It stays True if an error or a second Ctrl-C interrupts a
             step: the state is then inconsistent and must not be saved.
@@ -121,7 +123,7 @@ class Trainer:
             for i, name in enumerate(GENERATORS)
         }
         self.device = device or torch.device("cpu")
-        self._cameras = [view.camera.to(self.device) for view in dataset.train]
+        cameras = [view.camera.to(self.device) for view in dataset.train]
         self._background = Background(
             config.background, self._generators["background"], self.device
         )
@@ -132,8 +134,11 @@ class Trainer:
             or available_memory(self.device) // (2 * shards.in_memory),
             device=self.device,
         )
+        self.poses = PoseRefinement(
+            *(config.refine_poses, dataset, cameras, self._images, self.schedule, shards)
+        )
         self._queue = ViewQueue(
-            *(dataset.train, self._cameras, self._images, self._background, self._downscale),
+            *(dataset.train, self.poses.camera, self._images, self._background, self._downscale),
             *(self._generators["views"], config.batch, shards),
         )
         self.exposure = Exposure(
@@ -171,9 +176,9 @@ class Trainer:
             shards=shards,
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
-        self._scale_limit = ScaleLimit(config.relative_scale, self._cameras, self.schedule)
+        self._scale_limit = ScaleLimit(config.relative_scale, cameras, self.schedule)
         points = None if dataset.points is None else dataset.points.xyz
-        self._near_limit = NearLimit(config.near_limit, self._cameras, points, self.schedule)
+        self._near_limit = NearLimit(config.near_limit, cameras, points, self.schedule)
         self.transients = Transients(
             *(config.transients, dataset.train, neutral, self._background.evaluation),
             *(self.schedule, shards),
@@ -280,6 +285,7 @@ class Trainer:
         )
         for gradient in gradients:
             self._density.after_backward(step, self.gaussians, gradient)
+        self.poses.after_backward(step, self.gaussians, [each.index for each in batch], gradients)
         self._optimizer.step(self.gaussians, gradients, step)
 
     def _loss(self, image: Tensor, view: BatchView) -> Tensor:
@@ -293,7 +299,10 @@ class Trainer:
         background = self._background.evaluation.tolist()
         with single_threaded():
             return evaluate_views(
-                self.gaussians, self.dataset.test, background=background, render=self._render
+                self.gaussians,
+                self.poses.test_views(),
+                background=background,
+                render=self._render,
             )
 
     def _mask_what_moves(self) -> None:
@@ -308,7 +317,7 @@ class Trainer:
             return
         left_out = unexplained_views(
             self.gaussians,
-            self.dataset.train,
+            self.poses.views(),
             self._images,
             background=self._background.evaluation,
             sh_degree=self.config.sh_degree_at(self.step),
@@ -345,7 +354,10 @@ class Trainer:
         if self.config.leave_out_after:  # otherwise, as in earlier versions of the format
             tensors["checked"] = torch.tensor(self._checked)
             tensors["left_out"] = torch.tensor(self.left_out, dtype=torch.int64)
-        parts = {"exposure": self.exposure.state_tensors()}
+        parts = {
+            "exposure": self.exposure.state_tensors(),
+            "poses": self.poses.state_tensors(),
+        }
         if self.config.transients != "off":
             parts["transients"] = self.transients.state_tensors()
         if self.config.stop_overfitting:
@@ -387,6 +399,7 @@ class Trainer:
         self.exposure.load_state(part("exposure."))
         if self.config.transients != "off":
             self.transients.load_state(part("transients."))
+        self.poses.load_state(part("poses."))
         if self.config.stop_overfitting:
             self._overfitting.load_state(part("overfitting."))
         self._queue.continue_with(tensors["order"].tolist(), self.step)

@@ -33,7 +33,7 @@ from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 from snowsplat import ops
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
@@ -85,7 +85,7 @@ class Transients:
         self,
         mode: TransientsMode,
         views: Sequence[View],
-        images: ImageLoader,
+        images: Photos,
         background: Tensor,
         schedule: Schedule,
         shards: Shards,

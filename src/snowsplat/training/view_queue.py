@@ -29,7 +29,7 @@ class ViewQueue:
     def __init__(
         self,
         views: Sequence[View],
-        cameras: Sequence[Camera],
+        camera_of: Callable[[int], Camera],
         images: ImageLoader,
         background: Background,
         downscale_at: Callable[[int], int],
@@ -39,7 +39,7 @@ class ViewQueue:
     ) -> None:
         """
         Args:
-            cameras: those of the views, on the device.
+            camera_of: the present camera of a view, on the device.
             images: loads the photos of the views.
             downscale_at: the factor by which images are reduced at a step.
             generator: draws the order, on the CPU.
@@ -49,7 +49,7 @@ class ViewQueue:
         self.order: list[int] = []
         self.left_out: tuple[int, ...] = ()
         self._views = views
-        self._cameras = cameras
+        self._camera_of = camera_of
         self._images = images
         self._background = background
         self._downscale_at = downscale_at
@@ -79,7 +79,7 @@ class ViewQueue:
         i = self.order.pop(0)
         own = position % self._shards.size == self._shards.rank
         photo = self._images.get(self._views[i], downscale) if own else None
-        camera = self._cameras[i].downscaled(downscale)
+        camera = self._camera_of(i).downscaled(downscale)
         return BatchView(i, self._views[i], camera, photo, self._background.draw())
 
     def leave_out(self, indices: Iterable[int], after: int) -> None:

@@ -27,8 +27,8 @@ PACKED_HEADER = 8
 """Columns of `Splats2D.packed` before the colours."""
 PACKED_STRIDE = 16
 """The number of columns of `Splats2D.packed` is a multiple of this."""
-POSE_SUMS = 15
-"""Number of sums for the gradient of a pose: 9 for R, 3 for t, 3 for the camera's position."""
+POSE_SUMS = 16
+"""Number of sums for the gradient of a pose: 9 for R, 3 for t, 3 for the position, 1 for log f."""
 MAX_NEIGHBOURS = 64
 """Largest k of `nearest_neighbours.neighbours`."""
 ALIGNMENT_RADIUS = 7

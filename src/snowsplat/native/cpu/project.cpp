@@ -129,17 +129,21 @@ int64_t backward(const ProjectBackwardParams<T>& p) {
       V dposition[3];
       group_vjp(g, cam, degree, p.grad_packed, i, end, d, pose ? &dpose : nullptr,
                 pose ? dposition : nullptr);
-      add_rows(grads.means, 3, g.rows, 3, d.shape.mean);
-      add_rows(grads.log_scales, 3, g.rows, 3, d.shape.log_scale);
-      add_rows(grads.quats, 4, g.rows, 4, d.shape.quat);
-      add_rows(grads.opacity_logits, 1, g.rows, 1, &d.shape.opacity_logit);
-      add_rows(grads.sh_dc, 3, g.rows, 3, d.dc);
-      add_rows(grads.sh_rest, 3 * tensors.sh_rest_rows, g.rows, sh_columns(degree), d.rest);
+      if (grads.means) {
+        add_rows(grads.means, 3, g.rows, 3, d.shape.mean);
+        add_rows(grads.log_scales, 3, g.rows, 3, d.shape.log_scale);
+        add_rows(grads.quats, 4, g.rows, 4, d.shape.quat);
+        add_rows(grads.opacity_logits, 1, g.rows, 1, &d.shape.opacity_logit);
+        add_rows(grads.sh_dc, 3, g.rows, 3, d.dc);
+        add_rows(grads.sh_rest, 3 * tensors.sh_rest_rows, g.rows, sh_columns(degree), d.rest);
+      }
       if (pose) {
+        const auto rounded = [&](T term) { return (double(term) + p.rounding) - p.rounding; };
         for (int l = 0; l < g.rows.count; l++) {
-          for (int k = 0; k < 9; k++) sums[k] += double(dpose.rotation[k].v[l]);
-          for (int k = 0; k < 3; k++) sums[9 + k] += double(dpose.translation[k].v[l]);
-          for (int k = 0; k < 3; k++) sums[12 + k] += double(dposition[k].v[l]);
+          for (int k = 0; k < 9; k++) sums[k] += rounded(dpose.rotation[k].v[l]);
+          for (int k = 0; k < 3; k++) sums[9 + k] += rounded(dpose.translation[k].v[l]);
+          for (int k = 0; k < 3; k++) sums[12 + k] += rounded(dposition[k].v[l]);
+          sums[15] += rounded(dpose.log_focal.v[l]);
         }
       }
     }

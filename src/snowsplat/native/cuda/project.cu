@@ -10,8 +10,8 @@ namespace {
 // Adds the sums of the blocks of project_bwd, in a fixed order. One block.
 struct PoseSumParams {
   int64_t n;           // blocks of project_bwd
-  const double* sums;  // (n, 15)
-  double* pose;        // out, (15,)
+  const double* sums;  // (n, 16)
+  double* pose;        // out, (16,)
   SNOW_FIELDS(n, sums, pose)
 };
 
@@ -107,14 +107,16 @@ SNOW_INLINE void backward(const ProjectBackwardParams<T>& p) {
     row_vjp(tensors, id, cam, grad_splat, row, d_pose, d_position);
   }
   __syncthreads();
-  add_columns<3>(tile + kMeanColumn, 3, id_of, 3, grads.means);
-  add_columns<3>(tile + kLogScaleColumn, 3, id_of, 3, grads.log_scales);
-  add_columns<4>(tile + kQuatColumn, 4, id_of, 4, grads.quats);
-  add_columns<1>(tile + kLogitColumn, 1, id_of, 1, grads.opacity_logits);
-  add_columns<3>(tile + kDcColumn, 3, id_of, 3, grads.sh_dc);
-  if (degree > 0)
-    add_columns<kRestBatch>(tile, sh_columns(degree), id_of, 3 * tensors.sh_rest_rows,
-                            grads.sh_rest);
+  if (grads.means) {
+    add_columns<3>(tile + kMeanColumn, 3, id_of, 3, grads.means);
+    add_columns<3>(tile + kLogScaleColumn, 3, id_of, 3, grads.log_scales);
+    add_columns<4>(tile + kQuatColumn, 4, id_of, 4, grads.quats);
+    add_columns<1>(tile + kLogitColumn, 1, id_of, 1, grads.opacity_logits);
+    add_columns<3>(tile + kDcColumn, 3, id_of, 3, grads.sh_dc);
+    if (degree > 0)
+      add_columns<kRestBatch>(tile, sh_columns(degree), id_of, 3 * tensors.sh_rest_rows,
+                              grads.sh_rest);
+  }
   if (!p.pose) return;
 
   // The sums are computed in double and in a fixed order: each thread sums a quarter of the rows,
@@ -123,18 +125,20 @@ SNOW_INLINE void backward(const ProjectBackwardParams<T>& p) {
   for (int k = 0; k < 9; k++) row[k] = d_pose.rotation[k];
   for (int k = 0; k < 3; k++) row[9 + k] = d_pose.translation[k];
   for (int k = 0; k < 3; k++) row[12 + k] = d_position[k];
+  row[15] = d_pose.log_focal;
   __syncthreads();
-  constexpr int kParts = kRowThreads / 16, kPartRows = kRowThreads / kParts;
+  constexpr int kParts = kRowThreads / kPoseSums, kPartRows = kRowThreads / kParts;
   SNOW_SHARED(double, parts, kRowThreads);
-  const int column = int(threadIdx.x) % 16, part = int(threadIdx.x) / 16;
+  const int column = int(threadIdx.x) % kPoseSums, part = int(threadIdx.x) / kPoseSums;
   double sum = 0;
-  if (column < kPoseSums)
-    for (int r = 0; r < kPartRows; r++)
-      sum += double(tile[(part * kPartRows + r) * kRowColumns + column]);
+  for (int r = 0; r < kPartRows; r++) {
+    const double term = double(tile[(part * kPartRows + r) * kRowColumns + column]);
+    sum += (term + p.rounding) - p.rounding;
+  }
   parts[threadIdx.x] = sum;
   __syncthreads();
   if (threadIdx.x < kPoseSums) {
-    for (int k = 1; k < kParts; k++) sum += parts[16 * k + int(threadIdx.x)];
+    for (int k = 1; k < kParts; k++) sum += parts[kPoseSums * k + int(threadIdx.x)];
     p.pose[int64_t(blockIdx.x) * kPoseSums + threadIdx.x] = sum;
   }
 }
@@ -155,15 +159,15 @@ SNOW_KERNEL(project_bwd_f64, kRowThreads, ProjectBackwardParams<double>) { backw
 
 SNOW_KERNEL(project_pose_sum, kSumThreads, PoseSumParams) {
   SNOW_SHARED(double, parts, kSumThreads);
-  const int column = int(threadIdx.x) % 16;
+  const int column = int(threadIdx.x) % kPoseSums;
   double sum = 0;
-  if (column < kPoseSums)
-    for (int64_t b = int(threadIdx.x) / 16; b < p.n; b += kSumThreads / 16)
-      sum += p.sums[b * kPoseSums + column];
+  for (int64_t b = int(threadIdx.x) / kPoseSums; b < p.n; b += kSumThreads / kPoseSums)
+    sum += p.sums[b * kPoseSums + column];
   parts[threadIdx.x] = sum;
   __syncthreads();
   if (threadIdx.x < kPoseSums) {
-    for (int k = 1; k < kSumThreads / 16; k++) sum += parts[16 * k + int(threadIdx.x)];
+    for (int k = 1; k < kSumThreads / kPoseSums; k++)
+      sum += parts[kPoseSums * k + int(threadIdx.x)];
     p.pose[threadIdx.x] = sum;
   }
 }

@@ -61,6 +61,7 @@ class Trained:
         masks: the masks of what moves, by the name of the training view; see
             `Transients.pictures`.
         ended_early: why the training ended before its last planned step; None if it did not.
+        poses: the line about the camera poses; None if there is nothing to say.
         peak_bytes: peak memory; 0 if unknown.
     """
 
@@ -76,6 +77,7 @@ class Trained:
     exposures: tuple[float, ...] = ()
     masks: Mapping[str, Image.Image] = field(default_factory=dict)
     ended_early: str | None = None
+    poses: str | None = None
     peak_bytes: int = 0
 
 
@@ -101,6 +103,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
             _ended_early(trained.ended_early),
             _left_out(trained.left_out),
             masks.masked(trained.dataset.train, trained.masks),
+            _poses(trained.poses),
             _curves(trained.history),
             _exposures(trained.exposures),
             pictures.compared(trained.gaussians, views, evaluation, trained.background),
@@ -143,6 +146,10 @@ def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
 
 def _ended_early(why: str | None) -> str:
     return "" if why is None else f"<p>The training {text(why)}.</p>"
+
+
+def _poses(line: str | None) -> str:
+    return "" if line is None else f"<p>{text(line[:1].upper() + line[1:])}.</p>"
 
 
 def _left_out(names: tuple[str, ...]) -> str:

@@ -1,0 +1,85 @@
+"""The refined cameras of a training run: a COLMAP model in its output folder.
+
+OUT/refined/sparse/0 has the cameras of all photos, at their full size, and the points of the
+dataset. `load_dataset_of` uses it, and so can other programs and further training runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.data import Dataset, View
+
+#: The folder of the model in an output folder, beside which a link to the photos makes a dataset.
+FOLDER = "refined"
+_SPARSE = ("sparse", "0")
+
+
+def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
+    """Write the model; returns its folder.
+
+    Args:
+        views: with the refined cameras, at any size.
+        full: the same dataset, with the photos at their full size.
+
+    Raises:
+        OSError: the folder is not writable, or the disk is full.
+    """
+    import numpy as np
+
+    from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+    from snowsplat.scene.geometry import quat_from_rotation
+
+    sizes = {v.name: (v.camera.width, v.camera.height) for v in [*full.train, *full.test]}
+    numbers: dict[ColmapCamera, int] = {}
+    images = []
+    for view in views:
+        camera = view.camera.scaled(*sizes[view.name])
+        params = camera.fx, camera.fy, camera.cx, camera.cy
+        pinhole = ColmapCamera("PINHOLE", camera.width, camera.height, params)
+        number = numbers.setdefault(pinhole, len(numbers) + 1)
+        pose = camera.cam_from_world
+        numbers_of_pose = (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist())
+        images.append(ColmapImage(view.name, number, numbers_of_pose))
+    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if full.points is not None:
+        xyz, rgb = full.points.xyz.double().numpy(), full.points.rgb.numpy()
+    folder = output.joinpath(FOLDER, *_SPARSE)
+    write_model(folder, {number: camera for camera, number in numbers.items()}, images, xyz, rgb)
+    return folder
+
+
+def with_refined(output: Path, dataset: Dataset) -> Dataset:
+    """The dataset with the cameras of `write_refined`; unchanged if there are none.
+
+    Raises:
+        UserError: the model is damaged, or a photo is not in it.
+    """
+    from snowsplat.data.colmap import posed_camera, read_model
+
+    folder = output.joinpath(FOLDER, *_SPARSE)
+    if not folder.is_dir():
+        return dataset
+    model = read_model(folder)
+    images = {image.name: image for image in model.images}
+
+    def refined(view: View) -> View:
+        if view.name not in images:
+            raise UserError(
+                f"{folder}: has no camera for {view.name}; use the dataset of the training, or "
+                f"remove {output / FOLDER} to use the cameras of the dataset"
+            )
+        camera = posed_camera(model, images[view.name])
+        return replace(view, camera=camera.scaled(view.camera.width, view.camera.height))
+
+    return replace(
+        dataset,
+        train=[refined(view) for view in dataset.train],
+        test=[refined(view) for view in dataset.test],
+    )

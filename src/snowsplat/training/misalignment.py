@@ -1,0 +1,96 @@
+"""`misalignment`: how far the photos are shifted against the renderings of their views.
+
+If camera poses are not exact, no scene agrees with all photos. A trained scene is then a compromise
+of them, and each photo is shifted against its rendering. The shift (a, b) is found by one
+Gauss-Newton step of least squares,
+
+    photo ≈ gain · image + offset + a ∂image/∂x + b ∂image/∂y
+
+where gain and offset make it independent of the exposure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from snowsplat.data.dataset import View
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import render
+from snowsplat.util.process import single_threaded
+
+#: At most this number of views is compared, evenly chosen, to limit the time.
+_VIEWS = 24
+#: With fewer views, there is no result: a scene can agree with all of them, whatever the poses are.
+_FEWEST_VIEWS = 8
+#: Images are reduced to about this length of their diagonal, in pixels. Then a shift by a few
+#: thousandths of the image is about a pixel, and the derivative of the image predicts it.
+_DIAGONAL = 280
+#: The smallest shift that shows that poses are not exact, in the same reduced pixels; see
+#: docs/cameras.md.
+SHIFTED = 0.25
+
+
+def misalignment(
+    gaussians: Gaussians, views: Sequence[View], background: Sequence[float]
+) -> float | None:
+    """The median shift of the photos in pixels; None if it is small, or there are too few views.
+
+    Args:
+        gaussians: a trained scene.
+        views: the views that it was trained on.
+        background: RGB in 0..1.
+
+    Raises:
+        UserError: a photo is missing or damaged.
+    """
+    if len(views) < _FEWEST_VIEWS:
+        return None
+    shift, factor = shift_of(gaussians, views[:: math.ceil(len(views) / _VIEWS)], background)
+    return factor * shift if shift >= SHIFTED else None
+
+
+@torch.no_grad()
+def shift_of(
+    gaussians: Gaussians, views: Sequence[View], background: Sequence[float]
+) -> tuple[float, int]:
+    """The median shift in reduced pixels, and the factor by which the images were reduced."""
+    device = gaussians.means.device
+    color = torch.tensor(background, dtype=torch.float32, device=device)
+    diagonals = sorted(math.hypot(view.camera.width, view.camera.height) for view in views)
+    factor = max(1, round(diagonals[len(views) // 2] / _DIAGONAL))
+    shifts = []
+    with single_threaded(), ImageLoader(views, budget_bytes=0, device=device) as images:
+        images.prefetch(views, factor)
+        for view in views:
+            photo = images.get(view, factor)
+            camera = view.camera.downscaled(factor).to(device)
+            image = render(gaussians, camera, color).image.clamp(0.0, 1.0)
+            shifts.append(float(shift_between(image, photo.over(color), photo.mask).norm()))
+    return sorted(shifts)[len(shifts) // 2], factor
+
+
+def shift_between(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
+    """(2,) float64: the shift (x, y) in pixels that moves an image towards a photo.
+
+    It is accurate for shifts below about one pixel, and 0 for images of one colour.
+
+    Args:
+        image, photo: (H, W, C) in 0..1, at least 3x3.
+        mask: (H, W) bool, False for pixels of the photo to ignore.
+    """
+    grey, target = (each.double().mean(2) for each in (image, photo))
+    inner = grey[1:-1, 1:-1]
+    dx = 0.5 * (grey[1:-1, 2:] - grey[1:-1, :-2])
+    dy = 0.5 * (grey[2:, 1:-1] - grey[:-2, 1:-1])
+    columns = [dx, dy, inner, torch.ones_like(inner)]
+    used = torch.ones_like(inner, dtype=torch.bool) if mask is None else mask[1:-1, 1:-1]
+    a = torch.stack([column[used] for column in columns], 1)
+    normal = a.T @ a + 1e-6 * torch.eye(4, dtype=a.dtype, device=a.device)
+    solution = torch.linalg.solve(normal, a.T @ target[1:-1, 1:-1][used])
+    # photo(p) = gain · image(p − s) + offset ≈ gain · (image(p) − s · ∂image) + offset
+    return -solution[:2] / solution[2].clamp_min(1e-3)
