@@ -22,7 +22,14 @@ WORKER = Path(__file__).with_name("shards_worker.py")
 DENSE = {"iterations": 122, "densify_from": 20, "densify_interval": 20, "max_gaussians": 900}
 RUNS = [
     {**DENSE, "batch": 4, "stop_overfitting": True, "leave_out_after": 0.3, "exposure": "on"},
-    {**DENSE, "batch": 3, "name": "mcmc-short", "densify_until": 100, "test_iterations": (50,)},
+    {
+        **DENSE,
+        "batch": 3,
+        "name": "mcmc-short",
+        "densify_until": 100,
+        "test_iterations": (50,),
+        "antialias": True,
+    },
     {
         **DENSE,
         "batch": 2,
