@@ -191,6 +191,18 @@ def test_formats(tmp_path):
         assert similar > 30
 
 
+def test_scales(tmp_path):
+    dataset = write_toy_dataset(tmp_path / "capture", "colmap-bin", 9, 192, 144, n_points=60)
+    flags = ["-r", "96", "--eval", "--iterations", "20", "--quiet"]
+    assert main(["train", str(dataset), "-o", str(tmp_path / "out"), *flags]) == 0
+    cells = benchmark("scales.py", tmp_path / "out").splitlines()[-1].split("|")[1:-1]
+    measured = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert cells[0].strip() == "out"
+    assert cells[4].strip() == f"{measured['psnr']:.2f} / {measured['ssim']:.3f}"
+    assert all(float(cells[i].split("/")[0]) > 5 for i in (2, 3, 5))
+    assert cells[6].strip() == "-"  # larger than the photos
+
+
 # ------------------------------------------------------------------------------------------ gpu.py
 
 

@@ -119,6 +119,22 @@ def test_several_scenes_are_merged(run, ply, tmp_path):
     assert (len(both), both.sh_degree) == (430, 3)
 
 
+def test_antialiased_scenes_are_marked(run, ply, tmp_path):
+    mip = scene(30, 2, seed=1)
+    mip.antialiased = True
+    write_gaussians(tmp_path / "b.spz", mip)
+    edits = ("--rotate", 0, 0, 90, "--sh-degree", 1, "--decimate", "50%")
+    assert run("convert", tmp_path / "b.spz", tmp_path / "c.sog", *edits).code == 0
+    assert read_gaussians(tmp_path / "c.sog").antialiased
+    lost = run("convert", tmp_path / "b.spz", tmp_path / "c.splat")
+    assert lost.code == 0
+    assert "splat files cannot say so" in lost.err
+    mixed = run("convert", ply, tmp_path / "b.spz", tmp_path / "d.ply")
+    assert mixed.code == 0
+    assert "only some of the scenes are antialiased" in mixed.err
+    assert not read_gaussians(tmp_path / "d.ply").antialiased
+
+
 def test_the_newest_scene_of_an_output_folder(run, refused, ply, tmp_path):
     for step, count in ((900, 5), (1000, 7)):
         path = tmp_path / f"out/point_cloud/iteration_{step}/point_cloud.ply"

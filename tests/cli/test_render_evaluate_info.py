@@ -46,6 +46,28 @@ def test_render_writes_images_and_photos(run, trained, dataset):
     assert psnr == pytest.approx(metrics["views"]["view_08.png"]["psnr"], abs=0.02)
 
 
+def test_render_antialiased(run, trained, tmp_path):
+    """As the file is marked, unless the flag says something else."""
+    renders = trained / "test/ours_60/renders/00000.png"
+    images = {}
+    for flags in ((), ("--antialias", "on"), ("--antialias", "off")):
+        assert run("render", trained, "--split", "test", *flags).code == 0
+        images[flags] = image(renders)
+    assert np.array_equal(images[()], images["--antialias", "off"])
+    assert np.abs(images[()] - images["--antialias", "on"]).max() > 10
+
+    marked = tmp_path / "marked"
+    shutil.copytree(trained, marked)
+    scene = marked / "point_cloud/iteration_60/point_cloud.ply"
+    gaussians = read_gaussians(scene)
+    gaussians.antialiased = True
+    write_gaussians(scene, gaussians)
+    assert run("render", marked, "--split", "test").code == 0
+    again = image(marked / "test/ours_60/renders/00000.png")
+    assert np.array_equal(again, images["--antialias", "on"])
+    assert json.loads(run("info", scene, "--json").out)["antialiased"]
+
+
 def test_render_depth(run, trained):
     flags = ("--split", "test", "--iteration", 30)
     assert run("render", trained, *flags, "--depth", "16bit").code == 0

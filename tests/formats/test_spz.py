@@ -215,11 +215,13 @@ def test_degree_4_is_read_as_3_with_a_warning(tmp_path, caplog):
     assert "SH degree 4 is reduced to 3" in caplog.text
 
 
-def test_antialiased_scenes_are_a_warning(tmp_path, caplog):
+def test_antialiased_scenes(tmp_path, caplog):
     (tmp_path / "a.spz").write_bytes(version_4(COLUMNS, 1, 1, flags=1))
     with caplog.at_level(logging.WARNING):
-        check_the_one(read_gaussians(tmp_path / "a.spz"))
-    assert "anti-aliasing" in caplog.text
+        read = read_gaussians(tmp_path / "a.spz")
+    check_the_one(read)
+    assert read.antialiased
+    assert not caplog.text
 
 
 def test_extensions_are_ignored_except_for_another_frame(tmp_path, one_line):

@@ -1,6 +1,7 @@
 """The page of a globe, opened from disk in a real browser without a network."""
 
 import base64
+import dataclasses
 import json
 import re
 from collections.abc import Iterator
@@ -150,6 +151,33 @@ def test_the_picture_is_that_of_the_video(page):
     left, right = shown[115:135, 85:110].mean((0, 1)), shown[115:135, 130:155].mean((0, 1))
     assert left[0] > left[2] + 60
     assert right[2] > right[0] + 60
+
+
+@pytest.mark.browser
+def test_the_picture_of_an_antialiased_scene(tmp_path):
+    """Gaussians of about the size of a pixel are as opaque as in the video."""
+    scene = gaussians()
+    scene.log_scales -= 1.5
+    scene.antialiased = True
+    write_page(tmp_path / "globe.html", Arrangement(scene, True), "Dots")
+    camera = orbit_camera(0.0, SIDE, SIDE)
+    focal = camera.fx * 0.94
+    camera = type(camera)(SIDE, SIDE, focal, focal, SIDE / 2, 0.47 * SIDE, camera.cam_from_world)
+    errors = []
+    with Browser(SIDE, SIDE) as browser:
+        page = browser.open((tmp_path / "globe.html").as_uri())
+        page.wait_for("window.snowGlobe && snowGlobe.buffers && snowGlobe.renderer.count")
+        page.evaluate("snowGlobe.paused = true, snowGlobe.adapts = false, snowGlobe.turned = 0")
+        page.evaluate("snowGlobe.request([], true)")
+        advance(page, 0)
+        shown = picture(page)
+        assert not page.errors
+    for antialiased in (True, False):
+        output = render(dataclasses.replace(scene, antialiased=antialiased), camera)
+        wanted = draw(camera).around(output.image.numpy(), output.alpha.numpy()).astype(float)
+        errors.append(np.abs(shown - wanted)[90:150, 60:180].mean())
+    assert errors[0] < 4
+    assert errors[1] > 3 * errors[0]
 
 
 @pytest.mark.browser

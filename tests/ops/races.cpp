@@ -76,7 +76,7 @@ struct Tensor {
 std::vector<F> frame(const Scene& s) {
   const F pose[12] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0};
   const double f = 150;
-  const CameraParams<F> camera = {pose, kWidth, kHeight, f, f, kWidth / 2.0, kHeight / 2.0, 0.2};
+  const CameraParams<F> camera = {pose, kWidth, kHeight, f, f, kWidth / 2.0, kHeight / 2.0, 0.2, 1};
   const GaussianTensors<F> gaussians = {s.means.data(),
                                         s.log_scales.data(),
                                         s.quats.data(),

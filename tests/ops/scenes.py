@@ -63,7 +63,7 @@ class Scene:
 
     params: dict[str, Tensor]
     cam_from_world: Tensor  # (3, 4) float64 in every variant
-    view: dict[str, Any]  # width, height, fx, fy, cx, cy, sh_degree
+    view: dict[str, Any]  # width, height, fx, fy, cx, cy, sh_degree; antialiased or nothing
 
     def to(self, dtype: torch.dtype, requires_grad: bool = True) -> Scene:
         """New leaf tensors of another dtype."""
@@ -82,6 +82,9 @@ class Scene:
         if bool(seen.all()):
             return splats
         return Splats2D(splats.packed[seen], splats.ids[seen], splats.channels)
+
+    def antialiased(self) -> Scene:
+        return replace(self, view=self.view | {"antialiased": True})
 
     def rows(self, rows: Sequence[int]) -> Scene:
         """Only these Gaussians."""

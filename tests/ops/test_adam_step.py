@@ -165,6 +165,17 @@ def three_steps_of_the_reference(*case: Any) -> dict[str, Tensor]:
     return three_steps(REFERENCE, *case)
 
 
+def test_native_agrees_with_the_reference_if_antialiased(native: Variant) -> None:
+    scene = random_scene(5, 200, pixels=0.5).antialiased()
+    states = [Optimised(variant, scene) for variant in (REFERENCE, native)]
+    before = states[0].copy()
+    for state in states:
+        state.step(packed_grads(2, len(state.visible())), 10)
+    for name, expected in states[0].tensors().items():
+        change = states[1].tensors()[name].double() - before[name]
+        assert_close(change, expected - before[name], native.backward, name)
+
+
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 16, 17, 33, 63, 64, 65, 129, 300, 5000])
 def test_native_agrees_with_the_reference_for_any_count(native: Variant, count: int) -> None:
     before, after = a_step_of_the_reference(count)

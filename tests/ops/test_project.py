@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,6 +78,23 @@ def test_gaussian_on_the_axis(variant: Variant) -> None:
     close(splats.radii[0], torch.tensor(3 * math.sqrt(syy)))
     c0 = 0.5 / math.sqrt(math.pi)
     close(splats.colors[0], torch.tensor([0.5 + 0.5 * c0, 0.5 - 0.25 * c0, 0.0]))
+
+
+@pytest.mark.parametrize("size", [0.01, 0.1, 1.0])
+def test_an_antialiased_splat_keeps_its_integral(variant: Variant, size: float) -> None:
+    """∫ α = 2π o √det Σ' is that of the splat without low-pass filter, 2π o (f s / z)²."""
+    scene = single((0, 0, 2), (size, size, size), logit=2.0).antialiased()
+    splats = scene.to(variant.dtype, requires_grad=False).project(variant.ops)
+    a, b, c = splats.conics[0].double().tolist()
+    integral = float(splats.opacities[0]) / math.sqrt(a * c - b * b)
+    sharp = VIEW["fx"] * VIEW["fy"] * (size / 2) ** 2 / (1 + math.exp(-2))
+    assert integral == pytest.approx(sharp, rel=1e-5)
+
+
+def test_an_antialiased_splat_becomes_too_transparent_to_be_visible(variant: Variant) -> None:
+    small = single((0, 0, 2), (1e-4, 1e-4, 1e-4)).to(variant.dtype)
+    assert len(small.project(variant.ops)) == 1
+    assert len(small.antialiased().project(variant.ops)) == 0
 
 
 def test_quaternion_rotates_the_axes(variant: Variant) -> None:
@@ -256,6 +274,22 @@ def test_finite_differences(double: Variant, degree: int) -> None:
     assert torch.autograd.gradcheck(columns, leaves, eps=1e-6, atol=1e-6, rtol=1e-6)
 
 
+@pytest.mark.parametrize("size", [0.02, 0.1, 0.5])
+def test_finite_differences_if_antialiased(double: Variant, size: float) -> None:
+    """Of splats from a fraction of a pixel to some pixels."""
+    scene = smooth_scene(1, sh_degree=0).rows([0, 1, 2]).to(torch.float64).antialiased()
+    with torch.no_grad():
+        scene.params["log_scales"] += math.log(size)
+        scene.params["opacity_logits"] += 3.0
+
+    def columns(*leaves: Tensor) -> Tensor:
+        return differentiable_columns(double.ops.project(*leaves, **scene.view))
+
+    leaves = tuple(scene.leaves().values())
+    assert len(columns(*leaves)) == 3
+    assert torch.autograd.gradcheck(columns, leaves, eps=1e-6, atol=1e-6, rtol=1e-6)
+
+
 CASES = [
     (degree, rest) for rest in (0, 3, 8, 15) for degree in range(4) if (degree + 1) ** 2 <= rest + 1
 ]
@@ -273,13 +307,21 @@ def test_native_agrees_with_the_reference_for_any_count(native: Variant, count: 
     compare(native, random_scene(40 + count, count))
 
 
+@pytest.mark.parametrize("pixels", [0.1, 0.5, 2.0, 20.0])
+def test_native_agrees_with_the_reference_if_antialiased(native: Variant, pixels: float) -> None:
+    compare(native, random_scene(90, 300, pixels=pixels).antialiased())
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("length", [10.0, 100.0, 1000.0])
 @pytest.mark.parametrize("shape", ["needle", "disc"])
 def test_native_agrees_with_the_reference_for_long_thin_splats(
-    native: Variant, shape: str, length: float
+    native: Variant, shape: str, length: float, antialiased: bool
 ) -> None:
     """det Σ' as a difference cancels: with a σ of 1000 pixels, the error was 19% in float32."""
     scene = random_scene(3, 64, 64, 48)
+    if antialiased:
+        scene = scene.antialiased()
     R, t = scene.cam_from_world[:, :3], scene.cam_from_world[:, 3]
     depth = (scene.params["means"] @ R.T + t)[:, 2].abs()
     pixel = depth / scene.view["fx"]
@@ -291,7 +333,8 @@ def test_native_agrees_with_the_reference_for_long_thin_splats(
 
 def compare(native: Variant, scene: Scene) -> None:
     """Values and gradients of every input, with a random cotangent on every column."""
-    key = tuple(p.numpy().tobytes() for p in scene.params.values())
+    parameters = tuple(p.numpy().tobytes() for p in scene.params.values())
+    key = (parameters, "antialiased" in scene.view)
     if key not in _EXPECTED:
         _EXPECTED[key] = splats_and_gradients_of_the_reference(scene)
     (wanted, wanted_grads), actual = _EXPECTED[key], scene.to(native.dtype)
@@ -311,7 +354,7 @@ def compare(native: Variant, scene: Scene) -> None:
 
 
 #: Results of the reference, computed once for all variants.
-_EXPECTED: dict[tuple[bytes, ...], tuple[Splats2D, dict[str, Tensor]]] = {}
+_EXPECTED: dict[Any, tuple[Splats2D, dict[str, Tensor]]] = {}
 
 
 def splats_and_gradients_of_the_reference(scene: Scene) -> tuple[Splats2D, dict[str, Tensor]]:

@@ -66,6 +66,19 @@ def by_autograd(count: int, degree: int = 3, rest: int = 15) -> dict[str, Tensor
     return {n: torch.zeros_like(p) if p.grad is None else p.grad for n, p in leaf.params.items()}
 
 
+def test_of_antialiased_splats(variant: Variant) -> None:
+    scene = random_scene(5, 60, pixels=0.5).antialiased()
+    leaf = scene.to(torch.float64)
+    splats = leaf.project(reference)
+    splats.packed.backward(packed_grads(1, len(splats)))
+    scene = scene.to(variant.dtype, requires_grad=False)
+    grads = {name: torch.zeros_like(p) for name, p in scene.params.items()}
+    add(variant, scene, grads, 1)
+    for name, p in leaf.params.items():
+        assert p.grad is not None
+        assert_close(grads[name], p.grad, variant.backward, name)
+
+
 def scene_of(count: int, degree: int = 3, rest: int = 15) -> Scene:
     return random_scene(70 + count, count, sh_degree=degree, rest=rest)
 

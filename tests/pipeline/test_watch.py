@@ -17,7 +17,7 @@ from snowsplat.util.errors import UserError
 def trained(dataset, tmp_path_factory) -> Path:
     """Checkpoints of step 20 and 40, scenes of 20 and 50."""
     out = tmp_path_factory.mktemp("watch") / "out"
-    settings = {"iterations": 50, "checkpoint_every": 20}
+    settings = {"iterations": 50, "checkpoint_every": 20, "antialias": True}
     train(dataset, out, TrainOptions(settings=settings, save_iterations=(20,)))
     return out
 
@@ -38,6 +38,8 @@ def test_the_newest_scene_is_shown(trained, tmp_path):
     assert of_checkpoint.about[0] == "After 40 steps"
     tensors = checkpoint.latest(folder.checkpoints).tensors
     assert of_checkpoint.gaussians.means.equal(tensors["gaussians.means"])
+    assert of_checkpoint.gaussians.antialiased
+    assert scene.gaussians.antialiased
     assert newest() is of_checkpoint  # not read again
 
     # A newer scene appears, first damaged, then complete.

@@ -36,6 +36,7 @@ RUNS = [
         "densify_until": 100,
         "test_iterations": (50,),
         "refine_poses": True,
+        "antialias": True,
     },
     {
         **DENSE,

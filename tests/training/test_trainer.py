@@ -98,6 +98,7 @@ every_density_control = pytest.mark.parametrize(
         pytest.param(BUSY, id="adaptive"),
         pytest.param(BUSY_ABS_GRAD, id="abs-grad"),
         pytest.param(BUSY_MCMC, id="mcmc"),
+        pytest.param(replace(BUSY, antialias=True), id="antialias"),
     ],
 )
 CALM = TrainConfig(
@@ -116,6 +117,7 @@ def trained(dataset: Dataset, config: TrainConfig) -> Gaussians:
 
 
 def assert_identical(a: Gaussians, b: Gaussians) -> None:
+    assert a.antialiased == b.antialiased
     for name, parameter in a.parameters().items():
         assert torch.equal(parameter, b.parameters()[name]), name
 
@@ -194,6 +196,23 @@ def test_a_run_starts_from_given_gaussians_and_does_not_change_them(dataset):
     trainer.run()
     assert torch.equal(initial.means, true_scene().means)
     assert not torch.equal(trainer.gaussians.means, initial.means)
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_an_antialiased_scene(dataset, batch):
+    """It is trained with the filter: without it, the same Gaussians fit the photos less well."""
+    config = replace(CALM, antialias=True, batch=batch, learning_rates=LearningRates().scaled(3.0))
+    small = dataset.points.xyz.repeat(4, 1) + 0.1 * torch.randn(
+        4 * COUNT, 3, generator=torch.Generator().manual_seed(3)
+    )
+    points = Points(small, dataset.points.rgb.repeat(4, 1))
+    trainer = Trainer(replace(dataset, points=points), config)
+    before = trainer.evaluate().psnr
+    trainer.run()
+    assert trainer.gaussians.antialiased
+    with_filter = trainer.evaluate().psnr
+    trainer.gaussians.antialiased = False
+    assert with_filter > max(before, trainer.evaluate().psnr) + 2
 
 
 def test_a_resumed_run_does_not_initialise_again(dataset, monkeypatch):

@@ -54,6 +54,10 @@ class ConfigFlags:
     ] = None
     """Whether to learn a gain for each photo and colour channel, for photos with different
     exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
+    antialias: Annotated[Literal["on", "off"] | None, flag("{on,off}", default="off")] = None
+    """Whether to train a scene that also looks right in images that are much smaller or larger than
+    the photos. The scene file is marked, and viewers that know the mark show it as it was
+    trained."""
 
     sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
     """Degree of the spherical harmonics (view-dependent colour). A lower degree needs less
@@ -121,7 +125,7 @@ class ConfigFlags:
         given = {field.name: getattr(self, field.name) for field in fields(ConfigFlags)}
         if self.test_iterations is not None:
             given["test_iterations"] = tuple(step for step in self.test_iterations if step > 0)
-        for name in ("abs_grad", "stop_overfitting"):
+        for name in ("abs_grad", "stop_overfitting", "antialias"):
             if given[name] is not None:
                 given[name] = given[name] == "on"
         return {name: value for name, value in given.items() if value is not None}

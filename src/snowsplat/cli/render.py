@@ -52,6 +52,10 @@ class Render(SceneFlags):
     world_units_per_step.json; color: colours from yellow (near) to violet (far). With --path, color
     writes a second video."""
 
+    antialias: Annotated[Literal["on", "off"] | None, flag("{on,off}", default="as trained")] = None
+    """Whether to render for the size of the pixels, as scenes trained with --antialias on are
+    rendered. Use it if a scene file from another program lacks this mark."""
+
     path: Annotated[str | None, flag("{training,ellipse,spiral,FILE}", default="render images")] = (
         None
     )
@@ -85,9 +89,15 @@ class Render(SceneFlags):
             splits.append("train")
         from snowsplat.pipeline.render import render_images
 
-        for folder, count in render_images(self.load(), splits=splits, depth=self.depth).items():
+        rendered = render_images(
+            self.load(), splits=splits, depth=self.depth, antialias=self._antialias()
+        )
+        for folder, count in rendered.items():
             print(f"{folder}: {count} images")
         return 0
+
+    def _antialias(self) -> bool | None:
+        return None if self.antialias is None else self.antialias == "on"
 
     def _render_video(self, path: str) -> None:
         from snowsplat.pipeline.videos import VideoOptions, render_video
@@ -108,6 +118,7 @@ class Render(SceneFlags):
             size=self.size,
             depth=self.depth == "color",
             side_by_side=self.side_by_side,
+            antialias=self._antialias(),
         )
         with TerminalObserver() as observer:
             render_video(

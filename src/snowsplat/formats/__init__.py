@@ -6,6 +6,7 @@ write `GaussianArrays` with NumPy; torch is imported when these become `Gaussian
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,8 @@ from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
+
+logger = logging.getLogger(__name__)
 
 __all__ = [
     "FORMATS",
@@ -61,6 +64,13 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
         OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    write = format_for_writing(path).write
-    assert write is not None
-    write(path, GaussianArrays.from_gaussians(gaussians))
+    format = format_for_writing(path)
+    assert format.write is not None
+    format.write(path, GaussianArrays.from_gaussians(gaussians))
+    if gaussians.antialiased and not format.marks_antialiased:
+        logger.warning(
+            "%s: the scene is antialiased, but %s files cannot say so: viewers will show fine "
+            "details too thick; write .ply, .spz or .sog",
+            path,
+            format.name,
+        )

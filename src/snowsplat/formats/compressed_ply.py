@@ -14,8 +14,9 @@ packed_color     8, 8, 8, 8    r, g, b between the bounds of the chunk (0 to 1 i
 ===============  ============  ==================================================================
 
 The element ``sh`` has the properties f_rest_0, … of an uncompressed PLY. Each is one byte, which
-represents the range −4 to 4. The coordinate frame is that of the uncompressed PLY. The layout was
-taken from github.com/playcanvas/splat-transform (MIT).
+represents the range −4 to 4. The coordinate frame, and the comment of an antialiased scene, are
+those of the uncompressed PLY. The layout was taken from
+github.com/playcanvas/splat-transform (MIT).
 """
 
 from pathlib import Path
@@ -24,6 +25,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.ply import is_antialiased, mode_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -87,6 +89,7 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
         packing.opacity_logits(rgba[:, 3]),
         (_dequantize(colors[:, :3], colors[:, 3:], rgba[:, :3], 255)[:, None] - 0.5) / SH_C0,
         _read_sh(path, vertices),
+        antialiased=is_antialiased(vertices.comments),
     )
 
 
@@ -186,7 +189,8 @@ def _encode(path: Path, gaussians: GaussianArrays) -> list[bytes]:
     if k:
         elements.append(("sh", n, [("uchar", f"f_rest_{i}") for i in range(3 * k)]))
     limits = np.concatenate(bounds, 1).astype("<f4")
-    return [header_of(elements), limits.tobytes(), words.tobytes(), sh.tobytes()]
+    head = header_of(elements, mode_comments(gaussians.antialiased))
+    return [head, limits.tobytes(), words.tobytes(), sh.tobytes()]
 
 
 def _bounds(values: np.ndarray) -> np.ndarray:

@@ -7,8 +7,10 @@ for the import of torch.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,8 +20,12 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-class GaussianArrays(NamedTuple):
-    """N Gaussians: the parameters of `snowsplat.Gaussians` as float32 arrays, in its order."""
+@dataclass(frozen=True, eq=False)  # `==` of arrays has no truth value
+class GaussianArrays:
+    """N Gaussians: the parameters of `snowsplat.Gaussians` as float32 arrays, in its order.
+
+    ``antialiased`` is that of `snowsplat.Gaussians`. Iterating yields the six arrays.
+    """
 
     means: np.ndarray  # (N, 3) world units
     log_scales: np.ndarray  # (N, 3) natural logarithm of the standard deviations
@@ -27,6 +33,11 @@ class GaussianArrays(NamedTuple):
     opacity_logits: np.ndarray  # (N,)
     sh_dc: np.ndarray  # (N, 1, 3)
     sh_rest: np.ndarray  # (N, K, 3), K = 0, 3, 8 or 15
+    antialiased: bool = field(default=False, kw_only=True)
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        yield from (self.means, self.log_scales, self.quats)
+        yield from (self.opacity_logits, self.sh_dc, self.sh_rest)
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianArrays:
@@ -34,7 +45,8 @@ class GaussianArrays(NamedTuple):
         CPU.
         """
         tensors = gaussians.parameters().values()
-        return cls(*(tensor.detach().cpu().float().numpy() for tensor in tensors))
+        arrays = (tensor.detach().cpu().float().numpy() for tensor in tensors)
+        return cls(*arrays, antialiased=gaussians.antialiased)
 
     @classmethod
     def empty(cls, rest: int = 0) -> GaussianArrays:
@@ -42,17 +54,30 @@ class GaussianArrays(NamedTuple):
         shapes = ((0, 3), (0, 3), (0, 4), (0,), (0, 1, 3), (0, rest, 3))
         return cls(*(np.zeros(shape, np.float32) for shape in shapes))
 
+    @staticmethod
+    def cat(parts: Sequence[GaussianArrays]) -> GaussianArrays:
+        """All rows of ``parts`` in order, at the highest SH degree among them.
+
+        They are marked as the first part.
+        """
+        parts = parts or [GaussianArrays.empty()]
+        most = max(part.sh_rest.shape[1] for part in parts)
+        rest = [np.pad(p.sh_rest, ((0, 0), (0, most - p.sh_rest.shape[1]), (0, 0))) for p in parts]
+        padded = [replace(part, sh_rest=each) for part, each in zip(parts, rest, strict=True)]
+        columns = (np.concatenate(arrays) for arrays in zip(*padded, strict=True))
+        return GaussianArrays(*columns, antialiased=parts[0].antialiased)
+
     def to_gaussians(self) -> Gaussians:
         """As tensors on the CPU, which share memory with the arrays."""
         import torch
 
         from snowsplat.scene.gaussians import Gaussians
 
-        return Gaussians(*(torch.from_numpy(array) for array in self))
+        return Gaussians(*map(torch.from_numpy, self), antialiased=self.antialiased)
 
     def select(self, index: np.ndarray | slice) -> GaussianArrays:
         """The rows ``index``: (M,) integers in any order, an (N,) bool mask, or a slice."""
-        return GaussianArrays(*(array[index] for array in self))
+        return GaussianArrays(*(array[index] for array in self), antialiased=self.antialiased)
 
     def finite_rows(self) -> np.ndarray:
         """(N,) bool: Gaussians whose parameters are all finite."""
@@ -62,9 +87,10 @@ class GaussianArrays(NamedTuple):
         return finite
 
 
-def decoded(path: Path, *arrays: np.ndarray) -> GaussianArrays:
+def decoded(path: Path, *arrays: np.ndarray, antialiased: bool = False) -> GaussianArrays:
     """The six arrays read from ``path``, as float32; rows that are not finite are skipped."""
-    return skip_nonfinite(path, GaussianArrays(*(np.array(array, np.float32) for array in arrays)))
+    as_float32 = (np.array(array, np.float32) for array in arrays)
+    return skip_nonfinite(path, GaussianArrays(*as_float32, antialiased=antialiased))
 
 
 def skip_nonfinite(path: Path, gaussians: GaussianArrays) -> GaussianArrays:

@@ -7,7 +7,8 @@ points. A Gaussian of SH degree 3 takes about 236 bytes.
 
 The frame of glTF is x right, y up, z towards the viewer: our frame, rotated by 180° about x.
 Readers must apply the transforms of the nodes, which place the splats in the scene. Specification:
-Khronos, github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
+Khronos, github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting. It has no
+mark for antialiased scenes.
 """
 
 import logging
@@ -67,7 +68,7 @@ def read_glb(path: Path | str) -> GaussianArrays:
         raise UserError(f"{path}: {error}; copy or export it again") from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
         raise UserError(f"{path}: its JSON is not valid glTF; copy or export it again") from None
-    scene = _merge(parts)
+    scene = GaussianArrays.cat(parts)
     means, quats, sh_rest = flip_axes(scene.means, scene.quats, scene.sh_rest, UP_BACK)
     return decoded(path, means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
 
@@ -97,18 +98,6 @@ def _parts(
                 raise Damaged("its nodes repeat the splats too often")
             parts.append(_transform(part, world_from_mesh))
     return parts
-
-
-def _merge(parts: list[GaussianArrays]) -> GaussianArrays:
-    """All rows of ``parts`` in order, at the highest SH degree among them."""
-    rest = max((part.sh_rest.shape[1] for part in parts), default=0)
-    padded = [GaussianArrays.empty(rest)]
-    for part in parts:
-        missing = rest - part.sh_rest.shape[1]
-        if missing:
-            part = part._replace(sh_rest=np.pad(part.sh_rest, ((0, 0), (0, missing), (0, 0))))
-        padded.append(part)
-    return GaussianArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
 
 
 def _check(path: Path, primitive: dict[str, Any], extension: dict[str, Any]) -> None:

@@ -95,7 +95,7 @@ def read_lod(path: Path | str, level: int = 0) -> GaussianArrays:
     parts = [_rows(index.files[file], runs[file]) for file in sorted(runs)]
     if index.environment is not None:
         parts.append(read_stored(index.environment))
-    return skip_nonfinite(path, _joined(parts))
+    return skip_nonfinite(path, GaussianArrays.cat(parts))
 
 
 def read_index(path: Path) -> LodIndex:
@@ -180,13 +180,3 @@ def _rows(path: Path, runs: list[Run]) -> GaussianArrays:
         raise UserError(f"{path}: used twice by its {INDEX}; copy or export it again")
     rows = [np.arange(run.offset, run.offset + run.count) for run in runs]
     return scene.select(np.concatenate(rows))
-
-
-def _joined(parts: list[GaussianArrays]) -> GaussianArrays:
-    """All rows, with the highest SH degree of the parts."""
-    if not parts:
-        return GaussianArrays.empty()
-    most = max(part.sh_rest.shape[1] for part in parts)
-    rest = [np.pad(p.sh_rest, ((0, 0), (0, most - p.sh_rest.shape[1]), (0, 0))) for p in parts]
-    padded = [part._replace(sh_rest=each) for part, each in zip(parts, rest, strict=True)]
-    return GaussianArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))

@@ -273,10 +273,9 @@ class _Writer:
 
     def _store(self, name: str, parts: Sequence[GaussianArrays]) -> None:
         """Write one file, a SOG scene in a folder."""
-        joined = GaussianArrays(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
         folder = self._folder / name
         folder.mkdir()
-        for member, content in encode_sog(joined).items():
+        for member, content in encode_sog(GaussianArrays.cat(parts)).items():
             with atomic_path(folder / member) as temporary:
                 temporary.write_bytes(content)
 

@@ -4,6 +4,7 @@ Arrays are NumPy, float32 unless stated otherwise, one row per Gaussian, with th
 fields of `GaussianArrays`.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,7 @@ def packable(path: Path, gaussians: GaussianArrays) -> GaussianArrays:
     names ``path``. The zero quaternion becomes the identity.
     """
     finite = skip_nonfinite(path, gaussians)
-    return finite._replace(quats=unit_quats(finite.quats))
+    return replace(finite, quats=unit_quats(finite.quats))
 
 
 def spatial_order(means: np.ndarray) -> np.ndarray:

@@ -5,9 +5,12 @@ f_dc_0..2, f_rest_0..44, opacity, scale_0..2, rot_0..3. Values are the optimised
 their activations: opacity is a logit, scale a natural logarithm, rot a quaternion wxyz of any
 length. f_rest is channel-major: all K coefficients of red, then of green, then of blue (`sh_rest`
 of `GaussianArrays` is (N, K, 3)). Lower degrees have fewer f_rest properties.
+
+A comment in the header says how an antialiased scene is rendered: "SplatRenderMode: mip", which
+Brush introduced. Postshot writes "antialiased 1" or "postshot.anti_aliasing=1".
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +33,15 @@ _NORMALS = ["nx", "ny", "nz"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
+#: Comments in lower case, and whether the scene is antialiased.
+_MODES = {
+    "splatrendermode: mip": True,
+    "splatrendermode: default": False,
+    "antialiased 1": True,
+    "antialiased 0": False,
+    "postshot.anti_aliasing=1": True,
+    "postshot.anti_aliasing=0": False,
+}
 _REQUIRED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 
 
@@ -88,7 +100,19 @@ def read_ply(path: Path | str) -> GaussianArrays:
         for start, rows in table.rows():
             for name, target in columns:
                 target[start : start + len(rows)] = rows[name]
-    return GaussianArrays(means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
+    arrays = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
+    return GaussianArrays(*arrays, antialiased=is_antialiased(table.comments))
+
+
+def is_antialiased(comments: Sequence[str]) -> bool:
+    """Whether the comments of a header say so; the last one that says something counts."""
+    marks = [_MODES[line] for line in map(str.lower, comments) if line in _MODES]
+    return bool(marks) and marks[-1]
+
+
+def mode_comments(antialiased: bool) -> list[str]:
+    """The comments of a header for `is_antialiased`; a scene in the usual mode needs none."""
+    return ["SplatRenderMode: mip"] if antialiased else []
 
 
 def write_ply(path: Path | str, gaussians: GaussianArrays) -> None:
@@ -97,17 +121,24 @@ def write_ply(path: Path | str, gaussians: GaussianArrays) -> None:
     Raises:
         OSError: the folder is missing or not writable, or the disk is full.
     """
-    write_ply_parts(path, len(gaussians.means), gaussians.sh_rest.shape[1], [gaussians])
+    count, rest = len(gaussians.means), gaussians.sh_rest.shape[1]
+    write_ply_parts(path, count, rest, [gaussians], antialiased=gaussians.antialiased)
 
 
 def write_ply_parts(
-    path: Path | str, count: int, rest: int, parts: Iterable[GaussianArrays]
+    path: Path | str,
+    count: int,
+    rest: int,
+    parts: Iterable[GaussianArrays],
+    *,
+    antialiased: bool,
 ) -> None:
     """`write_ply` for a scene that does not fit into the memory: its parts one after the other.
 
     Args:
         count: number of Gaussians of all parts.
         rest: K, the number of SH coefficients beyond the constant one; parts may have fewer.
+        antialiased: whether the scene is marked as `Gaussians.antialiased`.
 
     Raises:
         OSError: see `write_ply`.
@@ -115,7 +146,8 @@ def write_ply_parts(
     names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), "opacity", *_SCALES, *_QUATS]
     written = 0
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(header(count, [("float", name) for name in names]))
+        properties = [("float", name) for name in names]
+        file.write(header(count, properties, mode_comments(antialiased)))
         for part in parts:
             for start in range(0, len(part.means), _WRITE_ROWS):
                 rows = part.select(slice(start, start + _WRITE_ROWS))

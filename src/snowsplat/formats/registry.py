@@ -42,6 +42,7 @@ class Format:
         read: None for a format that cannot be read.
         write: None for a format that cannot be written.
         loses: a description, for users, of the data that a scene loses in this format.
+        marks_antialiased: whether a file can say that its scene is antialiased, see `Gaussians`.
         version: the version of a file that ``recognises`` accepts, if the format has several.
         bytes: the size of a scene; None: that of its file, the only one.
     """
@@ -52,6 +53,7 @@ class Format:
     read: Callable[[Path], GaussianArrays] | None
     write: Callable[[Path, GaussianArrays], None] | None
     loses: str
+    marks_antialiased: bool
     version: Callable[[Path], str] | None = None
     bytes: Callable[[Path], int] | None = None
 
@@ -69,6 +71,7 @@ FORMATS: list[Format] = [
         read_compressed_ply,
         write_compressed_ply,
         "precision: positions and scales have 10 to 11 bits, rotations 10, all other values 8",
+        True,
     ),
     Format(
         "PLY",
@@ -77,6 +80,7 @@ FORMATS: list[Format] = [
         read_ply,
         write_ply,
         "nothing",
+        True,
     ),
     Format(
         "SPZ",
@@ -85,6 +89,7 @@ FORMATS: list[Format] = [
         read_spz,
         write_spz,
         "precision: positions have 24 bits, rotations 10, SH 4 to 8, all other values 8",
+        True,
         spz_version,
     ),
     Format(
@@ -94,6 +99,7 @@ FORMATS: list[Format] = [
         read_sog,
         write_sog,
         "precision: positions have 16 bits, all other values 8; SH are rows of a palette",
+        True,
         sog_version,
     ),
     Format(
@@ -103,6 +109,7 @@ FORMATS: list[Format] = [
         read_lod,
         write_lod,
         "precision: positions have 16 bits, all other values 8; SH are rows of palettes",
+        True,
         bytes=lod_bytes,
     ),
     Format(
@@ -112,6 +119,7 @@ FORMATS: list[Format] = [
         read_glb,
         write_glb,
         "nothing except for rounding",
+        False,
         lambda _: "2, KHR_gaussian_splatting",
     ),
     Format(
@@ -121,6 +129,7 @@ FORMATS: list[Format] = [
         read_splat,
         write_splat,
         "all SH, and precision: rotations, colours and opacity have 8 bits",
+        False,
     ),
     Format(
         "ksplat",
@@ -129,6 +138,7 @@ FORMATS: list[Format] = [
         read_ksplat,
         None,
         "precision: SH have 8 to 32 bits, all other values 16 or 32",
+        False,
     ),
 ]
 

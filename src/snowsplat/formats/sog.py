@@ -15,6 +15,8 @@ which has these images:
 - shN_centroids: the palette: 64 entries per row, one pixel per SH coefficient, as indices into a
   codebook.
 
+The entry "model" of `meta.json` is "antialiased" for an antialiased scene; other scenes have none.
+
 Version 1 has evenly spaced levels between mins and maxs instead of codebooks. A scene of version 1
 is usually a folder; `read_sog` takes the path of its `meta.json`. The coordinate frame is that of
 the PLY files. Specification: developer.playcanvas.com, "The SOG Format".
@@ -71,9 +73,11 @@ def read_stored(path: Path | str) -> GaussianArrays:
             layout = _layout(files.meta())
             packing.check_count(path, layout.count, files.bytes_with(layout.files.values()))
             arrays = _decode(files, layout)
+            antialiased = files.meta().get("model") == "antialiased"
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
-    return GaussianArrays(*(np.array(array, np.float32) for array in arrays))
+    as_float32 = (np.array(array, np.float32) for array in arrays)
+    return GaussianArrays(*as_float32, antialiased=antialiased)
 
 
 def sog_files(path: Path) -> list[Path]:
@@ -246,6 +250,7 @@ def encode_sog(gaussians: GaussianArrays) -> dict[str, bytes]:
         "version": 2,
         "asset": {"generator": "snowsplat"},
         "count": n,
+        **({"model": "antialiased"} if gaussians.antialiased else {}),
         "means": {
             "mins": low.tolist(),
             "maxs": high.tolist(),

@@ -73,12 +73,6 @@ def read_spz(path: Path | str) -> GaussianArrays:
     path = Path(path)
     contents = unpack(path, packing.read_file(path))
     header, columns = contents.header, contents.columns
-    if header.flags & ANTIALIASED:
-        logger.warning(
-            "%s: trained with the anti-aliasing of Mip-Splatting, which is not supported; "
-            "distant views look slightly different",
-            path,
-        )
     if header.sh_degree > 3:
         logger.warning("%s: SH degree %d is reduced to 3", path, header.sh_degree)
     n = header.count
@@ -101,6 +95,7 @@ def read_spz(path: Path | str) -> GaussianArrays:
         packing.opacity_logits(alpha[:, 0]),
         (color.astype(np.float32)[:, None] - 127.5) / _COLOR_STEP,
         sh_rest,
+        antialiased=bool(header.flags & ANTIALIASED),
     )
 
 
@@ -178,7 +173,8 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
         _pack_sh(sh_rest),
     ]
     degree = SH_REST_COUNTS.index(sh_rest.shape[1])
-    header = Header(version, len(means), degree, bits, flags=0)
+    flags = ANTIALIASED if gaussians.antialiased else 0
+    header = Header(version, len(means), degree, bits, flags)
     data = pack(header, [column.tobytes() for column in columns])
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)

@@ -6,6 +6,7 @@ The page does the same on the GPU (`web/splats.vert`).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -38,7 +39,8 @@ def appearance(gaussians: Gaussians, snow: Snow) -> Gaussians:
     colors = gaussians.base_colors
     bright = colors / colors.amax(1, keepdim=True).clamp(1.0 / BRIGHTER, 1.0)
     change = bright + WHITE * (1.0 - bright) - colors
-    return Gaussians(
+    return replace(
+        gaussians,
         means=torch.from_numpy(snow.position.T.copy()),
         log_scales=scales + morph[:, None] * (scales.clamp(low, high) - scales),
         quats=quat_product(_spin(snow), gaussians.rotations),

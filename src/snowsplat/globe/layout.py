@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -197,7 +197,7 @@ def _inside(gaussians: Gaussians) -> Gaussians:
     fade = ((_FADE[1] - reach) / (_FADE[1] - _FADE[0])).clamp(0.0, 1.0)
     opacities = gaussians.opacities * (fade * fade * (3 - 2 * fade)).to(gaussians.means.dtype)
     keep = (opacities > _MIN_OPACITY) & (means[:, 1] < FLOOR + _SUNK) & (lowest < FLOOR + 2 * _SUNK)
-    faded = Gaussians(**gaussians.parameters() | {"opacity_logits": opacities.logit(1e-6)})
+    faded = replace(gaussians, opacity_logits=opacities.logit(1e-6))
     return faded.select(keep)
 
 

@@ -54,7 +54,7 @@ def write_page(path: Path | str, arrangement: Arrangement, name: str) -> None:
         "surrounded": arrangement.surrounded,
         "columns": columns,
         "constants": constants(),
-        "glsl": glsl_constants(),
+        "glsl": glsl_constants(arrangement.gaussians.antialiased),
         "shaders": {key: _source(file) for key, file in _SHADERS.items()},
         "simulation": simulation,
     }
@@ -90,7 +90,7 @@ def constants() -> dict[str, Any]:
     }
 
 
-def glsl_constants() -> str:
+def glsl_constants(antialiased: bool) -> str:
     """The constants of this package that the shaders use, as GLSL declarations."""
     numbers = {
         name: getattr(module, name)
@@ -103,6 +103,7 @@ def glsl_constants() -> str:
         for name in names
     }
     lines = [f"const float {name} = {value!r};" for name, value in numbers.items()]
+    lines.append(f"const bool ANTIALIASED = {str(antialiased).lower()};")
     vectors = {name: getattr(glass, name) for name in ("SNOW", "BRASS", "LIGHT", "PLATE")}
     vectors["FLAKE"] = physics.FLAKE
     for name, value in vectors.items():

@@ -35,7 +35,8 @@ struct CameraParams {
   double width, height;     // pixels
   double fx, fy, cx, cy;    // pixels
   double near;              // world units; nearer Gaussians are not visible
-  SNOW_FIELDS(cam_from_world, width, height, fx, fy, cx, cy, near)
+  int64_t antialiased;      // 1: the dilation of a splat lowers its opacity; see projection.h
+  SNOW_FIELDS(cam_from_world, width, height, fx, fy, cx, cy, near, antialiased)
 };
 
 // The parameters of N Gaussians.

@@ -7,6 +7,10 @@
 //
 // Σ' is computed as U Uᵀ + 0.3 I, with U = T M, T = J W (2×3) and M = R S (3×3), without the 3D
 // covariance Σ.
+//
+// The dilation by 0.3 I makes a splat larger, and so small splats too prominent. If `antialiased`,
+// the opacity is multiplied by ρ = √(det(U Uᵀ) / det Σ'), so that the integral of the splat does not
+// change (the 2D mip filter of Yu et al. 2024, with the variance that other renderers use).
 #pragma once
 
 #include "params.h"
@@ -20,6 +24,7 @@ struct PinholeCamera {
   T rotation[9], translation[3];  // cam_from_world
   T position[3];                  // camera centre in the world, -Rᵀ t
   T fx, fy, cx, cy, width, height, near;
+  bool antialiased;
   // Limits of x/z and y/z, 15% outside of the image. J is evaluated with the clamped values,
   // because the linear approximation of the projection is unbounded farther outside.
   T min_tx, max_tx, min_ty, max_ty;
@@ -29,7 +34,7 @@ struct PinholeCamera {
   template <class Real>
   SNOW_INLINE PinholeCamera(const CameraParams<T>& c, Real)
       : fx(T(c.fx)), fy(T(c.fy)), cx(T(c.cx)), cy(T(c.cy)), width(T(c.width)), height(T(c.height)),
-        near(T(c.near)) {
+        near(T(c.near)), antialiased(c.antialiased != 0) {
     for (int i = 0; i < 3; i++) {
       for (int j = 0; j < 3; j++) rotation[3 * i + j] = c.cam_from_world[4 * i + j];
       translation[i] = c.cam_from_world[4 * i + 3];
@@ -60,7 +65,9 @@ struct ProjectedGaussian {
   Real R[9], M[9], T[6], U[6];
   Real normal[3];  // U₀ × U₁, the cross product of the rows of U
   Real cov_xx, cov_xy, cov_yy, inv_det;
-  Real mean2d[2], conic[3], opacity;
+  Real undilated_det;  // det(U Uᵀ) = |U₀ × U₁|²
+  Real mean2d[2], conic[3];
+  Real activated_opacity, opacity;  // sigmoid(logit); of the splat
 };
 
 // Quaternion wxyz (unit) → rotation matrix, row-major.
@@ -131,14 +138,16 @@ SNOW_INLINE void project_gaussian(const GaussianShape<Real>& g, const PinholeCam
   n[1] = U[2] * U[3] - U[0] * U[5];
   n[2] = U[0] * U[4] - U[1] * U[3];
   const Real dilation(kDilation);
-  p.inv_det = Real(1.f) / (n[0] * n[0] + n[1] * n[1] + n[2] * n[2] +
-                           dilation * (p.cov_xx + p.cov_yy - dilation));
+  p.undilated_det = n[0] * n[0] + n[1] * n[1] + n[2] * n[2];
+  p.inv_det = Real(1.f) / (p.undilated_det + dilation * (p.cov_xx + p.cov_yy - dilation));
   p.conic[0] = p.cov_yy * p.inv_det;
   p.conic[1] = -(p.cov_xy * p.inv_det);
   p.conic[2] = p.cov_xx * p.inv_det;
   p.mean2d[0] = Real(cam.fx) * u + Real(cam.cx);
   p.mean2d[1] = Real(cam.fy) * v + Real(cam.cy);
-  p.opacity = Real(1.f) / (Real(1.f) + exp(-g.opacity_logit));
+  p.activated_opacity = Real(1.f) / (Real(1.f) + exp(-g.opacity_logit));
+  p.opacity = p.activated_opacity;
+  if (cam.antialiased) p.opacity = p.opacity * sqrt(p.undilated_det * p.inv_det);
 }
 
 template <class Real>
@@ -160,29 +169,38 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
                                       PoseGradient<Real>* pose) {
   const T* W = cam.rotation;
   const Real two(2.f), half(0.5f);
-  grad.opacity_logit = d.opacity * p.opacity * (Real(1.f) - p.opacity);
+  grad.opacity_logit = d.opacity * p.opacity * (Real(1.f) - p.activated_opacity);
 
   // V = K U, where K = Σ'⁻¹ is the conic. It is computed from the identity
   // (v·v) u − (u·v) v = v × (u × v). The direct product K U is inaccurate for long thin splats, for
   // the same reason as the determinant above.
   const Real dilation(kDilation);
   const Real *U = p.U, *n = p.normal;
-  Real V[6];
+  Real X[6], V[6];  // X = det(U Uᵀ) (U Uᵀ)⁻¹ U
   for (int k = 0; k < 3; k++) {
     const int k1 = (k + 1) % 3, k2 = (k + 2) % 3;
-    V[k] = (dilation * U[k] + U[3 + k1] * n[k2] - U[3 + k2] * n[k1]) * p.inv_det;
-    V[3 + k] = (dilation * U[3 + k] + n[k1] * U[k2] - n[k2] * U[k1]) * p.inv_det;
+    X[k] = U[3 + k1] * n[k2] - U[3 + k2] * n[k1];
+    X[3 + k] = n[k1] * U[k2] - n[k2] * U[k1];
+    V[k] = (dilation * U[k] + X[k]) * p.inv_det;
+    V[3 + k] = (dilation * U[3 + k] + X[3 + k]) * p.inv_det;
   }
 
   // G is the symmetric matrix of the gradient of the conic; its off-diagonal element is half of
   // d.conic[1]. From Σ' = U Uᵀ + d I follow dΣ' = −K G K and dU = −2 K G V. Because U = T M and
   // M = R S, the gradient of log s_k is the dot product of the columns k of U and dU:
   // U_k·dU_k = −2 V_k·(G V_k).
+  //
+  // If antialiased, the opacity o' = o ρ depends on A = U Uᵀ: d ln ρ = ½ (A⁻¹ − K), as the gradient
+  // of A, and A⁻¹ − K = d A⁻¹ K. With Y = A⁻¹ U, it adds o' d K Y to dU, and o' d V_k·Y_k to the
+  // gradient of log s_k. So o' d Y is added to −2 G V. A visible splat has ρ ≥ 1/255.
   const Real a = p.conic[0], b = p.conic[1], c = p.conic[2];
   const Real ga = d.conic[0], gb = half * d.conic[1], gc = d.conic[2];
   Real dU[6], dM[9], dT[6];
+  Real gain(0.f);  // of A⁻¹ U · det A
+  if (cam.antialiased) gain = d.opacity * p.opacity * dilation / p.undilated_det;
   for (int k = 0; k < 3; k++) {
-    const Real g0 = -two * (ga * V[k] + gb * V[3 + k]), g1 = -two * (gb * V[k] + gc * V[3 + k]);
+    Real g0 = -two * (ga * V[k] + gb * V[3 + k]), g1 = -two * (gb * V[k] + gc * V[3 + k]);
+    if (cam.antialiased) g0 += gain * X[k], g1 += gain * X[3 + k];
     dU[k] = a * g0 + b * g1;
     dU[3 + k] = b * g0 + c * g1;
     grad.log_scale[k] = V[k] * g0 + V[3 + k] * g1;

@@ -39,11 +39,13 @@ def adam_step(
     visible_only: bool = False,
     valid: Tensor | None = None,
     nonfinite_rows: Tensor | None = None,
+    antialiased: bool = False,
 ) -> None:
     """Propagates the gradient of the splats through `project` and takes one Adam step, in place.
 
     The gradients of the parameters are never written to memory. This halves the time of this part
-    of a training step. The camera arguments and `sh_degree` must be those passed to `project`.
+    of a training step. The camera arguments, `sh_degree` and `antialiased` must be those passed to
+    `project`.
 
     Args:
         params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of
@@ -118,7 +120,9 @@ def adam_step(
             splats=len(ids),
             ids=ids,
             grad_packed=packed_grad,
-            camera=camera_params("adam_step", pose, width, height, fx, fy, cx, cy),
+            camera=camera_params(
+                *("adam_step", pose, width, height, fx, fy, cx, cy), antialiased=antialiased
+            ),
             sh_rest_rows=tensors[5].shape[1],
             sh_degree=sh_degree,
             **tensor_params,

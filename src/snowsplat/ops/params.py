@@ -25,6 +25,7 @@ class CameraParams(Params):
     cx: float
     cy: float
     near: float
+    antialiased: bool
 
 
 @dataclass(slots=True, kw_only=True)

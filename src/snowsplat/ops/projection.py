@@ -45,6 +45,7 @@ def project(
     cy: float,
     sh_degree: int,
     near: float = 0.2,
+    antialiased: bool = False,
 ) -> Splats2D:
     """Projects N Gaussians to splats on a camera's image plane, without the invisible ones.
 
@@ -61,18 +62,20 @@ def project(
         cam_from_world: (3, 4), with the axes of OpenCV.
         fx, fy, cx, cy: in pixels.
         near: > 0, in world units.
+        antialiased: multiply the opacity by √(det(J W Σ Wᵀ Jᵀ) / det Σ'), so that the term 0.3 I
+            below does not make small splats too prominent: the 2D mip filter of Yu et al. 2024.
 
     All tensors are float32, or all are float64.
 
     The 2D covariance is Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (Kerbl et al. 2023, eq. 5); the colour is
-    max(0, ½ + Σ c_k Y_k(direction)). A Gaussian is visible if it lies beyond `near`, its opacity is
-    at least 1/255, and the bounding box of its ellipse {α ≥ 1/255} overlaps the rectangle of the
-    pixel centres. Gradients flow to every tensor, including the camera's pose.
+    max(0, ½ + Σ c_k Y_k(direction)). A Gaussian is visible if it lies beyond `near`, the opacity of
+    its splat is at least 1/255, and the bounding box of its ellipse {α ≥ 1/255} overlaps the
+    rectangle of the pixel centres. Gradients flow to every tensor, including the camera's pose.
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """
     pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
-    camera = camera_params("project", pose, width, height, fx, fy, cx, cy, near)
+    camera = camera_params("project", pose, width, height, fx, fy, cx, cy, near, antialiased)
     check_parameters("project", means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_degree)
     parameters = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
     packed, ids = _Project.apply(sh_degree, camera, camera.cam_from_world, *parameters)
@@ -94,11 +97,12 @@ def add_project_gradients(
     cx: float,
     cy: float,
     sh_degree: int,
+    antialiased: bool = False,
 ) -> None:
     """Propagates the gradient of splats through `project`, and adds the result to ``grads``.
 
-    So the gradients of several views can be summed before an `adam_step`. The camera arguments and
-    `sh_degree` must be those passed to `project`.
+    So the gradients of several views can be summed before an `adam_step`. The camera arguments,
+    `sh_degree` and `antialiased` must be those passed to `project`.
 
     Args:
         params: the parameters of the Gaussians, as for `adam_step`.
@@ -118,7 +122,9 @@ def add_project_gradients(
     check_tensor("add_project_gradients", "packed_grad", packed_grad, shape, means)
     check_ids("add_project_gradients", ids, means)
     pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
-    camera = camera_params("add_project_gradients", pose, width, height, fx, fy, cx, cy)
+    camera = camera_params(
+        *("add_project_gradients", pose, width, height, fx, fy, cx, cy), antialiased=antialiased
+    )
     done = launch(
         variant("project_bwd", means),
         ProjectBackwardParams(
@@ -148,8 +154,9 @@ def camera_params(
     cx: float,
     cy: float,
     near: float = 0.2,
+    antialiased: bool = False,
 ) -> CameraParams:
-    """The camera as a parameter of the native functions.
+    """The camera, and how it filters, as a parameter of the native functions.
 
     Raises ValueError for an image without pixels, or a camera that is not finite or positive.
     """
@@ -171,6 +178,7 @@ def camera_params(
         cx=float(cx),
         cy=float(cy),
         near=float(near),
+        antialiased=antialiased,
     )
 
 

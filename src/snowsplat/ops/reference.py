@@ -18,6 +18,7 @@ kernels with these functions in float64. From top to bottom, this file describes
 - [Kerbl et al. 2023] 3D Gaussian Splatting for Real-Time Radiance Field Rendering. ACM TOG 42(4).
 - [Zwicker et al. 2001] EWA Volume Splatting. IEEE Visualization. (The J and Σ' of `_project_rows`.)
 - [Zwicker et al. 2002] EWA Splatting. IEEE TVCG 8(3). (The low-pass filter, here `LOW_PASS`.)
+- [Yu et al. 2024] Mip-Splatting: Alias-free 3D Gaussian Splatting. CVPR. (`antialiased`.)
 
 Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) has its centre at
 (i + 0.5, j + 0.5).
@@ -78,17 +79,18 @@ def project(
     cy: float,
     sh_degree: int,
     near: float = 0.2,
+    antialiased: bool = False,
 ) -> Splats2D:
     """Projects N Gaussians to splats on a camera's image plane, without the invisible ones.
 
     means (N, 3) in world units; log_scales (N, 3); quats (N, 4) wxyz, not necessarily normalised
     (zero: no rotation); opacity_logits (N,); sh_dc (N, 1, 3); sh_rest (N, K, 3), whose first
     (sh_degree + 1)² − 1 rows are used; cam_from_world (3, 4); fx, fy, cx, cy in pixels; near > 0 in
-    world units.
+    world units. If `antialiased`, the low-pass filter does not change the integral of a splat.
 
-    A Gaussian is visible if it lies beyond `near`, its opacity is ≥ 1/255, and the bounding box of
-    its ellipse {α ≥ 1/255} overlaps the rectangle of the pixel centres. A Gaussian whose 2D
-    covariance overflows the dtype is not visible.
+    A Gaussian is visible if it lies beyond `near`, the opacity of its splat is ≥ 1/255, and the
+    bounding box of its ellipse {α ≥ 1/255} overlaps the rectangle of the pixel centres. A Gaussian
+    whose 2D covariance overflows the dtype is not visible.
     """
     if sh_rest.shape[1] < (sh_degree + 1) ** 2 - 1:
         raise ValueError(
@@ -96,7 +98,7 @@ def project(
         )
     parameters = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
     cam_from_world = cam_from_world.to(means)
-    view = (cam_from_world, width, height, fx, fy, cx, cy, sh_degree)
+    view = (cam_from_world, width, height, fx, fy, cx, cy, sh_degree, antialiased)
     with torch.no_grad():
         depths = means @ cam_from_world[2, :3] + cam_from_world[2, 3]
         ids = torch.nonzero(depths > near)[:, 0]
@@ -120,6 +122,7 @@ def _project_rows(
     cx: float,
     cy: float,
     sh_degree: int,
+    antialiased: bool,
 ) -> tuple[Splats2D, Tensor]:
     """Projects every row of `parameters` (in the order of `project`), visible or not.
 
@@ -151,7 +154,8 @@ def _project_rows(
     # det Σ' = |u0 × u1|² + 0.3 (xx + yy) + 0.3². The formula xx·yy − xy² is inaccurate for thin
     # splats.
     cross = torch.linalg.cross(u0, u1)
-    det = (cross * cross).sum(dim=1) + LOW_PASS * (xx + yy) + LOW_PASS**2
+    undilated_det = (cross * cross).sum(dim=1)
+    det = undilated_det + LOW_PASS * (xx + yy) + LOW_PASS**2
     xx, yy = xx + LOW_PASS, yy + LOW_PASS
     conics = torch.stack([yy / det, -xy / det, xx / det], dim=1)
     major = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)  # the larger eigenvalue of Σ'
@@ -166,7 +170,10 @@ def _project_rows(
     basis = sh_basis(directions, sh_degree)  # (M, count)
     colors = (0.5 + (basis[:, :, None] * coefficients).sum(dim=1)).clamp(min=0)
 
+    # The 2D mip filter (Yu et al. 2024, eq. 10): the low-pass filter keeps the splat's integral.
     opacities = torch.sigmoid(opacity_logits)
+    if antialiased:
+        opacities = opacities * (undilated_det / det).sqrt()
     radii = 3 * major.detach().sqrt()
     return Splats2D.pack(means2d, conics, opacities, z, colors, radii), variances
 
@@ -237,6 +244,7 @@ def add_project_gradients(
     cx: float,
     cy: float,
     sh_degree: int,
+    antialiased: bool = False,
 ) -> None:
     """Propagates the gradient of splats through `project`, and adds the result to ``grads``.
 
@@ -249,7 +257,17 @@ def add_project_gradients(
     rows = ids.long()
     with torch.enable_grad():
         selected = [params[name].detach()[rows].requires_grad_() for name in PARAMETERS]
-        view = (cam_from_world.to(packed_grad), width, height, fx, fy, cx, cy, sh_degree)
+        view = (
+            cam_from_world.to(packed_grad),
+            width,
+            height,
+            fx,
+            fy,
+            cx,
+            cy,
+            sh_degree,
+            antialiased,
+        )
         splats, _ = _project_rows(selected, *view)
         of_rows = torch.autograd.grad(splats.packed, selected, packed_grad)
     for name, grad in zip(PARAMETERS, of_rows, strict=True):
@@ -539,6 +557,7 @@ def adam_step(
     visible_only: bool = False,
     valid: Tensor | None = None,
     nonfinite_rows: Tensor | None = None,
+    antialiased: bool = False,
 ) -> None:
     """Propagates the gradient of the splats through `project` and takes one Adam step, in place.
 
@@ -579,6 +598,7 @@ def adam_step(
             cx=cx,
             cy=cy,
             sh_degree=sh_degree,
+            antialiased=antialiased,
         )
 
     beta1, beta2 = betas

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.scene.simplify import simplify
 from snowsplat.util.errors import SettingError, UserError
+
+logger = logging.getLogger(__name__)
 
 Vector = tuple[float, float, float]
 Box = tuple[float, float, float, float, float, float]
@@ -146,7 +149,12 @@ def convert(
     given = [sources] if isinstance(sources, Path | str) else sources
     files = [scene_file(Path(source)) for source in given]
     refined = None if dataset is None else _refinement(edits, files[0], Path(dataset), observer)
-    scene = edits.apply(edit.merge([read_gaussians(file) for file in files]))
+    parts = [read_gaussians(file) for file in files]
+    if len({part.antialiased for part in parts}) > 1:
+        logger.warning(
+            "%s: only some of the scenes are antialiased; all are marked as the first one", target
+        )
+    scene = edits.apply(edit.merge(parts))
     write = write_gaussians
     if spz_version is not None:
         write = partial(_write_spz, version=spz_version)

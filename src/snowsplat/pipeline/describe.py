@@ -94,6 +94,7 @@ def _gaussians(gaussians: GaussianArrays) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "gaussians": count,
         "sh_degree": SH_REST_COUNTS.index(gaussians.sh_rest.shape[1]),
+        "antialiased": gaussians.antialiased,
         "bytes_in_memory": sum(array.nbytes for array in gaussians),
     }
     if finite_count < count:

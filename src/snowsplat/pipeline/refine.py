@@ -52,6 +52,7 @@ def refine(
         relative_scale=0.0,
         near_limit=0.0,
         max_gaussians=max(1, len(gaussians)),
+        antialias=gaussians.antialiased,
     )
     trainer = Trainer(dataset, config, initial=gaussians.clone())
     observer.steps_begin(0, _STEPS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -22,7 +23,11 @@ _RANGE_VIEWS = 8  # number of views that determine the range of the depth colour
 
 
 def render_images(
-    scene: TrainedScene, *, splits: Sequence[Split] = ("test", "train"), depth: Depth = "none"
+    scene: TrainedScene,
+    *,
+    splits: Sequence[Split] = ("test", "train"),
+    depth: Depth = "none",
+    antialias: bool | None = None,
 ) -> dict[Path, int]:
     """Render the views of a scene into OUT/SPLIT/ours_N, where N is the number of steps.
 
@@ -30,6 +35,9 @@ def render_images(
     gt/00000.png, and depth/00000.png. The depth is the mean camera z. It is written either as
     16-bit grey values, whose unit in world units is in depth/world_units_per_step.json, or in
     colours from near to far.
+
+    Args:
+        antialias: whether to render with the 2D mip filter, see `Gaussians`; default: as trained.
 
     Returns:
         The folders renders/ and the number of images in each.
@@ -44,6 +52,8 @@ def render_images(
         raise UserError(
             "no views to render: no photos were held out for testing; use the `split` train"
         )
+    if antialias is not None:
+        scene = replace(scene, gaussians=replace(scene.gaussians, antialiased=antialias))
     rendered = {}
     for split, of_split in chosen.items():
         target = scene.folder.path / split / f"ours_{scene.iteration}"

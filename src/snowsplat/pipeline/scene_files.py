@@ -38,5 +38,5 @@ def _write_html(path: Path, gaussians: GaussianArrays) -> None:
 
 
 register_format(
-    Format("HTML", (".html",), None, None, _write_html, "the same as in compressed PLY")
+    Format("HTML", (".html",), None, None, _write_html, "the same as in compressed PLY", True)
 )

@@ -88,6 +88,7 @@ class VideoOptions:
             photos.
         depth: render a second video that shows the depth in colours.
         side_by_side: render only one video, with colour on the left and depth on the right.
+        antialias: whether to render with the 2D mip filter, see `Gaussians`; None: as trained.
 
     Raises:
         UserError: an unusable length, rate or size.
@@ -99,6 +100,7 @@ class VideoOptions:
     size: str | None = None
     depth: bool = False
     side_by_side: bool = False
+    antialias: bool | None = None
 
     def __post_init__(self) -> None:
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
@@ -154,12 +156,15 @@ def render_video(
         raise UserError(f"{target}: the name of a video must end in .mp4")
     device = (compute or Compute()).apply()
     source = _load(Path(scene), iteration, options.name)
+    gaussians = source.gaussians.to(device)
+    if options.antialias is not None:
+        gaussians.antialiased = options.antialias
     cameras = cameras_along(
         *(options.path, source.gaussians, source.cameras, options.frames),
         VideoSize.parse(options.size),
     )
     video = Video(
-        gaussians=source.gaussians.to(device),
+        gaussians=gaussians,
         cameras=cameras,
         background=source.background,
         file=source.file if target is None else Path(target),

@@ -120,10 +120,11 @@ class NewestScene:
 
         if path.parent != self._folder.checkpoints:
             return read_gaussians(path)
-        tensors = checkpoint.load(path).tensors
+        saved = checkpoint.load(path)
         part = "gaussians."
-        own = {name[len(part) :]: t for name, t in tensors.items() if name.startswith(part)}
+        own = {n[len(part) :]: t for n, t in saved.tensors.items() if n.startswith(part)}
         try:
-            return Gaussians(**own)
-        except (TypeError, ValueError):
+            antialiased = saved.meta.get("training", {}).get("antialias", False)
+            return Gaussians(**own, antialiased=bool(antialiased))
+        except (AttributeError, TypeError, ValueError):
             raise UserError(f"{path}: not a checkpoint of a training run") from None

@@ -82,6 +82,5 @@ class Camera:
         """
         x_cam = transform_points(self.cam_from_world.to(points.dtype), points)
         depth = x_cam[:, 2]
-        focal = torch.tensor([self.fx, self.fy], dtype=points.dtype)
-        centre = torch.tensor([self.cx, self.cy], dtype=points.dtype)
+        focal, centre = points.new_tensor([[self.fx, self.fy], [self.cx, self.cy]])
         return x_cam[:, :2] / depth[:, None] * focal + centre, depth

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -26,12 +27,11 @@ def transform(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype)
     # A zero quaternion means the identity, but as a factor it would make the product zero.
     quats = torch.where((gaussians.quats == 0).all(1, keepdim=True), identity, gaussians.quats)
-    return Gaussians(
+    return replace(
+        gaussians,
         means=similarity.apply(gaussians.means.to(torch.float64)).to(dtype),
         log_scales=gaussians.log_scales + math.log(similarity.scale),
         quats=quat_product(turn, quats),
-        opacity_logits=gaussians.opacity_logits,
-        sh_dc=gaussians.sh_dc,
         sh_rest=_rotate_sh(gaussians.sh_rest, similarity.rotation),
     )
 
@@ -83,8 +83,7 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     wanted, rest = SH_REST_COUNTS[degree], gaussians.sh_rest
     if wanted > rest.shape[1]:
         rest = torch.cat([rest, rest.new_zeros(len(rest), wanted - rest.shape[1], 3)], 1)
-    values = gaussians.parameters() | {"sh_rest": rest[:, :wanted].contiguous()}
-    return Gaussians(**values)
+    return replace(gaussians, sh_rest=rest[:, :wanted].contiguous())
 
 
 def _rotate_sh(sh_rest: Tensor, rotation: Tensor) -> Tensor:

@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -38,6 +38,10 @@ class Gaussians:
     sh_rest             (N, K, 3)    other SH coefficients, K = (degree + 1)² − 1: 0, 3, 8, 15
     ==================  ===========  ======================================================
 
+    Attributes:
+        antialiased: whether the Gaussians were trained for the 2D mip filter, and must be rendered
+            with it: see `ops.project`. Scene files call this mode "mip" or "antialiased".
+
     Raises:
         ValueError: shapes, dtypes or devices do not match.
     """
@@ -48,6 +52,7 @@ class Gaussians:
     opacity_logits: Tensor
     sh_dc: Tensor
     sh_rest: Tensor
+    antialiased: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -125,7 +130,12 @@ class Gaussians:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Apply one function to every parameter tensor."""
-        return Gaussians(*(function(tensor) for tensor in self.parameters().values()))
+        return self.with_parameters({n: function(t) for n, t in self.parameters().items()})
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Gaussians:
+        """Other Gaussians, by the names of `parameters`, that are rendered as these."""
+        tensors = (parameters[name] for name in self.parameters())
+        return Gaussians(*tensors, antialiased=self.antialiased)
 
     def select(self, index: Tensor) -> Gaussians:
         """The rows ``index``: (M,) integers in any order, or an (N,) bool mask."""
@@ -142,9 +152,12 @@ class Gaussians:
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """The rows of all ``parts`` in order; needs at least one part, and equal SH degrees."""
-        columns = zip(*(part.parameters().values() for part in parts), strict=True)
-        return Gaussians(*(torch.cat(column) for column in columns))
+        """The rows of all ``parts`` in order; needs at least one part, and equal SH degrees.
+
+        They are rendered as the first part.
+        """
+        rows = [part.parameters() for part in parts]
+        return parts[0].with_parameters({n: torch.cat([r[n] for r in rows]) for n in rows[0]})
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None

@@ -49,6 +49,7 @@ def project(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) 
         cx=camera.cx,
         cy=camera.cy,
         sh_degree=degree,
+        antialiased=gaussians.antialiased,
     )
 
 

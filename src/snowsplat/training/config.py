@@ -58,6 +58,9 @@ class TrainConfig:
             scene. 0: no limit, and ``limit_views`` has no effect.
         limit_views: with more training views than this, the limit of Gaussians grows with the
             square root of their number, because they show a larger scene. 0: it does not grow.
+        antialias: whether the scene is trained and rendered without aliasing in other resolutions
+            than that of the photos: the 2D mip filter of `ops.project`, and the smallest scales of
+            `smoothing`.
         visible_only: whether the optimiser skips Gaussians that are not visible in the view of the
             step. In the paper, their momentum continues to change them. Skipping them is faster,
             without a measurable loss of quality.
@@ -103,6 +106,7 @@ class TrainConfig:
     density: DensityConfig = field(default_factory=AdaptiveDensity)
     gaussians_per_pixel: float = 0.0
     limit_views: int = 0
+    antialias: bool = False
     visible_only: bool = False
     coarse_to_fine: tuple[When, When] = (0, 0)
     leave_out_after: When = 0

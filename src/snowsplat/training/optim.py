@@ -8,7 +8,7 @@ in `lr_schedule`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -76,7 +76,7 @@ class Adam:
         camera, ids = gradient.camera, gradient.splats.ids
         packed_grad: Tensor | None = gradient.packed_grad
         if len(gradients) > 1:
-            ids, packed_grad = _add_up(parameters, gradients), None
+            ids, packed_grad = _add_up(gaussians, gradients), None
         assert ids is not None
         batch = self.schedule.batch
         ops.adam_step(
@@ -99,6 +99,7 @@ class Adam:
             visible_only=self.visible_only,
             valid=gradient.valid,
             nonfinite_rows=gradient.nonfinite_rows,
+            antialiased=gaussians.antialiased,
         )
         for parameter in parameters.values():
             parameter.grad = None
@@ -133,7 +134,7 @@ class Adam:
                 moments[name] = tensors[f"{key}.{name}"].to(average.device, copy=True)
 
 
-def _add_up(parameters: Mapping[str, Tensor], gradients: Sequence[ViewGradient]) -> Tensor:
+def _add_up(gaussians: Gaussians, gradients: Sequence[ViewGradient]) -> Tensor:
     """Add the gradients of several views to ``.grad`` of the parameters.
 
     Returns:
@@ -141,16 +142,16 @@ def _add_up(parameters: Mapping[str, Tensor], gradients: Sequence[ViewGradient])
         a row for each Gaussian, with -1 for the others: the CPU need not wait for their number.
     """
     sums = {}
-    for name, parameter in parameters.items():
+    for name, parameter in gaussians.parameters().items():
         if parameter.grad is None:
             shape = tuple(parameter.shape)
             parameter.grad = scratch.empty(shape, parameter.dtype, parameter.device).zero_()
         sums[name] = parameter.grad
-    means = parameters["means"]
+    means = gaussians.means
     # The index -1, an empty row, is the last element: it is no Gaussian.
     seen = torch.zeros(len(means) + 1, dtype=torch.bool, device=means.device)
     for gradient in gradients:
-        gradient.add_to(parameters, sums)
+        gradient.add_to(gaussians, sums)
         ids = gradient.splats.ids
         assert ids is not None
         seen[ids.long()] = True

@@ -189,7 +189,7 @@ class ProcessShards(Shards):
             for tensor in own.values():
                 if tensor.numel():
                     dist.recv(tensor, src=0)
-            return Gaussians(**own)
+            return Gaussians(*own.values())
         for tensor in gaussians.parameters().values():
             for rank in range(1, self.size):
                 low, high = share(count, rank, self.size)

@@ -125,7 +125,7 @@ class Shards:
 
     def collect(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians of all shards in process 0; the other processes get no rows."""
-        return Gaussians(**self.collected(gaussians.parameters()))
+        return gaussians.with_parameters(self.collected(gaussians.parameters()))
 
 
 #: The only process.

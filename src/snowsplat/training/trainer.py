@@ -29,6 +29,7 @@ from snowsplat.training.pose_refinement import PoseRefinement
 from snowsplat.training.scale_limit import ScaleLimit
 from snowsplat.training.sharded_render import sharded_render
 from snowsplat.training.shards import ALONE, Shards
+from snowsplat.training.smoothing import SmoothingFilter
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.transients import Transients, delayed
@@ -156,7 +157,7 @@ class Trainer:
                 first = initial_gaussians(
                     dataset, start, neutral, self._generators["start"], self.device
                 )
-        self.gaussians = shards.scattered(first)
+        self.gaussians = replace(shards.scattered(first), antialiased=config.antialias)
         self._optimizer = Adam(
             self.gaussians,
             config.learning_rates,
@@ -177,6 +178,7 @@ class Trainer:
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
         self._scale_limit = ScaleLimit(config.relative_scale, cameras, self.schedule)
+        self._smoothing = SmoothingFilter(config.antialias, cameras, self.schedule)
         points = None if dataset.points is None else dataset.points.xyz
         self._near_limit = NearLimit(config.near_limit, cameras, points, self.schedule)
         self.transients = Transients(
@@ -257,6 +259,7 @@ class Trainer:
                 )
                 self._decay.after_step(self.step, self.gaussians)
                 self._scale_limit.after_step(self.step, self.gaussians)
+                self._smoothing.after_step(self.step, self.gaussians)
             step = min(self.step + self.config.batch, self.schedule.iterations)
             batch = self._queue.take(self.step, step)
             losses = self._runner.run(
@@ -380,7 +383,8 @@ class Trainer:
         def part(prefix: str) -> dict[str, Tensor]:
             return {n[len(prefix) :]: t for n, t in tensors.items() if n.startswith(prefix)}
 
-        self.gaussians = Gaussians(**part("gaussians.")).clone().to(self.device)
+        self.gaussians = self.gaussians.with_parameters(part("gaussians.")).clone()
+        self.gaussians = self.gaussians.to(self.device)
         self._optimizer.load_state(part("optimizer."))
         self._runner.reset()
         self._density.load_state(part("density."))

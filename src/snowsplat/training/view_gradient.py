@@ -10,6 +10,7 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
@@ -43,12 +44,12 @@ class ViewGradient:
         assert self.splats.packed.grad is not None
         return self.splats.packed.grad
 
-    def add_to(self, parameters: Mapping[str, Tensor], grads: Mapping[str, Tensor]) -> None:
+    def add_to(self, gaussians: Gaussians, grads: Mapping[str, Tensor]) -> None:
         """Add the gradient with respect to the parameters of the Gaussians to ``grads``."""
         assert self.splats.ids is not None
         camera = self.camera
         ops.add_project_gradients(
-            parameters,
+            gaussians.parameters(),
             grads,
             self.splats.ids,
             self.packed_grad,
@@ -60,6 +61,7 @@ class ViewGradient:
             cx=camera.cx,
             cy=camera.cy,
             sh_degree=self.sh_degree,
+            antialiased=gaussians.antialiased,
         )
 
     def add_statistics(

@@ -69,6 +69,7 @@ class PlyTable:
     count: int  # number of rows
     columns: dict[str, str]  # name -> numpy type code, in the order of the file
     elements: tuple[str, ...]  # the names of all elements in the file
+    comments: tuple[str, ...]  # of the header, without the word "comment"; words are single-spaced
     _before: list[_Element]  # the elements before this one
     _data_start: int  # size of the header in bytes
 
@@ -175,7 +176,9 @@ def open_table(path: Path | str, element: str = "vertex") -> PlyTable:
         needed = sum(e.count * e.row_bytes for e in [*before, wanted])
     if wanted.count and needed > size - data_start:
         raise _truncated(path)
-    return PlyTable(path, format, wanted.count, wanted.properties, tuple(names), before, data_start)
+    comments = tuple(" ".join(words[1:]) for words in lines if words[0] == "comment")
+    layout = (path, format, wanted.count, wanted.properties, tuple(names), comments)
+    return PlyTable(*layout, before, data_start)
 
 
 def _header_lines(path: Path, file: BinaryIO) -> list[list[str]]:
@@ -228,18 +231,22 @@ def _parse_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Elemen
     return format, elements
 
 
-def header(count: int, properties: list[tuple[str, str]]) -> bytes:
+def header(count: int, properties: list[tuple[str, str]], comments: Sequence[str] = ()) -> bytes:
     """The header of a little-endian file of vertices; ``properties`` are pairs (PLY type, name)."""
-    return header_of([("vertex", count, properties)])
+    return header_of([("vertex", count, properties)], comments)
 
 
-def header_of(elements: Sequence[tuple[str, int, list[tuple[str, str]]]]) -> bytes:
+def header_of(
+    elements: Sequence[tuple[str, int, list[tuple[str, str]]]], comments: Sequence[str] = ()
+) -> bytes:
     """The header of a little-endian file.
 
     Args:
         elements: one tuple per element: its name, its count, and pairs (PLY type, name).
+        comments: ASCII, one line each.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {comment}" for comment in comments]
     for name, count, properties in elements:
         lines.append(f"element {name} {count}")
         lines += [f"property {kind} {column}" for kind, column in properties]

@@ -188,6 +188,27 @@ def test_a_real_browser_shows_levels_of_detail(trained, tmp_path):
         assert {name[0] for name in loaded} >= {"0", str(len(counts) - 1)}
 
 
+@pytest.mark.browser
+def test_a_real_browser_shows_an_antialiased_scene(trained, tmp_path):
+    """Its Gaussians are about as large as a pixel; without the filter they would look different."""
+    small = trained.gaussians.clone()
+    small.log_scales = small.log_scales.clamp(-6.0, -5.2)
+    small.opacity_logits += 4.0
+    small.antialiased = True
+    shown_scene, start, *_ = ready(small, trained.cameras)
+    ours = picture(shown_scene, camera_of(start))
+    unfiltered = dataclasses.replace(shown_scene, antialiased=False)
+    files, headers = site(Description("scene"), small, trained.cameras, (0.0, 0.0, 0.0))
+    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
+        page = browser.open(f"{server.url}?webgl&noui")
+        page.wait_for(LOADED, 60)
+        shown = soon(page, lambda shown: psnr(shown, ours) > 30)
+        page.screenshot(tmp_path / "viewer.png")  # for inspection
+        assert shown.mean() == pytest.approx(ours.mean(), rel=0.05)
+        assert picture(unfiltered, camera_of(start)).mean() > 1.2 * shown.mean()
+        assert not page.errors
+
+
 def with_controls(browser: Browser, server: StaticServer, before: np.ndarray) -> None:
     """A second viewer at the same time, with its controls.
 

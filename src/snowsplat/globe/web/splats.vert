@@ -54,6 +54,10 @@ void main() {
     vec3 jy = vec3(0.0, focal.y, -focal.y * slope.y) / p.z;
     vec3 fx = jx * factor, fy = jy * factor;
     float xx = dot(fx, fx) + 0.3, yy = dot(fy, fy) + 0.3, xy = dot(fx, fy);
+    if (ANTIALIASED) {
+        vec3 normal = cross(fx, fy); // det(U Uᵀ) = |U₀ × U₁|²
+        opacity *= sqrt(dot(normal, normal) / (xx * yy - xy * xy));
+    }
     float middle = 0.5 * (xx + yy);
     float radius = length(vec2(0.5 * (xx - yy), xy));
     float large = middle + radius, small = max(middle - radius, 0.05);

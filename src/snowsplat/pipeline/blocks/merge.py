@@ -71,17 +71,19 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
         steps.add(out.scenes()[-1])
         files.append(out.scene_path(out.scenes()[-1]))
     parts = [_own(plan, block.cell, file) for block, file in zip(plan.blocks, files, strict=True)]
-    counts, trained, rest = [], [], 0
+    counts, trained, rest, antialiased = [], [], 0, False
     for part in parts:
         all_of_block, own = part()
         counts.append(len(own.means))
         trained.append(all_of_block)
         rest = max(rest, own.sh_rest.shape[1])
+        antialiased |= own.antialiased  # all blocks have the same settings
     if not sum(counts):
         raise UserError(f"{folder}: no Gaussian is in the cell of its block; train more steps")
     scene = OutputFolder(folder).scene_path(max(steps))
     scene.parent.mkdir(parents=True, exist_ok=True)
-    write_ply_parts(scene, sum(counts), rest, (part()[1] for part in parts))
+    own_rows = (part()[1] for part in parts)
+    write_ply_parts(scene, sum(counts), rest, own_rows, antialiased=antialiased)
     if output is not None:
         with atomic_path(output) as temporary:
             shutil.copyfile(scene, temporary)

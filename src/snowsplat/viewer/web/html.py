@@ -64,6 +64,7 @@ def write_html(path: Path | str, scene: ReadyScene, about: Description | None = 
     bootstrap = {
         "settings": scene.settings(),
         "contentFilename": "scene.compressed.ply",
+        "antialiased": scene.gaussians.antialiased,
         "panel": scene.panel(about, pictures),
     }
     write_text(path, whole_page(about.title, bootstrap, _SCENE.format(scene=_base64(content))))

@@ -100,8 +100,9 @@ def _track(film: Sequence[InitialView], aspect: float) -> dict[str, Any]:
 def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "") -> str:
     """The page; its stylesheet and script are the separate files index.css and index.js.
 
-    ``bootstrap`` has the viewer's keys: settings, contentUrl, contentFilename, posterUrl; and
-    panel, see `panel.panel_settings`. ``head`` and ``body`` are HTML for these elements.
+    ``bootstrap`` has the viewer's keys: settings, contentUrl, contentFilename, posterUrl;
+    antialiased, that of the Gaussians; and panel, see `panel.panel_settings`. ``head`` and ``body``
+    are HTML for these elements.
     """
     text = asset("index.html")
     text = _replaced(
@@ -115,6 +116,8 @@ def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "
     if body:
         text = _replaced(text, "    </body>", f"{body}\n    </body>")
     text = _replaced(text, _CREATE, f"{{\n{panel.script()}}}")  # a block: its names are its own
+    # The viewer does not read the mark of an antialiased scene file.
+    text = _replaced(text, "aa: url.searchParams.has('aa')", "aa: bootstrap.antialiased")
     # No animation until the user presses Play.
     text = _replaced(text, "noanim: url.searchParams.has('noanim')", "noanim: true")
     slot = re.compile(r'(<script type="application/json" id="sse-bootstrap">)\s*null\s*(</script>)')

@@ -70,6 +70,7 @@ def write_site(
         "settings": scene.settings(),
         "contentUrl": f"./{content}",
         "posterUrl": f"./{POSTER}",
+        "antialiased": scene.gaussians.antialiased,
         "panel": scene.panel(about, f"./{PICTURES}"),
     }
     tags = _tags(

@@ -64,6 +64,7 @@ def site(
     bootstrap = {
         "settings": scene.settings(),
         "contentUrl": f"./{next(iter(content))}",
+        "antialiased": scene.gaussians.antialiased,
         "panel": scene.panel(about, f"./{PICTURES}", count),
     }
     index = page(f"{about.title} - snowsplat", bootstrap)

@@ -1,0 +1,56 @@
+"""The smallest scales, by the sampling rates of the photos."""
+
+import math
+from dataclasses import replace
+
+import torch
+
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.smoothing import INTERVAL, VARIANCE, SmoothingFilter, sampling_rates
+from snowsplat.training.step_schedule import Schedule
+
+POSE = torch.eye(3, 4, dtype=torch.float64)
+NEAR = Camera(40, 30, 30.0, 30.0, 20.0, 15.0, POSE)
+#: 8 units behind the other one, with 10 times the pixels.
+FAR_POSE = POSE.clone()
+FAR_POSE[2, 3] = 8.0
+FAR = replace(NEAR.scaled(400, 300), cam_from_world=FAR_POSE)
+# Seen by both, by the second one only (beside, behind the first), and by none (beside, behind).
+MEANS = torch.tensor(
+    [[0.0, 0.0, 2.0], [1.5, 0.0, 2.0], [0.0, 0.0, -1.0], [50.0, 0.0, 2.0], [0.0, 0.0, -9.0]]
+)
+
+
+def test_the_rate_is_the_largest_of_the_photos_that_show_the_mean():
+    torch.testing.assert_close(
+        sampling_rates(MEANS, [NEAR, FAR]), torch.tensor([30.0, 30.0, 300 / 7, 0.0, 0.0])
+    )
+    torch.testing.assert_close(
+        sampling_rates(MEANS, [NEAR]), torch.tensor([15.0, 0.0, 0.0, 0.0, 0.0])
+    )
+
+
+def scene() -> Gaussians:
+    bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    gaussians = Gaussians.random_in_bounds(bounds, 5, torch.Generator().manual_seed(5))
+    gaussians.means = MEANS.clone()
+    gaussians.log_scales = torch.tensor([1e-4, 0.02, 0.5]).log().repeat(5, 1)
+    return gaussians
+
+
+def test_scales_are_at_least_the_filter():
+    before, after = scene(), scene()
+    SmoothingFilter(True, [NEAR], Schedule(1000)).after_step(INTERVAL, after)
+    smallest = math.sqrt(VARIANCE) / 15
+    torch.testing.assert_close(after.scales[0], torch.tensor([smallest, smallest, 0.5]))
+    assert torch.equal(after.log_scales[1:], before.log_scales[1:])  # no photo shows them
+    for name in ("means", "quats", "opacity_logits", "sh_dc", "sh_rest"):
+        assert torch.equal(after.parameters()[name], before.parameters()[name])
+
+
+def test_nothing_changes_without_the_filter_and_between_its_steps():
+    gaussians = scene()
+    SmoothingFilter(False, [NEAR], Schedule(1000)).after_step(INTERVAL, gaussians)
+    SmoothingFilter(True, [NEAR], Schedule(1000)).after_step(INTERVAL + 1, gaussians)
+    assert torch.equal(gaussians.log_scales, scene().log_scales)
