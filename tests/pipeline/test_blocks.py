@@ -272,6 +272,13 @@ def test_unusable_folders_plans_and_flags(dataset, planned, tmp_path, capsys):
         assert "damaged" in error("merge", damaged)
 
 
+def test_gains_of_photos_are_rejected_because_blocks_would_not_agree(dataset, tmp_path):
+    options = replace(OPTIONS, settings=SETTINGS | {"exposure": "on"})
+    with pytest.raises(UserError, match="exposure"):
+        plan_blocks(dataset, tmp_path / "blocks", options)
+    assert not (tmp_path / "blocks").exists()
+
+
 def test_an_unfinished_plan_is_replaced(dataset, planned, tmp_path):
     plan = Plan.read(planned)
     replace(plan, blocks=[]).write(tmp_path)

@@ -156,6 +156,8 @@ def plan_blocks(
     options, folder = options or PlanOptions(), Path(folder)
     _check_free(folder)
     config = recipe(options.recipe, **options.settings)
+    if config.exposure != "off":
+        raise SettingError("exposure", "would learn other gains in each block; use off")
     train_options = TrainOptions(
         images=options.images,
         resolution=options.resolution,
