@@ -38,10 +38,13 @@ def scene_of(count: int, degree: int = 3) -> Scene:
     return random_scene(90 + count, count, sh_degree=degree)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_finite_differences(double: Variant, degree: int) -> None:
+@pytest.mark.parametrize(
+    ("degree", "antialiased"), [(0, False), (1, False), (2, False), (3, False), (1, True)]
+)
+def test_finite_differences(double: Variant, degree: int, antialiased: bool) -> None:
     """Of Σ cotangent · splats, in each of the 12 numbers of the pose, and in log f."""
     scene = scene_of(20, degree)
+    scene = replace(scene, view={**scene.view, "antialiased": antialiased})
     d_pose, d_focal = gradient(double, scene)
     seen = scene.project(reference)
     scene, grad = scene.rows(seen.ids.tolist()), cotangent(len(seen))

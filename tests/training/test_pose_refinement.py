@@ -20,7 +20,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training import checkpoint, pose_refinement
 from snowsplat.training.config import TrainConfig, config_from_json, config_to_json
 from snowsplat.training.pose_coordinates import Gauge, moved, pixel_hessian, whitening
-from snowsplat.training.pose_refinement import BEGIN, DECIDE, PoseRefinement
+from snowsplat.training.pose_refinement import PoseRefinement
 from snowsplat.training.recipes import recipe
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.trainer import Trainer
@@ -135,7 +135,7 @@ def test_the_gradient_of_a_motion(dataset: Dataset) -> None:
     """By finite differences of a function of the splats, in float64."""
     cameras = [view.camera for view in dataset.train]
     images = ImageLoader(dataset.train, budget_bytes=0)
-    poses = PoseRefinement(True, dataset, cameras, images, Schedule(10))
+    poses = PoseRefinement(True, dataset, cameras, images, Schedule(10), torch.zeros(3))
     poses.state_tensors()["motions"][0] = 0.01 * noise(3, 6)
     scene = Trainer(dataset, TrainConfig(iterations=1)).gaussians.to(dtype=torch.float64)
     scene = replace(scene, **{n: p[:50].clone() for n, p in scene.parameters().items()})
@@ -211,21 +211,18 @@ def test_perturbed_poses_come_back(dataset: Dataset) -> None:
 
 
 def test_exact_poses_are_left_unchanged(dataset: Dataset, monkeypatch) -> None:
-    """They have moved a little until this is decided."""
-    monkeypatch.setattr(pose_refinement, "EXACT", 1.0)
+    """The training is that without refinement, to the bit."""
+    monkeypatch.setattr(pose_refinement, "EXACT", 1.0)  # the scene of so few steps is blurred
+    without = Trainer(dataset, recipe("default", **SHORT))
     trainer = Trainer(dataset, recipe("default", **SHORT, refine_poses=True))
-    trainer.run(until=24)
-    assert BEGIN < 24 / 60 <= DECIDE
-    assert float(trainer.poses.drift().rotations.max()) > 0.0
-    trainer.run(until=25)
+    for each in (without, trainer):
+        each.run()
     drift = trainer.poses.drift()
     assert drift.exact
     assert "left unchanged" in str(drift)
     assert not drift.rotations.any()
-    trainer.run()
-    for view, first in zip(trainer.poses.views(), dataset.train, strict=True):
-        assert torch.equal(view.camera.cam_from_world, first.camera.cam_from_world)
-        assert view.camera.fx == first.camera.fx
+    for name, tensor in without.state_tensors().items():
+        assert torch.equal(trainer.state_tensors()[name], tensor), name
 
 
 def test_without_refinement_the_cameras_are_those_of_the_dataset(dataset: Dataset) -> None:

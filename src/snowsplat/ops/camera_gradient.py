@@ -40,13 +40,14 @@ def camera_gradient(
     cx: float,
     cy: float,
     sh_degree: int,
+    antialiased: bool = False,
     over_processes: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Propagates the gradient of splats through `project` to the camera, in one pass.
 
     All derivatives are included: those of the 2D means, of the 2D covariances and of the viewing
-    directions, which determine the colours. The camera arguments and `sh_degree` must be those
-    passed to `project`.
+    directions, which determine the colours. The camera arguments, `sh_degree` and `antialiased`
+    must be those passed to `project`.
 
     The gradient is computed from 16 sums over the splats. Each term is rounded to a multiple of
     2⁻⁴⁰, which is far below the gradients of a loss that is a mean over pixels. So the sums are
@@ -82,7 +83,7 @@ def camera_gradient(
             n=len(ids),
             ids=ids,
             gaussians=gaussian_tensors(sh_degree, *(t.contiguous() for t in tensors.values())),
-            camera=camera_params(op, pose, width, height, fx, fy, cx, cy),
+            camera=camera_params(op, pose, width, height, fx, fy, cx, cy, antialiased=antialiased),
             grad_packed=packed_grad.contiguous(),
             grads=GaussianGradients(),
             pose=sums,

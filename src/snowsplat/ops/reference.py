@@ -288,6 +288,7 @@ def camera_gradient(
     cx: float,
     cy: float,
     sh_degree: int,
+    antialiased: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Propagates the gradient of splats through `project` to the camera.
 
@@ -299,7 +300,7 @@ def camera_gradient(
         pose = pose.clone().requires_grad_()
         factor = pose.new_ones((), requires_grad=True)
         selected = [params[name].detach()[ids.long()] for name in PARAMETERS]
-        view = (width, height, factor * fx, factor * fy, cx, cy, sh_degree)
+        view = (width, height, factor * fx, factor * fy, cx, cy, sh_degree, antialiased)
         splats, _ = _project_rows(selected, pose, *view)
         # At the factor 1, the derivative by the factor is that by its logarithm.
         d_pose, d_factor = torch.autograd.grad(splats.packed, (pose, factor), packed_grad)

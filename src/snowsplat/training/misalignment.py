@@ -20,7 +20,7 @@ from torch import Tensor
 from snowsplat.data.dataset import View
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import render
+from snowsplat.scene.render import Renderer, render
 from snowsplat.util.process import single_threaded
 
 #: At most this number of views is compared, evenly chosen, to limit the time.
@@ -30,9 +30,9 @@ _FEWEST_VIEWS = 8
 #: Images are reduced to about this length of their diagonal, in pixels. Then a shift by a few
 #: thousandths of the image is about a pixel, and the derivative of the image predicts it.
 _DIAGONAL = 280
-#: The smallest shift that shows that poses are not exact, in the same reduced pixels; see
-#: docs/cameras.md.
-SHIFTED = 0.25
+#: The smallest shift after a training that shows that poses are not exact, as a share of the
+#: diagonal; see docs/cameras.md.
+SHIFTED = 0.0009
 
 
 def misalignment(
@@ -50,28 +50,46 @@ def misalignment(
     """
     if len(views) < _FEWEST_VIEWS:
         return None
-    shift, factor = shift_of(gaussians, views[:: math.ceil(len(views) / _VIEWS)], background)
-    return factor * shift if shift >= SHIFTED else None
+    shift = shift_of(gaussians, views, background)
+    return shift * _diagonal(views) if shift >= SHIFTED else None
 
 
 @torch.no_grad()
 def shift_of(
-    gaussians: Gaussians, views: Sequence[View], background: Sequence[float]
-) -> tuple[float, int]:
-    """The median shift in reduced pixels, and the factor by which the images were reduced."""
+    gaussians: Gaussians,
+    views: Sequence[View],
+    background: Sequence[float],
+    render: Renderer = render,
+    sh_degree: int | None = None,
+) -> float:
+    """The median shift of the photos of at most 24 views, as a share of the diagonal.
+
+    Args:
+        render: renders the scene.
+        sh_degree: the largest degree of the spherical harmonics to use.
+
+    The others are those of `misalignment`.
+    """
+    views = views[:: math.ceil(len(views) / _VIEWS)]
     device = gaussians.means.device
     color = torch.tensor(background, dtype=torch.float32, device=device)
-    diagonals = sorted(math.hypot(view.camera.width, view.camera.height) for view in views)
-    factor = max(1, round(diagonals[len(views) // 2] / _DIAGONAL))
+    diagonal = _diagonal(views)
+    factor = max(1, round(diagonal / _DIAGONAL))
     shifts = []
     with single_threaded(), ImageLoader(views, budget_bytes=0, device=device) as images:
         images.prefetch(views, factor)
         for view in views:
             photo = images.get(view, factor)
             camera = view.camera.downscaled(factor).to(device)
-            image = render(gaussians, camera, color).image.clamp(0.0, 1.0)
+            image = render(gaussians, camera, color, sh_degree).image.clamp(0.0, 1.0)
             shifts.append(float(shift_between(image, photo.over(color), photo.mask).norm()))
-    return sorted(shifts)[len(shifts) // 2], factor
+    return factor * sorted(shifts)[len(shifts) // 2] / diagonal
+
+
+def _diagonal(views: Sequence[View]) -> float:
+    """The median, in pixels."""
+    diagonals = sorted(math.hypot(view.camera.width, view.camera.height) for view in views)
+    return diagonals[len(views) // 2]
 
 
 def shift_between(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -14,9 +14,9 @@ The photos cannot determine a common similarity transform of all cameras, so the
 away from the held-out views. After each update, the part of all η that is such a transform is
 subtracted; see `pose_coordinates.Gauge`.
 
-Cameras move a little even if they are exact, because the scene is not. So after a part of the
-steps, it is decided whether they have moved by more than that. If not, they return to their first
-poses and stay there.
+Cameras would move a little even if they are exact, because the scene is not. So before the first
+update, the photos are compared with the scene (`misalignment`). If their shift is small, no camera
+moves, and the training is that without refinement, to the bit.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.ops import camera_gradient
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import Renderer, render
+from snowsplat.training.misalignment import shift_of
 from snowsplat.training.pose_coordinates import Gauge, moved, pixel_hessian, whitening
 from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.view_gradient import ViewGradient
 
 #: The first fraction of the steps, in which the scene is still too blurred to move cameras.
-BEGIN = 0.1
-#: The fraction of the steps after which it is decided whether the poses are exact: the median of
-#: |η| is below this share of the diagonal of the image.
-DECIDE = 0.4
+BEGIN = 0.2
+#: The poses are exact if the median shift of the photos is then below this share of the diagonal.
 EXACT = 0.002
 #: An estimate of the mean difference of colours of a rendering and its photo.
 GAIN = 0.05
@@ -68,12 +68,16 @@ class PoseRefinement:
         cameras: Sequence[Camera],
         images: ImageLoader,
         schedule: Schedule,
+        background: Tensor,
+        render: Renderer = render,
         shards: Shards = ALONE,
     ) -> None:
         """
         Args:
             cameras: those of the training views of ``dataset``, on the device of the Gaussians.
             images: the photos of these views.
+            background: (3,) colour in 0..1.
+            render: renders the scene.
             shards: the processes; each of them computes the same cameras.
         """
         self.on = on
@@ -82,6 +86,8 @@ class PoseRefinement:
         self._shards = shards
         self._dataset = dataset
         self._images = images
+        self._background = background
+        self._render = render
         self._energies: dict[tuple[int, int], float] = {}  # of `_energy`
         if not on:
             return
@@ -148,6 +154,23 @@ class PoseRefinement:
         factor = 1.0 if group is None else self._factors[group]
         return replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
 
+    def after_step(self, step: int, gaussians: Gaussians, sh_degree: int) -> None:
+        """Decide once, after the first part of the training, whether the poses are exact.
+
+        Args:
+            sh_degree: degree of the spherical harmonics in use.
+
+        Raises:
+            UserError: a photo is missing or damaged.
+        """
+        if not self.on or self._exact != 0.0 or step < self._schedule.step_of(BEGIN):
+            return
+        shift = shift_of(
+            gaussians, self.views(), self._background.tolist(), self._render, sh_degree
+        )
+        self._state["exact"].fill_(1.0 if shift < EXACT else -1.0)
+        self._read_state()
+
     def after_backward(
         self,
         step: int,
@@ -161,17 +184,12 @@ class PoseRefinement:
             views: the indices of the training views of the batch.
             gradients: one for each of them.
         """
-        if not self.on or self._exact > 0.0 or step <= self._schedule.step_of(BEGIN):
+        if not self.on or self._exact >= 0.0:
             return
-        if self._exact == 0.0 and step > self._schedule.step_of(DECIDE):
-            self._decide()
-            if self._exact > 0.0:
-                return
         done = (self._schedule.share(step) - BEGIN) / (1.0 - BEGIN)
         limit = self._diagonal * FIRST_LIMIT * (LAST_LIMIT / FIRST_LIMIT) ** done
-        parameters = gaussians.parameters()
         for view, gradient in zip(views, gradients, strict=True):
-            d_motion, d_focal = self._gradient(view, parameters, gradient)
+            d_motion, d_focal = self._gradient(view, gaussians, gradient)
             downscale = round(self._first[view].width / gradient.camera.width)
             # The loss of a batch is the mean over its views.
             gain = GAIN * len(views) / self._energy(view, downscale)
@@ -181,17 +199,6 @@ class PoseRefinement:
         motions -= self._gauge.part(motions)
         if self._schedule.multiples(step, len(self._first)):
             self._update_focals(limit)
-
-    def _decide(self) -> None:
-        """Decide whether the first poses are exact; if so, return to them."""
-        moved_by = self._state["motions"].norm(dim=1).median()
-        if float(moved_by) < EXACT * self._diagonal:
-            for tensor in self._state.values():
-                tensor.zero_()
-            self._state["exact"].fill_(1.0)
-        else:
-            self._state["exact"].fill_(-1.0)
-        self._read_state()
 
     def _energy(self, view: int, downscale: int) -> float:
         """The mean square of the derivative of a reduced photo by a shift of one original pixel."""
@@ -205,14 +212,14 @@ class PoseRefinement:
         return self._energies[key]
 
     def _gradient(
-        self, view: int, parameters: dict[str, Tensor], gradient: ViewGradient
+        self, view: int, gaussians: Gaussians, gradient: ViewGradient
     ) -> tuple[Tensor, Tensor]:
         """(6,) with respect to (ω, τ), to first order, and () with respect to log f; finite."""
         camera, splats = gradient.camera, gradient.splats
         assert splats.ids is not None
         over = self._over_processes if self._shards.size > 1 else None
         d_pose, d_focal = camera_gradient(
-            parameters,
+            gaussians.parameters(),
             splats.ids,
             gradient.packed_grad,
             camera.cam_from_world,
@@ -223,6 +230,7 @@ class PoseRefinement:
             cx=camera.cx,
             cy=camera.cy,
             sh_degree=gradient.sh_degree,
+            antialiased=gaussians.antialiased,
             over_processes=over,
         )
         motion = self._units[view] @ self._state["motions"][view]
@@ -313,7 +321,7 @@ class PoseDrift:
 
     def __str__(self) -> str:
         if self.exact:
-            return "the camera poses are as exact as a refinement could make them: left unchanged"
+            return "the photos agree with the camera poses, which are left unchanged"
         turn, shift = self.rotations, 100.0 * self.translations
         return (
             f"camera poses refined: rotation by {float(turn.median()):.2f}° in the median, at most "

@@ -136,7 +136,8 @@ class Trainer:
             device=self.device,
         )
         self.poses = PoseRefinement(
-            *(config.refine_poses, dataset, cameras, self._images, self.schedule, shards)
+            *(config.refine_poses, dataset, cameras, self._images, self.schedule),
+            *(self._background.evaluation, self._render, shards),
         )
         self._queue = ViewQueue(
             *(dataset.train, self.poses.camera, self._images, self._background, self._downscale),
@@ -244,6 +245,7 @@ class Trainer:
         self.within_step = True
         with single_threaded():
             self._leave_out_unexplained()
+            self.poses.after_step(self.step, self.gaussians, self.config.sh_degree_at(self.step))
             if self.config.stop_overfitting:
                 self._overfitting.after_step(
                     self.step, self.gaussians, self.config.sh_degree_at(self.step), self.left_out
