@@ -34,7 +34,7 @@ class Blocks:
       snowsplat blocks train out                            train all blocks
       snowsplat blocks train out --block 3                  only the third one
       snowsplat blocks merge out                            join them
-      snowsplat evaluate out                                PSNR and SSIM of the whole
+      snowsplat evaluate out                                PSNR and SSIM
       snowsplat view out
 
     Notes:

@@ -32,8 +32,8 @@ class Convert:
     The suffix of FILE selects the format:
       .ply              lossless; read by every program for Gaussian splats
       .compressed.ply   1/4 of the size of .ply; for SuperSplat
-      .spz              1/8 of the size; for the programs of Niantic and many others.
-                        Older viewers need --spz-version 2
+      .spz              1/8 of the size; for the programs of Niantic and many others
+                        (older viewers need --spz-version 2)
       .sog              1/10 of the size; for the web viewers of PlayCanvas
       .glb              glTF; lossless except for rounding
       .splat            1/8 of the size; no view-dependent colour
