@@ -65,7 +65,7 @@ nitpick_ignore_regex = [
     # types of Python and of libraries, private types, and names of literals
     (
         "py:class",
-        r"(torch|np|numpy|collections|datetime|typing|contextlib|os|pathlib)\..*|Path|Tensor",
+        r"(torch|np|numpy|PIL|Image|collections|datetime|typing|contextlib|os|pathlib)\..*|Path|Tensor",
     ),
     ("py:class", r".*\._\w+|Color|Depth|Split"),
 ]
