@@ -117,7 +117,7 @@ def test_every_setting_is_a_flag_and_a_setting_of_some_recipe():
     for name in settings:
         assert name in flags
         value: object = (5,) if name == "test_iterations" else 1
-        value = {"background": "white", "init": "random"}.get(name, value)
+        value = {"background": "white", "init": "random", "transients": "on"}.get(name, value)
         recipe("default", **{name: value})
     assert list(RECIPES) == list(get_args(Recipe))
 

@@ -5,6 +5,7 @@ import os
 import signal
 
 import pytest
+from PIL import Image
 
 from snowsplat.data import load
 from snowsplat.pipeline.evaluate import evaluate
@@ -132,6 +133,32 @@ def test_photos_that_are_left_out_are_named_also_by_a_resumed_run(dataset, tmp_p
     evaluate(load_trained(tmp_path), split="train")
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert (metrics["split"], metrics["left_out"]) == ("train", list(names))
+
+
+def test_what_moves_is_masked_and_shown(tmp_path):
+    photos = write_toy_dataset(tmp_path / "photos", "colmap-bin", 30, 128, 96, n_points=800)
+    for name, left in (("view_03.png", 16), ("view_06.png", 40), ("view_10.png", 64)):
+        with Image.open(photos / "images" / name) as image:
+            image.paste((250, 20, 240), (left, 24, left + 48, 80))
+            image.save(photos / "images" / name)
+    recorder, settings = Recorder(), {"iterations": 80, "checkpoint_every": 60}
+    result = train(photos, tmp_path / "out", TrainOptions(settings=settings), observer=recorder)
+    assert set(result.moving) == {"view_03.png", "view_06.png", "view_10.png"}
+    mean = 100 * sum(result.moving.values()) / 3
+    line = f"something moves in 3 of 30 photos: masked there, {mean:.1f}% of their pixels; "
+    assert recorder.notes.count(line + "see the report") == 1
+    for name in result.moving:
+        with Image.open(tmp_path / "out" / "masks" / f"{name}.png") as mask:
+            assert mask.size == (128, 96)
+            assert mask.histogram()[0] == round(result.moving[name] * 128 * 96)
+    report = result.report.read_text()
+    assert "<h2>What moves</h2>" in report
+    assert report.count(": masked parts") == 3 * 2  # alt and title
+
+    recorder = Recorder()
+    again = resume(tmp_path / "out", observer=recorder)
+    assert again.moving == result.moving
+    assert recorder.notes.count(line + "see the report") == 1
 
 
 @pytest.mark.parametrize("damaged", ["", "[1]", '{"left_out": 3}'])

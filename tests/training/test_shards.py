@@ -21,7 +21,14 @@ WORKER = Path(__file__).with_name("shards_worker.py")
 # All kinds of density control and of hooks between the steps; the last batch has fewer views.
 DENSE = {"iterations": 122, "densify_from": 20, "densify_interval": 20, "max_gaussians": 900}
 RUNS = [
-    {**DENSE, "batch": 4, "stop_overfitting": True, "leave_out_after": 0.3, "exposure": "on"},
+    {
+        **DENSE,
+        "batch": 4,
+        "stop_overfitting": True,
+        "leave_out_after": 0.3,
+        "exposure": "on",
+        "transients": "on",
+    },
     {**DENSE, "batch": 3, "name": "mcmc-short", "densify_until": 100, "test_iterations": (50,)},
     {
         **DENSE,

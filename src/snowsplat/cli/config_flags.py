@@ -38,6 +38,13 @@ class ConfigFlags:
     """After this step, leave out the training photos that the scene does not explain: their camera
     poses are probably wrong. A value with a decimal point (0.15) is a fraction of all steps; 0:
     never."""
+    transients: Annotated[
+        Literal["auto", "on", "off"] | None, flag("{auto,on,off}", default="off")
+    ] = None
+    """Whether to mask what moves, such as people who walk past: it looks different from what the
+    other photos show at this place. auto: if there are at least 30 photos and something moves in
+    several of them; on: in any of at least 8 photos, and add Gaussians only after the first masks
+    are known."""
     stop_overfitting: Annotated[Literal["on", "off"] | None, flag("{on,off}", default="off")] = None
     """Whether the training ends earlier if the views between the photos become worse. This happens
     in long training runs with few photos. The dataset needs points."""

@@ -9,6 +9,7 @@
     OUT/metrics.json                               metrics of the last evaluation
     OUT/history.json                               *the curves of the training
     OUT/report.html                                *a page about the training
+    OUT/masks/NAME.png                             *masks of what moves, if something moves
     OUT/test/ours_N/renders, gt                    rendered images and photos; also train/
     OUT/videos/                                    *rendered videos (films/ in earlier versions)
 
@@ -21,6 +22,7 @@ import argparse
 import ast
 import re
 import shutil
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,10 +30,18 @@ from typing import TYPE_CHECKING, Any
 
 from snowsplat._version import __version__
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import is_temporary, remove_temporaries, write_json, write_text
+from snowsplat.util.files import (
+    atomic_path,
+    is_temporary,
+    remove_temporaries,
+    write_json,
+    write_text,
+)
 from snowsplat.util.safe_json import from_json, read_json
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from snowsplat.data import Dataset, DatasetFiles
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.scene.gaussians import Gaussians
@@ -49,7 +59,7 @@ _NAMESPACE_LIMIT = 1 << 20  # characters
 # have three words, NAME = VALUE; one more word is stored to detect longer arguments.
 _STORED_WORDS = 4
 _SCENE = re.compile(r"iteration_(\d+)")
-_RESULTS = ("point_cloud", "checkpoints", "train", "test", "videos", "films")
+_RESULTS = ("point_cloud", "checkpoints", "train", "test", "videos", "films", "masks")
 _REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html")
 _FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
 
@@ -273,6 +283,16 @@ class OutputFolder:
         write_json(path, head | evaluation.as_json())
 
     # Settings
+
+    def write_masks(self, masks: Mapping[str, np.ndarray]) -> None:
+        """Write masks by the name of the photo, in the format of the masks of a dataset."""
+        from PIL import Image
+
+        for name, mask in masks.items():
+            path = self.path / "masks" / f"{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(path) as temporary:
+                Image.fromarray(mask).save(temporary, format="PNG")
 
     def settings(self) -> tuple[DatasetSettings, tuple[float, float, float]]:
         """How the dataset was read, and the background colour (red, green, blue in 0..1).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,6 +48,8 @@ class TrainResult:
         evaluation: the step and the metrics of the last evaluation on held-out photos.
         left_out: names of the training photos that were left out, because the scene does not
             explain them; see ``TrainConfig.leave_out_after``.
+        moving: the share of each photo that is masked because something moves there, by name; see
+            ``TrainConfig.transients``.
         ended_early: the line about a training run that ends before its last planned step, because
             the scene overfits; otherwise None. See ``TrainConfig.stop_overfitting``.
         time: the seconds that were used, including earlier runs, and the time budget in seconds;
@@ -64,6 +66,7 @@ class TrainResult:
     reductions: tuple[str, ...]
     evaluation: tuple[int, Evaluation] | None
     left_out: tuple[str, ...]
+    moving: Mapping[str, float]
     ended_early: str | None
     time: tuple[float, float] | None
 
@@ -117,6 +120,7 @@ class TrainingRun:
         self.history = History.read(self.out.history, self.first_step)
         self._left = StepsLeft(Work.of(self.config, self.trainer.dataset))
         self._told = False  # whether the observer knows which photos are left out
+        self._told_moving = False  # whether the observer knows in which photos something moves
         self._told_end = False  # whether the observer knows that the training ends early
 
     def run(self) -> TrainResult:
@@ -181,6 +185,10 @@ class TrainingRun:
         if self.trainer.left_out and not self._told:
             self.observer.note(left_out_line(self._left_out()))
             self._told = True
+        if not self._told_moving and self.trainer.transients.complete(progress.step):
+            if moving := self._moving():
+                self.observer.note(moving_line(moving, len(self.trainer.dataset.train)))
+            self._told_moving = True
         if (line := self._ended_early()) is not None and not self._told_end:
             self.observer.note(line)
             self._told_end = True
@@ -213,6 +221,10 @@ class TrainingRun:
 
     def _left_out(self) -> tuple[str, ...]:
         return tuple(self.trainer.dataset.train[i].name for i in self.trainer.left_out)
+
+    def _moving(self) -> dict[str, float]:
+        found = self.trainer.transients.found
+        return {self.trainer.dataset.train[i].name: share for i, share in found.items()}
 
     def _ended_early(self) -> str | None:
         found, iterations = self.trainer.overfitting, self.trainer.schedule.iterations
@@ -308,6 +320,7 @@ class TrainingRun:
         self.history.write(self.out.history)
         if self.trainer.exposure.active:
             self.out.write_exposure(self._exposures())
+        self.out.write_masks(self.trainer.transients.pictures())
         report = self._write_report(gaussians)
         time_used = None
         if self.budget is not None:
@@ -324,6 +337,7 @@ class TrainingRun:
             reductions=self.memory.plan.reductions,
             evaluation=self.evaluation,
             left_out=self._left_out(),
+            moving=self._moving(),
             ended_early=self._ended_early(),
             time=time_used,
         )
@@ -356,6 +370,7 @@ class TrainingRun:
                 evaluation=None if self.evaluation is None else self.evaluation[1],
                 left_out=self._left_out(),
                 exposures=tuple(self.trainer.exposure.ev.mean(1).tolist()),
+                masks=self.trainer.transients.pictures(),
                 ended_early=self._ended_early(),
                 settings={
                     "recipe": self.recipe,
@@ -378,4 +393,18 @@ def left_out_line(names: Sequence[str]) -> str:
     return (
         f"{len(names)} {photos} not explained by the scene and left out of the training: {listed}; "
         f"{'its' if one else 'their'} camera {poses} probably wrong"
+    )
+
+
+def moving_line(shares: Mapping[str, float], photos: int) -> str:
+    """The line for the user about what moves.
+
+    Args:
+        shares: the masked share of each photo in which something moves; at least one.
+        photos: number of training photos.
+    """
+    mean = 100.0 * sum(shares.values()) / len(shares)
+    return (
+        f"something moves in {len(shares)} of {photos} photos: masked there, {mean:.1f}% of their "
+        "pixels; see the report"
     )

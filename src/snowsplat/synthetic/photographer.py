@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,6 +91,7 @@ def take_photos(
     poses: Sequence[Tensor],
     seed: int = 0,
     report: Report = silent,
+    passing: Mapping[int, Scene] | None = None,
 ) -> Truth:
     """Render photos ``IMG_0001.jpg`` … of a scene into ``folder``; existing photos are kept.
 
@@ -99,6 +100,8 @@ def take_photos(
         poses: ``cam_from_world`` (3, 4) float64 of each photo, metres.
         seed: seed of the noise of the image sensor.
         report: progress callback.
+        passing: what is in front of the camera in only one photo, by the index of its pose. It
+            casts no shadow on the scene.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -108,10 +111,11 @@ def take_photos(
     if not missing:
         return truth
     report(0, len(missing), "building the scene")
-    scene = build()
+    scene, passing = build(), passing or {}
 
     def take(i: int) -> None:
-        pixels = photograph(scene, lens, poses[i], np.random.default_rng([seed, i]))
+        random = np.random.default_rng([seed, i])
+        pixels = photograph(scene, lens, poses[i], random, passing.get(i))
         with atomic_path(folder / names[i]) as temporary:
             _save(temporary, pixels)
 
@@ -152,15 +156,28 @@ def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
 
 
 def photograph(
-    scene: Scene, lens: Lens, cam_from_world: Tensor, random: np.random.Generator
+    scene: Scene,
+    lens: Lens,
+    cam_from_world: Tensor,
+    random: np.random.Generator,
+    passing: Scene | None = None,
 ) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB, with the noise of a small image sensor."""
+    """(H, W, 3) uint8 sRGB, with the noise of a small image sensor.
+
+    Args:
+        random: draws the noise.
+        passing: more objects, which cast no shadow on the scene.
+    """
     world_from_cam = invert_rigid(cam_from_world).numpy()
     rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
     spread = 1 / (lens.focal * _RAYS)
     light = np.empty((lens.height, lens.width, 3), np.float32)
     for rows, columns, rays in _tiles(lens):
-        seen = scene.radiance(origin, rotation @ rays, spread)
+        directions = rotation @ rays
+        seen = scene.radiance(origin, directions, spread)
+        if passing is not None:
+            near = passing.distances(origin, directions) < scene.distances(origin, directions)
+            seen = np.where(near, passing.radiance(origin, directions, spread), seen)
         # A sensor saturates: values above white are clipped before a pixel is averaged.
         height, width = rows.stop - rows.start, columns.stop - columns.start
         seen = seen.clip(0, 1).reshape(3, height, _RAYS, width, _RAYS).mean(axis=(2, 4))

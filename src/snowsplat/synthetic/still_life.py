@@ -14,10 +14,10 @@ from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
-_FLOOR = -0.72
+FLOOR = -0.72
 _CEILING = 2.0
 _ROOM = (5.2, 4.8)
-_LAMP = Lamp(middle=(0.5, -0.4, 1.95), size=(1.1, 0.8), power=2.5, ambient=0.60)
+LAMP = Lamp(middle=(0.5, -0.4, 1.95), size=(1.1, 0.8), power=2.5, ambient=0.60)
 # sRGB colours of wood.
 _OAK = (0.62, 0.45, 0.29)
 _PINE = (0.78, 0.62, 0.42)
@@ -34,12 +34,12 @@ def still_life(seed: int = 0) -> Scene:
     """The scene with its illumination; equal seeds produce equal scenes."""
     random = np.random.default_rng(seed)
     objects = [*_room(random), *_furniture(random), *_objects_on_the_table(random)]
-    return Scene(objects, _LAMP)
+    return Scene(objects, LAMP)
 
 
 def _room(random: np.random.Generator) -> list[SceneObject]:
     x, y = _ROOM
-    height = _CEILING - _FLOOR
+    height = _CEILING - FLOOR
     texel = 0.005
     brick = paint.bricks(_size((y, height), texel), 22, 16, random)
     brick = paint.paste(brick, paint.printed((180, 240), random), (0.30, 0.52), 0.16, 2)
@@ -59,18 +59,18 @@ def _room(random: np.random.Generator) -> list[SceneObject]:
     )
     floor = paint.wood(_size(_ROOM, texel), 24, _PINE, random)
     ceiling = np.full((32, 32, 3), 0.86, np.float32)
-    room = Box((0, 0, (_CEILING + _FLOOR) / 2), (x, y, height), inside=True)
+    room = Box((0, 0, (_CEILING + FLOOR) / 2), (x, y, height), inside=True)
     lamp = np.full((8, 8, 3), 9.0, np.float32)
     return [
         SceneObject(room, [brick, boards, plaster, papered, floor, ceiling]),
-        SceneObject(Box(_LAMP.middle, (*_LAMP.size, 0.04)), [lamp], emissive=True),
+        SceneObject(Box(LAMP.middle, (*LAMP.size, 0.04)), [lamp], emissive=True),
     ]
 
 
 def _furniture(random: np.random.Generator) -> list[SceneObject]:
     objects = []
     rug_colours = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
-    rug = Frustum((0, 0, _FLOOR), 0.012, 1.35, 1.35)
+    rug = Frustum((0, 0, FLOOR), 0.012, 1.35, 1.35)
     edge = paint.plain((256, 16), (0.5, 0.3, 0.2), random)
     objects.append(SceneObject(rug, [edge, paint.woven((640, 640), 34, rug_colours, random), edge]))
     shelf = paint.spines(_size((1.7, 1.5), 0.004), 4, random)
@@ -78,7 +78,7 @@ def _furniture(random: np.random.Generator) -> list[SceneObject]:
     top = paint.wood(_size((1.7, 0.3), 0.005), 2, _DARK, random)
     objects.append(
         SceneObject(
-            Box((-0.7, 2.24, _FLOOR + 0.75), (1.7, 0.3, 1.5)), [side, side, shelf, shelf, top, top]
+            Box((-0.7, 2.24, FLOOR + 0.75), (1.7, 0.3, 1.5)), [side, side, shelf, shelf, top, top]
         )
     )
     front = paint.wood(_size((1.3, 0.75), 0.004), 3, _PINE, random)
@@ -86,7 +86,7 @@ def _furniture(random: np.random.Generator) -> list[SceneObject]:
     top = paint.wood(_size((1.3, 0.4), 0.004), 2, _PINE, random)
     objects.append(
         SceneObject(
-            Box((0.9, -2.15, _FLOOR + 0.375), (1.3, 0.4, 0.75)),
+            Box((0.9, -2.15, FLOOR + 0.375), (1.3, 0.4, 0.75)),
             [side, side, front, front, top, top],
         )
     )
@@ -95,11 +95,11 @@ def _furniture(random: np.random.Generator) -> list[SceneObject]:
         SceneObject(Ellipsoid((1.2, -2.15, 0.22), (0.15, 0.15, 0.2)), [vase], gloss=0.04)
     )
     for x, y, z, side_length, angle in (
-        (2.05, 1.75, _FLOOR, 0.62, 0.2),
-        (2.10, 1.80, _FLOOR + 0.62, 0.45, 0.6),
-        (2.15, 1.05, _FLOOR, 0.48, -0.3),
-        (-2.15, -1.75, _FLOOR, 0.7, 0.35),
-        (-2.2, -1.0, _FLOOR, 0.42, -0.1),
+        (2.05, 1.75, FLOOR, 0.62, 0.2),
+        (2.10, 1.80, FLOOR + 0.62, 0.45, 0.6),
+        (2.15, 1.05, FLOOR, 0.48, -0.3),
+        (-2.15, -1.75, FLOOR, 0.7, 0.35),
+        (-2.2, -1.0, FLOOR, 0.42, -0.1),
     ):
         faces = []
         for _ in range(6):
@@ -114,7 +114,7 @@ def _furniture(random: np.random.Generator) -> list[SceneObject]:
         rim = paint.wood((512, 16), 1, _OAK, random)
         leg = paint.wood((64, 128), 1, _DARK, random)
         objects.append(SceneObject(Frustum((x, y, -0.32), 0.04, 0.18, 0.18), [rim, seat, seat]))
-        objects.append(SceneObject(Frustum((x, y, _FLOOR), 0.4, 0.12, 0.05), [leg]))
+        objects.append(SceneObject(Frustum((x, y, FLOOR), 0.4, 0.12, 0.05), [leg]))
     return objects
 
 
@@ -129,7 +129,7 @@ def _objects_on_the_table(random: np.random.Generator) -> list[SceneObject]:
     leg = paint.wood((128, 256), 1, _DARK, random)
     objects = [
         SceneObject(Frustum((0, 0, -0.04), 0.04, 0.72, 0.72), [rim, top, top]),
-        SceneObject(Frustum((0, 0, _FLOOR), 0.68, 0.22, 0.08), [leg]),
+        SceneObject(Frustum((0, 0, FLOOR), 0.68, 0.22, 0.08), [leg]),
     ]
 
     world = paint.globe((768, 384), random)

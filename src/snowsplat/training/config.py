@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import DENSITY_CONTROLS, AdaptiveDensity, DensityConfig
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.starts import STARTS
 from snowsplat.training.step_schedule import Schedule, When
+from snowsplat.training.transients import TransientsMode
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import from_json
 
@@ -65,6 +66,9 @@ class TrainConfig:
         leave_out_after: the moment after which training views are left out if the scene does not
             explain them, because their camera poses are probably wrong; see `unexplained`. 0:
             never.
+        transients: whether what moves is masked in the photos, such as people who walk past; see
+            `transients`. "auto": only with at least 30 views, and if something moves in several of
+            them. "on" also delays densification until the first masks are known.
         stop_overfitting: whether the training ends earlier if the views between the photos become
             worse; see `overfitting`.
         exposure: whether a gain for each photo and channel is learnt, because the photos have
@@ -100,6 +104,7 @@ class TrainConfig:
     visible_only: bool = False
     coarse_to_fine: tuple[When, When] = (0, 0)
     leave_out_after: When = 0
+    transients: TransientsMode = "off"
     stop_overfitting: bool = False
     exposure: Literal["auto", "on", "off"] = "off"
     image_memory: int = 0
@@ -160,6 +165,8 @@ class TrainConfig:
                 f"{self.initial_points:g} is neither a number nor a share of the limit of "
                 "Gaussians; use e.g. 20000 or 0.4",
             )
+        if self.transients not in get_args(TransientsMode):
+            raise SettingError("transients", f"{self.transients!r}: use auto, on or off")
         if self.leave_out_after < 0:
             raise SettingError(
                 "leave_out_after", f"{self.leave_out_after} is negative; use 0 for never"

@@ -30,6 +30,7 @@ from snowsplat.training.sharded_render import sharded_render
 from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.transients import Transients, delayed
 from snowsplat.training.unexplained import unexplained_views
 from snowsplat.training.view_queue import ViewQueue
 from snowsplat.util.errors import UserError
@@ -74,6 +75,7 @@ class Trainer:
     Attributes:
         exposure: the gains of the training photos.
         gaussians: the scene after ``step`` steps, on ``device``.
+        transients: the masks of what moves; see ``TrainConfig.transients``.
         within_step: True during a step. It stays True if an error or a second Ctrl-C interrupts a
             step: the state is then inconsistent and must not be saved.
     """
@@ -158,7 +160,8 @@ class Trainer:
             visible_only=config.visible_only,
             shards=shards,
         )
-        self._density = config.density.control(
+        density = delayed(config.density) if config.transients == "on" else config.density
+        self._density = density.control(
             len(self.gaussians),
             schedule=self.schedule,
             extent=dataset.extent,
@@ -171,6 +174,10 @@ class Trainer:
         self._scale_limit = ScaleLimit(config.relative_scale, self._cameras, self.schedule)
         points = None if dataset.points is None else dataset.points.xyz
         self._near_limit = NearLimit(config.near_limit, self._cameras, points, self.schedule)
+        self.transients = Transients(
+            *(config.transients, dataset.train, self._images, self._background.evaluation),
+            *(self.schedule, shards),
+        )
         self._overfitting = OverfittingCheck(
             *(dataset, neutral, self.schedule, self._background.evaluation, self._render)
         )
@@ -234,6 +241,7 @@ class Trainer:
                 self._overfitting.after_step(
                     self.step, self.gaussians, self.config.sh_degree_at(self.step), self.left_out
                 )
+            self._mask_what_moves()
             # In the paper, a step ends with density control. Here, density control runs at the
             # beginning of the next step, so that a scene is never evaluated or saved directly after
             # a change by density control.
@@ -275,10 +283,10 @@ class Trainer:
         self._optimizer.step(self.gaussians, gradients, step)
 
     def _loss(self, image: Tensor, view: BatchView) -> Tensor:
-        photo, background = view.photo, view.background
-        assert photo is not None
+        assert view.photo is not None
+        photo = self.transients.masked(view.index, view.photo)
         image = self.exposure.clipped(image, photo, view.index)
-        return view_loss(image, photo, background, self.config.ssim_weight)
+        return view_loss(image, photo, view.background, self.config.ssim_weight)
 
     def evaluate(self) -> Evaluation:
         """Metrics of the test views in the current state. Black replaces a random background."""
@@ -287,6 +295,11 @@ class Trainer:
             return evaluate_views(
                 self.gaussians, self.dataset.test, background=background, render=self._render
             )
+
+    def _mask_what_moves(self) -> None:
+        settings = self.config.sh_degree_at(self.step), self._downscale(self.step)
+        if self.transients.after_step(self.step, self.gaussians, *settings, self.left_out):
+            self._queue.continue_with(self._queue.order, self.step)
 
     def _leave_out_unexplained(self) -> None:
         """Decide once, after the step of ``leave_out_after``, which views are used from now on."""
@@ -333,6 +346,8 @@ class Trainer:
             tensors["checked"] = torch.tensor(self._checked)
             tensors["left_out"] = torch.tensor(self.left_out, dtype=torch.int64)
         parts = {"exposure": self.exposure.state_tensors()}
+        if self.config.transients != "off":
+            parts["transients"] = self.transients.state_tensors()
         if self.config.stop_overfitting:
             parts["overfitting"] = self._overfitting.state_tensors()
         for part, state in parts.items():
@@ -370,6 +385,8 @@ class Trainer:
             self._checked = bool(tensors["checked"])
             self._queue.left_out = tuple(tensors["left_out"].tolist())
         self.exposure.load_state(part("exposure."))
+        if self.config.transients != "off":
+            self.transients.load_state(part("transients."))
         if self.config.stop_overfitting:
             self._overfitting.load_state(part("overfitting."))
         self._queue.continue_with(tensors["order"].tolist(), self.step)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from snowsplat import ops
 from snowsplat.data import Dataset
@@ -15,7 +18,7 @@ from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.ops import native
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.history import History
-from snowsplat.training.report import pictures
+from snowsplat.training.report import masks, pictures
 from snowsplat.util import charts
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
@@ -33,6 +36,7 @@ _SMOOTHED = 40
 _STYLE = (
     charts.STYLE
     + pictures.STYLE
+    + masks.STYLE
     + """
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr));
   gap: 22px 28px; }
@@ -54,6 +58,8 @@ class Trained:
         settings: the settings by name, as JSON values.
         left_out: names of the training views that the training has left out.
         exposures: the learnt exposure of each training view in EV; empty if none is learnt.
+        masks: the masks of what moves, by the name of the training view; see
+            `Transients.pictures`.
         ended_early: why the training ended before its last planned step; None if it did not.
         peak_bytes: peak memory; 0 if unknown.
     """
@@ -68,6 +74,7 @@ class Trained:
     settings: dict[str, Any]
     left_out: tuple[str, ...] = ()
     exposures: tuple[float, ...] = ()
+    masks: Mapping[str, np.ndarray] = field(default_factory=dict)
     ended_early: str | None = None
     peak_bytes: int = 0
 
@@ -93,6 +100,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
             _cards(trained, evaluation, held_out),
             _ended_early(trained.ended_early),
             _left_out(trained.left_out),
+            masks.masked(trained.dataset.train, trained.masks),
             _curves(trained.history),
             _exposures(trained.exposures),
             pictures.compared(trained.gaussians, views, evaluation, trained.background),

@@ -86,7 +86,7 @@ def _triple(
     if loaded.mask is not None:
         difference = torch.where(loaded.mask, difference, 0.0)
     images = "".join(
-        picture(_small(pixels), f"{view.name}: {what}", quality=80)
+        picture(small(pixels), f"{view.name}: {what}", quality=80)
         for what, pixels in (
             ("photo", _bytes(photo)),
             ("rendering", _bytes(image)),
@@ -110,7 +110,8 @@ def _error_in_color(difference: np.ndarray) -> np.ndarray:
     return np.rint(color).astype(np.uint8)
 
 
-def _small(pixels: np.ndarray) -> Image.Image:
+def small(pixels: np.ndarray) -> Image.Image:
+    """(H, W, 3) uint8 as an image whose longer side has at most `_IMAGE_SIDE` pixels."""
     image = Image.fromarray(pixels)
     scale = min(1.0, _IMAGE_SIDE / max(image.size))
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))

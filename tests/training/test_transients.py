@@ -1,0 +1,241 @@
+"""Things that are in only one photo are masked there, and a static scene is trained as before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat import Dataset, Gaussians, TrainConfig, Trainer, load_dataset, ops, recipe
+from snowsplat.data.decode import LoadedImage, load_image
+from snowsplat.scene.render import render
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training import checkpoint
+from snowsplat.training.transients import MOMENTS, delayed, moving
+from snowsplat.util.errors import SettingError, UserError
+
+COUNT, WIDTH, HEIGHT = 36, 128, 96
+#: The photos with something in front of the camera, and where: left, upper, right, lower edge.
+BOXES = {3: (32, 24, 72, 72), 9: (8, 40, 56, 88), 14: (64, 16, 112, 56)}
+CONFIG = recipe("default", iterations=150, transients="auto")
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory) -> Dataset:
+    folder = tmp_path_factory.mktemp("still")
+    return load_dataset(write_toy_dataset(folder, "colmap-bin", COUNT, WIDTH, HEIGHT, n_points=800))
+
+
+def painted(path: Path, box: tuple[int, int, int, int]) -> None:
+    pixels = np.asarray(Image.open(path)).copy()
+    left, upper, right, lower = box
+    pixels[upper:lower, left:right] = (250, 20, 240)
+    Image.fromarray(pixels).save(path)
+
+
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory) -> Dataset:
+    folder = write_toy_dataset(
+        tmp_path_factory.mktemp("busy"), "colmap-bin", COUNT, WIDTH, HEIGHT, n_points=800
+    )
+    dataset = load_dataset(folder)
+    for i, box in BOXES.items():
+        painted(dataset.train[i].image.path, box)
+    return dataset
+
+
+def run(dataset: Dataset, config: TrainConfig, until: int | None = None) -> Trainer:
+    trainer = Trainer(dataset, config)
+    trainer.run(until=until)
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def trained(busy) -> Trainer:
+    return run(busy, CONFIG)
+
+
+def assert_identical(a: Gaussians, b: Gaussians) -> None:
+    for name, parameter in a.parameters().items():
+        assert torch.equal(parameter, b.parameters()[name]), name
+
+
+# The rule
+
+
+#: The smallest large residual, and the result of the last time.
+RULE = 0.1, torch.zeros(12, 16, dtype=torch.bool)
+#: The detail of the photo is not that of the rendering.
+OTHER = torch.zeros(12, 16)
+
+
+def cells(value: float) -> torch.Tensor:
+    return torch.full((12, 16), value)
+
+
+def test_a_large_residual_in_one_view_only():
+    residual, elsewhere, others = cells(0.02), cells(0.02), cells(6.0)
+    residual[4:8, 5:9] = 0.3
+    found = moving(residual, OTHER, elsewhere, others, *RULE)
+    expected = torch.zeros(12, 16, dtype=torch.bool)
+    expected[3:9, 4:10] = True  # and the cells around
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    "reason", ["elsewhere too", "few others", "alone", "small", "in another light"]
+)
+def test_what_does_not_move(reason):
+    residual, elsewhere, others = cells(0.02), cells(0.02), cells(6.0)
+    residual[4:8, 5:9] = 0.3
+    if reason == "elsewhere too":
+        elsewhere[4:8, 5:9] = 0.15
+    elif reason == "few others":
+        others[4:8, 5:9] = 1.0
+    elif reason == "alone":
+        residual[:] = 0.02
+        residual[5, 6] = 0.5
+    elif reason == "small":
+        residual[4:8, 5:9] = 0.08
+    light = OTHER + (0.8 if reason == "in another light" else 0.0)
+    assert not moving(residual, light, elsewhere, others, *RULE).any()
+
+
+def test_the_edges_of_a_thing_may_have_a_smaller_residual():
+    residual, elsewhere, others = cells(0.01), cells(0.01), cells(6.0)
+    residual[4:8, 2:12] = 0.07
+    residual[4:8, 5:9] = 0.3
+    assert moving(residual, OTHER, elsewhere, others, *RULE)[4:8, 2:12].all()
+
+
+def test_a_thing_remains_masked_while_its_residual_is_notable():
+    residual, elsewhere, others = cells(0.02), cells(0.02), cells(1.0)
+    residual[4:8, 5:9] = 0.12
+    before = torch.zeros(12, 16, dtype=torch.bool)
+    assert not moving(residual, OTHER, elsewhere, others, 0.1, before).any()
+    before[5, 6] = True
+    assert moving(residual, OTHER, elsewhere, others, 0.1, before)[4:8, 5:9].all()
+
+
+# The masks
+
+
+def test_what_moves_is_found(trained):
+    assert set(trained.transients.found) == set(BOXES)
+    for i, (left, upper, right, lower) in BOXES.items():
+        mask = trained.transients.masks[i]
+        inside = torch.zeros_like(mask)
+        inside[-(-upper // 8) : lower // 8, -(-left // 8) : right // 8] = True
+        assert (~mask & inside).sum() >= 0.9 * inside.sum(), i
+        assert (~mask).sum() <= 2.0 * inside.sum(), i
+
+
+def test_the_scene_behind_what_moves(busy, still, trained):
+    """Where the boxes are, the rendering is compared with photos without them."""
+
+    def error(trainer: Trainer) -> float:
+        total = 0.0
+        for i, (left, upper, right, lower) in BOXES.items():
+            view = still.train[i]
+            with torch.no_grad():
+                image = render(trainer.gaussians, view.camera).image[upper:lower, left:right]
+            photo = load_image(view.image).permute(1, 2, 0)[upper:lower, left:right] / 255
+            total += float((image - photo).square().mean())
+        return total
+
+    unmasked = run(busy, replace(CONFIG, transients="off"))
+    assert error(trained) < 0.9 * error(unmasked)
+
+
+def test_a_static_scene_changes_no_bit(still):
+    masked, unmasked = (run(still, replace(CONFIG, transients=t)) for t in ("auto", "off"))
+    assert masked.transients.found == {}
+    assert_identical(masked.gaussians, unmasked.gaussians)
+
+
+def test_the_mask_of_the_user_remains(trained):
+    transients, size = trained.transients, (HEIGHT, WIDTH)
+    planes = torch.zeros(3, *size, dtype=torch.uint8)
+    users = torch.ones(size, dtype=torch.bool)
+    users[:, :20] = False
+    found = transients.masked(3, LoadedImage(planes)).mask
+    both = transients.masked(3, LoadedImage(planes, users)).mask
+    assert found is not None
+    assert both is not None
+    assert torch.equal(both, found & users)
+    assert transients.masked(0, LoadedImage(planes, users)).mask is users
+    assert transients.masked(0, LoadedImage(planes)).mask is None
+    half = transients.masked(3, LoadedImage(planes[:, ::2, ::2])).mask
+    assert torch.equal(half, found[::2, ::2])
+
+
+def test_masks_as_pictures(busy, trained):
+    pictures = trained.transients.pictures()
+    assert set(pictures) == {busy.train[i].name for i in BOXES}
+    for i, (left, upper, right, lower) in BOXES.items():
+        mask = np.asarray(pictures[busy.train[i].name])
+        assert mask.shape == (HEIGHT, WIDTH)
+        assert set(np.unique(mask)) == {0, 255}
+        assert mask[upper:lower, left:right].mean() < 0.1 * 255
+
+
+# Resuming, and other settings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [14, 15, 60])
+def test_a_resumed_run_has_the_same_masks(busy, trained, tmp_path, stop):
+    first = run(busy, CONFIG, until=stop)
+    path = checkpoint.save(tmp_path, stop, first.state_tensors(), {})
+    second = Trainer(busy, CONFIG)
+    second.load_state(checkpoint.load(path).tensors)
+    second.run()
+    assert second.transients.found == trained.transients.found
+    assert_identical(second.gaussians, trained.gaussians)
+
+
+@pytest.mark.slow
+def test_the_masks_do_not_depend_on_the_number_of_threads(busy, trained):
+    before = ops.get_num_threads()
+    ops.set_num_threads(1 if before > 1 else 2)
+    try:
+        again = run(busy, CONFIG)
+    finally:
+        ops.set_num_threads(before)
+    assert_identical(again.gaussians, trained.gaussians)
+
+
+def test_the_masks_of_another_dataset_are_rejected(busy):
+    trainer = Trainer(busy, CONFIG)
+    state = trainer.state_tensors()
+    state["transients.masks"] = state["transients.masks"][:-1].clone()
+    with pytest.raises(UserError, match="another dataset or recipe"):
+        trainer.load_state(state)
+
+
+def test_a_checkpoint_without_the_setting_is_as_before(busy):
+    state = Trainer(busy, replace(CONFIG, transients="off")).state_tensors()
+    assert not [name for name in state if name.startswith("transients.")]
+
+
+@pytest.mark.parametrize(("mode", "views"), [("auto", 29), ("on", 7)])
+def test_with_few_photos_nothing_is_masked(busy, mode, views):
+    few = replace(busy, train=busy.train[:views])
+    trainer = run(few, replace(CONFIG, iterations=30, transients=mode))
+    assert trainer.transients.found == {}
+
+
+def test_growth_waits_for_the_masks():
+    for name in ("default", "paper", "mcmc"):
+        assert delayed(recipe(name).density).densify_from == MOMENTS[1]
+    later = replace(recipe("default").density, densify_from=0.4)
+    assert delayed(later) is later
+
+
+def test_an_unknown_value():
+    with pytest.raises(SettingError, match="auto, on or off"):
+        recipe("default", transients="maybe")
