@@ -24,7 +24,7 @@ START = [ROOT / "docs" / name for name in ("index.md", "installation.md", "quick
 PAGES = [ROOT / "README.md", *START, *GUIDES, ROOT / "docs" / "environment-variables.md"]
 TEXTS = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in PAGES}
 # Programs besides snowsplat that the pages use.
-TOOLS = {".", "apt", "cp", "make", "mkdir", "pip", "python", "python3", "ssh", "torchrun"}
+TOOLS = {".", "apt", "cp", "make", "mkdir", "npm", "pip", "python", "python3", "ssh", "torchrun"}
 
 
 def examples(page: str) -> list[str]:
@@ -149,6 +149,7 @@ def test_named_flags_exist(capsys):
 # Flags of the other programs.
 OTHERS = {
     "docs/guides/reference-implementation.md": {
+        "--antialiasing",
         "--checkpoint_iterations",
         "--data_device",
         "--random_background",
