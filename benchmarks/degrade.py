@@ -1,6 +1,7 @@
-"""Copies a dataset and changes exposure and white balance of its training photos at random.
+"""Copies a dataset and changes its training photos, or their poses, at random.
 
     python benchmarks/degrade.py fox_small /tmp/degraded --exposure 1 --white-balance 0.1 --seed 3
+    python benchmarks/degrade.py fox_small /tmp/moved --rotation 0.3 --translation 0.005
     python benchmarks/recipes.py default:exposure=off default --datasets /tmp --captures degraded
 
 The held-out photos (every 8th, or the test split of the dataset) are copied unchanged, so that they
@@ -8,12 +9,17 @@ measure how much the changes of the other photos harm the scene. The light of a 
 by 2^u, u uniform in ±EXPOSURE, and that of red and blue by another factor, uniform in
 1 ± WHITE_BALANCE. Values above white are clipped. The points of a COLMAP dataset get their colours
 from the changed photos, as structure from motion would find them.
+
+With --rotation and --translation, the camera of a photo is rotated by an angle and moved by a
+distance, both with a random direction. The distance is a share of the extent of the cameras.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +28,9 @@ import torch
 from PIL import Image
 
 from snowsplat import Dataset, load_dataset
+from snowsplat.data.colmap import read_model, read_points, write_model
 from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
 from snowsplat.training.point_colors import point_colors
 
 
@@ -64,28 +72,58 @@ def recolor(dataset: Dataset, model: Path) -> None:
     reconstruction.write(model)
 
 
+def move_cameras(dataset: Dataset, model: Path, degrees: float, share: float, seed: int) -> None:
+    """Rotate and move the cameras of the training photos in a COLMAP model; tracks are dropped."""
+    generator = torch.Generator().manual_seed(seed)
+    trained = {view.name for view in dataset.train}
+    colmap, points = read_model(model), read_points(model)
+    images = []
+    for image in colmap.images:
+        directions = torch.randn(2, 3, dtype=torch.float64, generator=generator)
+        axis, way = torch.nn.functional.normalize(directions, dim=1)
+        half = math.radians(degrees) / 2
+        turn = rotation_from_quat(
+            torch.cat([torch.tensor([math.cos(half)]), math.sin(half) * axis])
+        )
+        quat, shift = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
+        rotation = rotation_from_quat(quat)
+        centre = -rotation.T @ shift + share * dataset.extent * way
+        if image.name in trained:
+            turned = turn @ rotation
+            pose = torch.cat([quat_from_rotation(turned), -turned @ centre])
+            image = replace(image, pose=tuple(pose.tolist()))
+        images.append(image)
+    assert points is not None
+    write_model(model, colmap.cameras, images, points.xyz.numpy(), points.rgb.numpy())
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", type=Path)
     parser.add_argument("output", type=Path, help="a new folder")
-    parser.add_argument("--exposure", type=float, default=1.0, metavar="EV")
-    parser.add_argument("--white-balance", type=float, default=0.1, metavar="SHARE")
+    parser.add_argument("--exposure", type=float, default=0.0, metavar="EV")
+    parser.add_argument("--white-balance", type=float, default=0.0, metavar="SHARE")
+    parser.add_argument("--rotation", type=float, default=0.0, metavar="DEGREES")
+    parser.add_argument("--translation", type=float, default=0.0, metavar="SHARE")
     parser.add_argument("--seed", type=int, default=0)
     flags = parser.parse_args()
     shutil.copytree(flags.dataset, flags.output, copy_function=shutil.copyfile)
     for folder in (flags.output, *flags.output.rglob("*/")):
         folder.chmod(0o755)
     dataset = load_dataset(flags.output, hold_out=8)
-    generator = np.random.default_rng(flags.seed)
-    for view in dataset.train:
-        factors = np.full(3, 2.0 ** generator.uniform(-flags.exposure, flags.exposure))
-        balance = generator.uniform(1 - flags.white_balance, 1 + flags.white_balance, 2)
-        factors[[0, 2]] *= balance
-        degrade(view.image.path, factors)
-        print(f"{view.name}: {np.log2(factors).round(2)} EV")
     model = flags.output / "sparse" / "0"
-    if model.is_dir():
-        recolor(load_dataset(flags.output, hold_out=8), model)
+    if flags.exposure or flags.white_balance:
+        generator = np.random.default_rng(flags.seed)
+        for view in dataset.train:
+            factors = np.full(3, 2.0 ** generator.uniform(-flags.exposure, flags.exposure))
+            balance = generator.uniform(1 - flags.white_balance, 1 + flags.white_balance, 2)
+            factors[[0, 2]] *= balance
+            degrade(view.image.path, factors)
+            print(f"{view.name}: {np.log2(factors).round(2)} EV")
+        if model.is_dir():
+            recolor(load_dataset(flags.output, hold_out=8), model)
+    if flags.rotation or flags.translation:
+        move_cameras(dataset, model, flags.rotation, flags.translation, flags.seed)
 
 
 if __name__ == "__main__":
