@@ -141,7 +141,8 @@ def test_what_moves_is_masked_and_shown(tmp_path):
         with Image.open(photos / "images" / name) as image:
             image.paste((250, 20, 240), (left, 24, left + 48, 80))
             image.save(photos / "images" / name)
-    recorder, settings = Recorder(), {"iterations": 80, "checkpoint_every": 60}
+    settings = {"iterations": 80, "checkpoint_every": 60, "transients": "auto"}
+    recorder = Recorder()
     result = train(photos, tmp_path / "out", TrainOptions(settings=settings), observer=recorder)
     assert set(result.moving) == {"view_03.png", "view_06.png", "view_10.png"}
     mean = 100 * sum(result.moving.values()) / 3
