@@ -145,7 +145,7 @@ def test_the_gradient_of_a_motion(dataset: Dataset) -> None:
     cotangent[:, 7] = 0.0  # radii have no gradient
     splats.packed.grad = cotangent
     gradient = ViewGradient(splats, poses.camera(0), 0)
-    d_motion, d_focal = poses._gradient(0, scene.parameters(), gradient)
+    d_motion, d_focal = poses._gradient(0, scene, gradient)
 
     def value(numbers: Tensor) -> float:
         shown = poses.camera(0)
