@@ -154,7 +154,7 @@ class Transients:
     def masked(self, view: int, photo: LoadedImage) -> LoadedImage:
         """The photo of a view, at any size, with the mask of the user and that of what moves."""
         cells = self.masks[view]
-        if bool(cells.all()):
+        if self._mode == "off" or bool(cells.all()):
             return photo
         size = photo.planes.shape[1:]
         mask = interpolate(cells[None, None].to(torch.uint8), size)[0, 0].to(torch.bool)
