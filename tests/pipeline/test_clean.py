@@ -25,11 +25,17 @@ def with_floater(gaussians: Gaussians, position: torch.Tensor) -> Gaussians:
 
 
 @pytest.fixture
-def trained(dataset, tmp_path):
+def photos(dataset, tmp_path):
+    """A copy of the dataset, which a test may move."""
+    return shutil.copytree(dataset, tmp_path / "photos")
+
+
+@pytest.fixture
+def trained(photos, tmp_path):
     """An output folder whose scene has a floater before the first held-out camera."""
     options = TrainOptions(hold_out=4, settings={"iterations": 150, "visible_only": False})
     out = tmp_path / "out"
-    train(dataset, out, options)
+    train(photos, out, options)
     scene = load_trained(out)
     camera = scene.dataset.test[0].camera
     ahead = camera.position + 0.8 * camera.cam_from_world[2, :3]
@@ -53,21 +59,21 @@ def test_held_out_photos_decide(trained, tmp_path):
         clean(out, tmp_path / "clean.ply")
 
 
-def test_a_scene_file_needs_its_dataset(trained, dataset, tmp_path):
+def test_a_scene_file_needs_its_dataset(trained, photos, tmp_path):
     out, ahead = trained
     alone = tmp_path / "alone.ply"
     shutil.copyfile(out / "point_cloud/iteration_150/point_cloud.ply", alone)
     with pytest.raises(UserError, match="cameras are unknown"):
         clean(alone, tmp_path / "clean.spz")
-    done = clean(alone, tmp_path / "clean.spz", dataset=dataset)
+    done = clean(alone, tmp_path / "clean.spz", dataset=photos)
     assert "training" in done.compared
     assert done.psnr[1] >= done.psnr[0] - 0.03
     assert nearest(tmp_path / "clean.spz", ahead) > 0.01
 
 
-def test_without_photos_the_images_stay(trained, dataset, tmp_path):
+def test_without_photos_the_images_stay(trained, photos, tmp_path):
     out, _ = trained
-    dataset.rename(tmp_path / "moved")
+    photos.rename(tmp_path / "moved")
     done = clean(out, tmp_path / "clean.ply")
     assert "renderings" in done.compared
     assert done.psnr[1] >= 40.0

@@ -30,6 +30,7 @@ _FEWEST_VIEWS = 8
 #: Images are reduced to about this length of their diagonal, in pixels. Then a shift by a few
 #: thousandths of the image is about a pixel, and the derivative of the image predicts it.
 _DIAGONAL = 280
+_FACTORS = (1, 2, 4)  # those of `ImageLoader`
 #: The smallest shift after a training that shows that poses are not exact, as a share of the
 #: diagonal; see docs/cameras.md.
 SHIFTED = 0.0009
@@ -74,7 +75,7 @@ def shift_of(
     device = gaussians.means.device
     color = torch.tensor(background, dtype=torch.float32, device=device)
     diagonal = _diagonal(views)
-    factor = max(1, round(diagonal / _DIAGONAL))
+    factor = min(_FACTORS, key=lambda factor: abs(math.log(factor * _DIAGONAL / diagonal)))
     shifts = []
     with single_threaded(), ImageLoader(views, budget_bytes=0, device=device) as images:
         images.prefetch(views, factor)
