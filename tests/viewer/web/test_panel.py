@@ -170,5 +170,8 @@ def test_a_click_on_every_control(file):
         page.evaluate("document.querySelector('.sse-orbitCamera').click()")
         page.evaluate("document.querySelector('.sse-play').click()")
         assert page.evaluate(MODE) == "anim"
+        # The fly mode has asked for the pointer; the browser may grant it late.
+        page.evaluate("document.exitPointerLock()")
+        page.wait_for("!document.pointerLockElement")
         page.drag(100, 280, 180, 290)
         page.wait_for(f"{MODE} === 'orbit'", 30)
