@@ -217,7 +217,7 @@ def test_any_order_elsewhere_and_interrupted_gives_the_same_scene(planned, train
     # The first 20 steps of block 2, as if its process had been killed after a checkpoint.
     block = plan.blocks[1]
     options = TrainOptions(
-        settings=SETTINGS | {"max_gaussians": block.max_gaussians, "checkpoint_every": 20},
+        settings=plan.settings | {"max_gaussians": block.max_gaussians, "checkpoint_every": 20},
         resolution=-1,
     )
     train(folder / "block_02" / "dataset", folder / "block_02" / "scene", options)
@@ -229,7 +229,8 @@ def test_any_order_elsewhere_and_interrupted_gives_the_same_scene(planned, train
     # A copy of block 1 without links, trained by the ordinary function.
     copy = tmp_path / "copy"
     shutil.copytree(folder / "block_01" / "dataset", copy)
-    options = replace(options, settings=SETTINGS | {"max_gaussians": plan.blocks[0].max_gaussians})
+    limit = {"max_gaussians": plan.blocks[0].max_gaussians}
+    options = replace(options, settings=plan.settings | limit)
     train(copy, folder / "block_01" / "scene", options)
 
     lines.clear()

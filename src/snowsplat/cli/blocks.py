@@ -136,6 +136,8 @@ class Blocks:
                 f"{self.output / block.name}: {block.views} photos, {block.points:,} points, "
                 f"at most {limit} Gaussians"
             )
+        if distance := plan.settings.get("sky_distance"):
+            print(f"distance of the sky in all of them: {distance:g}")
         print(f"train them with: snowsplat blocks train {self.output}")
         return 0
 

@@ -72,6 +72,11 @@ class ConfigFlags:
     initial_points: Annotated[int | float | None, flag("N|F", default=RECIPE)] = None
     """Number of points of each start except points, which uses all. A value with a decimal point
     (0.4) is a share of the maximum number of Gaussians."""
+    sky: Annotated[Literal["on", "off"] | None, flag("{on,off}", default=RECIPE)] = None
+    """Whether to start with Gaussians far behind the scene if the photos show the sky, and with
+    none before it. The dataset needs points."""
+    sky_distance: Annotated[float | None, flag("F", default="100 x the size of the path")] = None
+    """Distance of these Gaussians from the middle of the cameras, in units of the scene."""
     grad_threshold: Annotated[
         float | None, flag("F", "--densify-grad-threshold", default=RECIPE)
     ] = None
@@ -125,7 +130,7 @@ class ConfigFlags:
         given = {field.name: getattr(self, field.name) for field in fields(ConfigFlags)}
         if self.test_iterations is not None:
             given["test_iterations"] = tuple(step for step in self.test_iterations if step > 0)
-        for name in ("abs_grad", "stop_overfitting", "antialias"):
+        for name in ("abs_grad", "stop_overfitting", "antialias", "sky"):
             if given[name] is not None:
                 given[name] = given[name] == "on"
         return {name: value for name, value in given.items() if value is not None}

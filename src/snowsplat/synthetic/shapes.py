@@ -105,14 +105,20 @@ class Box:
 
 
 class Ellipsoid:
-    """A ball with a radius for each axis; one face, as a world map: north is up."""
+    """A ball with a radius for each axis; one face, as a world map: north is up. ``inside``: a dome
+    seen from inside, on which the map is mirrored.
+    """
 
     def __init__(
-        self, centre: tuple[float, float, float], radii: tuple[float, float, float]
+        self,
+        centre: tuple[float, float, float],
+        radii: tuple[float, float, float],
+        inside: bool = False,
     ) -> None:
         self.centre = _column(*centre)
         self.radii = _column(*radii)
-        self.radius = max(radii)
+        self.radius = math.inf if inside else max(radii)
+        self._side = np.float32(-1 if inside else 1)
         self.sizes: Sizes = ((2 * math.pi * max(radii[:2]), math.pi * radii[2]),)
         self.wraps: tuple[bool, ...] = (True,)
 
@@ -127,7 +133,7 @@ class Ellipsoid:
         along = (to_centre * direction).sum(axis=0)
         foot = to_centre - along * direction
         within = 1 - (foot * foot).sum(axis=0)
-        distance = along - np.sqrt(np.maximum(within, 0))
+        distance = along - self._side * np.sqrt(np.maximum(within, 0))
         return np.where((within > 0) & (distance > 0), distance / length, _FAR)
 
     def surface(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -148,7 +154,7 @@ class Ellipsoid:
         return own * self.radii + self.centre, self._normals(own)
 
     def _normals(self, own: np.ndarray) -> np.ndarray:
-        normals = own / self.radii
+        normals = self._side * own / self.radii
         return normals / np.sqrt((normals * normals).sum(axis=0))
 
 

@@ -1,7 +1,7 @@
 """A street: façades with windows and shops, trees, lamps, planters, a road and a sky.
 
 Metres; x is along the street, z is up, and the middle of the road is y = 0. All textures depend on
-the seed. Distant walls are painted with a skyline.
+the seed. The sky and a distant skyline are painted on a dome.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 
 #: From the middle of the road to the façades.
 HALF_WIDTH = 6.0
-#: The street continues by this distance behind its ends, up to the painted walls.
-BEYOND = 22.0
+#: The road continues by this distance behind its ends.
+BEYOND = 60.0
 _ROAD = 3.4  # from the middle of the road to the kerb
-_SIDE = 11.0  # from the middle of the road to the walls behind the houses
-_SKY = 30.0  # height of the ceiling, which is painted as the sky
+_SIDE = 11.0  # from the middle of the road to the edge of the ground, behind the houses
+_DOME = 3000.0  # its radius
+_PANORAMA = (2048, 1024)  # pixels
 _TEXEL = 0.03
 _DEPTH = 4.0  # of a house
 _PLANE_LEAVES = ((0.28, 0.42, 0.16), (0.36, 0.46, 0.18), (0.22, 0.36, 0.17))
@@ -31,7 +32,7 @@ _METAL = (0.16, 0.19, 0.20)
 def street(length: float, seed: int = 0) -> Scene:
     """The scene with its illumination; equal arguments produce equal scenes."""
     random = np.random.default_rng(seed)
-    objects = [_surroundings(length, random)]
+    objects = [_surroundings(length, random), _ground_box(length, random)]
     for side in (-1, 1):
         objects += _houses(length, side, random)
         objects += _pavement(length, side, random)
@@ -45,14 +46,19 @@ def _size(metres: tuple[float, float], texel: float = _TEXEL) -> tuple[int, int]
     return width, height
 
 
-def _surroundings(length: float, random: np.random.Generator) -> SceneObject:
-    """The road, the painted walls and the sky, as the inside of a box."""
+def _ground_box(length: float, random: np.random.Generator) -> SceneObject:
+    """The road and the pavements, on the upper face of a flat box."""
     along, across = length + 2 * BEYOND, 2 * _SIDE
-    ends = [_skyline(_size((across, _SKY), 0.06), random) for _ in range(2)]
-    sides = [_skyline(_size((along, _SKY), 0.2), random) for _ in range(2)]
-    sky = _clouds(_size((along, across), 0.2), random)
-    box = Box((length / 2, 0, _SKY / 2), (along, across, _SKY), inside=True)
-    return SceneObject(box, [*ends, *sides, _ground(along, across, random), sky])
+    other = np.full((16, 16, 3), 0.3, np.float32)
+    box = Box((length / 2, 0, -0.5), (along, across, 1.0))
+    return SceneObject(box, [other] * 5 + [_ground(along, across, random)])
+
+
+def _surroundings(length: float, random: np.random.Generator) -> SceneObject:
+    """Fields, a distant skyline and the sky: a dome so large that its parallax is not visible."""
+    box = (_DOME, _DOME, _DOME)
+    dome = Ellipsoid((length / 2, 0, 0), box, inside=True)
+    return SceneObject(dome, [_panorama(_PANORAMA, random)], emissive=True)
 
 
 def _ground(along: float, across: float, random: np.random.Generator) -> np.ndarray:
@@ -79,22 +85,29 @@ def _ground(along: float, across: float, random: np.random.Generator) -> np.ndar
     return ground.clip(0, 1).astype(np.float32)
 
 
-def _skyline(size: tuple[int, int], random: np.random.Generator) -> np.ndarray:
-    """Roofs and trees before the sky."""
-    sky = _clouds(size, random)
+def _panorama(size: tuple[int, int], random: np.random.Generator) -> np.ndarray:
+    """All directions, the zenith in the first row: clouds, roofs and hills at the horizon, fields.
+
+    Its left and right sides fit.
+    """
     width, height = size
-    hills = paint.noise((width, 1), (9, 1), 5, random)[0]
-    blocks = np.repeat(random.uniform(0.0, 0.12, width // 24 + 1), 24)[:width]
-    top = 1 - (0.24 + 0.05 * hills + blocks)
-    rows = (np.arange(height) + 0.5)[:, None] / height
-    houses = paint.bricks(size, 60, width // 20, random) * 0.7 + 0.12
-    return np.where((rows > top)[..., None], houses, sky).astype(np.float32)
-
-
-def _clouds(size: tuple[int, int], random: np.random.Generator) -> np.ndarray:
-    share = (1.1 * paint.noise(size, (5, 3), 5, random) + 0.35).clip(0, 1)[..., None]
+    elevation = np.radians(90 - 180 * (np.arange(height) + 0.5) / height)[:, None]
     blue, white = np.array([0.55, 0.72, 0.92]), np.array([0.95, 0.96, 0.97])
-    return (blue + share * (white - blue)).astype(np.float32)
+    # Clouds become smaller towards the horizon, as on a plane; haze hides the most distant ones.
+    azimuth = 2 * math.pi * (np.arange(width) + 0.5) / width
+    reach = np.minimum(1 / np.tan(np.maximum(elevation, 0.02)), 12.0)
+    plane = paint.noise((1024, 1024), (24, 24), 5, random)
+    x, y = (((reach * turn(azimuth) / 24 + 0.5) * 1024).astype(int) for turn in (np.cos, np.sin))
+    haze = np.exp(-np.maximum(elevation, 0) / 0.12)
+    share = ((1.6 * plane[y, x] + 0.3).clip(0, 1) * (1 - haze) + 0.8 * haze)[..., None]
+    sky = blue + share * (white - blue)
+    step = width // 128
+    roofs = np.repeat(random.uniform(0.0, 0.05, 128), step)
+    hills = 0.02 + 0.015 * np.sin(3 * azimuth + 1.0) + 0.01 * np.sin(8 * azimuth)
+    houses = paint.bricks(size, 200, 256, random) * 0.5 + 0.25
+    fields = paint.plain(size, (0.38, 0.42, 0.28), random, stains=0.3)
+    town = np.where((elevation < hills + roofs)[..., None], houses, sky)
+    return np.where((elevation < 0)[..., None], fields, town).clip(0, 1).astype(np.float32)
 
 
 def _houses(length: float, side: int, random: np.random.Generator) -> list[SceneObject]:

@@ -26,8 +26,8 @@ _LANE = 1.3  # metres between the path and the middle of the road
 _GAZES = (20.0, -50.0, 80.0, -15.0, 50.0, -85.0)
 _POINT_ERROR = 0.01  # metres, standard deviation, as in structure from motion
 _FAR = 30.0  # metres; more distant points are left out
-# x right, y down, z forward, as in other datasets; in the scene, z is up.
-_DATASET_FROM_SCENE = torch.tensor(
+#: x right, y down, z forward, as in other datasets; in the scene, z is up.
+DATASET_FROM_SCENE = torch.tensor(
     [[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]], dtype=torch.float64
 )
 
@@ -63,11 +63,11 @@ def write_street_dataset(
             found = _points(scene, length, lens, pose, np.asarray(photo), points_per_view, random)
         xyz.append(found[0])
         rgb.append(found[1])
-        moved = compose_rigid(pose, invert_rigid(_DATASET_FROM_SCENE))
+        moved = compose_rigid(pose, invert_rigid(DATASET_FROM_SCENE))
         quat = quat_from_rotation(moved[:, :3])
         images.append(ColmapImage(name, 1, (*quat.tolist(), *moved[:, 3].tolist())))
     camera = ColmapCamera("PINHOLE", width, height, lens.params[:4])
-    turned = np.concatenate(xyz) @ _DATASET_FROM_SCENE[:, :3].numpy().T
+    turned = np.concatenate(xyz) @ DATASET_FROM_SCENE[:, :3].numpy().T
     write_model(folder / "sparse" / "0", {1: camera}, images, turned, np.concatenate(rgb))
     return folder
 

@@ -46,6 +46,9 @@ class TrainConfig:
         initial_opacity: the opacity of every Gaussian at initialisation.
         initial_scale: the scale of every Gaussian at initialisation, in units of the mean distance
             to its three nearest neighbours.
+        sky: whether the first Gaussians include some for the sky, if the photos show it; see `sky`.
+        sky_distance: the distance of the sky from the middle of the cameras, in world units; 0: a
+            hundred times the distance of the cameras from it.
         learning_rates: see `LearningRates`.
         decay: see `DecayRates`.
         relative_scale: largest scale of a Gaussian, in units of its distance to the nearest camera
@@ -99,6 +102,8 @@ class TrainConfig:
     initial_points: int | float = 100_000
     initial_opacity: float = 0.1
     initial_scale: float = 1.0
+    sky: bool = False
+    sky_distance: float = 0.0
     learning_rates: LearningRates = field(default_factory=LearningRates)
     decay: DecayRates = field(default_factory=DecayRates)
     relative_scale: float = 0.0
@@ -158,6 +163,7 @@ class TrainConfig:
         for name, limit in (
             ("relative_scale", self.relative_scale),
             ("near_limit", self.near_limit),
+            ("sky_distance", self.sky_distance),
         ):
             if not 0.0 <= limit < math.inf:
                 raise SettingError(name, f"{limit:g} is not valid; use e.g. 0.5, or 0 for none")

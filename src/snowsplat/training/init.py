@@ -10,8 +10,10 @@ from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.image_loader import Photos
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
+from snowsplat.training.background import FIXED_BACKGROUNDS
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.finite import check_finite
+from snowsplat.training.sky import most_sky_points, with_sky
 from snowsplat.training.starts import STARTS
 
 
@@ -20,6 +22,8 @@ def initial_count(dataset: Dataset, config: TrainConfig) -> int:
     limit = config.density.max_gaussians
     points = 0 if dataset.points is None else len(dataset.points)
     count = sum(points if name == "points" else config.points_per_start for name in config.starts)
+    if config.sky:
+        count += most_sky_points(config.points_per_start)
     return min(count or config.points_per_start, limit or count)
 
 
@@ -38,7 +42,8 @@ def initial_gaussians(
 ) -> Gaussians:
     """One Gaussian for each point of the starts of ``config.init``.
 
-    There are at most ``density.max_gaussians``. As in section 5.1 of the paper, they are isotropic.
+    If ``config.sky`` is set, `with_sky` changes the points. There are at most
+    ``density.max_gaussians``. As in section 5.1 of the paper, they are isotropic.
     The scale is the mean distance to the three nearest neighbours times ``config.initial_scale``;
     the colour is that of the point; the opacity is ``config.initial_opacity``. The rows are in
     Morton order.
@@ -56,6 +61,10 @@ def initial_gaussians(
     points = _points_of(config.starts, dataset, config, images, generator)
     if not len(points):
         points = _points_of(("random",), dataset, config, images, generator)
+    if config.sky:
+        most = most_sky_points(config.points_per_start)
+        background = FIXED_BACKGROUNDS.get(config.background)
+        points = with_sky(points, dataset, images, most, config.sky_distance, background)
     limit = config.density.max_gaussians or math.inf
     if len(points) > limit:
         chosen = torch.randperm(len(points), generator=generator)[: int(limit)]

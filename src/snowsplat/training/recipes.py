@@ -23,12 +23,12 @@ def default() -> TrainConfig:
     """The best quality for a few thousand steps on a CPU.
 
     It is `classic` with these changes, which docs/performance.md measures: the training starts with
-    points on the surfaces, which are found by plane sweep; in the last part of the training, all
-    learning rates decrease; opacities and scales decay, so that Gaussians which no photo needs
-    become transparent; Gaussians with an opacity below 0.1 are removed, and their places are used
-    again; no Gaussian is much nearer to a camera than the points that it sees; densification lasts
-    longer, uses absolute gradients, and always reaches the maximum number; and of the same time,
-    more is used for Gaussians and less for steps.
+    points on the surfaces, which are found by plane sweep, and in the sky; in the last part of the
+    training, all learning rates decrease; opacities and scales decay, so that Gaussians which no
+    photo needs become transparent; Gaussians with an opacity below 0.1 are removed, and their
+    places are used again; no Gaussian is much nearer to a camera than the points that it sees;
+    densification lasts longer, uses absolute gradients, and always reaches the maximum number; and
+    of the same time, more is used for Gaussians and less for steps.
     """
     config = classic()
     return replace(
@@ -38,6 +38,7 @@ def default() -> TrainConfig:
         initial_points=0.4,
         initial_opacity=0.3,
         initial_scale=0.6,
+        sky=True,
         learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),
         decay=DecayRates(opacity=0.04, scale=0.02, until=0.7),
         relative_scale=0.3,

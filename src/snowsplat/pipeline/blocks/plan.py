@@ -152,6 +152,7 @@ def plan_blocks(
     from snowsplat.pipeline.blocks.content import block_content
     from snowsplat.pipeline.train import TrainOptions
     from snowsplat.training.recipes import recipe
+    from snowsplat.training.sky import sky_distance
 
     options, folder = options or PlanOptions(), Path(folder)
     _check_free(folder)
@@ -178,7 +179,11 @@ def plan_blocks(
     axes, contents = block_content(whole, options.blocks, options.margin)
     sizes = sorted(view.camera.width * view.camera.height for view in whole.train)
     config = config.capped(sizes[len(sizes) // 2], len(sizes))
-    plan = Plan(settings, options.recipe, dict(options.settings), axes, options.margin, [])
+    shared = dict(options.settings)
+    if config.sky and not config.sky_distance:  # so that the parts of the sky fit
+        distance = sky_distance([view.camera for view in whole.train])
+        shared["sky_distance"] = float(f"{distance:.4g}")
+    plan = Plan(settings, options.recipe, shared, axes, options.margin, [])
     folder.mkdir(parents=True, exist_ok=True)
     plan.write(folder)  # without blocks: it is unfinished
     limit, blocks, digits = config.density.max_gaussians, [], max(2, len(str(options.blocks)))

@@ -1,0 +1,192 @@
+"""The sky: where photos show it, points there, and none before it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.data.decode import ImageSource
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import look_at
+from snowsplat.training.config import changed
+from snowsplat.training.direction_cells import (
+    ANGLE,
+    COUNT,
+    cells_of,
+    directions_of,
+    median_of,
+    spread_of,
+)
+from snowsplat.training.init import initial_count, initial_gaussians
+from snowsplat.training.recipes import recipe
+from snowsplat.training.sky import find_sky, sky_distance, with_sky
+
+SIZE = 96
+GROUND = 1.5  # y of the ground, below the cameras; y points down
+EMPTY = torch.tensor([[1.0, -3.0, 9.0], [-9.0, -3.0, 2.0], [7.0, -3.0, -7.0]])  # in the air
+
+
+def ring(radius: float = 2.0) -> list[Camera]:
+    """Cameras on a circle that look outwards and ahead."""
+    cameras = []
+    for i in range(36):
+        angle = 2.0 * math.pi * i / 36
+        out = torch.tensor([math.cos(angle), 0.0, math.sin(angle)], dtype=torch.float64)
+        ahead = torch.tensor([-math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64)
+        gaze = out * (1.0 - 2.0 * (i % 2)) + 0.5 * ahead
+        up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+        pose = look_at(radius * out, radius * out + gaze, up)
+        cameras.append(Camera(SIZE, SIZE, 60.0, 60.0, SIZE / 2, SIZE / 2, pose))
+    return cameras
+
+
+def sky_color(directions: Tensor) -> Tensor:
+    return 0.6 + 0.3 * torch.sin(2.0 * directions + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def ground_color(xyz: Tensor) -> Tensor:
+    """A pattern with details of 0.7 units."""
+    x, _, z = xyz.unbind(-1)
+    phases = [torch.sin(4.0 * x + i) * torch.cos(3.7 * z + 2 * i) for i in range(3)]
+    return 0.5 + 0.45 * torch.stack(phases, dim=-1)
+
+
+def photo(camera: Camera, height: float) -> Tensor:
+    """(H, W, 3) in 0..1: the ground at y = ``height`` below the sky; or, above, a ceiling."""
+    y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    ones = torch.ones(SIZE, SIZE)
+    rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, ones], -1)
+    pose = camera.world_from_cam.float()
+    rays = torch.nn.functional.normalize(rays @ pose[:, :3].T, dim=-1)
+    down = rays[..., 1:2]
+    floor = pose[:, 3] + rays * (GROUND - pose[1, 3]) / down
+    ceiling = pose[:, 3] + rays * (height - pose[1, 3]) / down
+    above = sky_color(rays) if math.isinf(height) else ground_color(ceiling)
+    return torch.where(down > 0, ground_color(floor), above)
+
+
+def dataset(folder: Path, height: float = -math.inf, radius: float = 2.0) -> Dataset:
+    views = []
+    for i, camera in enumerate(ring(radius)):
+        pixels = (255.0 * photo(camera, height)).clamp(0, 255).round().numpy().astype(np.uint8)
+        file = folder / f"{i}.png"
+        Image.fromarray(pixels).save(file)
+        views.append(View(f"{i}", camera, ImageSource(file, SIZE, SIZE)))
+    xyz = 24.0 * torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) - 12.0
+    xyz[:, 1] = GROUND
+    if not math.isinf(height):
+        xyz[::2, 1] = height
+    rgb = (255 * ground_color(xyz)).clamp(0, 255).to(torch.uint8)
+    return Dataset(views, [], Points(xyz, rgb), 2.2)
+
+
+@pytest.fixture(scope="module")
+def outdoors(tmp_path_factory) -> Dataset:
+    return dataset(tmp_path_factory.mktemp("outdoors"))
+
+
+def images(data: Dataset) -> ImageLoader:
+    return ImageLoader(data.train, budget_bytes=1 << 26)
+
+
+def test_the_middle_of_a_cell_is_in_it_and_cells_are_of_similar_size():
+    cells = torch.arange(COUNT)
+    directions = directions_of(cells)
+    assert torch.equal(cells_of(3.0 * directions), cells)
+    some = directions[::997]
+    to_others = torch.acos((some @ directions.T).clamp(-1, 1))
+    to_next = to_others.topk(2, largest=False).values[:, 1]
+    assert 0.6 * ANGLE < float(to_next.min()) <= float(to_next.max()) < 1.4 * ANGLE
+
+
+def test_medians_and_spreads_of_cells():
+    cell = torch.tensor([5, 2, 5, 5, 2])
+    values = torch.tensor([[1.0], [7.0], [9.0], [3.0], [8.0]])
+    medians = median_of(cell, values)
+    assert medians.shape == (COUNT, 1)
+    assert medians[[5, 2, 3], 0].tolist() == [3.0, 7.0, 0.0]
+    positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [0, 0, 0], [5, 0, 0]])
+    spread = spread_of(cell, positions)
+    assert spread[2] == pytest.approx(2.0)
+    assert spread[5] == pytest.approx(math.sqrt(2.0))
+
+
+def test_the_sky_is_found_with_its_colours(outdoors):
+    sky = find_sky(outdoors, images(outdoors))
+    assert sky is not None
+    above = sky.directions[:, 1] < ANGLE
+    assert float(above.float().mean()) > 0.99
+    assert len(sky.colors) > 3000
+    error = sky.colors / 255.0 - sky_color(sky.directions)
+    wrong = error[above].abs().amax(1) > 0.03
+    assert int(wrong.sum()) <= 3  # cells across the horizon
+    assert 0.2 < sky.share < 0.5  # half of the photos is above the horizon; points are near it
+
+
+def test_points_before_the_sky_are_removed_and_others_kept(outdoors):
+    assert outdoors.points is not None
+    floating = Points(
+        torch.cat([outdoors.points.xyz, EMPTY]),
+        torch.cat([outdoors.points.rgb, torch.full((3, 3), 9, dtype=torch.uint8)]),
+    )
+    result = with_sky(floating, outdoors, images(outdoors), 500)
+    ground = result.xyz[:, 1] == GROUND
+    assert int(ground.sum()) == len(outdoors.points)
+    assert not (result.rgb == 9).all(1).any()
+    sky = result.xyz[~ground]
+    assert 250 < len(sky) <= 500
+    distance = sky.norm(dim=1)
+    assert torch.allclose(distance, torch.full_like(distance, sky_distance(ring())), rtol=1e-4)
+    assert sky_distance(ring()) == pytest.approx(200.0)
+
+
+def test_the_distance_can_be_chosen(outdoors):
+    result = with_sky(outdoors.points, outdoors, images(outdoors), 500, 37.0)
+    assert float(result.xyz.norm(dim=1).max()) == pytest.approx(37.0, rel=1e-4)
+
+
+def test_a_sky_of_the_colour_of_the_background_needs_no_points(tmp_path):
+    data = dataset(tmp_path)
+    for view in data.train:
+        with Image.open(view.image.path) as file:
+            pixels = np.array(file)
+        pixels[: SIZE // 2] = 255
+        Image.fromarray(pixels).save(view.image.path)
+    with_white = with_sky(data.points, data, images(data), 500, background=(1.0, 1.0, 1.0))
+    assert len(with_white) <= len(data.points) + 3  # cells across the horizon
+    assert len(with_sky(data.points, data, images(data), 500, background=(0, 0, 0))) > 3200
+
+
+def test_a_ceiling_is_not_the_sky(tmp_path):
+    data = dataset(tmp_path, height=-2.0)
+    assert find_sky(data, images(data)) is None
+    assert with_sky(data.points, data, images(data), 500) is data.points
+
+
+def test_photos_from_one_place_and_datasets_without_points_show_no_sky(tmp_path, outdoors):
+    near = dataset(tmp_path, radius=0.05)
+    assert find_sky(near, images(near)) is None
+    without = Dataset(outdoors.train, [], None, 2.2)
+    assert find_sky(without, images(without)) is None
+    behind = Dataset(outdoors.train, [], Points(torch.tensor([[0.0, 90, 0]]), torch.zeros(1, 3)), 2)
+    assert find_sky(behind, images(behind)) is None
+
+
+def test_the_default_recipe_starts_with_the_sky(outdoors):
+    config = changed(recipe("default"), max_gaussians=2000, init="points")
+    device, generator = torch.device("cpu"), torch.Generator()
+    gaussians = initial_gaussians(outdoors, config, images(outdoors), generator, device)
+    far = gaussians.means.norm(dim=1) > 100.0
+    assert 20 < int(far.sum()) <= 100
+    assert len(gaussians) <= initial_count(outdoors, config) == 2000
+    without = changed(config, sky=False)
+    gaussians = initial_gaussians(outdoors, without, images(outdoors), generator, device)
+    assert not (gaussians.means.norm(dim=1) > 100.0).any()
