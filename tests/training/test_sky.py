@@ -15,6 +15,7 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.training.config import changed
 from snowsplat.training.direction_cells import (
@@ -25,16 +26,19 @@ from snowsplat.training.direction_cells import (
     median_of,
     spread_of,
 )
-from snowsplat.training.init import initial_count, initial_gaussians
+from snowsplat.training.init import initial_count
 from snowsplat.training.recipes import recipe
-from snowsplat.training.sky import find_sky, sky_distance, with_sky
+from snowsplat.training.sky import find_sky, sky_distance
+from snowsplat.training.sky_limit import INTERVAL, SkyLimit
+from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.trainer import Trainer
 
 SIZE = 96
 GROUND = 1.5  # y of the ground, below the cameras; y points down
 EMPTY = torch.tensor([[1.0, -3.0, 9.0], [-9.0, -3.0, 2.0], [7.0, -3.0, -7.0]])  # in the air
 
 
-def ring(radius: float = 2.0) -> list[Camera]:
+def ring(radius: float = 2.0, size: int = SIZE) -> list[Camera]:
     """Cameras on a circle that look outwards and ahead."""
     cameras = []
     for i in range(36):
@@ -44,7 +48,8 @@ def ring(radius: float = 2.0) -> list[Camera]:
         gaze = out * (1.0 - 2.0 * (i % 2)) + 0.5 * ahead
         up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
         pose = look_at(radius * out, radius * out + gaze, up)
-        cameras.append(Camera(SIZE, SIZE, 60.0, 60.0, SIZE / 2, SIZE / 2, pose))
+        focal = 0.625 * size
+        cameras.append(Camera(size, size, focal, focal, size / 2, size / 2, pose))
     return cameras
 
 
@@ -61,8 +66,8 @@ def ground_color(xyz: Tensor) -> Tensor:
 
 def photo(camera: Camera, height: float) -> Tensor:
     """(H, W, 3) in 0..1: the ground at y = ``height`` below the sky; or, above, a ceiling."""
-    y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
-    ones = torch.ones(SIZE, SIZE)
+    y, x = torch.meshgrid(*(torch.arange(camera.width) + 0.5,) * 2, indexing="ij")
+    ones = torch.ones_like(x)
     rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, ones], -1)
     pose = camera.world_from_cam.float()
     rays = torch.nn.functional.normalize(rays @ pose[:, :3].T, dim=-1)
@@ -73,13 +78,15 @@ def photo(camera: Camera, height: float) -> Tensor:
     return torch.where(down > 0, ground_color(floor), above)
 
 
-def dataset(folder: Path, height: float = -math.inf, radius: float = 2.0) -> Dataset:
+def dataset(
+    folder: Path, height: float = -math.inf, radius: float = 2.0, size: int = SIZE
+) -> Dataset:
     views = []
-    for i, camera in enumerate(ring(radius)):
+    for i, camera in enumerate(ring(radius, size)):
         pixels = (255.0 * photo(camera, height)).clamp(0, 255).round().numpy().astype(np.uint8)
         file = folder / f"{i}.png"
         Image.fromarray(pixels).save(file)
-        views.append(View(f"{i}", camera, ImageSource(file, SIZE, SIZE)))
+        views.append(View(f"{i}", camera, ImageSource(file, size, size)))
     xyz = 24.0 * torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) - 12.0
     xyz[:, 1] = GROUND
     if not math.isinf(height):
@@ -131,26 +138,56 @@ def test_the_sky_is_found_with_its_colours(outdoors):
     assert 0.2 < sky.share < 0.5  # half of the photos is above the horizon; points are near it
 
 
-def test_points_before_the_sky_are_removed_and_others_kept(outdoors):
-    assert outdoors.points is not None
-    floating = Points(
-        torch.cat([outdoors.points.xyz, EMPTY]),
-        torch.cat([outdoors.points.rgb, torch.full((3, 3), 9, dtype=torch.uint8)]),
-    )
-    result = with_sky(floating, outdoors, images(outdoors), 500)
-    ground = result.xyz[:, 1] == GROUND
-    assert int(ground.sum()) == len(outdoors.points)
-    assert not (result.rgb == 9).all(1).any()
-    sky = result.xyz[~ground]
-    assert 250 < len(sky) <= 500
-    distance = sky.norm(dim=1)
+def test_points_in_the_sky(outdoors):
+    sky = find_sky(outdoors, images(outdoors))
+    points = sky.points(500)
+    assert 250 < len(points) <= 500
+    distance = points.xyz.norm(dim=1)
     assert torch.allclose(distance, torch.full_like(distance, sky_distance(ring())), rtol=1e-4)
     assert sky_distance(ring()) == pytest.approx(200.0)
+    chosen = find_sky(outdoors, images(outdoors), 37.0)
+    assert float(chosen.points(500).xyz.norm(dim=1).max()) == pytest.approx(37.0, rel=1e-4)
 
 
-def test_the_distance_can_be_chosen(outdoors):
-    result = with_sky(outdoors.points, outdoors, images(outdoors), 500, 37.0)
-    assert float(result.xyz.norm(dim=1).max()) == pytest.approx(37.0, rel=1e-4)
+def test_what_is_before_the_sky_is_known(outdoors):
+    sky = find_sky(outdoors, images(outdoors))
+    assert sky.is_before(EMPTY).all()
+    assert not sky.is_before(outdoors.points.xyz).any()
+    assert not sky.is_before(sky.points(500).xyz).any()
+    assert not sky.is_before(torch.tensor([[0.0, 60.0, 0.0], [0.0, -60.0, 0.0]])).any()  # unseen
+
+
+def test_a_wire_before_the_sky_is_kept(tmp_path):
+    """It is thinner than a cell, so it hardly changes the colour of one."""
+    data = dataset(tmp_path, size=512)
+    wire = torch.tensor([[1.0, -3.0, 9.0]])
+    for view in data.train:
+        pixel, depth = view.camera.project(wire.double())
+        x, y = pixel[0].long().tolist()
+        if depth > 0 and 0 <= x < 512 and 0 <= y < 512:
+            with Image.open(view.image.path) as file:
+                pixels = np.array(file)
+            pixels[:, x] -= np.minimum(pixels[:, x], 150)
+            Image.fromarray(pixels).save(view.image.path)
+    sky = find_sky(data, images(data))
+    assert not sky.is_before(wire).any()
+    assert sky.is_before(EMPTY[1:]).all()
+
+
+def test_the_limit_removes_gaussians_before_the_sky(outdoors):
+    sky = find_sky(outdoors, images(outdoors))
+    means = torch.cat([EMPTY, outdoors.points.xyz[:4], sky.points(5).xyz])
+    bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    gaussians = Gaussians.random_in_bounds(bounds, len(means), torch.Generator().manual_seed(5))
+    gaussians.means = means
+    before = gaussians.opacities.clone()
+    limit = SkyLimit(sky, torch.device("cpu"), Schedule(1000))
+    limit.after_step(INTERVAL - 1, gaussians)
+    assert torch.equal(gaussians.opacities, before)
+    limit.after_step(INTERVAL, gaussians)
+    assert float(gaussians.opacities[:3].max()) < 1 / 255
+    assert torch.equal(gaussians.opacities[3:], before[3:])
+    SkyLimit(None, torch.device("cpu"), Schedule(1000)).after_step(INTERVAL, gaussians)
 
 
 def test_a_sky_of_the_colour_of_the_background_needs_no_points(tmp_path):
@@ -160,15 +197,14 @@ def test_a_sky_of_the_colour_of_the_background_needs_no_points(tmp_path):
             pixels = np.array(file)
         pixels[: SIZE // 2] = 255
         Image.fromarray(pixels).save(view.image.path)
-    with_white = with_sky(data.points, data, images(data), 500, background=(1.0, 1.0, 1.0))
-    assert len(with_white) <= len(data.points) + 3  # cells across the horizon
-    assert len(with_sky(data.points, data, images(data), 500, background=(0, 0, 0))) > 3200
+    sky = find_sky(data, images(data))
+    assert len(sky.points(500, background=(1.0, 1.0, 1.0))) <= 3  # cells across the horizon
+    assert len(sky.points(500, background=(0.0, 0.0, 0.0))) > 200
 
 
 def test_a_ceiling_is_not_the_sky(tmp_path):
     data = dataset(tmp_path, height=-2.0)
     assert find_sky(data, images(data)) is None
-    assert with_sky(data.points, data, images(data), 500) is data.points
 
 
 def test_photos_from_one_place_and_datasets_without_points_show_no_sky(tmp_path, outdoors):
@@ -181,12 +217,15 @@ def test_photos_from_one_place_and_datasets_without_points_show_no_sky(tmp_path,
 
 
 def test_the_default_recipe_starts_with_the_sky(outdoors):
-    config = changed(recipe("default"), max_gaussians=2000, init="points")
-    device, generator = torch.device("cpu"), torch.Generator()
-    gaussians = initial_gaussians(outdoors, config, images(outdoors), generator, device)
-    far = gaussians.means.norm(dim=1) > 100.0
+    config = changed(recipe("default"), max_gaussians=2000, init="points", iterations=2)
+    trainer = Trainer(outdoors, config)
+    far = trainer.gaussians.means.norm(dim=1) > 100.0
     assert 20 < int(far.sum()) <= 100
-    assert len(gaussians) <= initial_count(outdoors, config) == 2000
-    without = changed(config, sky=False)
-    gaussians = initial_gaussians(outdoors, without, images(outdoors), generator, device)
-    assert not (gaussians.means.norm(dim=1) > 100.0).any()
+    assert len(trainer.gaussians) <= initial_count(outdoors, config) == 2000
+    trainer.run()
+    resumed = Trainer(outdoors, config, state=trainer.state_tensors())
+    assert resumed.sky is not None
+    refined = Trainer(outdoors, config, initial=trainer.gaussians)
+    assert refined.sky is None  # other programs may have placed their sky nearer
+    without = Trainer(outdoors, changed(config, sky=False))
+    assert not (without.gaussians.means.norm(dim=1) > 100.0).any()

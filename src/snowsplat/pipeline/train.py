@@ -293,6 +293,11 @@ class _Job:
 
         if trainer.exposure.reason:
             self.observer.note(trainer.exposure.reason)
+        if trainer.sky is not None:
+            self.observer.note(
+                f"{100 * trainer.sky.share:.0f}% of the photos shows the sky: the training starts "
+                "with Gaussians there"
+            )
         self.observer.note(str(memory))
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(

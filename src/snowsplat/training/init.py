@@ -13,7 +13,7 @@ from snowsplat.scene.geometry import morton_order
 from snowsplat.training.background import FIXED_BACKGROUNDS
 from snowsplat.training.config import TrainConfig
 from snowsplat.training.finite import check_finite
-from snowsplat.training.sky import most_sky_points, with_sky
+from snowsplat.training.sky import Sky, most_sky_points
 from snowsplat.training.starts import STARTS
 
 
@@ -39,11 +39,11 @@ def initial_gaussians(
     images: Photos,
     generator: torch.Generator,
     device: torch.device,
+    sky: Sky | None = None,
 ) -> Gaussians:
     """One Gaussian for each point of the starts of ``config.init``.
 
-    If ``config.sky`` is set, `with_sky` changes the points. There are at most
-    ``density.max_gaussians``. As in section 5.1 of the paper, they are isotropic.
+    There are at most ``density.max_gaussians``. As in section 5.1 of the paper, they are isotropic.
     The scale is the mean distance to the three nearest neighbours times ``config.initial_scale``;
     the colour is that of the point; the opacity is ``config.initial_opacity``. The rows are in
     Morton order.
@@ -52,6 +52,7 @@ def initial_gaussians(
         images: the photos of the dataset.
         generator: a random generator on the CPU. If there are too many points, it selects those
             that are used.
+        sky: there are also points in it, and none before it.
 
     Raises:
         UserError: some points are so far apart that single precision cannot represent their
@@ -61,10 +62,8 @@ def initial_gaussians(
     points = _points_of(config.starts, dataset, config, images, generator)
     if not len(points):
         points = _points_of(("random",), dataset, config, images, generator)
-    if config.sky:
-        most = most_sky_points(config.points_per_start)
-        background = FIXED_BACKGROUNDS.get(config.background)
-        points = with_sky(points, dataset, images, most, config.sky_distance, background)
+    if sky is not None:
+        points = _with_sky(points, sky, config)
     limit = config.density.max_gaussians or math.inf
     if len(points) > limit:
         chosen = torch.randperm(len(points), generator=generator)[: int(limit)]
@@ -89,3 +88,10 @@ def _points_of(
     count = 0 if starts == ("points",) else config.points_per_start
     found = [STARTS[name](dataset, images, count, generator) for name in starts]
     return Points(torch.cat([p.xyz for p in found]), torch.cat([p.rgb for p in found]))
+
+
+def _with_sky(points: Points, sky: Sky, config: TrainConfig) -> Points:
+    background = FIXED_BACKGROUNDS.get(config.background)
+    far = sky.points(most_sky_points(config.points_per_start), background)
+    kept = ~sky.is_before(points.xyz)
+    return Points(torch.cat([points.xyz[kept], far.xyz]), torch.cat([points.rgb[kept], far.rgb]))

@@ -44,7 +44,7 @@ _QUANTILE = 0.02
 _FEWEST_POINTS = 50
 #: The opacity of a removed Gaussian, as a logit. It is too transparent to be visible, so the
 #: optimiser does not restore it, and density control removes it or uses it elsewhere.
-_REMOVED = -10.0
+REMOVED = -10.0
 #: This number of Gaussians is processed at a time, to limit the memory.
 _ROWS = 1 << 14
 
@@ -81,7 +81,7 @@ class NearLimit:
         """Make the Gaussians that are too near transparent, in every `INTERVAL`-th step."""
         if self._views is not None and self._schedule.multiples(step, INTERVAL):
             near = torch.cat([self._is_near(means) for means in gaussians.means.split(_ROWS)])
-            gaussians.opacity_logits.masked_fill_(near, _REMOVED)
+            gaussians.opacity_logits.masked_fill_(near, REMOVED)
 
     def _is_near(self, means: Tensor) -> Tensor:
         """(M,) bool: which of the means (M, 3) are in front of the limit of a view."""

@@ -12,10 +12,9 @@ point which several of them would show before the sky is in empty space.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -33,8 +32,6 @@ from snowsplat.training.direction_cells import (
 )
 from snowsplat.training.starts.photos import reduced_photo, usable_pixels
 
-logger = logging.getLogger(__name__)
-
 #: Distance of the sky from the middle of the cameras, in units of the root mean square of their
 #: distances from it. From two of them, the sky is seen in directions that differ by a degree.
 _DISTANCE = 100.0
@@ -46,6 +43,9 @@ _VIEWS = 100
 _POINTS = 20_000
 #: Photos are reduced so that a cell has this number of pixels squared.
 _PIXELS = 2.0
+#: Thin things are searched for at up to this multiple of the size. They differ from the sky by more
+#: than this, in 0..255.
+_FINE, _PLAIN = 4, 60.0
 #: The parts of a photo within this number of cells around a point show the scene.
 _AROUND = 1.5
 #: The colours of two photos are the same if they differ by at most this, in 0..255.
@@ -69,29 +69,52 @@ class Sky:
         directions: (M, 3) float32, unit vectors in the world frame: the middles of the cells.
         colors: (M, 3) uint8.
         share: the share of the photos that shows the sky.
+        middle: (3,) float32, the middle of the cameras.
+        distance: of the sky from there, in world units.
         views: cameras of reduced photos, and where they show the sky, (H, W) bool.
     """
 
     directions: Tensor
     colors: Tensor
     share: float
+    middle: Tensor
+    distance: float
     views: list[tuple[Camera, Tensor]]
 
-    def is_before(self, xyz: Tensor) -> Tensor:
-        """(N,) bool: the points (N, 3) in the world frame that several photos would show before the
-        sky.
+    def points(self, most: int, background: Sequence[float] | None = None) -> Points:
+        """At most ``most`` points, on the CPU.
+
+        Args:
+            background: RGB in 0..1 behind the scene; a sky of this colour, such as the background
+                of rendered images, needs no points.
         """
-        count = torch.zeros(len(xyz), dtype=torch.int16)
+        behind = torch.tensor(background or (torch.inf,) * 3) * 255.0
+        needed = ((self.colors - behind).abs() > _BACKGROUND).any(1).nonzero()[:, 0]
+        chosen = needed[:: math.ceil(len(needed) / most) or 1]
+        xyz = self.middle + self.distance * self.directions[chosen]
+        return Points(xyz, self.colors[chosen])
+
+    def to(self, device: torch.device) -> Sky:
+        """This with the middle and the views on ``device``."""
+        views = [(camera.to(device), sky.to(device)) for camera, sky in self.views]
+        return replace(self, middle=self.middle.to(device), views=views)
+
+    def is_before(self, xyz: Tensor) -> Tensor:
+        """(N,) bool: the points (N, 3) in the world frame, on the device of the views, that are not
+        in the sky, although most of the photos that would show them show the sky there.
+        """
+        before, shown = (torch.zeros(len(xyz), dtype=torch.int16, device=xyz.device) for _ in "12")
         for camera, sky in self.views:
             x, y, depth = _pixels(camera, xyz)
-            count += (depth > 0.0) & sky[y, x]
-        return count >= _FEWEST_VIEWS
+            shown += depth > 0.0
+            before += (depth > 0.0) & sky[y, x]
+        near = (xyz - self.middle).norm(dim=1) < 0.5 * self.distance
+        return near & (before >= _FEWEST_VIEWS) & (before >= _LEAST_AGREEMENT * shown)
 
 
 def sky_distance(cameras: Sequence[Camera]) -> float:
     """The distance of the sky from the middle of the cameras, in world units."""
-    positions = torch.stack([camera.position.cpu() for camera in cameras]).to(torch.float64)
-    return _DISTANCE * float((positions - positions.mean(0)).square().sum(1).mean().sqrt())
+    return _DISTANCE * float(_offsets(cameras)[1].square().sum(1).mean().sqrt())
 
 
 def most_sky_points(count: int) -> int:
@@ -99,45 +122,11 @@ def most_sky_points(count: int) -> int:
     return math.ceil(_SHARE * count)
 
 
-def with_sky(
-    points: Points,
-    dataset: Dataset,
-    images: Photos,
-    most: int,
-    distance: float = 0.0,
-    background: Sequence[float] | None = None,
-) -> Points:
-    """The points without those before the sky, and at most ``most`` points of the sky.
-
-    They are unchanged if the photos show no sky.
+def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | None:
+    """The directions in which the photos show something very far away.
 
     Args:
-        points: on the CPU.
         distance: of the sky from the middle of the cameras, in world units; 0: `sky_distance`.
-        background: RGB in 0..1 behind the scene; a sky of this colour, such as the background of
-            rendered images, needs no points.
-    """
-    sky = find_sky(dataset, images)
-    if sky is None:
-        return points
-    cameras = [view.camera for view in dataset.train]
-    middle = torch.stack([camera.position.cpu() for camera in cameras]).mean(0).to(torch.float32)
-    behind = torch.tensor(background or (torch.inf,) * 3) * 255.0
-    needed = ((sky.colors - behind).abs() > _BACKGROUND).any(1)
-    directions, colors = sky.directions[needed], sky.colors[needed]
-    step = math.ceil(len(colors) / most) or 1
-    xyz = middle + (distance or sky_distance(cameras)) * directions[::step]
-    kept = ~sky.is_before(points.xyz)
-    logger.info(
-        "%.0f%% of the photos shows the sky: %d points there, %d before it removed",
-        *(100 * sky.share, len(xyz), int((~kept).sum())),
-    )
-    rgb = torch.cat([points.rgb[kept], colors[::step]])
-    return Points(torch.cat([points.xyz[kept], xyz]), rgb)
-
-
-def find_sky(dataset: Dataset, images: Photos) -> Sky | None:
-    """The directions in which the photos show something very far away.
 
     Returns:
         None if the photos hardly show it, or if this cannot be known: without points, or if all
@@ -175,8 +164,21 @@ def find_sky(dataset: Dataset, images: Photos) -> Sky | None:
         (sample.camera, sample.mask(part))
         for sample, part in zip(samples, confirmed.split(number.tolist()), strict=True)
     ]
-    colors = middle[found].round().to(torch.uint8)
-    return Sky(directions_of(found), colors, share, [m for m in masks if m[1].any()])
+    cameras = [view.camera for view in dataset.train]
+    return Sky(
+        directions_of(found),
+        middle[found].round().to(torch.uint8),
+        share,
+        _offsets(cameras)[0].to(torch.float32),
+        distance or sky_distance(cameras),
+        masks,
+    )
+
+
+def _offsets(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
+    """The mean (3,) of the positions of the cameras, and their offsets (C, 3) from it."""
+    positions = torch.stack([camera.position.cpu() for camera in cameras]).to(torch.float64)
+    return positions.mean(0), positions - positions.mean(0)
 
 
 @dataclass(frozen=True)
@@ -189,6 +191,7 @@ class _Sample:
         depths: (P,) of the points that the photo shows.
         shown: the number of all cells that the photo shows.
         pixels: (H, W) int64: the row in ``cells`` of each pixel; -1: the scene.
+        plain: (H, W) bool: pixels without thin things before the sky, such as wires and branches.
     """
 
     camera: Camera
@@ -197,6 +200,7 @@ class _Sample:
     depths: Tensor
     shown: int
     pixels: Tensor
+    plain: Tensor
 
     @staticmethod
     def of(view: View, images: Photos, points: Tensor) -> _Sample:
@@ -206,6 +210,9 @@ class _Sample:
         )
         camera = view.camera.scaled(width, height)
         photo = reduced_photo(view, images, width, height)
+        fine = min(_FINE, view.camera.width // width, view.camera.height // height)
+        detail = reduced_photo(view, images, fine * width, fine * height).planes[None].float()
+        contrast = max_pool2d(detail, fine) + max_pool2d(-detail, fine)
         x, y, depth = _pixels(camera, points)
         visible = depth > 0.0
         scene = torch.zeros(1, 1, height, width)
@@ -220,11 +227,12 @@ class _Sample:
         total = torch.zeros(len(cell), 3).index_add_(0, own, photo.rgb[used].to(torch.float32))
         pixels = torch.full((height, width), -1).masked_scatter_(used, own)
         colors = total / torch.bincount(own, minlength=len(cell))[:, None]
-        return _Sample(camera, cell, colors, depth[visible], len(cells.unique()), pixels)
+        plain = (contrast <= _PLAIN).all(1)[0]
+        return _Sample(camera, cell, colors, depth[visible], len(cells.unique()), pixels, plain)
 
     def mask(self, confirmed: Tensor) -> Tensor:
-        """(H, W) bool: the pixels of the cells (M,) bool, without those at their borders."""
-        sky = torch.cat([confirmed, torch.zeros(1, dtype=torch.bool)])[self.pixels]
+        """(H, W) bool: the plain pixels of the cells (M,) bool, without those at their borders."""
+        sky = torch.cat([confirmed, torch.zeros(1, dtype=torch.bool)])[self.pixels] & self.plain
         return max_pool2d((~sky)[None, None].float(), 3, stride=1, padding=1)[0, 0] == 0.0
 
 

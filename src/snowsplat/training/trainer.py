@@ -20,16 +20,15 @@ from snowsplat.training.decay import Decay
 from snowsplat.training.exposure import Exposure
 from snowsplat.training.finite import check_state
 from snowsplat.training.init import initial_gaussians, starts_at_random
+from snowsplat.training.limits import Limits
 from snowsplat.training.losses import view_loss
-from snowsplat.training.near_limit import NearLimit
 from snowsplat.training.neutral_photos import NeutralPhotos
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
 from snowsplat.training.pose_refinement import PoseRefinement
-from snowsplat.training.scale_limit import ScaleLimit
 from snowsplat.training.sharded_render import sharded_render
 from snowsplat.training.shards import ALONE, Shards
-from snowsplat.training.smoothing import SmoothingFilter
+from snowsplat.training.sky import Sky, find_sky
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.transients import Transients, delayed
@@ -78,6 +77,7 @@ class Trainer:
         exposure: the gains of the training photos.
         gaussians: the scene after ``step`` steps, on ``device``.
         poses: the cameras of the views, which are refined if ``TrainConfig.refine_poses`` is set.
+        sky: where the photos show the sky; None: they do not, or ``TrainConfig.sky`` is not set.
         transients: the masks of what moves; see ``TrainConfig.transients``.
         within_step: True during a step. It stays True if an error or a second Ctrl-C interrupts a
             step: the state is then inconsistent and must not be saved.
@@ -150,13 +150,16 @@ class Trainer:
         neutral = NeutralPhotos(self._images, dataset.train, self.exposure.start)
         # The Gaussians of a resumed training run are replaced by those of the state.
         start = config if state is None else replace(config, init="points")
+        self.sky: Sky | None = None
         first = None
         with single_threaded():
+            if config.sky and initial is None:
+                self.sky = find_sky(dataset, neutral, config.sky_distance)
             if shards.rank == 0 and initial is not None:
                 first = initial.clone().to(self.device)
             elif shards.rank == 0:
                 first = initial_gaussians(
-                    dataset, start, neutral, self._generators["start"], self.device
+                    dataset, start, neutral, self._generators["start"], self.device, self.sky
                 )
         self.gaussians = replace(shards.scattered(first), antialiased=config.antialias)
         self._optimizer = Adam(
@@ -178,10 +181,8 @@ class Trainer:
             shards=shards,
         )
         self._decay = Decay(config.decay, len(dataset.train), self.schedule)
-        self._scale_limit = ScaleLimit(config.relative_scale, cameras, self.schedule)
-        self._smoothing = SmoothingFilter(config.antialias, cameras, self.schedule)
         points = None if dataset.points is None else dataset.points.xyz
-        self._near_limit = NearLimit(config.near_limit, cameras, points, self.schedule)
+        self._limits = Limits(config, cameras, points, self.sky, self.schedule)
         self.transients = Transients(
             *(config.transients, dataset.train, neutral, self._background.evaluation),
             *(self.schedule, shards),
@@ -255,13 +256,12 @@ class Trainer:
             # beginning of the next step, so that a scene is never evaluated or saved directly after
             # a change by density control.
             if self.step > 0:
-                self._near_limit.after_step(self.step, self.gaussians)
+                self._limits.remove(self.step, self.gaussians)
                 self.gaussians = self._density.after_step(
                     self.step, self.gaussians, self._optimizer
                 )
                 self._decay.after_step(self.step, self.gaussians)
-                self._scale_limit.after_step(self.step, self.gaussians)
-                self._smoothing.after_step(self.step, self.gaussians)
+                self._limits.limit_scales(self.step, self.gaussians)
             step = min(self.step + self.config.batch, self.schedule.iterations)
             batch = self._queue.take(self.step, step)
             losses = self._runner.run(
