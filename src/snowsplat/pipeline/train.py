@@ -15,6 +15,7 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.processes import Setup, count, follow, joined
 from snowsplat.pipeline.time_budget import TimeBudget, check_minutes
+from snowsplat.pipeline.training_notes import sky_line
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 
@@ -294,10 +295,7 @@ class _Job:
         if trainer.exposure.reason:
             self.observer.note(trainer.exposure.reason)
         if trainer.sky is not None:
-            self.observer.note(
-                f"{100 * trainer.sky.share:.0f}% of the photos shows the sky: the training starts "
-                "with Gaussians there"
-            )
+            self.observer.note(sky_line(trainer.sky.share))
         self.observer.note(str(memory))
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(

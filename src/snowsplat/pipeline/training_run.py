@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.processes import Announcement
 from snowsplat.pipeline.refined_cameras import write_refined
 from snowsplat.pipeline.time_budget import TimeBudget
+from snowsplat.pipeline.training_notes import ended_early_line, left_out_line, moving_line
 from snowsplat.training.history import History
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import peak_bytes
@@ -26,11 +27,6 @@ if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.time_budget.pace import Pace
     from snowsplat.training.trainer import Progress, Trainer
-
-#: Largest number of photos that a line for the user names.
-_LISTED = 10
-#: Why a training run ends early.
-_WORSE = "the views between the photos became worse"
 
 
 @dataclass(frozen=True)
@@ -235,7 +231,7 @@ class TrainingRun:
         # `resume` with `iterations` may continue a training run that has ended early.
         if found is None or iterations >= found.planned:
             return None
-        return f"stopped after {iterations} of {found.planned} steps: {_WORSE}"
+        return ended_early_line(iterations, found.planned)
 
     def _checkpoint_is_due(self, step: int) -> bool:
         every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
@@ -413,30 +409,3 @@ class TrainingRun:
             ),
         )
         return self.out.report
-
-
-def left_out_line(names: Sequence[str]) -> str:
-    """The line for the user about photos that the scene does not explain; at least one name."""
-    one = len(names) == 1
-    photos, poses = ("photo is", "pose is") if one else ("photos are", "poses are")
-    listed = ", ".join(names[:_LISTED])
-    if len(names) > _LISTED:
-        listed += f" and {len(names) - _LISTED} more"
-    return (
-        f"{len(names)} {photos} not explained by the scene and left out of the training: {listed}; "
-        f"{'its' if one else 'their'} camera {poses} probably wrong"
-    )
-
-
-def moving_line(shares: Mapping[str, float], photos: int) -> str:
-    """The line for the user about what moves.
-
-    Args:
-        shares: the masked share of each photo in which something moves; at least one.
-        photos: number of training photos.
-    """
-    mean = 100.0 * sum(shares.values()) / len(shares)
-    return (
-        f"something moves in {len(shares)} of {photos} photos: masked there, {mean:.1f}% of their "
-        "pixels; see the report"
-    )
