@@ -111,13 +111,12 @@ class Exposure:
         """The image (H, W, 3), at most 1 where the photo of view ``index`` is overexposed."""
         if not self.active:
             return image
-        overexposed = photo.rgb >= _OVEREXPOSED
         key = index, image.shape[0]
         if key not in self._overexposed:  # most photos have no such pixels, which saves time
-            self._overexposed[key] = bool(overexposed.any())
+            self._overexposed[key] = bool((photo.rgb >= _OVEREXPOSED).any())
         if not self._overexposed[key]:
             return image
-        return torch.where(overexposed & (image.detach() > 1.0), 1.0, image)
+        return torch.where((photo.rgb >= _OVEREXPOSED) & (image.detach() > 1.0), 1.0, image)
 
     def after_backward(self, splats: Splats2D) -> None:
         """Store the gradient of the gains; change that of the splats to that without the gains."""
