@@ -80,6 +80,11 @@ def surfaces(ground: int, random: int, up: torch.Tensor) -> np.ndarray:
     return torch.nn.functional.normalize(torch.cat([level, others]).double(), dim=1).numpy()
 
 
+def somewhere(count: int) -> np.ndarray:
+    """Random positions."""
+    return np.random.default_rng(0).uniform(-1.0, 1.0, (count, 3))
+
+
 @pytest.mark.parametrize("tilt", [0.0, 15.0, 35.0])
 def test_the_ground_implies_the_up_direction(tilt):
     """A larger wall does not, because it is vertical."""
@@ -87,16 +92,30 @@ def test_the_ground_implies_the_up_direction(tilt):
     up = torch.tensor([math.sin(angle), -math.cos(angle), 0.0])
     wall = surfaces(1000, 0, torch.tensor([0.0, 0.0, 1.0]))
     normals = np.concatenate([surfaces(500, 1500, up), wall])
-    found = up_of_surfaces(normals, np.ones(len(normals)))
+    found = up_of_surfaces(normals, np.ones(len(normals)), somewhere(len(normals)))
     assert found is not None
     assert np.degrees(np.arccos(found @ up.numpy())) < 1
     areas = np.ones(len(normals))
     areas[:500] = 0.1  # now the ground is only a small part
-    assert up_of_surfaces(normals, areas) is None
+    assert up_of_surfaces(normals, areas, somewhere(len(normals))) is None
 
 
 def test_surfaces_that_imply_no_up_direction():
-    assert up_of_surfaces(np.zeros((0, 3)), np.zeros(0)) is None
-    assert up_of_surfaces(surfaces(0, 3000, UP.float()), np.ones(3000)) is None
+    assert up_of_surfaces(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))) is None
+    assert up_of_surfaces(surfaces(0, 3000, UP.float()), np.ones(3000), somewhere(3000)) is None
     steep = surfaces(1000, 0, torch.tensor([math.sin(0.9), -math.cos(0.9), 0.0]))
-    assert up_of_surfaces(steep, np.ones(1000)) is None
+    assert up_of_surfaces(steep, np.ones(1000), somewhere(1000)) is None
+
+
+@pytest.mark.parametrize("end", [-1.0, 1.0])
+def test_an_object_on_a_plate_at_the_lowest_z_has_z_up(end):
+    """A wall behind the subject is at the highest z, seen by cameras that look along z."""
+    plate, rest = surfaces(500, 0, torch.tensor([0.0, 0.0, 1.0])), surfaces(0, 3000, UP.float())
+    positions = somewhere(3500)
+    positions[:500, 2] = end
+    found = up_of_surfaces(np.concatenate([plate, rest]), np.ones(3500), positions)
+    if end < 0:
+        assert found is not None
+        assert found.tolist() == [0.0, 0.0, 1.0]
+    else:
+        assert found is None

@@ -24,6 +24,10 @@ _LARGEST_TILT = math.radians(40)
 # of the same size with the same variance of the total area). Less may be by chance.
 _GROUND = 0.08
 _FEWEST = 150
+# The lowest part of the heights, and the share of all surfaces that must be ground there for the
+# scene to stand on it. At the other end, at most a quarter of that.
+_BOTTOM = 0.15
+_STANDS = 0.05
 # Largest length of the mean of unit vectors that are considered to have no common direction.
 _NO_DIRECTION = 0.3
 
@@ -65,22 +69,49 @@ def up_direction(rotations: np.ndarray) -> np.ndarray:
     return -up if looks_down and forward @ up > 0 else up
 
 
-def up_of_surfaces(normals: np.ndarray, areas: np.ndarray) -> np.ndarray | None:
+def up_of_surfaces(
+    normals: np.ndarray, areas: np.ndarray, positions: np.ndarray
+) -> np.ndarray | None:
     """The up direction of a scene without cameras: that of the ground, tables and ceilings.
 
     It is the direction within `_LARGEST_TILT` of −y, the usual up direction of files, to which most
-    surfaces are perpendicular.
+    surfaces are perpendicular. If there is none, but the scene stands on ground at its lowest z, it
+    is z, the up direction of many synthetic scenes.
 
     Args:
         normals: (N, 3) unit vectors in the world frame; their signs are not used.
         areas: (N,) of the surfaces, in any unit.
+        positions: (N, 3) of the surfaces in the world frame.
 
     Returns:
         (3,) unit vector in the world frame; None if there is no such direction.
     """
-    total = float(areas.sum())
-    if total <= 0:
+    if float(areas.sum()) <= 0:
         return None
+    found = _up_near_minus_y(normals, areas)
+    if found is None and _stands_on_z(normals, areas, positions):
+        return np.array([0.0, 0.0, 1.0])
+    return found
+
+
+def _stands_on_z(normals: np.ndarray, areas: np.ndarray, positions: np.ndarray) -> bool:
+    """Whether a scene stands on ground at its lowest z, as in files whose up direction is z.
+
+    In a capture whose up direction is −y, the photographer stands there and looks along z, so there
+    is no surface.
+    """
+    low, high = np.quantile(positions[:, 2], [0.01, 0.99])
+    height = (positions[:, 2] - low) / max(high - low, 1e-12)
+    flat = np.where(np.abs(normals[:, 2]) > math.cos(_PARALLEL), areas, 0.0)
+    ground = flat[height < _BOTTOM]
+    bottom, top = float(ground.sum()), float(flat[height > 1 - _BOTTOM].sum())
+    several = bottom**2 > _FEWEST * float((ground**2).sum())
+    return several and bottom > _STANDS * float(areas.sum()) and top < 0.25 * bottom
+
+
+def _up_near_minus_y(normals: np.ndarray, areas: np.ndarray) -> np.ndarray | None:
+    """The direction within `_LARGEST_TILT` of −y to which most surfaces are perpendicular."""
+    total = float(areas.sum())
 
     def around(up: np.ndarray) -> np.ndarray:
         """The areas of surfaces parallel to the ground, 0 for others."""

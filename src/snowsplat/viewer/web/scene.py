@@ -184,8 +184,9 @@ def _viewing_frame(direction: np.ndarray, depth: float) -> Similarity | None:
     return Similarity(1.0 if is_near else ratio, turn, torch.zeros(3, dtype=torch.float64))
 
 
-def _surfaces(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (N, 3) and areas (N,) of the flat opaque Gaussians in the `bound` of a scene."""
+def _surfaces(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normals (N, 3), areas (N,) and positions (N, 3) of a scene's surfaces: the flat opaque
+    Gaussians in its `bound`."""
     middle, radius = bound(gaussians)
     scales, axes = gaussians.log_scales.detach().double().sort(1)
     inside = (gaussians.means.detach().double() - middle).norm(dim=1) < radius
@@ -197,7 +198,7 @@ def _surfaces(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     areas = (scales[rows, 1] + scales[rows, 2]).exp()
     if len(areas):  # a few may be huge
         areas = areas.clamp_max(float(areas.quantile(0.9)))
-    return normals.numpy(), areas.numpy()
+    return normals.numpy(), areas.numpy(), gaussians.means.detach()[rows].double().numpy()
 
 
 def _shortest_rotation(source: Tensor, target: Tensor) -> Tensor:
