@@ -1,5 +1,8 @@
 """PSNR of a scene with fewer Gaussians: dropped, merged, by PlayCanvas' converter, refined.
 
+"merged" uses the cameras of OUT, as `convert OUT` does; "merged, no cameras" is what it does with a
+scene file alone.
+
     python benchmarks/decimate.py out/fox out/fern --images pictures
 
 Each OUT is the output folder of a training with --eval, whose held-out photos are compared. The
@@ -23,7 +26,7 @@ from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.image_files import write_png
 from snowsplat.pipeline.refine import photos_of, refine
-from snowsplat.pipeline.scene_source import folder_around, scene_file
+from snowsplat.pipeline.scene_source import cameras_of, folder_around, scene_file
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.scene.simplify import simplify
@@ -59,6 +62,7 @@ class Scene:
     def __post_init__(self) -> None:
         self.file = scene_file(self.folder)
         self.whole = read_gaussians(self.file)
+        self.cameras = cameras_of(folder_around(self.file))
         photos = Path(folder_around(self.file).settings()[0].path)
         self.dataset, self.background = photos_of(self.file, photos)
 
@@ -67,9 +71,10 @@ class Scene:
         return {
             "dropped": lambda: dropped(self.whole, count),
             "PlayCanvas": lambda: by_playcanvas(self.file, count),
-            "merged": lambda: simplify(self.whole, count),
+            "merged, no cameras": lambda: simplify(self.whole, count),
+            "merged": lambda: simplify(self.whole, count, self.cameras),
             "merged, refined": lambda: refine(
-                simplify(self.whole, count), self.dataset, self.background
+                simplify(self.whole, count, self.cameras), self.dataset, self.background
             ),
         }
 

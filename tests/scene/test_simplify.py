@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from snowsplat.evaluation.metrics import psnr
+from snowsplat.scene import sight
 from snowsplat.scene import simplify as module
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
@@ -29,12 +30,14 @@ def scene(n: int, seed: int = 0) -> Gaussians:
     )
 
 
+CAMERA = Camera(
+    *(96, 96, 100.0, 100.0, 48.0, 48.0),
+    look_at(torch.tensor([0.0, -1.0, -3.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])),
+)
+
+
 def image(gaussians: Gaussians) -> torch.Tensor:
-    camera = Camera(
-        *(96, 96, 100.0, 100.0, 48.0, 48.0),
-        look_at(torch.tensor([0.0, -1.0, -3.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])),
-    )
-    return render(gaussians, camera).image
+    return render(gaussians, CAMERA).image
 
 
 def test_two_gaussians_become_the_gaussian_with_their_moments():
@@ -57,7 +60,15 @@ def test_two_gaussians_become_the_gaussian_with_their_moments():
     minors = torch.stack(
         [torch.linalg.det(expected[[i, j]][:, [i, j]]) for i, j in ((0, 1), (1, 2), (0, 2))]
     )
-    torch.testing.assert_close(one.opacities[0] * minors.sum().sqrt(), mass.sum())
+    # Seen from everywhere, the area is the root of the principal minors. The pair overlaps.
+    sums = covariances.sum(0)
+    area = torch.stack(
+        [torch.linalg.det(sums[[i, j]][:, [i, j]]) for i, j in ((0, 1), (1, 2), (0, 2))]
+    )
+    apart = pair.means[1] - pair.means[0]
+    density = (-apart @ torch.linalg.solve(sums, apart) / 2).exp()
+    covered = mass.sum() - mass.prod() / area.sum().sqrt() * density
+    torch.testing.assert_close(one.opacities[0] * minors.sum().sqrt(), covered)
 
 
 def test_equal_gaussians_cost_nothing_and_different_ones_cost_more():
@@ -67,12 +78,12 @@ def test_equal_gaussians_cost_nothing_and_different_ones_cost_more():
     far.means += same.scales[0, 0]
     red.sh_dc += 1.0
     costs = [
-        float(module._costs(module._Mixture.of(Gaussians.cat([same, other])))[0, 0])
+        float(module._costs(module._Mixture.of(Gaussians.cat([same, other]), []))[0, 0])
         for other in (same, near, far, red)
     ]
     assert costs[0] == pytest.approx(0.0, abs=1e-6)
     assert costs[0] < costs[1] < costs[2]
-    assert costs[3] == pytest.approx(3.0, rel=1e-5)
+    assert costs[3] == pytest.approx(0.3 * 3.0 * math.sqrt(2 * float(same.opacities)), rel=1e-5)
 
 
 def test_the_pairs_are_the_greedy_choice():
@@ -105,6 +116,36 @@ def test_a_redundant_scene_looks_the_same():
             torch.randperm(4000, generator=torch.Generator().manual_seed(0))[:count]
         )
         assert psnr(image(smaller), reference) > psnr(image(dropped), reference) + 1.5
+
+
+def test_gaussians_below_the_size_of_a_pixel_stay_visible(monkeypatch):
+    """Their pictures are of the size of a pixel; merged ones must not become transparent."""
+    whole = scene(4000)
+    whole.log_scales -= 4.0  # from 1.9 to 0.03 pixels
+    reference = image(whole)
+    with_cameras, without = (image(simplify(whole, 1300, known)) for known in ([CAMERA], []))
+    monkeypatch.setattr(sight, "_SPACING", 0.0)
+    as_if_sharp = image(simplify(whole, 1300))
+    assert psnr(with_cameras, reference) > psnr(without, reference) + 5.0
+    assert psnr(without, reference) > psnr(as_if_sharp, reference) + 3.0
+    assert float(with_cameras.mean()) > 0.8 * float(reference.mean())
+
+
+def test_what_the_cameras_do_not_see_is_merged_first():
+    whole = scene(2000)
+    behind = whole.means @ CAMERA.position.float() < 0
+    smaller = simplify(whole, 1500, [CAMERA])
+    rows = {tuple(row) for row in smaller.means.tolist()}
+    kept = torch.tensor([tuple(row) in rows for row in whole.means.tolist()])
+    assert float(kept[~behind].float().mean()) > float(kept[behind].float().mean()) + 0.2
+
+
+def test_for_views_from_farther_away_gaussians_become_less_opaque():
+    whole = scene(500)
+    whole.opacity_logits -= 3.0
+    whole.log_scales -= 2.0
+    near, far = simplify(whole, 250), simplify(whole, 250, farther=4.0)
+    assert float(far.opacities.mean()) < float(near.opacities.mean())
 
 
 def test_gaussians_that_are_not_merged_do_not_change():

@@ -8,7 +8,7 @@ the depth of a Gaussian in a view, and D(p) the depth of the surface in pixel p.
     position = z · Σ w(p) / D(p)  /  Σ w(p)
 
 is about 1 on the surface and small in front of it; the sums are over the pixels in which there is a
-surface. They are gradients of a rendered image: that of Σ w(p) g(p) with respect to a colour.
+surface.
 """
 
 from __future__ import annotations
@@ -20,14 +20,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from snowsplat import ops
-from snowsplat.ops.splats import COLORS
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import project, render
+from snowsplat.scene.render import render
+from snowsplat.scene.sight import blended, reduced
 
-#: Longest side of the images in pixels. More pixels do not change what is in front of what.
-_SIDE = 400
 #: A pixel has a surface if the Gaussians that may form one cover this share of it.
 _COVERED = 0.5
 #: A Gaussian is in front of the surface of a view if its position is below this number.
@@ -76,16 +73,12 @@ def coverage(gaussians: Gaussians, cameras: Sequence[Camera]) -> Coverage:
         gaussians: N Gaussians.
         cameras: those of the photos.
     """
-    small = [_reduced(camera) for camera in cameras]
+    small = [reduced(camera) for camera in cameras]
     solid = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     found = _measure(gaussians, solid, small)
     for _ in range(_ROUNDS - 1):
         found = _measure(gaussians, ~found.floaters, small)
     return found
-
-
-def _reduced(camera: Camera) -> Camera:
-    return camera.downscaled(max(1, round(max(camera.width, camera.height) / _SIDE)))
 
 
 def _measure(gaussians: Gaussians, solid: Tensor, cameras: Sequence[Camera]) -> Coverage:
@@ -117,20 +110,8 @@ def _weights(
         assert output.depth is not None
         covered = (output.alpha > _COVERED) & (output.depth > 0.0)
         inverse = torch.where(covered, output.alpha / output.depth.clamp_min(1e-12), 0.0)
-        splats = project(gaussians, camera)
-    splats.packed = splats.packed.detach().requires_grad_()
-    with torch.enable_grad():
-        image, _, _ = ops.rasterize(splats, camera.width, camera.height)
-        each = torch.stack([torch.ones_like(inverse), covered.to(inverse.dtype), inverse], dim=2)
-        (image * each).sum().backward()
-    assert splats.ids is not None
-    assert splats.packed.grad is not None
-    rows = splats.ids >= 0
-    return (
-        splats.ids[rows].long(),
-        splats.depths.detach()[rows],
-        splats.packed.grad[rows, COLORS : COLORS + 3],
-    )
+    each = torch.stack([torch.ones_like(inverse), covered.to(inverse.dtype), inverse], dim=2)
+    return blended(gaussians, camera, each)
 
 
 def clean(

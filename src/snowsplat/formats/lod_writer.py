@@ -33,6 +33,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_text
 
 _FACTOR = 4  # between the numbers of Gaussians of two levels
+_FARTHER = 2.3  # see `simplify`: each level is shown from about three times the distance
 # Each thread needs memory for one file.
 _MOST_THREADS = 4
 _SAMPLE = 4096  # Gaussians from which the shape of a box is estimated
@@ -261,7 +262,7 @@ class _Writer:
         assert leaf.rows is not None
         found = [scene.select(leaf.rows).to_gaussians()]
         for run in leaf.runs[1:]:
-            found.append(simplify(found[-1], run["count"]))
+            found.append(simplify(found[-1], run["count"], farther=_FARTHER))
         levels = []
         for gaussians in found:
             arrays = GaussianArrays.from_gaussians(gaussians)

@@ -20,6 +20,7 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
 from snowsplat.pipeline.scene_source import background_of, cameras_of, folder_around, scene_file
 from snowsplat.scene import edit
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.scene.simplify import simplify
@@ -71,8 +72,11 @@ class Edits:
         if self.decimate is not None and file_size(self.decimate) is None:
             gaussians_to_keep(self.decimate, 0)
 
-    def apply(self, scene: Gaussians) -> Gaussians:
+    def apply(self, scene: Gaussians, cameras: Sequence[Camera] = ()) -> Gaussians:
         """The edited scene; ``scene`` is unchanged. A size in ``decimate`` is left to `convert`.
+
+        Args:
+            cameras: those of the photos of ``scene``, for merging its Gaussians; may be empty.
 
         Raises:
             UserError: no Gaussian is in the box.
@@ -88,7 +92,9 @@ class Edits:
         if self.sh_degree is not None:
             scene = edit.with_sh_degree(scene, self.sh_degree)
         if self.decimate is not None and file_size(self.decimate) is None:
-            scene = simplify(scene, gaussians_to_keep(self.decimate, len(scene)))
+            # The cameras are not where the scene is after a transform.
+            known = () if transform else cameras
+            scene = simplify(scene, gaussians_to_keep(self.decimate, len(scene)), known)
         return scene
 
     def transform(self) -> Similarity | None:
@@ -154,7 +160,9 @@ def convert(
         logger.warning(
             "%s: only some of the scenes are antialiased; all are marked as the first one", target
         )
-    scene = edits.apply(edit.merge(parts))
+    # Cameras of one of several scenes do not show the others.
+    cameras = cameras_of(folder_around(files[0])) if len(files) == 1 else []
+    scene = edits.apply(edit.merge(parts), cameras)
     write = write_gaussians
     if spz_version is not None:
         write = partial(_write_spz, version=spz_version)
@@ -163,7 +171,8 @@ def convert(
     if format.name == LEVELS:
         write = partial(write_levels, observer=observer)
     if size is not None:
-        write_within(size, target, scene, write, refined)
+        known = [] if edits.transform() else cameras
+        write_within(size, target, scene, write, refined, known)
     else:
         write(target, refined(scene) if refined else scene)
     return format

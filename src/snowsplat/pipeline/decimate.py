@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.simplify import simplify
 from snowsplat.util.errors import SettingError
@@ -46,12 +47,14 @@ def write_within(
     scene: Gaussians,
     write: Callable[[Path, Gaussians], None],
     refined: Callable[[Gaussians], Gaussians] | None = None,
+    cameras: Sequence[Camera] = (),
 ) -> None:
     """Write ``scene`` with so many Gaussians that the file ``target`` has at most ``size`` bytes.
 
     Args:
         write: writes a scene to a path.
         refined: improves a scene before it is written; may change its size a little.
+        cameras: those of the photos, see `simplify`.
 
     Raises:
         SettingError: even one Gaussian needs more.
@@ -63,7 +66,7 @@ def write_within(
         try:
             for improve in [None, refined] if refined else [None]:
                 while count:
-                    smaller = simplify(scene, count)
+                    smaller = simplify(scene, count, cameras)
                     write(path, improve(smaller) if improve else smaller)
                     actual = path.stat().st_size
                     if actual <= size:

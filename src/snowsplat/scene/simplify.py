@@ -1,8 +1,13 @@
 """Fewer Gaussians that look the same: neighbours are merged, two at a time.
 
 Two Gaussians are replaced by one with the mean and the covariance of both together. In every pass,
-the pairs that lose least are merged, at most a quarter of the scene; a merged Gaussian can be
-merged again in the next pass.
+the pairs that lose least are merged, at most a third of the scene; a merged Gaussian can be merged
+again in the next pass.
+
+What counts is what is seen. A renderer draws a Gaussian that is smaller than a pixel as large as a
+pixel, so areas are those after this blur. Without it, a scene whose Gaussians are small loses most
+of its opacity when they are merged. If the cameras are known, it is also known how large a pixel
+is, from where a Gaussian is seen, and how much of it is not hidden (`sight`).
 
 The candidates for a partner are close in a Morton order. In every pass the grid of this order has
 another orientation, so two neighbours that are on different sides of a border meet in another pass.
@@ -10,47 +15,61 @@ another orientation, so two neighbours that are on different sides of a border m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
+from snowsplat.ops.reference import LOW_PASS
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, quat_from_rotation, rotation_from_quat
+from snowsplat.scene.sight import ENTRIES, sight
 
 # Candidates for a partner: so many that follow in the Morton order, and as many before.
 _NEIGHBOURS = 8
 # Largest share of the Gaussians that one pass removes.
-_SHARE = 0.25
-# The cost considers a Gaussian as at least this thick, relative to its largest extent. The cost
-# depends on volumes, and would otherwise protect thin Gaussians, although nobody sees a thickness.
-_THICKNESS = 0.001
+_SHARE = 1 / 3
+# The weight of a squared difference of the SH coefficients, relative to the growth of the area.
+_COLOR = 0.3
 # Gaussians that are compared at a time, so that the intermediate results fit into the cache.
 _CHUNK = 1 << 15
 # The rotation of the grid between two passes, about an axis that is no axis of the grid.
 _TURN = rotation_from_quat(torch.tensor([[0.9, 0.25, -0.31, 0.17]], dtype=torch.float64))[0]
 # Largest opacity of a merged Gaussian: its logit is finite.
 _MAX_OPACITY = 0.9999
-# The entries of a symmetric matrix that are stored.
-_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_TINY = torch.finfo(torch.float64).tiny
 
 
 @torch.no_grad()
-def simplify(gaussians: Gaussians, count: int) -> Gaussians:
+def simplify(
+    gaussians: Gaussians, count: int, cameras: Sequence[Camera] = (), *, farther: float = 1.0
+) -> Gaussians:
     """``count`` Gaussians that look like ``gaussians``; neighbours are merged.
 
-    The means and covariances of a pair are merged by their moments, with the weights w = opacity ×
-    area. The opacity preserves opacity × area, and the SH coefficients are the weighted mean. The
-    cost of a pair is the increase of the entropy, ½ (log |Σ| − w₁ log |Σ₁| − w₂ log |Σ₂|), plus the
-    squared difference of the SH coefficients. It has no unit, so small and large Gaussians are
-    merged alike. Gaussians that are not merged do not change.
+    Let A be the area of a Gaussian in the views, blurred as by the renderer, up to a factor:
+    A² = tr(D adj Σ), with the mean D of d dᵀ over the viewing directions d. The means and
+    covariances of a pair are merged by their moments, with the weights w = opacity × A, and the SH
+    coefficients are the weighted mean. The pair and its replacement cover equal areas:
+    opacity × A of both, less their overlap. The cost of a pair is
+
+        (log A − w₁ log A₁ − w₂ log A₂ + 0.3 |c₁ − c₂|²) · √(min(o₁, o₂) · v)
+
+    with the SH coefficients c, the opacities o and the weight v of both together in the views. The
+    growth of log A has no unit, so small and large Gaussians are merged alike. Gaussians that are
+    not merged do not change.
 
     Args:
         gaussians: N Gaussians on the CPU. Those that are not finite are removed first.
         count: how many to keep. If it is at least N, the result is ``gaussians``.
+        cameras: those of the photos, see `sight`. They make the result better.
+        farther: the factor by which a pixel becomes larger where two Gaussians are merged. 1: the
+            result is for views from the same distance; 3: with a quarter of the Gaussians, it is
+            for views from three times the distance.
 
     References:
-        Runnalls 2007, Kullback-Leibler approach to Gaussian mixture reduction (the cost).
+        Runnalls 2007, Kullback-Leibler approach to Gaussian mixture reduction (greedy merging).
         Kerbl et al. 2024, A hierarchical 3D Gaussian representation (the weights).
     """
     if count >= len(gaussians):
@@ -58,11 +77,11 @@ def simplify(gaussians: Gaussians, count: int) -> Gaussians:
     if count <= 0:
         return gaussians.select(torch.empty(0, dtype=torch.int64))
     gaussians = gaussians.select(gaussians.finite_rows())
-    mixture, turn = _Mixture.of(gaussians), torch.eye(3, dtype=torch.float64)
+    mixture, turn = _Mixture.of(gaussians, cameras), torch.eye(3, dtype=torch.float64)
     while len(mixture) > count:
         mixture = mixture.select(morton_order(mixture.means.T @ turn))
         surplus = min(len(mixture) - count, max(1, int(_SHARE * len(mixture))))
-        mixture = _merge(mixture, *_cheapest_pairs(_costs(mixture), surplus))
+        mixture = _merge(mixture, *_cheapest_pairs(_costs(mixture), surplus), farther)
         turn = turn @ _TURN
     return mixture.gaussians(gaussians)
 
@@ -73,10 +92,13 @@ class _Mixture:
 
     ===========  ==================  ==========================================================
     means        (3, N) float64
-    covariances  (6, N) float64      as in `_ENTRIES`
+    covariances  (6, N) float64      the entries `ENTRIES`
     opacities    (N,) float64
     colors       (3 + 3 K, N)        all SH coefficients
     origins      (N,) int64          the row in the original scene; −1 for a merged Gaussian
+    blurs        (N,) float64        the variance of the blur of the renderer, in world units
+    directions   (6, N) float64      see `Sight`
+    weights      (N,) float64        see `Sight`
     ===========  ==================  ==========================================================
     """
 
@@ -85,16 +107,23 @@ class _Mixture:
     opacities: Tensor
     colors: Tensor
     origins: Tensor
+    blurs: Tensor
+    directions: Tensor
+    weights: Tensor
 
     @staticmethod
-    def of(gaussians: Gaussians) -> _Mixture:
+    def of(gaussians: Gaussians, cameras: Sequence[Camera]) -> _Mixture:
+        seen = sight(gaussians, cameras)
         axes = rotation_from_quat(gaussians.rotations.double()) * gaussians.scales.double()[:, None]
         return _Mixture(
             gaussians.means.double().T.contiguous(),
-            torch.stack([(axes[:, i] * axes[:, j]).sum(1) for i, j in _ENTRIES]),
+            torch.stack([(axes[:, i] * axes[:, j]).sum(1) for i, j in ENTRIES]),
             gaussians.opacities.double(),
             torch.cat([gaussians.sh_dc, gaussians.sh_rest], 1).flatten(1).T.contiguous(),
             torch.arange(len(gaussians)),
+            LOW_PASS * seen.pixels,
+            seen.directions,
+            seen.weights,
         )
 
     def __len__(self) -> int:
@@ -108,15 +137,19 @@ class _Mixture:
         return _Mixture(*(torch.cat(pair, -1) for pair in pairs))
 
     def areas(self) -> Tensor:
-        """(N,) a mean area of the projections: the root of λ₁λ₂ + λ₂λ₃ + λ₃λ₁, eigenvalues of Σ."""
-        xx, yy, zz, xy, xz, yz = self.covariances
-        return (xx * yy + yy * zz + zz * xx - xy * xy - xz * xz - yz * yz).clamp_min(0.0).sqrt()
+        """(N,) A, see `simplify`."""
+        adjugate = _adjugate(_blurred(self.covariances, self.blurs))
+        return _product(self.directions, adjugate).clamp_min(_TINY).sqrt()
+
+    def masses(self) -> Tensor:
+        """(N,) opacity × A."""
+        return self.opacities * self.areas()
 
     def gaussians(self, original: Gaussians) -> Gaussians:
         """The Gaussians of this mixture; those with an origin are rows of ``original``."""
         merged = self.select(self.origins < 0)
         matrices = torch.empty(len(merged), 3, 3, dtype=torch.float64)
-        for (i, j), entry in zip(_ENTRIES, merged.covariances, strict=True):
+        for (i, j), entry in zip(ENTRIES, merged.covariances, strict=True):
             matrices[:, i, j] = matrices[:, j, i] = entry
         variances, axes = torch.linalg.eigh(matrices)
         axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, no reflection
@@ -140,18 +173,18 @@ def _costs(mixture: _Mixture) -> Tensor:
     """(`_NEIGHBOURS`, N) float32: what is lost by merging Gaussian i with Gaussian i + 1 + row."""
     count = len(mixture)
     costs = torch.full((min(_NEIGHBOURS, count - 1), count), torch.inf)
-    masses = mixture.opacities * mixture.areas()
-    entropies = _entropy(mixture.covariances)
+    masses, sizes = mixture.masses(), mixture.areas().log()
     for row in range(len(costs)):
         for start in range(0, count - row - 1, _CHUNK):
             a = slice(start, min(start + _CHUNK, count - row - 1))
             b = slice(a.start + row + 1, a.stop + row + 1)
-            weight = _weight(masses[b], masses[a])
-            offset = mixture.means[:, b] - mixture.means[:, a]
-            both = _covariance(mixture.covariances[:, a], mixture.covariances[:, b], offset, weight)
-            shape = _entropy(both) - torch.lerp(entropies[a], entropies[b], weight)
-            color = (mixture.colors[:, b] - mixture.colors[:, a]).square().sum(0)
-            costs[row, a] = (shape + color).float()
+            first, second = mixture.select(a), mixture.select(b)
+            share = _share(masses[b], masses[a])
+            both = _together(first, second, share)
+            growth = both.areas().log() - torch.lerp(sizes[a], sizes[b], share)
+            color = (second.colors - first.colors).square().sum(0)
+            seen = torch.minimum(first.opacities, second.opacities) * both.weights
+            costs[row, a] = ((growth + _COLOR * color) * seen.sqrt()).float()
     return costs
 
 
@@ -183,43 +216,74 @@ def _cheapest_pairs(costs: Tensor, most: int) -> tuple[Tensor, Tensor]:
     return first, second
 
 
-def _merge(mixture: _Mixture, first: Tensor, second: Tensor) -> _Mixture:
+def _merge(mixture: _Mixture, first: Tensor, second: Tensor, farther: float = 1.0) -> _Mixture:
     """The mixture with each pair replaced by one Gaussian; the pairs are disjoint."""
     a, b = mixture.select(first), mixture.select(second)
-    mass_a, mass_b = a.opacities * a.areas(), b.opacities * b.areas()
-    weight = _weight(mass_b, mass_a)
-    offset = b.means - a.means
-    both = _Mixture(
-        a.means + weight * offset,
-        _covariance(a.covariances, b.covariances, offset, weight),
-        mass_a + mass_b,
-        torch.lerp(a.colors, b.colors, weight.to(a.colors.dtype)),
-        torch.full_like(first, -1),
-    )
-    both.opacities = (both.opacities / both.areas()).clamp(1.0 - _MAX_OPACITY, _MAX_OPACITY)
+    mass_a, mass_b = a.masses(), b.masses()
+    both = _together(a, b, _share(mass_b, mass_a))
+    covered = mass_a + mass_b - _overlap(a, b, mass_a, mass_b)
+    both.blurs *= farther
+    both.opacities = (covered / both.areas()).clamp(1.0 - _MAX_OPACITY, _MAX_OPACITY)
     alone = torch.ones(len(mixture), dtype=torch.bool)
     alone[first] = alone[second] = False
     return mixture.select(alone).append(both)
 
 
-def _weight(mass: Tensor, other: Tensor) -> Tensor:
+def _together(a: _Mixture, b: _Mixture, share: Tensor) -> _Mixture:
+    """Each Gaussian of a with that of b, whose share is ``share`` (N,); without an opacity."""
+    offset = b.means - a.means
+    spread = torch.stack([offset[i] * offset[j] for i, j in ENTRIES])
+    return _Mixture(
+        a.means + share * offset,
+        torch.lerp(a.covariances, b.covariances, share) + share * (1.0 - share) * spread,
+        torch.empty_like(share),
+        torch.lerp(a.colors, b.colors, share.to(a.colors.dtype)),
+        torch.full_like(a.origins, -1),
+        torch.lerp(a.blurs, b.blurs, share),
+        torch.lerp(a.directions, b.directions, share),
+        a.weights + b.weights,
+    )
+
+
+def _overlap(a: _Mixture, b: _Mixture, mass_a: Tensor, mass_b: Tensor) -> Tensor:
+    """(N,) the integral of α₁ α₂ in the views, in the unit of the masses: the product of two
+    Gaussians is o₁ o₂ A₁ A₂ / A(Σ₁ + Σ₂) · exp(−½ Δᵀ (Σ₁ + Σ₂)⁻¹ Δ)."""
+    sums = _blurred(a.covariances + b.covariances, a.blurs + b.blurs)
+    adjugate = _adjugate(sums)
+    determinant = sums[0] * adjugate[0] + sums[3] * adjugate[3] + sums[4] * adjugate[4]
+    offset = b.means - a.means
+    square = torch.stack([offset[i] * offset[j] for i, j in ENTRIES])
+    distance = _product(square, adjugate) / determinant.clamp_min(_TINY)
+    area = _product((a.directions + b.directions) / 2, adjugate).clamp_min(_TINY).sqrt()
+    return mass_a * mass_b / area * (-0.5 * distance).exp()
+
+
+def _share(mass: Tensor, other: Tensor) -> Tensor:
     """The share of ``mass`` in both masses."""
-    return mass / (mass + other).clamp_min(torch.finfo(mass.dtype).tiny)
+    return mass / (mass + other).clamp_min(_TINY)
 
 
-def _covariance(a: Tensor, b: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
-    """(6, N) covariances of two Gaussians together, which are ``offset`` (3, N) apart.
-
-    ``weight`` (N,) is that of b.
-    """
-    spread = torch.stack([offset[i] * offset[j] for i, j in _ENTRIES])
-    return torch.lerp(a, b, weight) + weight * (1.0 - weight) * spread
+def _blurred(covariances: Tensor, variances: Tensor) -> Tensor:
+    """(6, N) Σ + variance · I."""
+    return torch.cat([covariances[:3] + variances, covariances[3:]])
 
 
-def _entropy(covariances: Tensor) -> Tensor:
-    """(N,) ½ log |Σ|, where no standard deviation is below `_THICKNESS` of the largest."""
-    xx, yy, zz, xy, xz, yz = covariances
-    floor = _THICKNESS * _THICKNESS * (xx + yy + zz)
-    xx, yy, zz = xx + floor, yy + floor, zz + floor
-    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    return determinant.clamp_min(torch.finfo(torch.float64).tiny).log() / 2
+def _adjugate(matrices: Tensor) -> Tensor:
+    """(6, N) the adjugates of symmetric matrices (6, N)."""
+    xx, yy, zz, xy, xz, yz = matrices
+    return torch.stack(
+        [
+            yy * zz - yz * yz,
+            xx * zz - xz * xz,
+            xx * yy - xy * xy,
+            xz * yz - xy * zz,
+            xy * yz - xz * yy,
+            xy * xz - xx * yz,
+        ]
+    )
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """(N,) tr(A B) of symmetric matrices (6, N)."""
+    products = a * b
+    return products[:3].sum(0) + 2.0 * products[3:].sum(0)

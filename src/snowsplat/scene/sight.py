@@ -1,0 +1,129 @@
+"""What cameras see of each Gaussian: from where, how large a pixel is there, and how much of it.
+
+The blending weight of a Gaussian in a pixel is w = T α, with the transmittance T in front of it.
+Sums of these weights are gradients of a rendered image: that of Σ w(p) g(p) with respect to a
+colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from snowsplat import ops
+from snowsplat.ops.splats import COLORS
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import project
+
+#: The entries of a symmetric 3×3 matrix that are stored.
+ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+#: Longest side of the images in which weights are summed, in pixels.
+SIDE = 400
+# At most so many cameras are rendered; more do not change the means below.
+_CAMERAS = 16
+# A Gaussian is in a view if it is not farther outside of the image, in units of its size.
+_MARGIN = 0.1
+# The side of a pixel in units of the distance to the third neighbour, if the cameras are unknown.
+_SPACING = 0.15
+
+
+@dataclass
+class Sight:
+    """What the cameras see of each of N Gaussians; all tensors are float64.
+
+    Attributes:
+        weights: (N,) the mean over the views of Σ w, in pixels; all 1 if unknown.
+        pixels: (N,) the area of a pixel at the Gaussian, in squared world units; 0: negligible.
+        directions: (6, N) three times the mean of d dᵀ, with the unit vectors d from the cameras;
+            the entries are `ENTRIES`. From everywhere, this is the identity.
+    """
+
+    weights: Tensor
+    pixels: Tensor
+    directions: Tensor
+
+
+def reduced(camera: Camera) -> Camera:
+    """The camera with an image of at most about `SIDE` pixels."""
+    return camera.downscaled(max(1, round(max(camera.width, camera.height) / SIDE)))
+
+
+def blended(gaussians: Gaussians, camera: Camera, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The ids (M,) of the Gaussians in a view, their depths (M,), and (M, 3) Σ w(p) g(p).
+
+    Args:
+        values: (H, W, 3) g for three sums.
+    """
+    with torch.no_grad():
+        splats = project(gaussians, camera)
+    splats.packed = splats.packed.detach().requires_grad_()
+    with torch.enable_grad():
+        image, _, _ = ops.rasterize(splats, camera.width, camera.height)
+        (image * values).sum().backward()
+    assert splats.ids is not None
+    assert splats.packed.grad is not None
+    rows = splats.ids >= 0
+    return (
+        splats.ids[rows].long(),
+        splats.depths.detach()[rows],
+        splats.packed.grad[rows, COLORS : COLORS + 3],
+    )
+
+
+def sight(gaussians: Gaussians, cameras: Sequence[Camera]) -> Sight:
+    """What the cameras see, or what they may see if there are none.
+
+    Without cameras, every Gaussian is seen from everywhere, and pixels are as large as the spacing
+    of the Gaussians suggests: training puts about one Gaussian on a few pixels. The pixels of a
+    scene that was trained without aliasing have no effect on it.
+
+    Args:
+        gaussians: N finite Gaussians on the CPU.
+        cameras: those of the photos; some of them, evenly spaced, are used.
+    """
+    found = _by_cameras(gaussians, cameras) if cameras else _by_spacing(gaussians)
+    if gaussians.antialiased:
+        found.pixels = torch.zeros_like(found.pixels)
+    return found
+
+
+def _by_spacing(gaussians: Gaussians) -> Sight:
+    spacing = ops.neighbours(gaussians.means, k=3)[:, 2].double()
+    spacing = torch.where(spacing.isfinite(), spacing, 0.0)
+    everywhere = torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    return Sight(
+        torch.ones_like(spacing),
+        (_SPACING * spacing).square(),
+        everywhere[:, None].repeat(1, len(spacing)),
+    )
+
+
+def _by_cameras(gaussians: Gaussians, cameras: Sequence[Camera]) -> Sight:
+    used = cameras[:: -(-len(cameras) // _CAMERAS)]
+    found = _by_spacing(gaussians)
+    means = gaussians.means.double()
+    weights, density, squared = torch.zeros(3, len(means), dtype=torch.float64)
+    directions = torch.zeros_like(found.directions)
+    for camera in used:
+        small = reduced(camera)
+        ids, _, sums = blended(gaussians, small, torch.ones(small.height, small.width, 3))
+        weights[ids] += sums[:, 0].double() * (camera.width / small.width) ** 2
+        place, depth = camera.project(means)
+        size = torch.tensor([camera.width, camera.height])
+        inside = ((place > -_MARGIN * size) & (place < (1 + _MARGIN) * size)).all(1) & (depth > 0)
+        # Pixels for a unit of area: the views that show it largest count most.
+        pixels = torch.where(inside, camera.fx * camera.fy / depth.square(), 0.0)
+        towards = normalize(means - camera.position.double(), dim=1)
+        directions += pixels * torch.stack([towards[:, i] * towards[:, j] for i, j in ENTRIES])
+        density += pixels
+        squared += pixels.square()
+    seen = density > 0
+    found.weights = weights / len(used)
+    found.directions[:, seen] = 3.0 * directions[:, seen] / density[seen]
+    found.pixels[seen] = density[seen] / squared[seen]
+    return found
