@@ -73,7 +73,12 @@ def crop(gaussians: Gaussians, box: Tensor) -> Gaussians:
 
 
 def merge(parts: Sequence[Gaussians]) -> Gaussians:
-    """All rows of ``parts`` (at least one) in order, with the highest SH degree of the parts."""
+    """All rows of ``parts`` (at least one) in order, with the highest SH degree of the parts.
+
+    A single part is returned as it is: a copy of a large scene would need much memory.
+    """
+    if len(parts) == 1:
+        return parts[0]
     degree = max(part.sh_degree for part in parts)
     return Gaussians.cat([with_sh_degree(part, degree) for part in parts])
 
