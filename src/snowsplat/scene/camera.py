@@ -54,6 +54,12 @@ class Camera:
         """(3,): the camera centre in the world frame."""
         return self.world_from_cam[:, 3]
 
+    @property
+    def intrinsics(self) -> Tensor:
+        """(3, 3) float64: K, which maps a point of the camera frame to (x·z, y·z, z) in pixels."""
+        rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(rows, dtype=torch.float64)
+
     def scaled(self, width: int, height: int) -> Camera:
         """The same view at another image size: intrinsics are scaled by the ratio of each axis."""
         sx, sy = width / self.width, height / self.height

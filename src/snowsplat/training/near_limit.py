@@ -130,7 +130,6 @@ def _sample(points: Tensor, count: int) -> Tensor:
 
 def _row(camera: Camera, limit: float) -> Tensor:
     """(15,) float64: the limit, the size of the image, and K [R | t], row by row."""
-    k = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    affine = k.to(torch.float64) @ camera.cam_from_world.to(torch.float64)
+    affine = camera.intrinsics @ camera.cam_from_world.to(torch.float64)
     size = torch.tensor([limit, camera.width, camera.height], dtype=torch.float64)
     return torch.cat([size, affine.reshape(-1)])

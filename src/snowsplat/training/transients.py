@@ -12,6 +12,9 @@ photo, as by a mask of the user. It is found by four properties:
 - most of the cells around it have these properties, too (patches as in RobustNeRF, Sabour et al.
   2023).
 
+If several photos have such a thing, smaller residuals are enough, and the photos are compared again
+without it. Then places that no other photos show are judged, too, by their own photo.
+
 The masks are computed anew at a few moments. A place that is masked by mistake is still trained by
 the other photos, so it is not masked the next time. As in RobustSplat (Fu et al. 2025), Gaussians
 are added only after the first masks, if the part is always on: many Gaussians would reproduce what
@@ -41,6 +44,7 @@ from snowsplat.training.density import DensityConfig
 from snowsplat.training.shards import Shards
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.view_residuals import (
+    CellMap,
     cell_map,
     cell_size,
     residuals_elsewhere,
@@ -60,6 +64,8 @@ _FEWEST_VIEWS = {"auto": 30, "on": 8, "off": 0}
 _LARGE, _LARGE_TIMES, _QUANTILE = 0.1, 2.0, 0.9
 #: Around cells with a large residual, this share of it is enough, up to this number of cells away.
 _NOTABLE, _RINGS = 0.5, 3
+#: If something moves in several photos, this share of a large residual is enough.
+_LESS = 0.8
 #: It must be this many times the residual of the same place in other views, ...
 _TIMES = 3.0
 #: ... of which there must be at least this number.
@@ -70,7 +76,7 @@ _SAME_DETAIL = 0.5
 _VOTES = 0.5
 #: With "auto", a photo counts if this share of its cells are found. Things move in the scene if at
 #: least this number of photos and this share of all photos count.
-_SHARE, _PHOTOS, _PHOTOS_SHARE = 0.004, 3, 0.08
+_SHARE, _PHOTOS, _PHOTOS_SHARE = 0.02, 3, 0.08
 
 
 class Transients:
@@ -140,13 +146,7 @@ class Transients:
             view = self._views[i]
             photo = self._images.get(view, downscale)
             maps.append(cell_map(view.camera, photo, downscale, self._background, with_depth))
-        large = _large([cells.residual for cells in maps])
-        found = [
-            moving(cells.residual, cells.correlation, *elsewhere, large, ~self.masks[i])
-            for i, cells, elsewhere in zip(used, maps, residuals_elsewhere(maps), strict=True)
-        ]
-        if self._mode == "auto" and not _significant(found):
-            found = [torch.zeros_like(cells) for cells in found]
+        found = _moving_cells(maps, [~self.masks[i] for i in used], self._mode)
         for i, cells in zip(used, found, strict=True):
             self.masks[i] = ~cells
         return True
@@ -204,36 +204,61 @@ def delayed(density: DensityConfig) -> DensityConfig:
     return replace(density, densify_from=_GROWTH) if late else density
 
 
+def _moving_cells(
+    maps: Sequence[CellMap], before: Sequence[Tensor], mode: TransientsMode
+) -> list[Tensor]:
+    """The cells (h, w) bool of each map in which something moves; ``before``: of the last time."""
+    large = _large([cells.residual for cells in maps])
+
+    def found(ignored: Sequence[Tensor], large: float, alone: bool) -> list[Tensor]:
+        return [
+            moving(cells, *elsewhere, large, last, alone)
+            for cells, elsewhere, last in zip(
+                maps, residuals_elsewhere(maps, ignored), before, strict=True
+            )
+        ]
+
+    first = found(before, large, False)
+    if _significant(first):
+        return found(first, _LESS * large, True)
+    return [torch.zeros_like(cells) for cells in first] if mode == "auto" else first
+
+
 def moving(
-    residual: Tensor,
-    correlation: Tensor,
-    elsewhere: Tensor,
-    others: Tensor,
-    large: float,
-    before: Tensor,
+    cells: CellMap, elsewhere: Tensor, others: Tensor, large: float, before: Tensor, alone: bool
 ) -> Tensor:
     """(h, w) bool: the cells in which something moves, and the cells around them.
 
     Args:
-        residual, correlation: (h, w), of the cells of a view.
+        cells: those of a view.
         elsewhere: (h, w), the residual of their places in other views; see `residuals_elsewhere`.
         others: (h, w), the number of these views.
         large: the smallest large residual.
         before: (h, w) bool, the result of the last time.
+        alone: whether places that too few other views show can be found, too.
     """
-    judged, stands_out = others >= _FEWEST_OTHERS, residual >= _TIMES * elsewhere
-    stands_out &= correlation < _SAME_DETAIL
-    confirmed = judged & stands_out & (residual >= large)
-    votes = avg_pool2d(confirmed[None].float(), 3, stride=1, padding=1, count_include_pad=False)[0]
-    found = confirmed & (votes >= _VOTES)
+    large_here = cells.residual >= large
+    differs = cells.correlation < _SAME_DETAIL
+    judged = others >= _FEWEST_OTHERS
+    stands_out = judged & differs & (cells.residual >= _TIMES * elsewhere)
+    unknown = ~judged & differs & (cells.places.inverse_depth > 0.0) & large_here
+    confirmed = stands_out & large_here
+    found = confirmed & (_votes(confirmed, border=False) >= _VOTES)
+    if alone:
+        likely = confirmed | unknown
+        found |= likely & (_votes(likely, border=True) >= _VOTES)
     # Other photos need not confirm the cells around, but must not contradict.
-    notable = (judged & stands_out & (residual >= _NOTABLE * large)) | (
-        ~judged & (correlation < _SAME_DETAIL) & (residual >= large)
-    )
+    notable = (stands_out & (cells.residual >= _NOTABLE * large)) | unknown
     found |= before & notable
     for _ in range(_RINGS):
         found |= _dilated(found) & notable
     return _dilated(found)  # the edge of a thing lies within a cell
+
+
+def _votes(cells: Tensor, border: bool) -> Tensor:
+    """The share of the 3 × 3 cells around each cell, with those beyond the border or without."""
+    planes = cells[None].float()
+    return avg_pool2d(planes, 3, stride=1, padding=1, count_include_pad=border)[0]
 
 
 def _dilated(cells: Tensor) -> Tensor:

@@ -119,31 +119,41 @@ def _correlation(image: Tensor, photo: Tensor, size: tuple[int, int]) -> Tensor:
     return (xy - x * y) / variances.sqrt().clamp_min(_PLAIN)
 
 
-def residuals_elsewhere(maps: Sequence[CellMap]) -> list[tuple[Tensor, Tensor]]:
+def residuals_elsewhere(
+    maps: Sequence[CellMap], ignored: Sequence[Tensor]
+) -> list[tuple[Tensor, Tensor]]:
     """For each map, the usual residual (h, w) of its places in other views, and the number (h, w)
     of these views. The residual is infinite if there are none.
+
+    Args:
+        ignored: (h, w) bool for each map, cells that do not count in other views.
     """
-    positions = torch.stack([cells.places.camera.position for cells in maps]).to(torch.float64)
+    cameras = [cells.places.camera for cells in maps]
+    positions = torch.stack([camera.position for camera in cameras])
+    to_image = torch.stack([camera.intrinsics @ camera.cam_from_world for camera in cameras])
+    to_image = to_image.to(torch.float32)
+    size = torch.tensor([[camera.width, camera.height] for camera in cameras])
+    # The cells of all maps, one after the other.
+    start = size.prod(1).cumsum(0) - size.prod(1)
+    inverse_depth = torch.cat([cells.places.inverse_depth.flatten() for cells in maps])
+    residual = torch.cat([cells.residual.flatten() for cells in maps])
+    residual[torch.cat([cells.flatten() for cells in ignored])] = torch.nan
     found = []
     for i, cells in enumerate(maps):
-        order = torch.argsort((positions - positions[i]).norm(dim=1), stable=True).tolist()
+        order = torch.argsort((positions - positions[i]).norm(dim=1), stable=True)
+        others = order[order != i][:_NEIGHBOURS]
         known = cells.places.inverse_depth > 0.0
         points = cells.places.points(known)
+        x, y, z = (points @ to_image[others, :, :3].mT + to_image[others, None, :, 3]).unbind(2)
+        pixel = (torch.stack([x, y], 2) / z[:, :, None]).nan_to_num(-1.0).clamp(-1.0, 1e6)
+        place = pixel.floor().to(torch.int64)
+        inside = (z > 0.0) & ((place >= 0) & (place < size[others, None])).all(2)
+        row = start[others, None] + place[:, :, 1] * size[others, None, 0] + place[:, :, 0]
+        row = row.where(inside, 0)
+        # 0 if the depth is unknown there, which is none of the same place.
+        visible = inside & ((inverse_depth[row] * z - 1.0).abs() <= _SAME_DEPTH)
         table = torch.full((_NEIGHBOURS, *known.shape), torch.nan)
-        for row, j in zip(table, [j for j in order if j != i], strict=False):
-            row[known] = _residual_at(points, maps[j])
+        table[: len(others), known] = residual[row].where(visible, torch.nan)
         usual = table.nanquantile(_USUAL, 0).nan_to_num(torch.inf)
         found.append((usual, (~table.isnan()).sum(0)))
     return found
-
-
-def _residual_at(points: Tensor, cells: CellMap) -> Tensor:
-    """(P,): the residual of the cell that shows each point; NaN if the point is not visible."""
-    height, width = cells.residual.shape
-    pixel, depth = cells.places.camera.project(points)
-    x, y = pixel.nan_to_num(-1.0).clamp(-1.0, 1e6).floor().to(torch.int64).unbind(1)
-    inside = (depth > 0.0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
-    found = cells.places.inverse_depth[y, x]
-    visible = inside & (found > 0.0) & ((found * depth - 1.0).abs() <= _SAME_DEPTH)
-    return torch.where(visible, cells.residual[y, x], torch.nan)

@@ -164,14 +164,6 @@ def _reduced(picture: _Picture, factor: int) -> tuple[Camera, Tensor]:
 def _source_from_pixel(camera: Camera, source: Camera) -> Tensor:
     """(3, 4) [A | b]: pixel (u, v) at inverse depth w is at A (u, v, 1)ᵀ + w b in the source."""
     source_from_cam = compose_rigid(source.cam_from_world, camera.world_from_cam)
-    matrix = _intrinsics(source) @ source_from_cam.to(torch.float64)
-    matrix[:, :3] = matrix[:, :3] @ torch.linalg.inv(_intrinsics(camera))
+    matrix = source.intrinsics @ source_from_cam.to(torch.float64)
+    matrix[:, :3] = matrix[:, :3] @ torch.linalg.inv(camera.intrinsics)
     return matrix.to(torch.float32)
-
-
-def _intrinsics(camera: Camera) -> Tensor:
-    """(3, 3) float64."""
-    return torch.tensor(
-        [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]],
-        dtype=torch.float64,
-    )
