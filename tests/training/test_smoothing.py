@@ -7,7 +7,15 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.smoothing import INTERVAL, VARIANCE, SmoothingFilter, sampling_rates
+from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.smoothing import (
+    INTERVAL,
+    OPACITY_RATE,
+    VARIANCE,
+    SmoothingFilter,
+    compensated,
+    sampling_rates,
+)
 from snowsplat.training.step_schedule import Schedule
 
 POSE = torch.eye(3, 4, dtype=torch.float64)
@@ -35,16 +43,20 @@ def scene() -> Gaussians:
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     gaussians = Gaussians.random_in_bounds(bounds, 5, torch.Generator().manual_seed(5))
     gaussians.means = MEANS.clone()
-    gaussians.log_scales = torch.tensor([1e-4, 0.02, 0.5]).log().repeat(5, 1)
+    gaussians.log_scales = torch.tensor([0.01, 1e-4, 0.5]).log().repeat(5, 1)
+    gaussians.log_scales[1:] = math.log(1e-4)
     return gaussians
 
 
-def test_scales_are_at_least_the_filter():
+def test_all_scales_but_the_smallest_are_at_least_the_filter():
     before, after = scene(), scene()
-    SmoothingFilter(True, [NEAR], Schedule(1000)).after_step(INTERVAL, after)
-    smallest = math.sqrt(VARIANCE) / 15
-    torch.testing.assert_close(after.scales[0], torch.tensor([smallest, smallest, 0.5]))
-    assert torch.equal(after.log_scales[1:], before.log_scales[1:])  # no photo shows them
+    SmoothingFilter(True, [NEAR, FAR], Schedule(1000)).after_step(INTERVAL, after)
+    limits = math.sqrt(VARIANCE) / torch.tensor([30.0, 30.0, 300 / 7])
+    torch.testing.assert_close(after.scales[0], torch.tensor([limits[0], 1e-4, 0.5]))
+    for row in (1, 2):  # from needles to discs
+        expected = torch.tensor([1e-4, limits[row], limits[row]])
+        torch.testing.assert_close(after.scales[row].sort().values, expected)
+    assert torch.equal(after.log_scales[3:], before.log_scales[3:])  # no photo shows them
     for name in ("means", "quats", "opacity_logits", "sh_dc", "sh_rest"):
         assert torch.equal(after.parameters()[name], before.parameters()[name])
 
@@ -54,3 +66,8 @@ def test_nothing_changes_without_the_filter_and_between_its_steps():
     SmoothingFilter(False, [NEAR], Schedule(1000)).after_step(INTERVAL, gaussians)
     SmoothingFilter(True, [NEAR], Schedule(1000)).after_step(INTERVAL + 1, gaussians)
     assert torch.equal(gaussians.log_scales, scene().log_scales)
+
+
+def test_only_the_rate_of_the_opacities_changes():
+    rates = LearningRates()
+    assert compensated(rates) == replace(rates, opacity_logits=OPACITY_RATE * 0.05)

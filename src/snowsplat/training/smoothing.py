@@ -1,4 +1,4 @@
-"""`SmoothingFilter`: no Gaussian is smaller than what the photos can show of it.
+"""`SmoothingFilter`: no Gaussian is thinner than what the photos can show of it, except for discs.
 
 A photo of focal length f samples a Gaussian at depth d with the rate f / d, in pixels per world
 unit. Let ν be the largest rate of all photos that show it. Details that are much finer than 1 / ν
@@ -6,26 +6,34 @@ cannot be trained. But in the photos a thinner Gaussian looks the same, because 
 it to the size of a pixel; nearer to the camera, or in a larger image, it becomes an edge or a
 needle. Mip-Splatting (Yu et al., CVPR 2024) therefore convolves each Gaussian with one of the
 variance s / ν², its 3D smoothing filter: Σ + s / ν² I. The Gaussians that result are those whose
-standard deviations are at least √s / ν. So here this is a lower limit of the scales. A training run
-finds the same Gaussians, without further parameters, and every viewer shows the filtered scene.
+standard deviations are at least √s / ν. So here this is a lower limit of the scales, without
+further parameters, and every viewer shows the filtered scene.
+
+The smallest of the three scales has no limit. A disc of any thickness looks the same from the
+front, and surfaces need thin discs; with a limit for all scales, the photos are reproduced less
+well. A needle has two small scales, so there are no needles.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.step_schedule import Schedule
 
 #: Number of steps between two applications.
 INTERVAL = 100
 #: s: the variance of the filter, in units of the distance between samples, squared.
 VARIANCE = 0.2
+#: Factor of the learning rate of the opacities.
+OPACITY_RATE = 4.0
 #: Photos show only what is farther away, in world units: the default of `ops.project`.
 _NEAR = 0.2
 
@@ -42,12 +50,25 @@ class SmoothingFilter:
         self._schedule = schedule
 
     def after_step(self, step: int, gaussians: Gaussians) -> None:
-        """Raise the scales below the limit, in place, in every `INTERVAL`-th step."""
+        """Raise the scales below the limit, except for the smallest one of each Gaussian, in place,
+        in every `INTERVAL`-th step.
+        """
         if self._cameras and self._schedule.multiples(step, INTERVAL):
             rates = sampling_rates(gaussians.means, self._cameras)
             limit = math.sqrt(VARIANCE) / rates  # inf for a Gaussian that no photo shows
             limit = limit.nan_to_num(posinf=0.0).log()
-            gaussians.log_scales.copy_(torch.maximum(gaussians.log_scales, limit[:, None]))
+            scales = gaussians.log_scales
+            smallest = scales.argmin(1, keepdim=True)
+            raised = torch.maximum(scales, limit[:, None])
+            scales.copy_(raised.scatter(1, smallest, scales.gather(1, smallest)))
+
+
+def compensated(rates: LearningRates) -> LearningRates:
+    """The learning rates for splats whose opacity is reduced where they are smaller than a pixel.
+
+    Their opacities before this reduction are larger, and so farther from those of the first step.
+    """
+    return replace(rates, opacity_logits=OPACITY_RATE * rates.opacity_logits)
 
 
 def sampling_rates(means: Tensor, cameras: Sequence[Camera]) -> Tensor:

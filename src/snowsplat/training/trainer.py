@@ -29,6 +29,7 @@ from snowsplat.training.pose_refinement import PoseRefinement
 from snowsplat.training.sharded_render import sharded_render
 from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.sky import Sky, find_sky
+from snowsplat.training.smoothing import compensated
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.transients import Transients, delayed
@@ -162,9 +163,10 @@ class Trainer:
                     dataset, start, neutral, self._generators["start"], self.device, self.sky
                 )
         self.gaussians = replace(shards.scattered(first), antialiased=config.antialias)
+        rates = config.learning_rates
         self._optimizer = Adam(
             self.gaussians,
-            config.learning_rates,
+            compensated(rates) if config.antialias else rates,
             schedule=self.schedule,
             extent=dataset.extent,
             visible_only=config.visible_only,
