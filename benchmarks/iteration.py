@@ -43,7 +43,7 @@ REST = "rest (Python)"
 TOTAL = "total"
 #: Queries of sizes, which take no time: counted with the rest.
 QUERIES = (
-    "rasterize_sums_in_order",
+    "rasterize_has_slots",
     "splat_record_bytes",
     "tiles_parts",
     "tiles_workspace_bytes",

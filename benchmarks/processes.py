@@ -125,7 +125,7 @@ def _rows(trainer: Trainer, views: list[View], shards: Shards) -> np.ndarray:
     order = trainer._queue.order[: len(views)]
     if not order:
         order = list(range(len(views)))
-    counts = [len(project(trainer.gaussians, trainer._cameras[i])) for i in order]
+    counts = [len(project(trainer.gaussians, trainer.poses.camera(i))) for i in order]
     return shards.table(torch.tensor(counts)).numpy()
 
 

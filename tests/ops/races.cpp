@@ -31,7 +31,6 @@ ENTRY(tiles_fill, TilesFillParams<F>);
 ENTRY(rasterize_block_bytes, SizeQueryParams);
 ENTRY(rasterize_fwd, RasterizeForwardParams<F>);
 ENTRY(rasterize_bwd, RasterizeBackwardParams<F>);
-ENTRY(splats_reduce, SplatsReduceParams<F>);
 ENTRY(photometric, PhotometricParams<F, F>);
 ENTRY(adam_step, AdamStepParams<F>);
 
@@ -100,13 +99,13 @@ std::vector<F> frame(const Scene& s) {
   const int64_t tx = (kWidth + 15) / 16, ty = (kHeight + 15) / 16, tiles = tx * ty;
   const int64_t parts = tiles_parts({m, 0, 0});
   Aligned<char> workspace(tiles_workspace_bytes({m, tiles, parts}));
-  std::vector<U> start(size_t(tiles + 1)), end(size_t(tiles), 0), range(size_t(2 * m));
+  std::vector<U> start(size_t(tiles + 1)), end(size_t(tiles), 0);
   int64_t needed = 0;
   const TileBinning<F> binning = {order.data(), packed.data(), kStride,        records,     tx,
                                   ty,           parts,         workspace.data, start.data()};
   const int64_t n = tiles_count({m, binning, -1, &needed});
-  std::vector<U> splat(size_t(n), 0), slot(splat);
-  tiles_fill({m, binning, n, splat.data(), slot.data(), range.data()});
+  std::vector<U> splat(size_t(n), 0);
+  tiles_fill({m, binning, n, splat.data(), nullptr, nullptr});
 
   Aligned<char> blocks(n * rasterize_block_bytes({0, 0, 0}));
   const FrameParams<F> sorted = {kWidth,  kHeight,      packed.data(), kStride,      columns,
@@ -119,11 +118,8 @@ std::vector<F> frame(const Scene& s) {
   double means[2];
   photometric(
       {3, kWidth, kHeight, image.data(), s.target.data(), 0.8, -0.2, d_image.data(), means});
-  Aligned<F> slots(16 * n);
-  rasterize_bwd({tiles, sorted, 3, slot.data(), image.data(), d_image.data(), alpha.data(), nullptr,
-                 slots.data, nullptr, nullptr});
-  splats_reduce({m, slots.data, range.data(), packed.data(), kStride, 3, columns, 0, grad.data(),
-                 abs_grad.data()});
+  rasterize_bwd({tiles, sorted, 3, nullptr, image.data(), d_image.data(), alpha.data(), nullptr,
+                 nullptr, grad.data(), abs_grad.data()});
 
   Tensor centres(s.means), scales(s.log_scales), quats(s.quats), logits(s.logits), dc(s.dc);
   Tensor rest(s.rest);

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 
 import pytest
 import torch
 from torch import Tensor
 
 from snowsplat import ops
+from snowsplat.ops.capacity import Capacity
 
 from .scenes import (
     Scene,
@@ -36,12 +38,12 @@ def _threads_as_before() -> Iterator[None]:
     ops.set_num_threads(before)
 
 
-def assert_same_bits(results: list[dict[str, Tensor]]) -> None:
-    for threads, result in zip(THREADS[1:], results[1:], strict=True):
+def assert_same_bits(results: list[dict[str, Tensor]], threads: Sequence[int] = THREADS) -> None:
+    for number, result in zip(threads[1:], results[1:], strict=True):
         for name, expected in results[0].items():
             # As bytes: equal NaNs are the same, and −0 is not 0.
             same = torch.equal(bits(result[name]), bits(expected))
-            assert same, f"{name} with {threads} threads is not what it is with one"
+            assert same, f"{name} with {number} threads is not what it is with one"
 
 
 def bits(tensor: Tensor) -> Tensor:
@@ -87,6 +89,28 @@ def test_rasterize(dtype: torch.dtype, channels: int, count: int) -> None:
             grads["abs_grad"] = splats.abs_grad
         results.append({**outputs, **grads})
     assert_same_bits(results)
+
+
+@pytest.mark.parametrize("channels", [3, 5])
+@pytest.mark.parametrize(("count", "size", "pixels"), [(4000, 640, 12.0), (40_000, 16, 1.0)])
+def test_rasterize_in_bands(channels: int, count: int, size: int, pixels: float) -> None:
+    """One thread sums the gradients in several bands, or a tile is larger than a band; eight
+    threads sum them in one band.
+    """
+    made = random_splats(5, count, size, size, channels, pixels=pixels)
+    capacity = Capacity(sys.maxsize, torch.zeros(1, dtype=torch.int64))
+    results = []
+    for threads in (1, 8):
+        ops.set_num_threads(threads)
+        splats = leaf_splats(made, torch.float32, with_abs_grad=channels == 3)
+        image, _, _ = ops.rasterize(splats, size, size, capacity=capacity)
+        image.square().sum().backward()
+        grads = {"packed": splats.packed.grad}
+        if splats.abs_grad is not None:
+            grads["abs_grad"] = splats.abs_grad
+        results.append(grads)
+    assert 32_768 < int(capacity.required) < 8 * 32_768
+    assert_same_bits(results, (1, 8))
 
 
 @pytest.mark.usefixtures("sums_in_order")

@@ -216,8 +216,8 @@ struct TilesFillParams {
   TileBinning<T> binning;
   int64_t capacity;          // size of the instance arrays
   uint32_t* instance_splat;  // out, (capacity,) sorted by tile
-  uint32_t* instance_slot;   // out, (capacity,) index in the list ordered by splat; CUDA: or null
-  uint32_t* slot_range;      // out, (n, 2) first slot of a splat, and its last slot + 1; or null
+  uint32_t* instance_slot;   // out, (capacity,) index in the list ordered by splat; or null (CPU)
+  uint32_t* slot_range;      // out, (n, 2) first slot of a splat, its last slot + 1; or null (CPU)
   SNOW_FIELDS(n, binning, capacity, instance_splat, instance_slot, slot_range)
 };
 
@@ -271,14 +271,15 @@ struct RasterizeBackwardParams {
   const T* alpha;                 // (height, width)
   const T* grad_alpha;            // (height, width), or null
   T* slots;                       // out, (instances, 16) gradients, which splats_reduce adds;
-                                  // null: they are added to grad_packed atomically (CUDA)
+                                  // null (CPU, CUDA): they are added to grad_packed. The order is
+                                  // fixed on the CPU; CUDA adds atomically
   T* grad_packed;                 // (splats, stride)
   T* abs_grad;                    // as for splats_reduce, if `slots` is null; or null
   SNOW_FIELDS(n, frame, channels, instance_slot, image, grad_image, alpha, grad_alpha, slots,
               grad_packed, abs_grad)
 };
 
-// splats_reduce: the gradient of a splat as the sum over its instances.
+// splats_reduce (CUDA): the gradient of a splat as the sum over its instances.
 template <class T>
 struct SplatsReduceParams {
   int64_t n;                   // splats

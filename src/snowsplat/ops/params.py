@@ -328,8 +328,8 @@ class SizeQueryParams(Params):
     parts: int = 0
 
 
-#: The struct of every operation. The operations for float64 tensors, with the suffix "_f64", have
-#: the same structs.
+#: The struct of every operation on the CPU. The operations for float64 tensors, with the suffix
+#: "_f64", have the same structs. A GPU also has `splats_reduce`.
 ENTRIES: dict[str, type[Params]] = {
     "project_cull": ProjectCullParams,
     "project_fwd": ProjectForwardParams,
@@ -345,9 +345,8 @@ ENTRIES: dict[str, type[Params]] = {
     "tiles_workspace_bytes": SizeQueryParams,
     "tiles_count": TilesCountParams,
     "tiles_fill": TilesFillParams,
-    "splats_reduce": SplatsReduceParams,
     "rasterize_block_bytes": SizeQueryParams,
-    "rasterize_sums_in_order": SizeQueryParams,
+    "rasterize_has_slots": SizeQueryParams,
     "rasterize_fwd": RasterizeForwardParams,
     "rasterize_count": RasterizeCountParams,
     "rasterize_bwd": RasterizeBackwardParams,

@@ -114,9 +114,9 @@ class _Frame:
     tiles: int
     instances: int
     """Number of instances for which memory is allocated."""
-    sums_in_order: bool
-    """True: gradients are summed in slots, in a fixed order. False: they are added atomically."""
     instance_slot: Tensor | None
+    """The slot of each instance, and the slots of each splat, if the backward pass writes the
+    gradient of each instance to memory of its own; see `_grad_packed`."""
     slot_range: Tensor | None
 
 
@@ -166,10 +166,10 @@ def _bin_splats(
         ),
     )
 
-    sums_in_order = query("rasterize_sums_in_order") == 1
+    has_slots = query("rasterize_has_slots") == 1
     instance_splat = empty(instances)
-    instance_slot = empty(instances) if sums_in_order else None
-    slot_range = empty(2 * n) if sums_in_order else None
+    instance_slot = empty(instances) if has_slots else None
+    slot_range = empty(2 * n) if has_slots else None
     launch(
         variant("tiles_fill", packed),
         TilesFillParams(
@@ -196,7 +196,7 @@ def _bin_splats(
         instance_blocks=empty(instances * block_bytes, torch.uint8),
         additive=additive,
     )
-    return _Frame(params, tiles, instances, sums_in_order, instance_slot, slot_range)
+    return _Frame(params, tiles, instances, instance_slot, slot_range)
 
 
 def _sort_by_depth(
@@ -327,11 +327,15 @@ def _grad_packed(
     grad_alpha: Tensor | None,
     abs_grad: Tensor | None,
 ) -> Tensor:
-    """The gradient of the splats, of the shape of `packed`. Also adds to `abs_grad`, if given."""
+    """The gradient of the splats, of the shape of `packed`. Also adds to `abs_grad`, if given.
+
+    The CPU adds the gradients of a few tiles at a time, in a fixed order. A GPU adds them
+    atomically. If their order must be fixed, it needs memory for all instances: the slots.
+    """
     packed, stride = frame.params.packed, frame.params.stride
     grad_packed = scratch.empty(tuple(packed.shape), packed.dtype, packed.device)
-    slots = None  # the gradients of the instances, if they are summed in a fixed order
-    if frame.sums_in_order:
+    slots = None
+    if frame.slot_range is not None:
         slots = scratch.empty((frame.instances, SLOT_WIDTH), packed.dtype, packed.device)
     else:
         grad_packed.zero_()

@@ -12,9 +12,14 @@
 //           splats are behind, so S₀ = g·C is known. The derivative with respect to log α is
 //           w·(g·c) − α S/(1 − α) for a splat with the weight w = α T and the colour c. This needs
 //           no division by T, and for each pixel no index of the last splat that contributes to it.
-//           The sums of a splat over its blocks stay in SIMD lanes. At the end, the lanes are added
-//           and written to the slot of the instance. No atomic operations are used, so the result
-//           does not depend on the number of threads.
+//           The sums of a splat over its blocks stay in SIMD lanes. At the end, the lanes are added:
+//           this is the gradient of the instance, which is written to its slot. After a band of
+//           tiles, the slots are added to the rows of their splats. Each thread adds the slots of its
+//           own splats, in the order of the tiles. No atomic operations are used, so the result
+//           does not depend on the number of threads, and not on the size of the bands either.
+#include <algorithm>
+#include <memory>
+
 #include "cpu/entry.h"
 #include "cpu/pool.h"
 #include "cpu/splat_record.h"
@@ -24,6 +29,7 @@ namespace snow {
 namespace {
 
 constexpr int kChunk = 64;
+constexpr int64_t kBandSlots = 32768;  // slots of a band of tiles, for each thread
 
 template <int W>
 struct BlocksOf;
@@ -174,6 +180,24 @@ struct Frame {
         instance_blocks(static_cast<typename Tile<V>::Bits*>(p.instance_blocks)) {}
 };
 
+// The gradient of an instance. The columns are those of a packed row with three or four colours.
+template <class T>
+struct alignas(64) Slot {
+  T column[kPackedStride];
+
+  // From the sums of the colours and of q = ∂L/∂(log α) over the pixels.
+  template <int C>
+  SNOW_INLINE void set(const SplatRecord<T>& r, const T* sums) {
+    const T* q = sums + C;
+    const T conic[3] = {T(-2 * kLn2) * r.terms.A, T(-kLn2) * r.terms.B, T(-2 * kLn2) * r.terms.C};
+    splat_terms_vjp<T>(conic, r.opacity, {q[0], q[1], q[2], q[3], q[4], q[5]}, column, column + 2,
+                       column[5]);
+    column[6] = column[7] = T(0);
+    for (int k = 0; k < kPackedStride - kPackedHeader; k++)
+      column[kPackedHeader + k] = k < C ? sums[k] : T(0);
+  }
+};
+
 // kCount: the value of a pixel is the number of splats that are composited.
 enum class Blend { kFrontToBack, kAdditive, kCount };
 
@@ -270,10 +294,10 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
 
 // grad_alpha may be null. image and grad_image contain only the channels of this pass (at most
 // kGroupChannels).
+// The slot of instance i is slots[i].
 template <class V, int C, Blend kBlend, class T = typename V::Scalar>
-void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_t* instance_slot,
-                   const T* image, const T* grad_image, const T* alpha, const T* grad_alpha,
-                   T* slots) {
+void backward_tile(const Frame<V>& f, int64_t index, int channels, const T* image,
+                   const T* grad_image, const T* alpha, const T* grad_alpha, Slot<T>* slots) {
   using TileV = Tile<V>;
   using Bits = typename TileV::Bits;
   constexpr int B = TileV::kBlocks;
@@ -309,18 +333,9 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
   uint32_t i = f.tile_start[index];
   RowTerms<V> rows;
   for (; i < end; i++) {
-    if (i + 12 < end) {
-      prefetch(&f.records[f.instance_splat[i + 12]]);
-      // Slots are written in random order, and stores complete in program order: one slot that is
-      // not in the cache delays all stores behind it.
-      prefetch_to_write(slots + int64_t(instance_slot[i + 12]) * kSlotWidth);
-    }
-    T* slot = slots + int64_t(instance_slot[i]) * kSlotWidth;
-    Bits touched = f.instance_blocks[i];
-    if (!touched) {
-      for (int k = 0; k < kSlotWidth; k += V::width) V(0.f).store(slot + k);
-      continue;
-    }
+    if (i + 12 < end) prefetch(&f.records[f.instance_splat[i + 12]]);
+    const Bits touched = f.instance_blocks[i];
+    if (!touched) continue;
     const SplatRecord<T>& r = f.records[f.instance_splat[i]];
     rows.set(r.terms, tile);
     const T x0 = r.terms.mean_x - (T(tile.x) + T(0.5));
@@ -364,11 +379,41 @@ void backward_tile(const Frame<V>& f, int64_t index, int channels, const uint32_
       sums[C] += q0, sums[C + 1] += qx, sums[C + 2] += qy;
       sums[C + 3] += qx * dx, sums[C + 4] += qy * dx, sums[C + 5] += qyy;
     }
-    sum_lanes<C + 6>(sums, slot);
+    alignas(64) T total[16];
+    sum_lanes<C + 6>(sums, total);
+    slots[i].template set<C>(r, total);
   }
-  for (; i < f.tile_start[index + 1]; i++) {
-    T* slot = slots + int64_t(instance_slot[i]) * kSlotWidth;
-    for (int k = 0; k < kSlotWidth; k += V::width) V(0.f).store(slot + k);
+}
+
+// Adds the slots of a band of tiles to the rows of those splats whose part is `part`. The number of
+// parts is a power of two.
+template <class V, class T = typename V::Scalar>
+void add_slots(const RasterizeBackwardParams<T>& p, int64_t begin, int64_t end, uint32_t parts,
+               uint32_t part, const Slot<T>* slots) {
+  constexpr int kSplatsOfPart = 64;  // adjacent rows
+  const Frame<V> f(p.frame);
+  const int64_t stride = p.frame.stride, *columns = p.frame.columns;
+  const int channels = int(p.channels);
+  bool in_place = true;  // whether the colours of the slots are in the columns of the rows
+  for (int k = 0; k < channels; k++) in_place &= columns[k] == kPackedHeader + k;
+  for (int64_t tile = begin; tile < end; tile++) {
+    const uint32_t last = f.tile_end[tile];
+    for (uint32_t i = f.tile_start[tile]; i < last; i++) {
+      if (i + 16 < last) prefetch_to_write(p.grad_packed + f.instance_splat[i + 16] * stride);
+      const int64_t splat = f.instance_splat[i];
+      if ((uint32_t(splat) / kSplatsOfPart & (parts - 1)) != part || !f.instance_blocks[i]) continue;
+      const T* slot = slots[i].column;
+      T* row = p.grad_packed + splat * stride;
+      if (in_place) {
+        for (int k = 0; k < kPackedStride; k += V::width)
+          (V::load(row + k) + V::load(slot + k)).store(row + k);
+      } else {
+        for (int k = 0; k < kPackedHeader - 2; k++) row[k] += slot[k];
+        for (int k = 0; k < channels; k++) row[columns[k]] += slot[kPackedHeader + k];
+      }
+      if (p.abs_grad)
+        for (int k = 0; k < 2; k++) p.abs_grad[2 * splat + k] += abs(slot[k]);
+    }
   }
 }
 
@@ -388,11 +433,11 @@ int64_t background_rows(const BackgroundBackwardParams<T>& p) {
 }
 
 template <class F>
-void for_tiles(int64_t tiles, F&& body) {
+void for_tiles(int64_t begin, int64_t end, F&& body) {
   constexpr int64_t kTilesPerTask = 4;  // adjacent tiles share splats in the cache
-  parallel_for((tiles + kTilesPerTask - 1) / kTilesPerTask, [&](int64_t task) {
-    for (int64_t t = task * kTilesPerTask; t < tiles && t < (task + 1) * kTilesPerTask; t++)
-      body(t);
+  parallel_for((end - begin + kTilesPerTask - 1) / kTilesPerTask, [&](int64_t task) {
+    const int64_t first = begin + task * kTilesPerTask;
+    for (int64_t t = first; t < end && t < first + kTilesPerTask; t++) body(t);
   });
 }
 
@@ -403,7 +448,7 @@ int64_t forward(const RasterizeForwardParams<T>& p) {
                                                          : forward_tile<V, 4, Blend::kAdditive>)
                                       : (p.channels <= 3 ? forward_tile<V, 3, Blend::kFrontToBack>
                                                          : forward_tile<V, 4, Blend::kFrontToBack>);
-  for_tiles(p.n, [&](int64_t t) { tile(f, t, int(p.channels), p.background, p.image, p.alpha); });
+  for_tiles(0, p.n, [&](int64_t t) { tile(f, t, int(p.channels), p.background, p.image, p.alpha); });
   return 0;
 }
 
@@ -411,7 +456,7 @@ template <class V, class T = typename V::Scalar>
 int64_t count(const RasterizeCountParams<T>& p) {
   const Frame<V> f(p.frame);
   const T nothing_behind = 0;
-  for_tiles(p.n, [&](int64_t t) {
+  for_tiles(0, p.n, [&](int64_t t) {
     forward_tile<V, 1, Blend::kCount, T>(f, t, 1, &nothing_behind, p.counts, nullptr);
   });
   return 0;
@@ -425,10 +470,25 @@ int64_t backward(const RasterizeBackwardParams<T>& p) {
                                             : backward_tile<V, 4, Blend::kAdditive>)
                          : (p.channels <= 3 ? backward_tile<V, 3, Blend::kFrontToBack>
                                             : backward_tile<V, 4, Blend::kFrontToBack>);
-  for_tiles(p.n, [&](int64_t t) {
-    tile(f, t, int(p.channels), p.instance_slot, p.image, p.grad_image, p.alpha, p.grad_alpha,
-         p.slots);
-  });
+  int64_t largest = 0;  // number of instances of a tile
+  for (int64_t t = 0; t < p.n; t++)
+    largest = std::max(largest, int64_t(f.tile_start[t + 1]) - f.tile_start[t]);
+  const int64_t capacity = std::max(largest, kBandSlots * pool_size());
+  const int64_t count = std::min(capacity, int64_t(f.tile_start[p.n]));
+  const std::unique_ptr<Slot<T>[]> memory(new Slot<T>[size_t(count)]);
+  uint32_t parts = 1;
+  while (int(parts) < pool_size()) parts *= 2;
+  for (int64_t begin = 0, end; begin < p.n; begin = end) {
+    const int64_t first = f.tile_start[begin];
+    for (end = begin + 1; end < p.n && f.tile_start[end + 1] - first <= capacity;) end++;
+    Slot<T>* slots = memory.get() - first;
+    for_tiles(begin, end, [&](int64_t t) {
+      tile(f, t, int(p.channels), p.image, p.grad_image, p.alpha, p.grad_alpha, slots);
+    });
+    parallel_for(parts, [&](int64_t part) {
+      add_slots<V>(p, begin, end, parts, uint32_t(part), slots);
+    });
+  }
   return 0;
 }
 
@@ -449,5 +509,5 @@ SNOW_ENTRY(background_bwd_f64, BackgroundBackwardParams<double>) { return backgr
 // Bytes of instance_blocks per instance.
 SNOW_ENTRY(rasterize_block_bytes, SizeQueryParams) { return (void)p, sizeof(Tile<VecF>::Bits); }
 SNOW_ENTRY(rasterize_block_bytes_f64, SizeQueryParams) { return (void)p, sizeof(Tile<VecD>::Bits); }
-// 1: gradients are summed in slots, in a fixed order; 0: they are added atomically.
-SNOW_ENTRY(rasterize_sums_in_order, SizeQueryParams) { return (void)p, 1; }
+// 1: the caller allocates slots for all instances; 0: rasterize_bwd adds to the rows of the splats.
+SNOW_ENTRY(rasterize_has_slots, SizeQueryParams) { return (void)p, 0; }

@@ -3,8 +3,7 @@
 //   splats_sort      a stable radix sort by depth key: splats of equal depth stay in row order
 //   tiles_count      the exact set of tiles that each splat touches; the number of splats per tile
 //   tiles_fill       the instances, sorted by tile; within a tile, they stay in depth order
-// In the backward pass, splats_reduce sums the gradients of a splat over its tiles. No result
-// depends on the number of threads.
+// No result depends on the number of threads.
 #include <cstring>
 #include <vector>
 
@@ -18,7 +17,6 @@ namespace {
 
 constexpr int64_t kBlock = 2048;
 constexpr int64_t kSerialBelow = 8000;  // splats; below this, one part is faster than several
-constexpr uint32_t kPrefetched = 16;    // largest number of slots of a splat that are prefetched
 
 int64_t part_count(int64_t m) { return m < kSerialBelow ? 1 : pool_size(); }
 
@@ -55,6 +53,7 @@ int64_t prepare(const SplatsPrepareParams<T>& p) {
       for (int l = 0; l < count; l++) {
         SplatRecord<T>& r = records[i + l];
         set_colors(r, packed + (i + l) * stride, p.columns);
+        r.opacity = packed[(i + l) * stride + 5];
         const bool on = visible >> l & 1;
         r.tile_x0 = on ? uint16_t(int(rect[0][l]) / kTile) : 1;
         r.tile_y0 = on ? uint16_t(int(rect[1][l]) / kTile) : 1;
@@ -187,17 +186,15 @@ SNOW_INLINE void for_each_tile_of_large(const SplatRecord<T>& r, int64_t tiles_x
 }
 
 // The data that tiles_count passes to tiles_fill, in one block of memory: the tiles of every splat,
-// the first slot of every part, and for each part and tile a count.
+// and for each part and tile a count.
 struct TileWork {
   TileSpan* spans;
-  uint32_t* part_slots;
   uint32_t* counts;
 
-  TileWork(void* memory, int64_t m, int64_t parts)
-      : spans(static_cast<TileSpan*>(memory)), part_slots((uint32_t*)(spans + m)),
-        counts(part_slots + parts) {}
+  TileWork(void* memory, int64_t m)
+      : spans(static_cast<TileSpan*>(memory)), counts((uint32_t*)(spans + m)) {}
   static int64_t bytes(int64_t m, int64_t tiles, int64_t parts) {
-    return m * int64_t(sizeof(TileSpan)) + parts * (tiles + 1) * int64_t(sizeof(uint32_t));
+    return m * int64_t(sizeof(TileSpan)) + parts * tiles * int64_t(sizeof(uint32_t));
   }
 };
 
@@ -219,14 +216,13 @@ int64_t count_tiles(const TilesCountParams<T>& p) {
   const uint32_t* order = p.binning.order;
   const SplatRecord<T>* records = p.binning.records;
   uint32_t* tile_start = p.binning.tile_start;
-  const TileWork work(p.binning.workspace, m, parts);
+  const TileWork work(p.binning.workspace, m);
   TileSpan* spans = work.spans;
-  uint32_t *part_slots = work.part_slots, *counts = work.counts;
+  uint32_t* counts = work.counts;
   const SmallOffsets offsets(tiles_x);
   parallel_for(parts, [&](int64_t part) {
     uint32_t* count = counts + part * tiles;
     std::memset(count, 0, sizeof(uint32_t) * size_t(tiles));
-    uint32_t total = 0;
     const Range range = split_range(m, parts, part);
     for (int64_t i = range.begin; i < range.end; i++) {
       if (i + 12 < range.end) prefetch(&records[order[i + 12]]);
@@ -240,14 +236,12 @@ int64_t count_tiles(const TilesCountParams<T>& p) {
                                        ((1u << (w * h)) - 1));
         const int64_t first = r.tile_y0 * tiles_x + r.tile_x0;
         for (uint32_t b = s.bits; b; b &= b - 1) count[first + offsets.at[w][__builtin_ctz(b)]]++;
-        total += uint32_t(__builtin_popcount(s.bits));
       } else if (w > 0) {
         s.large = 1;
-        for_each_tile_of_large<V>(r, tiles_x, [&](int64_t tile) { count[tile]++, total++; });
+        for_each_tile_of_large<V>(r, tiles_x, [&](int64_t tile) { count[tile]++; });
       }
       spans[i] = s;
     }
-    part_slots[part] = total;
   });
   uint32_t sum = 0;
   for (int64_t tile = 0; tile < tiles; tile++) {
@@ -259,11 +253,6 @@ int64_t count_tiles(const TilesCountParams<T>& p) {
     }
   }
   tile_start[tiles] = sum;
-  uint32_t slots = 0;
-  for (int64_t part = 0; part < parts; part++) {
-    const uint32_t n = part_slots[part];
-    part_slots[part] = slots, slots += n;
-  }
   return *p.required = sum;
 }
 
@@ -273,92 +262,27 @@ int64_t fill_tiles(const TilesFillParams<T>& p) {
   const int64_t tiles = tiles_x * p.binning.tiles_y;
   const uint32_t* order = p.binning.order;
   const SplatRecord<T>* records = p.binning.records;
-  uint32_t *instance_splat = p.instance_splat, *instance_slot = p.instance_slot;
-  uint32_t* slot_range = p.slot_range;
-  const TileWork work(p.binning.workspace, m, parts);
+  uint32_t* instance_splat = p.instance_splat;
+  const TileWork work(p.binning.workspace, m);
   TileSpan* spans = work.spans;
-  uint32_t *part_slots = work.part_slots, *counts = work.counts;
+  uint32_t* counts = work.counts;
   const SmallOffsets offsets(tiles_x);
   parallel_for(parts, [&](int64_t part) {
-    uint32_t *next = counts + part * tiles, slot = part_slots[part];
+    uint32_t* next = counts + part * tiles;
     const Range range = split_range(m, parts, part);
     for (int64_t i = range.begin; i < range.end; i++) {
-      const uint32_t splat = order[i], first_slot = slot;
+      const uint32_t splat = order[i];
       const TileSpan s = spans[i];
       if (!s.large) {
         const int64_t first = s.y0 * tiles_x + s.x0;
-        for (uint32_t b = s.bits; b; b &= b - 1) {
-          const uint32_t at = next[first + offsets.at[s.width][__builtin_ctz(b)]]++;
-          instance_splat[at] = splat, instance_slot[at] = slot++;
-        }
+        for (uint32_t b = s.bits; b; b &= b - 1)
+          instance_splat[next[first + offsets.at[s.width][__builtin_ctz(b)]]++] = splat;
       } else {
-        for_each_tile_of_large<V>(records[splat], tiles_x, [&](int64_t tile) {
-          const uint32_t at = next[tile]++;
-          instance_splat[at] = splat, instance_slot[at] = slot++;
-        });
+        for_each_tile_of_large<V>(records[splat], tiles_x,
+                                  [&](int64_t tile) { instance_splat[next[tile]++] = splat; });
       }
-      slot_range[2 * splat] = first_slot, slot_range[2 * splat + 1] = slot;
     }
   });
-  return 0;
-}
-
-// Sums the slots of each splat in slot order. Writes the sum to the splat's row of the packed
-// gradient; for further groups of channels, adds it to this row.
-template <class V, bool kAbsGrad, class T = typename V::Scalar>
-void sum_slots(const SplatsReduceParams<T>& p) {
-  const int64_t m = p.n, stride = p.stride, channels = p.channels;
-  const T* slots = p.slots;
-  const uint32_t* slot_range = p.slot_range;
-  const bool add = p.add != 0;
-  constexpr int W = V::width, kVectors = kSlotWidth / W;
-  const int base = channels <= 3 ? 3 : 4;
-  parallel_for((m + kBlock - 1) / kBlock, [&](int64_t block) {
-    const int64_t begin = block * kBlock, end = begin + kBlock < m ? begin + kBlock : m;
-    for (int64_t i = begin; i < end; i++) {
-      if (i + 20 < end) {
-        const uint32_t first = slot_range[2 * (i + 20)], past = slot_range[2 * (i + 20) + 1];
-        const uint32_t last = past - first < kPrefetched ? past : first + kPrefetched;
-        // Most splats have few slots: the first four are prefetched without a branch.
-        for (uint32_t s = first; s < first + 4; s++) prefetch(slots + int64_t(s) * kSlotWidth);
-        for (uint32_t s = first + 4; s < last; s++) prefetch(slots + int64_t(s) * kSlotWidth);
-      }
-      V sum[kVectors];
-      for (int k = 0; k < kVectors; k++) sum[k] = V(0.f);
-      const T *row = p.packed + i * stride, *conic = row + 2;
-      T d_mean[2], d_conic[3], d_opacity, abs_sum[2] = {T(0), T(0)};
-      for (int64_t s = slot_range[2 * i]; s < slot_range[2 * i + 1]; s++) {
-        const T* slot = slots + s * kSlotWidth;
-        for (int k = 0; k < kVectors; k++) sum[k] += V::load(slot + k * W);
-        if constexpr (kAbsGrad) {
-          mean_vjp(conic, slot[base + 1], slot[base + 2], d_mean);
-          abs_sum[0] += abs(d_mean[0]), abs_sum[1] += abs(d_mean[1]);
-        }
-      }
-      if constexpr (kAbsGrad) p.abs_grad[2 * i] += abs_sum[0], p.abs_grad[2 * i + 1] += abs_sum[1];
-      alignas(64) T total[kSlotWidth];
-      for (int k = 0; k < kVectors; k++) sum[k].store(total + k * W);
-      const T* q = total + base;
-      T* g = p.grad_packed + i * stride;
-      if (!add)
-        for (int64_t k = 0; k < stride; k += W) V(0.f).store(g + k);
-      if (slot_range[2 * i] == slot_range[2 * i + 1]) continue;
-      splat_terms_vjp<T>(conic, row[5], {q[0], q[1], q[2], q[3], q[4], q[5]}, d_mean, d_conic,
-                         d_opacity);
-      g[0] += d_mean[0], g[1] += d_mean[1];
-      g[2] += d_conic[0], g[3] += d_conic[1], g[4] += d_conic[2];
-      g[5] += d_opacity;
-      for (int k = 0; k < channels; k++) g[p.columns[k]] += total[k];
-    }
-  });
-}
-
-template <class V, class T = typename V::Scalar>
-int64_t reduce(const SplatsReduceParams<T>& p) {
-  if (p.abs_grad)
-    sum_slots<V, true>(p);
-  else
-    sum_slots<V, false>(p);
   return 0;
 }
 
@@ -383,8 +307,6 @@ SNOW_ENTRY(tiles_count, TilesCountParams<float>) { return count_tiles<VecF>(p); 
 SNOW_ENTRY(tiles_count_f64, TilesCountParams<double>) { return count_tiles<VecD>(p); }
 SNOW_ENTRY(tiles_fill, TilesFillParams<float>) { return fill_tiles<VecF>(p); }
 SNOW_ENTRY(tiles_fill_f64, TilesFillParams<double>) { return fill_tiles<VecD>(p); }
-SNOW_ENTRY(splats_reduce, SplatsReduceParams<float>) { return reduce<VecF>(p); }
-SNOW_ENTRY(splats_reduce_f64, SplatsReduceParams<double>) { return reduce<VecD>(p); }
 
 // Bytes of a record.
 SNOW_ENTRY(splat_record_bytes, SizeQueryParams) { return (void)p, sizeof(SplatRecord<float>); }

@@ -23,7 +23,7 @@ KERNELS: dict[str, Kernel] = {
 }
 
 
-def _sums_in_order(run: Run, suffix: str, query: SizeQueryParams) -> int:
+def _has_slots(run: Run, suffix: str, query: SizeQueryParams) -> int:
     """Sums in a fixed order need memory and time, so they are used only if torch is set to it."""
     return int(torch.are_deterministic_algorithms_enabled())
 
@@ -35,5 +35,5 @@ def _block_bytes(run: Run, suffix: str, query: SizeQueryParams) -> int:
 
 SEQUENCES: dict[str, Callable[..., int]] = {
     "rasterize_block_bytes": _block_bytes,
-    "rasterize_sums_in_order": _sums_in_order,
+    "rasterize_has_slots": _has_slots,
 }
