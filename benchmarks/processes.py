@@ -69,38 +69,16 @@ def work(size: str, batch: int, folder: Path) -> None:
     """One process: prints its result as a line of JSON."""
     ops.set_num_threads(max(1, (os.cpu_count() or 1) // processes.local_count()))
     with processes.joined(torch.device("cpu")) as shards:
-        base = resident_bytes()  # Python and its libraries
-        # Only process 0 creates the workload; this is not part of the measurement.
-        scene = workload(size) if shards.rank == 0 else None
-        camera = workload("tiny").camera
-        _, width, height = SIZES[size]
-        camera = camera.scaled(width, height)
-        views = [
-            View(str(i), beside(camera, i), ImageSource(folder / f"{i}.png", width, height))
-            for i in range(batch)
-        ]
-        dataset = Dataset(views, [], Points(torch.zeros(1, 3), torch.zeros(1, 3).byte()), 5.0)
-        updates = WARM_UP + MEASURED
-        config = recipe(
-            *("default",),
-            batch=batch,
-            iterations=100 * batch,
-            densify_from=1.0,
-            max_gaussians=SIZES[size][0],
-            coarse_to_fine=(0, 0),
-            sh_interval=0,
-            leave_out_after=0,
-            near_limit=0.0,
-        )
-        initial = None if scene is None else scene.gaussians
-        trainer = Trainer(dataset, config, initial=initial, shards=shards)
-        del scene, initial
+        _trainer("tiny", batch, folder / "tiny", shards).run(until=WARM_UP * batch)
+        reset_peak()
+        base = resident_bytes()  # Python and its libraries, which are loaded now
+        trainer = _trainer(size, batch, folder, shards)
         gc.collect()
         trainer.run(until=WARM_UP * batch)
         reset_peak()
         seconds, sent, expected = [], [], []
-        for update in range(WARM_UP, updates):
-            rows = _rows(trainer, views, shards)
+        for update in range(WARM_UP, WARM_UP + MEASURED):
+            rows = _rows(trainer, shards)
             before = _sent(shards)
             start = time.perf_counter()
             trainer.run(until=(update + 1) * batch)
@@ -120,11 +98,36 @@ def work(size: str, batch: int, folder: Path) -> None:
     print(json.dumps(result), flush=True)
 
 
-def _rows(trainer: Trainer, views: list[View], shards: Shards) -> np.ndarray:
+def _trainer(size: str, batch: int, folder: Path, shards: Shards) -> Trainer:
+    """The training of a workload with the photos of `write_photos`."""
+    # Only process 0 creates the workload; this is not part of the measurement.
+    scene = workload(size) if shards.rank == 0 else None
+    _, width, height = SIZES[size]
+    camera = workload("tiny").camera.scaled(width, height)
+    views = [
+        View(str(i), beside(camera, i), ImageSource(folder / f"{i}.png", width, height))
+        for i in range(batch)
+    ]
+    dataset = Dataset(views, [], Points(torch.zeros(1, 3), torch.zeros(1, 3).byte()), 5.0)
+    config = recipe(
+        *("default",),
+        batch=batch,
+        iterations=100 * batch,
+        densify_from=1.0,
+        max_gaussians=SIZES[size][0],
+        coarse_to_fine=(0, 0),
+        sh_interval=0,
+        leave_out_after=0,
+        near_limit=0.0,
+    )
+    initial = None if scene is None else scene.gaussians
+    return Trainer(dataset, config, initial=initial, shards=shards)
+
+
+def _rows(trainer: Trainer, shards: Shards) -> np.ndarray:
     """(N, V): the number of splats of each process in each view of the next batch."""
-    order = trainer._queue.order[: len(views)]
-    if not order:
-        order = list(range(len(views)))
+    views = trainer.dataset.train
+    order = trainer._queue.order[: len(views)] or range(len(views))
     counts = [len(project(trainer.gaussians, trainer.poses.camera(i))) for i in order]
     return shards.table(torch.tensor(counts)).numpy()
 
@@ -162,6 +165,7 @@ def measure(size: str, batch: int, count: int, folder: Path) -> list[dict[str, f
 
 def write_photos(folder: Path, size: str, batch: int) -> None:
     """Photos of the size of a workload: smooth noise."""
+    folder.mkdir(exist_ok=True)
     _, width, height = SIZES[size]
     random = np.random.default_rng(0)
     for i in range(batch):
@@ -182,6 +186,7 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
         write_photos(folder, flags.size, flags.batch)
+        write_photos(folder / "tiny", "tiny", flags.batch)
         print("processes  Gaussians each  state MB  peak MB  s/update  sent MB  model MB")
         for count in flags.processes:
             for each in measure(flags.size, flags.batch, count, folder):

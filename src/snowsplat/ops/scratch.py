@@ -1,9 +1,11 @@
-"""Reuses memory: `empty` returns tensors from a pool of blocks.
+"""Reuses memory: `empty` returns tensors from a pool.
 
 Every frame needs the same few large arrays. New memory from the operating system causes a page
-fault every 4 kB; for the arrays of a sort, this takes longer than the sort itself. Therefore a
-block of memory returns to the pool when its last tensor is deleted, and the next frame uses it.
-Large blocks request huge pages.
+fault every 4 kB; for the arrays of a sort, this takes longer than the sort itself. Therefore the
+memory of a tensor returns to the pool when its last reference is deleted, and the next tensors use
+it. The pool is one segment of memory, which is divided as required: free parts that are adjacent
+become one. So it takes little more than the tensors that exist at the same time. If it is too small,
+a larger one replaces it. Segments request huge pages.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from __future__ import annotations
 import math
 import mmap
 import threading
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -19,33 +22,60 @@ from torch import Tensor
 
 _HUGE = 2 << 20  # bytes of a huge page
 _PAGE = 4096
-_KEEP = 24  # maximum number of free blocks; the two passes of a frame need fewer
-# Blocks begin at different offsets in a page. Otherwise the distance between a value and its
+_SMALLEST = 256 << 20  # bytes of a segment; the system gives memory for those that are written
+_LINE = 64  # bytes; tensors begin at multiples of it
+# Tensors begin at different offsets in a page. Otherwise the distance between a value and its
 # moments could be a multiple of 4 kB, and loads would wait for stores to addresses with the same
 # lower bits.
-_STAGGER = 17 * 64
+_STAGGER = 17 * _LINE
 
-_free: list[np.ndarray] = []
-_made = 0  # number of blocks created
+
+class _Segment:
+    """Contiguous memory. ``holes`` are its free parts, each with its begin and end, ascending."""
+
+    def __init__(self, size: int) -> None:
+        self.memory = _make(size)
+        self.holes = [(0, len(self.memory))]
+
+    def take(self, length: int) -> int | None:
+        """The begin of a new part, in the smallest hole that suffices; None if there is none."""
+        suitable = [hole for hole in self.holes if hole[1] - hole[0] >= length]
+        if not suitable:
+            return None
+        begin, end = hole = min(suitable, key=lambda hole: hole[1] - hole[0])
+        rest = [(begin + length, end)] if begin + length < end else []
+        position = self.holes.index(hole)
+        self.holes[position : position + 1] = rest
+        return begin
+
+    def give(self, begin: int, end: int) -> None:
+        """Free a part."""
+        holes: list[tuple[int, int]] = []
+        for low, high in sorted([*self.holes, (begin, end)]):
+            if holes and holes[-1][1] == low:
+                low = holes.pop()[0]
+            holes.append((low, high))
+        self.holes = holes
+
+
+_pool: _Segment | None = None
+# Parts to be freed. A tensor may be deleted at any time, also while this thread has the lock.
+_returned: deque[tuple[_Segment, int, int]] = deque()
+_made = 0  # number of calls of `_make`
 _lock = threading.Lock()
 
 
-class _BlockInUse(np.ndarray):
-    """Memory of a block in use. The tensor refers to this array; its deletion frees the block."""
+class _InUse(np.ndarray):
+    """Memory in use. The tensor refers to this array; its deletion frees the memory."""
 
-    block: np.ndarray | None = None
+    part: tuple[_Segment, int, int] | None = None
 
     def __array_finalize__(self, source: Any) -> None:
-        self.block = None  # a view does not free the block
+        self.part = None  # a view does not free the memory
 
     def __del__(self) -> None:
-        if self.block is None:
-            return
-        with _lock:
-            _free.append(self.block)
-            _free.sort(key=len)
-            # The smallest blocks are removed first: they are the fastest to allocate again.
-            del _free[: max(0, len(_free) - _KEEP)]
+        if self.part is not None and self.part[0] is _pool:
+            _returned.append(self.part)
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
@@ -58,9 +88,9 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | Non
     size = _bytes(shape, dtype)
     if size < _PAGE:
         return torch.empty(shape, dtype=dtype)
-    block = _take(size)
-    array = block[:size].view(_BlockInUse)
-    array.block = block
+    segment, begin, end = part = _take(size)
+    array = segment.memory[begin : begin + size].view(_InUse)
+    array.part = part
     return torch.from_numpy(array).view(dtype).view(shape)
 
 
@@ -68,18 +98,26 @@ def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
     return math.prod(shape) * dtype.itemsize
 
 
-def _take(size: int) -> np.ndarray:
-    """The smallest free block of at least `size` bytes that is not several times too large."""
+def _take(size: int) -> tuple[_Segment, int, int]:
+    """A part of at least `size` bytes: its segment, begin and end."""
+    global _pool
+    length = -(-size // _LINE) * _LINE + _STAGGER
     with _lock:
-        for i, block in enumerate(_free):
-            if size <= len(block) <= 4 * size + _HUGE:
-                return _free.pop(i)
-    # 25% more than requested, so that a growing scene does not need a new block every frame.
-    return _make(size + size // 4)
+        while _returned:
+            segment, begin, end = _returned.popleft()
+            segment.give(begin, end)
+        found = None if _pool is None else _pool.take(length)
+        if _pool is None or found is None:
+            # The system gets the memory of the old segment back when its last tensor is deleted.
+            old = 0 if _pool is None else len(_pool.memory)
+            _pool = _Segment(max(2 * old, old + 2 * length, _SMALLEST))
+            found = _pool.take(length)
+        assert found is not None
+        return _pool, found, found + length
 
 
 def _make(size: int) -> np.ndarray:
-    """A new block of at least `size` bytes."""
+    """New memory of at least `size` bytes."""
     global _made
     _made += 1
     unit = _PAGE if size < _HUGE else _HUGE
@@ -94,9 +132,9 @@ def _make(size: int) -> np.ndarray:
 def take_rows(tensor: Tensor, index: Tensor) -> Tensor:
     """`tensor[index]` along the first dimension, for long-lived tensors: parameters, moments.
 
-    Like the blocks of the pool, the memory has huge pages, and blocks begin at different offsets in
-    a page. But it is not part of the pool: it is returned to the operating system, because the next
-    size will be different.
+    Like the pool, the memory has huge pages, and tensors begin at different offsets in a page. But it
+    is not part of the pool: it is returned to the operating system, because the next size will be
+    different.
     """
     if tensor.requires_grad or tensor.device.type != "cpu" or index.dtype == torch.bool:
         return tensor[index]

@@ -58,8 +58,8 @@ def batch_gradients(
         exposure: the exposures of the photos.
         loss_of: the loss of an image (H, W, 3) of a view whose photo this process has.
     """
-    views = rounds(batch, shards.size)
     found: list[tuple[Splats2D, BatchView]] = []
+    views = rounds(batch, shards.size)
     for number, group in enumerate(views):
         splats = [project(gaussians, each.camera, sh_degree) for each in group]
         if shards.size > 1:
@@ -70,11 +70,20 @@ def batch_gradients(
             own = group[shards.rank]
             exposure.apply(blended, own.index)
             with torch.enable_grad():  # `project` is outside: the optimiser computes its gradient
-                image = runner.rasterize(blended, own.camera, own.background)
-                loss = loss_of(image, own)
-        runner.backward(loss, share=1.0 / len(batch), last=number == len(views) - 1)
+                loss = loss_of(runner.rasterize(blended, own.camera, own.background), own)
+        runner.backward(loss, last=number == len(views) - 1)
+        del loss  # and with it the image and the tiles
         if blended is not None:
+            _multiply_gradient(blended, 1.0 / len(batch))
             exposure.after_backward(blended)
         shards.return_gradients(blended, splats, absolute=runner.abs_grad)
         found += zip(splats, group, strict=True)
     return [runner.gradient(splats, each.camera, sh_degree) for splats, each in found]
+
+
+def _multiply_gradient(splats: Splats2D, factor: float) -> None:
+    """In place: a multiple of the gradient of the image would need memory."""
+    assert splats.packed.grad is not None
+    for gradient in (splats.packed.grad, splats.abs_grad):
+        if gradient is not None and factor != 1.0:
+            gradient *= factor

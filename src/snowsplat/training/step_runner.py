@@ -119,12 +119,11 @@ class StepRunner:
         image, _, _ = ops.rasterize(splats, *size, background, capacity=self.capacity)
         return image
 
-    def backward(self, loss: Tensor | None, *, share: float = 1.0, last: bool = True) -> None:
+    def backward(self, loss: Tensor | None, *, last: bool = True) -> None:
         """Run the backward pass from the loss of a view to its splats.
 
         Args:
             loss: (); None if this process has no view in this round.
-            share: the weight of the view in the loss of the batch.
             last: whether this is the last view of the step. Then the read-back starts, before the
                 backward pass.
         """
@@ -134,7 +133,7 @@ class StepRunner:
         if last:
             self._start_readback()
         if loss is not None:
-            loss.backward(None if share == 1.0 else torch.full_like(loss, share))
+            loss.backward()
 
     def _start_readback(self) -> None:
         device = self._nonfinite_rows.device
