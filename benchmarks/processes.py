@@ -159,6 +159,7 @@ def ranks(command: list[str], count: int) -> list[str]:
 
 def measure(size: str, batch: int, count: int, folder: Path) -> list[dict[str, float]]:
     """The results of all processes, for photos from `write_photos`."""
+    write_photos(folder / "tiny", "tiny", batch)
     flags = ["--size", size, "--batch", str(batch), "--worker", str(folder)]
     return [json.loads(line) for line in ranks([sys.executable, __file__, *flags], count)]
 
@@ -186,7 +187,6 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
         write_photos(folder, flags.size, flags.batch)
-        write_photos(folder / "tiny", "tiny", flags.batch)
         print("processes  Gaussians each  state MB  peak MB  s/update  sent MB  model MB")
         for count in flags.processes:
             for each in measure(flags.size, flags.batch, count, folder):

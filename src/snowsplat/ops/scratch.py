@@ -4,8 +4,8 @@ Every frame needs the same few large arrays. New memory from the operating syste
 fault every 4 kB; for the arrays of a sort, this takes longer than the sort itself. Therefore the
 memory of a tensor returns to the pool when its last reference is deleted, and the next tensors use
 it. The pool is one segment of memory, which is divided as required: free parts that are adjacent
-become one. So it takes little more than the tensors that exist at the same time. If it is too small,
-a larger one replaces it. Segments request huge pages.
+become one. So it takes little more than the tensors that exist at the same time. If it is too
+small, a larger one replaces it. Segments request huge pages.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | Non
     size = _bytes(shape, dtype)
     if size < _PAGE:
         return torch.empty(shape, dtype=dtype)
-    segment, begin, end = part = _take(size)
+    segment, begin, _ = part = _take(size)
     array = segment.memory[begin : begin + size].view(_InUse)
     array.part = part
     return torch.from_numpy(array).view(dtype).view(shape)
@@ -132,9 +132,9 @@ def _make(size: int) -> np.ndarray:
 def take_rows(tensor: Tensor, index: Tensor) -> Tensor:
     """`tensor[index]` along the first dimension, for long-lived tensors: parameters, moments.
 
-    Like the pool, the memory has huge pages, and tensors begin at different offsets in a page. But it
-    is not part of the pool: it is returned to the operating system, because the next size will be
-    different.
+    Like the pool, the memory has huge pages, and tensors begin at different offsets in a page. But
+    it is not part of the pool: it is returned to the operating system, because the next size will
+    be different.
     """
     if tensor.requires_grad or tensor.device.type != "cpu" or index.dtype == torch.bool:
         return tensor[index]

@@ -401,7 +401,8 @@ void add_slots(const RasterizeBackwardParams<T>& p, int64_t begin, int64_t end, 
     for (uint32_t i = f.tile_start[tile]; i < last; i++) {
       if (i + 16 < last) prefetch_to_write(p.grad_packed + f.instance_splat[i + 16] * stride);
       const int64_t splat = f.instance_splat[i];
-      if ((uint32_t(splat) / kSplatsOfPart & (parts - 1)) != part || !f.instance_blocks[i]) continue;
+      if ((uint32_t(splat) / kSplatsOfPart & (parts - 1)) != part || !f.instance_blocks[i])
+        continue;
       const T* slot = slots[i].column;
       T* row = p.grad_packed + splat * stride;
       if (in_place) {
@@ -448,7 +449,8 @@ int64_t forward(const RasterizeForwardParams<T>& p) {
                                                          : forward_tile<V, 4, Blend::kAdditive>)
                                       : (p.channels <= 3 ? forward_tile<V, 3, Blend::kFrontToBack>
                                                          : forward_tile<V, 4, Blend::kFrontToBack>);
-  for_tiles(0, p.n, [&](int64_t t) { tile(f, t, int(p.channels), p.background, p.image, p.alpha); });
+  for_tiles(0, p.n,
+            [&](int64_t t) { tile(f, t, int(p.channels), p.background, p.image, p.alpha); });
   return 0;
 }
 
@@ -485,9 +487,8 @@ int64_t backward(const RasterizeBackwardParams<T>& p) {
     for_tiles(begin, end, [&](int64_t t) {
       tile(f, t, int(p.channels), p.image, p.grad_image, p.alpha, p.grad_alpha, slots);
     });
-    parallel_for(parts, [&](int64_t part) {
-      add_slots<V>(p, begin, end, parts, uint32_t(part), slots);
-    });
+    parallel_for(parts,
+                 [&](int64_t part) { add_slots<V>(p, begin, end, parts, uint32_t(part), slots); });
   }
   return 0;
 }
