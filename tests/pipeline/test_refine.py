@@ -1,12 +1,15 @@
 """A decimated scene is trained again on its photos."""
 
 import pytest
+import torch
 
 from snowsplat.data import load_dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.convert import Edits, convert
+from snowsplat.pipeline.scene_source import cameras_of, training_folder
 from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.scene.simplify import simplify
 from snowsplat.util.errors import SettingError
 
 
@@ -32,3 +35,23 @@ def test_edits_that_move_the_scene_are_refused(dataset, tmp_path):
         with pytest.raises(SettingError) as error:
             convert(tmp_path / "a.ply", tmp_path / "b.ply", edits, dataset=dataset)
         assert error.value.setting == "refine"
+
+
+def test_the_cameras_of_an_output_folder_are_used(dataset, tmp_path):
+    train(
+        dataset, tmp_path / "out", TrainOptions(settings={"iterations": 20, "max_gaussians": 2000})
+    )
+    whole = read_gaussians(tmp_path / "out/point_cloud/iteration_20/point_cloud.ply")
+    count, cameras = len(whole) // 2, cameras_of(training_folder(tmp_path / "out"))
+    for edits, known in (
+        (Edits(decimate=count), cameras),
+        (Edits(decimate="50%"), cameras),
+        (Edits(decimate=count, translate=(0.0, 0.0, 0.5)), []),  # the cameras are not there
+    ):
+        convert(tmp_path / "out", tmp_path / "small.ply", edits, overwrite=True)
+        found = read_gaussians(tmp_path / "small.ply")
+        expected = simplify(whole, len(found), known)
+        expected.means += torch.tensor(edits.translate)
+        torch.testing.assert_close(found.means, expected.means, rtol=1e-3, atol=1e-3)
+    other = simplify(whole, count, [])
+    assert not torch.equal(other.means, simplify(whole, count, cameras).means)
