@@ -54,8 +54,8 @@ def block_content(dataset: Dataset, count: int, margin: float) -> tuple[Axes, li
 
     The views of a block are those whose cameras are in the cell, expanded by ``margin`` times its
     size; those of whose image at least a quarter shows the cell; and, a fifth as many, views that
-    are spread over the rest, because parts of the cell are seen only from afar, for example the sky
-    above it. The points are those in the expanded cell, and a random selection, a quarter as many,
+    are spread over the rest, because parts of the cell are seen only from afar, for example high
+    roofs. The points are those in the expanded cell, and a random selection, a quarter as many,
     of others that these views show.
 
     Returns:
