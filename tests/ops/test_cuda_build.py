@@ -223,7 +223,8 @@ def test_every_function_is_on_both_kinds_of_device():
     assert {"project_cull", "rasterize_fwd", "adam_step", "tiles_parts", "neighbours"} <= launched
     on_gpu = set(KERNELS) | set(SEQUENCES)
     assert launched - on_gpu == set()
-    assert launched - cpu_entries() == set()
+    # The backward pass on a CPU sums the gradients of a splat itself.
+    assert launched - cpu_entries() == {"splats_reduce"}
     assert set(ENTRIES) - on_gpu == set()
     entries = {name.removesuffix("_layout") for name in cpu_entries() if name.endswith("_layout")}
     assert entries <= cpu_entries()
