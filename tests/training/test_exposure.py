@@ -17,7 +17,7 @@ from snowsplat.data import load_dataset
 from snowsplat.data.dataset import Dataset
 from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import ImageLoader
-from snowsplat.ops.splats import COLORS
+from snowsplat.ops.splats import COLORS, Splats2D
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
@@ -140,10 +140,10 @@ def initial(dataset: Dataset) -> Gaussians:
     return Trainer(dataset, replace(CONFIG, initial_opacity=0.7, exposure="off")).gaussians
 
 
-def exposure_of(setting: str, dataset: Dataset) -> Exposure:
+def exposure_of(setting: str, dataset: Dataset, black: bool = False) -> Exposure:
     with ImageLoader(dataset.train) as images:
         schedule = Schedule(80)
-        return Exposure(setting, dataset, images, schedule, CPU, ALONE, resumed=False)
+        return Exposure(setting, dataset, images, schedule, CPU, ALONE, resumed=False, black=black)
 
 
 def test_the_decision(clean, degraded):
@@ -162,50 +162,64 @@ def test_the_decision(clean, degraded):
     assert not unknown.active
 
 
-def test_the_gradients_of_the_gains_and_of_the_splats(degraded):
-    """Against finite differences and a scene whose colours contain the gains."""
-    exposure, view = exposure_of("on", degraded), degraded.train[0]
+@pytest.mark.parametrize("background", [(0.3, 0.9, 0.6), (0.0, 0.0, 0.0)])
+def test_the_gradients_of_the_gains_and_of_the_splats(degraded, background):
+    """Those of a scene in float64 whose colours are multiplied by the gains."""
+    exposure, view = exposure_of("on", degraded, black=not any(background)), degraded.train[0]
     with ImageLoader(degraded.train) as images:
         photo = images.get(view)
-    scene = initial(degraded)
-    background = torch.tensor([0.3, 0.9, 0.6])
+    dark = LoadedImage(photo.planes.clamp(max=253))
+    scene, behind = initial(degraded), torch.tensor(background)
+    size = view.camera.width, view.camera.height
+    exposure.log_gains[0] = at = torch.tensor([0.1, -0.2, 0.05])
 
-    def loss(log_gain):
-        exposure.log_gains[0] = log_gain
-        exposure.begin_step()
-        splats = project(scene, view.camera, 0)
-        exposure.apply(splats, 0)
-        splats.packed.requires_grad_()
-        image, _, _ = ops.rasterize(splats, view.camera.width, view.camera.height, background)
-        return view_loss(image, photo, background, 0.2), splats
-
-    at = torch.tensor([0.1, -0.2, 0.05])
-    value, splats = loss(at)
+    exposure.begin_step()
+    splats = project(scene, view.camera, 0)
+    splats.packed.requires_grad_()
+    image, _, _ = ops.rasterize(splats, *size, exposure.begin_view(behind, 0))
+    value = view_loss(exposure.exposed(image, dark, 0), dark, behind, 0.2)
     value.backward()
-    expected = splats.packed.grad.clone()
-    expected[:, COLORS : COLORS + 3] *= at.exp()
-    exposure.after_backward(splats)
-    assert torch.allclose(splats.packed.grad, expected)
-    [gradient] = exposure._gradients
-    for c in range(3):
-        h = torch.zeros(3)
-        h[c] = 5e-3
-        higher, lower = (loss(at + sign * h)[0].item() for sign in (1, -1))
-        assert float(gradient[c]) == pytest.approx((higher - lower) / 1e-2, rel=0.02, abs=1e-4)
+
+    exact = project(scene.to(dtype=torch.float64), view.camera, 0)
+    exact.packed.requires_grad_()
+    gains = at.double().requires_grad_()
+    factors = torch.ones(exact.packed.shape[1], dtype=torch.float64)
+    factors = factors.index_copy(0, torch.arange(COLORS, COLORS + 3), gains.exp())
+    colored = Splats2D(exact.packed * factors, exact.ids, 3)
+    image, _, _ = ops.rasterize(colored, *size, behind.double())
+    expected = ops.photometric_loss(image, dark.over(behind).double(), 0.2)
+    expected.backward()
+
+    assert value.item() == pytest.approx(expected.item(), rel=1e-5)
+    assert torch.equal(splats.ids, exact.ids)
+    for found, true in (
+        (splats.packed.grad, exact.packed.grad),
+        (exposure._present[0].grad, gains.grad),
+    ):
+        assert (found - true).abs().max() < 1e-4 * true.abs().max()
 
 
-def test_overexposed_pixels_count_only_if_the_image_is_darker(degraded):
+@pytest.mark.parametrize("bright_rows", [1, 4])  # with 4, the positions are not kept
+def test_overexposed_pixels_count_only_if_the_image_is_darker(degraded, bright_rows):
     exposure = exposure_of("on", degraded)
+    exposure.log_gains[0] = 0.0
     planes = torch.full((3, 4, 5), 200, dtype=torch.uint8)
-    planes[:, :2] = 255
-    image = torch.full((4, 5, 3), 1.5)
-    image[0] = 0.7
-    found = exposure.clipped(image, LoadedImage(planes), 0)
-    assert (found[0] == 0.7).all()
-    assert (found[1] == 1.0).all()
-    assert (found[2:] == 1.5).all()
-    dark = LoadedImage(planes.clamp(max=200))
-    assert exposure.clipped(image, dark, 1) is image
+    planes[:, :bright_rows, :3] = 255
+    values = 0.5 + torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(6))
+    weights = torch.randn(4, 5, 3, generator=torch.Generator().manual_seed(7))
+    photo = LoadedImage(planes)
+    bright = (photo.rgb == 255) & (values.permute(1, 2, 0) > 1.0)
+    assert 0 < int(bright.sum()) < bright_rows * 9
+    for _ in range(2):  # the second time, the positions may be known
+        image = values.permute(1, 2, 0).clone().requires_grad_()
+        exposure.begin_step()
+        exposure.begin_view(torch.zeros(3), 0)
+        found = exposure.exposed(image, photo, 0)
+        assert torch.equal(found, torch.where(bright, 1.0, image))
+        (found * weights).sum().backward()
+        assert torch.equal(image.grad, weights * ~bright)
+        expected = (image.detach() * weights * ~bright).sum((0, 1))
+        assert torch.allclose(exposure._present[0].grad, expected, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -68,14 +68,13 @@ def batch_gradients(
         loss = None
         if blended is not None:
             own = group[shards.rank]
-            exposure.apply(blended, own.index)
+            background = exposure.begin_view(own.background, own.index)
             with torch.enable_grad():  # `project` is outside: the optimiser computes its gradient
-                loss = loss_of(runner.rasterize(blended, own.camera, own.background), own)
+                loss = loss_of(runner.rasterize(blended, own.camera, background), own)
         runner.backward(loss, last=number == len(views) - 1)
         del loss  # and with it the image and the tiles
         if blended is not None:
             _multiply_gradient(blended, 1.0 / len(batch))
-            exposure.after_backward(blended)
         shards.return_gradients(blended, splats, absolute=runner.abs_grad)
         found += zip(splats, group, strict=True)
     return [runner.gradient(splats, each.camera, sh_degree) for splats, each in found]

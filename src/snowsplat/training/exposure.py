@@ -1,19 +1,19 @@
 """`Exposure`: a gain for each photo and channel, which the training learns together with the scene.
 
 A camera that chooses exposure and white balance for each photo makes the same surface brighter in
-one photo than in another. The scene has one colour for it. So the colours c of the splats are
-multiplied by the gains of the photo, before they are blended and the image is compared:
+one photo than in another. The scene has one colour for it. So the image I is multiplied by the
+gains of the photo v, before the two are compared:
 
-    c'_i = c_i exp(g_v),      ∂L/∂g_v = Σ_i ∂L/∂c'_i c'_i      for each channel.
+    I' = I exp(g_v),      ∂L/∂g_v = Σ ∂L/∂I' I'      over the pixels, for each channel.
 
-Blending is linear in the colours, so this multiplies the image, without the background, which is
-not a part of the photo.
+The background is not a part of the photo, so the image is rendered over its colour times exp(−g_v).
 
 The gains follow Adam, with the prior ε √(τ² + g²), which is quadratic for small gains and linear
 for large ones. After each update, the mean of g over the photos is subtracted. Otherwise scene and
 gains could change together, and the colours of the scene would be arbitrary; so they are neutral.
 
-Where a photo is overexposed, it only says that the image is at least as bright.
+Where a photo is overexposed, it only says that the image is at least as bright; see
+`exposed_image`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from torch import Tensor
 from snowsplat.data.dataset import Dataset
 from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import Photos
-from snowsplat.ops.splats import COLORS, Splats2D
+from snowsplat.training.exposed_image import ExposedImages
 from snowsplat.training.exposure_start import GAMMA, ExposureStart, exposure_start
 from snowsplat.training.shards import Shards
 from snowsplat.training.step_schedule import Schedule
@@ -40,9 +40,6 @@ _BETAS = 0.9, 0.99
 _EPSILON = 1e-12
 #: ε and τ of the prior.
 _PRIOR, _SMALL = 1e-3, 0.3
-_CHANNELS = slice(COLORS, COLORS + 3)
-#: 8-bit values from this one on are overexposed.
-_OVEREXPOSED = 254
 
 
 class Exposure:
@@ -64,11 +61,13 @@ class Exposure:
         device: torch.device,
         shards: Shards,
         resumed: bool,
+        black: bool = False,
     ) -> None:
         """
         Args:
             setting: "auto", "on" or "off", see ``TrainConfig.exposure``.
             resumed: whether `load_state` follows, so that the photos need not be compared.
+            black: whether each background is black, which saves a pass over the image.
 
         Raises:
             UserError: a photo is missing or damaged.
@@ -85,11 +84,12 @@ class Exposure:
         self._square = torch.zeros_like(self.log_gains)
         self._updates = torch.zeros(len(dataset.train), dtype=torch.int64)
         self._setting = setting
+        self._black = black
         self._schedule = schedule
         self._shards = shards
-        self._gain = torch.ones(3)  # of the present view
-        self._gradients: list[Tensor] = []  # of the views of this process in the present step
-        self._overexposed: dict[tuple[int, int], bool] = {}  # by view and height
+        # (3,) log-gains, with their gradients, of the views of this process in the present step.
+        self._present: list[Tensor] = []
+        self._images = ExposedImages()
 
     @property
     def ev(self) -> Tensor:
@@ -99,36 +99,28 @@ class Exposure:
 
     def begin_step(self) -> None:
         """Forget the gradients of the last attempt."""
-        self._gradients = []
+        self._present = []
 
-    def apply(self, splats: Splats2D, index: int) -> None:
-        """Multiply the colours of splats, in place, by the gains of the training view ``index``."""
-        if self.active:
-            self._gain = self.log_gains[index].exp()
-            splats.packed[:, _CHANNELS] *= self._gain
+    def begin_view(self, background: Tensor, index: int) -> Tensor:
+        """The colour (3,) over which the training view ``index`` is rendered.
 
-    def clipped(self, image: Tensor, photo: LoadedImage, index: int) -> Tensor:
-        """The image (H, W, 3), at most 1 where the photo of view ``index`` is overexposed."""
+        Args:
+            background: (3,) colour in 0..1 behind the photo.
+        """
+        if not self.active:
+            return background
+        log_gains = self.log_gains[index].clone().requires_grad_()
+        self._present.append(log_gains)
+        if self._black:
+            return background
+        with torch.enable_grad():
+            return background * (-log_gains).exp()
+
+    def exposed(self, image: Tensor, photo: LoadedImage, index: int) -> Tensor:
+        """The image (H, W, 3) of the view of `begin_view` as its camera exposes it."""
         if not self.active:
             return image
-        key = index, image.shape[0]
-        if key not in self._overexposed:  # most photos have no such pixels, which saves time
-            self._overexposed[key] = bool((photo.rgb >= _OVEREXPOSED).any())
-        if not self._overexposed[key]:
-            return image
-        return torch.where((photo.rgb >= _OVEREXPOSED) & (image.detach() > 1.0), 1.0, image)
-
-    def after_backward(self, splats: Splats2D) -> None:
-        """Store the gradient of the gains; change that of the splats to that without the gains."""
-        if not self.active:
-            return
-        colors, packed_grad = splats.packed.detach()[:, _CHANNELS], splats.packed.grad
-        assert packed_grad is not None
-        grad = packed_grad[:, _CHANNELS]
-        # Empty rows may contain any values, but have no gradient.
-        products = torch.where(grad == 0.0, 0.0, colors * grad)
-        self._gradients.append(products.sum(0, dtype=torch.float64).to(torch.float32))
-        grad *= self._gain
+        return self._images.of(image, self._present[-1], photo, index)
 
     def after_step(self, step: int, indices: Sequence[int]) -> None:
         """Update the gains of the photos of a step.
@@ -140,13 +132,13 @@ class Exposure:
             return
         size = self._shards.size
         own = self.log_gains.new_zeros(-(-len(indices) // size), 3)
-        for row, gradient in zip(own, self._gradients, strict=False):
-            row += gradient
+        for row, log_gains in zip(own, self._present, strict=False):
+            assert log_gains.grad is not None
+            row += log_gains.grad
         table = self._shards.table(own.flatten()).view(size, -1, 3)
         rate = _RATE * (_LAST_RATE / _RATE) ** (step / self._schedule.iterations)
         for position, i in enumerate(indices):  # in each round, process r has view r
-            gradient = len(indices) * table[position % size, position // size]
-            self._update(i, gradient, rate)
+            self._update(i, table[position % size, position // size], rate)
         self.log_gains -= self.log_gains.mean(0)
 
     def _update(self, i: int, gradient: Tensor, rate: float) -> None:

@@ -147,6 +147,7 @@ class Trainer:
         self.exposure = Exposure(
             *(config.exposure, dataset, self._images, self.schedule, self.device, shards),
             resumed=state is not None,
+            black=config.background == "black",
         )
         neutral = NeutralPhotos(self._images, dataset.train, self.exposure.start)
         # The Gaussians of a resumed training run are replaced by those of the state.
@@ -298,7 +299,7 @@ class Trainer:
     def _loss(self, image: Tensor, view: BatchView) -> Tensor:
         assert view.photo is not None
         photo = self.transients.masked(view.index, view.photo)
-        image = self.exposure.clipped(image, photo, view.index)
+        image = self.exposure.exposed(image, photo, view.index)
         return view_loss(image, photo, view.background, self.config.ssim_weight)
 
     def evaluate(self) -> Evaluation:
