@@ -26,6 +26,7 @@ import numpy as np
 import pycolmap
 import torch
 from PIL import Image
+from torch import Tensor
 
 from snowsplat import Dataset, load_dataset
 from snowsplat.data.colmap import read_model, read_points, write_model
@@ -72,6 +73,20 @@ def recolor(dataset: Dataset, model: Path) -> None:
     reconstruction.write(model)
 
 
+def disturbed_pose(
+    cam_from_world: Tensor, generator: torch.Generator, degrees: float, distance: float
+) -> Tensor:
+    """(3, 4): a pose (3, 4) float64 rotated and moved in random directions."""
+    directions = torch.randn(2, 3, dtype=torch.float64, generator=generator)
+    axis, way = torch.nn.functional.normalize(directions, dim=1)
+    half = math.radians(degrees) / 2
+    turn = rotation_from_quat(torch.cat([torch.tensor([math.cos(half)]), math.sin(half) * axis]))
+    rotation, shift = cam_from_world[:, :3], cam_from_world[:, 3]
+    centre = -rotation.T @ shift + distance * way
+    turned = turn @ rotation
+    return torch.cat([turned, -(turned @ centre)[:, None]], 1)
+
+
 def move_cameras(dataset: Dataset, model: Path, degrees: float, share: float, seed: int) -> None:
     """Rotate and move the cameras of the training photos in a COLMAP model; tracks are dropped."""
     generator = torch.Generator().manual_seed(seed)
@@ -79,19 +94,12 @@ def move_cameras(dataset: Dataset, model: Path, degrees: float, share: float, se
     colmap, points = read_model(model), read_points(model)
     images = []
     for image in colmap.images:
-        directions = torch.randn(2, 3, dtype=torch.float64, generator=generator)
-        axis, way = torch.nn.functional.normalize(directions, dim=1)
-        half = math.radians(degrees) / 2
-        turn = rotation_from_quat(
-            torch.cat([torch.tensor([math.cos(half)]), math.sin(half) * axis])
-        )
         quat, shift = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
-        rotation = rotation_from_quat(quat)
-        centre = -rotation.T @ shift + share * dataset.extent * way
+        pose = torch.cat([rotation_from_quat(quat), shift[:, None]], 1)
+        pose = disturbed_pose(pose, generator, degrees, share * dataset.extent)
         if image.name in trained:
-            turned = turn @ rotation
-            pose = torch.cat([quat_from_rotation(turned), -turned @ centre])
-            image = replace(image, pose=tuple(pose.tolist()))
+            quat = quat_from_rotation(pose[:, :3])
+            image = replace(image, pose=(*quat.tolist(), *pose[:, 3].tolist()))
         images.append(image)
     assert points is not None
     write_model(model, colmap.cameras, images, points.xyz.numpy(), points.rgb.numpy())
