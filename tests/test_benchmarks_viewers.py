@@ -78,6 +78,27 @@ def test_a_viewer_that_is_not_installed_is_named(viewers, camera, tmp_path, monk
     assert "Spark: @sparkjsdev/spark is not installed; skipped" in capsys.readouterr().err
 
 
+def test_rows_below_the_limits_are_counted(viewers, camera, tmp_path, monkeypatch, capsys):
+    (tmp_path / "package.json").write_text((viewers.FOLDER / "package.json").read_text())
+    monkeypatch.setattr(viewers, "FOLDER", tmp_path)
+
+    class Fixed(viewers.Comparison):
+        def psnr(self, viewer, suffix, options):
+            if (viewer.name, suffix) == ("Spark", ".sog"):
+                raise viewers.BrowserError("no picture")
+            low = (viewer.name, suffix) == ("gsplat.js", ".ply")
+            return viewer.formats[suffix] - (0.01 if low and options else 0.0)
+
+    comparison = Fixed(scene(5), [camera], None, "", tmp_path, None)
+    for viewer in viewers.VIEWERS:
+        (tmp_path / "node_modules" / viewer.package).mkdir(parents=True)
+    assert viewers.rows(comparison, list(viewers.VIEWERS), []) == 2
+    printed = capsys.readouterr()
+    assert printed.out.count("| Spark 2.2.0 |") == 6
+    assert "Spark, .sog: no picture" in printed.err
+    assert viewers.rows(comparison, list(viewers.VIEWERS), [".splat"]) == 0
+
+
 @pytest.mark.browser
 @pytest.mark.slow
 def test_gsplat_js_draws_the_same_picture_with_our_low_pass_filter(
