@@ -49,6 +49,15 @@ _FLAGS = [
 ]
 
 
+# WebGPU in software; Chromium's GPU process ends if pages are composed without it.
+_WEBGPU_FLAGS = [
+    *(flag for flag in _FLAGS if flag != "--disable-gpu"),
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan",
+    "--use-vulkan=swiftshader",
+]
+
 # Scripts get the next frame that begins this many milliseconds later.
 _SLOW_FRAMES = """(() => {
     const request = window.requestAnimationFrame.bind(window);
@@ -76,13 +85,20 @@ class Browser:
     Tabs have ``width`` × ``height`` CSS pixels, of ``scale`` pixels of the screen. Without a GPU,
     the time to draw a page is proportional to the number of pixels of the screen. Scripts that
     draw for each frame of the screen run at most ``frames`` times per second, because pages with
-    WebGL otherwise use the processor all the time.
+    WebGL otherwise use the processor all the time. ``webgpu``: pages can use WebGPU, too.
     """
 
     def __init__(
-        self, width: int = 640, height: int = 480, scale: float = 1.0, frames: float = 10.0
+        self,
+        width: int = 640,
+        height: int = 480,
+        scale: float = 1.0,
+        frames: float = 10.0,
+        *,
+        webgpu: bool = False,
     ) -> None:
         self.width, self.height, self.scale, self.frames = width, height, scale, frames
+        self._flags = _WEBGPU_FLAGS if webgpu else _FLAGS
 
     def __enter__(self) -> Browser:
         program = chromium()
@@ -92,7 +108,7 @@ class Browser:
         self._replies, from_browser = _pipe()
         # Chromium reads commands from file descriptor 3 and writes responses to 4.
         shell = f'exec "$@" 3<&{to_browser} 4>&{from_browser}'
-        flags = [*_FLAGS, f"--window-size={self.width},{self.height}"]
+        flags = [*self._flags, f"--window-size={self.width},{self.height}"]
         command = [program, *flags, f"--user-data-dir={self._profile}", "about:blank"]
         self._process = subprocess.Popen(
             ["bash", "-c", shell, "chromium", *command],

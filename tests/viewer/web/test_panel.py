@@ -162,7 +162,7 @@ def test_a_click_on_every_control(file):
                 break
             clicked.add(new[-1])
             page.evaluate(f"{shown}[{names.index(new[-1])}].click()")
-        assert {"Photos", "Copy link", "Photo 12 of 12"} <= clicked
+        assert {"Photos", "Clean up", "Copy link", "Photo 12 of 12"} <= clicked
         named = ("flyCamera", "settings", "frame", "reset", "controlsButton", "info", "infoClose")
         assert {f"sse-{name}" for name in named} <= clicked
         for key in "12ghfr":
@@ -173,5 +173,5 @@ def test_a_click_on_every_control(file):
         # The fly mode has asked for the pointer; the browser may grant it late.
         page.evaluate("document.exitPointerLock()")
         page.wait_for("!document.pointerLockElement")
-        page.drag(100, 280, 180, 290)
+        page.drag(300, 315, 380, 325)  # below the pictures
         page.wait_for(f"{MODE} === 'orbit'", 30)

@@ -3,6 +3,7 @@
 // of the shape `aspect`; the window shows all of it, whatever its own shape.
 const scene = JSON.parse(document.getElementById('sse-bootstrap').textContent).panel;
 const { aspect, start, stops } = scene;
+const NARROW = 600;
 
 /** Half of the width and of the height of what the window shows at a distance of 1. */
 const shownBy = (fov, { width, height }) => {
@@ -24,10 +25,10 @@ const linkedView = () => {
     return valid ? numbers : undefined;
 };
 
-const element = (name, properties, ...children) => {
-    const made = Object.assign(document.createElement(name), properties);
-    made.append(...children);
-    return made;
+/** The values of the sliders in the address of the page; undefined if there are none. */
+const linkedHiding = () => {
+    const numbers = /[#&]hide=([^&]*)/.exec(location.hash)?.[1].split(',').map(Number);
+    return numbers?.length === 2 && numbers.every((x) => x >= 0 && x <= 100) ? numbers : undefined;
 };
 
 settings.cameras[0].initial = addView(linkedView() ?? start);
@@ -37,6 +38,7 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
     const { camera } = app.root.findByName('camera');
     const { canvas } = app.graphicsDevice;
     const [subject, radius] = [scene.subject.slice(0, 3), scene.subject[3]];
+    const hiding = hidingSliders(app, subject, scene.hiding);
 
     // The viewer sets the field of view before each frame, once the scene is loaded.
     let fov = start[6];
@@ -94,7 +96,10 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
     const begin = () => {
         // In orbit; the viewer itself would begin in its animation.
         viewer.resetCamera();
+        hiding.set(linkedHiding() ?? scene.hiding.start);
         showMatte(!linkedView());
+        // The list of controls would cover the scene; a button opens it.
+        if (canvas.clientWidth < NARROW) document.querySelector('.sse-controlsHintClose')?.click();
         // These follow the viewer's own handlers.
         events.on('inputEvent', (name) => {
             if (name === 'frame') flyTo(subjectView());
@@ -105,6 +110,7 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         window.addEventListener('hashchange', () => {
             const view = linkedView();
             if (view) flyTo(view);
+            hiding.set(linkedHiding() ?? scene.hiding.start);
         });
     };
     state.loaded ? begin() : events.once('loaded:changed', begin);
@@ -120,11 +126,15 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         return button;
     };
 
+    const clean = toggle('Clean up', hiding.element);
+
     const copied = element('span', { className: 'snow-copied', role: 'status' });
     const link = element('button', { type: 'button', textContent: 'Copy link', title: 'A link to the present view' });
     link.onclick = async () => {
         const view = presentView().map((number) => Number(number.toPrecision(6)));
-        history.replaceState(null, '', `#view=${view}`);
+        const values = String(hiding.values());
+        const hidden = values === String(scene.hiding.start) ? '' : `&hide=${values}`;
+        history.replaceState(null, '', `#view=${view}${hidden}`);
         const done = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
         copied.textContent = done ? 'Copied' : 'It is in the address bar';
         setTimeout(() => { copied.textContent = ''; }, 3000);
@@ -154,14 +164,17 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
             { className: 'snow-card' },
             element('h1', { textContent: scene.title }),
             element('p', { textContent: scene.facts }),
-            element('div', { className: 'snow-buttons' }, ...(stops.length ? [photos] : []), link, copied)
+            element('div', { className: 'snow-buttons' }, ...(stops.length ? [photos] : []), clean, link, copied)
         ),
+        hiding.element,
         strip
     );
-    // Keys for the buttons of the panel are not for the camera.
+    // Keys for the buttons and sliders of the panel are not for the camera.
     panel.addEventListener('keydown', (event) => {
-        if ([' ', 'Enter'].includes(event.key)) event.stopPropagation();
+        if ([' ', 'Enter'].includes(event.key) || event.target.type === 'range') event.stopPropagation();
     });
-    events.on('controlsHidden:changed', (hidden) => panel.classList.toggle('snow-faded', hidden && strip.hidden));
+    events.on('controlsHidden:changed', (hidden) =>
+        panel.classList.toggle('snow-faded', hidden && strip.hidden && hiding.element.hidden)
+    );
     document.querySelector('.sse-viewer').append(panel);
 });

@@ -2,7 +2,7 @@
 
 It names the scene, has the stops along the path of the photos, and makes links to the present view.
 Its script also fits what a view must show into the window, and frames the subject. Style sheet and
-script are `panel.css` and `panel.js`.
+scripts are `panel.css`, `hiding.js` and `panel.js`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.scene.initial_view import InitialView
+from snowsplat.viewer.web.hiding import Hiding
 
 _FOLDER = Path(__file__).parent
 
@@ -60,6 +61,7 @@ def panel_settings(
     subject: tuple[Sequence[float], float],
     stops: Sequence[InitialView],
     pictures: str,
+    hiding: Hiding,
 ) -> dict[str, Any]:
     """What the script needs.
 
@@ -69,6 +71,7 @@ def panel_settings(
         subject: middle and radius of what Frame shows.
         stops: the views of the stops.
         pictures: the address of the image with the pictures of the stops.
+        hiding: the ranges of the sliders.
     """
     (x, y, z), radius = subject
     return {
@@ -79,12 +82,15 @@ def panel_settings(
         "subject": [-x, -y, z, radius],
         "stops": [view_numbers(stop, start.aspect) for stop in stops],
         "pictures": pictures,
+        "hiding": hiding.settings(),
     }
 
 
 def script() -> str:
     """The script of the panel, which also creates the viewer."""
-    return (_FOLDER / "panel.js").read_text(encoding="utf-8")
+    return "".join(
+        (_FOLDER / name).read_text(encoding="utf-8") for name in ("hiding.js", "panel.js")
+    )
 
 
 def style() -> str:

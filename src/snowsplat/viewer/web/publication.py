@@ -58,6 +58,8 @@ def write_site(
     """
     scene = ready(gaussians, cameras, background)
     content = write_scene(folder, scene.gaussians)
+    if content == INDEX:
+        scene = scene.complete()
     _write(folder / POSTER, _poster(scene))
     if scene.stops.views:
         _write(folder / PICTURES, scene.stops.pictures)
@@ -110,7 +112,8 @@ def _poster(scene: ReadyScene) -> bytes:
     """The initial view as a JPEG file."""
     camera = scene.start.camera(*POSTER_SIZE)
     with torch.no_grad():
-        image = render(scene.gaussians.detach(), camera, torch.tensor(scene.background)).image
+        shown = scene.hiding.shown(scene.gaussians.detach())
+        image = render(shown, camera, torch.tensor(scene.background)).image
     pixels = image.clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=88)

@@ -26,6 +26,7 @@ from snowsplat.scene.orientation import VIEWING_DISTANCE, up_direction, up_of_su
 from snowsplat.scene.render import render
 from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
+from snowsplat.viewer.web.hiding import Hiding, hiding_of
 from snowsplat.viewer.web.page import asset, content_policy, page, settings
 from snowsplat.viewer.web.panel import Description, panel_settings
 from snowsplat.viewer.web.server import FileOnDisk, Served, ServedFile
@@ -60,6 +61,8 @@ def site(
             stays that of the levels.
     """
     scene = ready(gaussians, cameras, background, in_place=count is not None)
+    if levels is not None:
+        scene = scene.complete()
     content = _content(scene.gaussians, levels)
     bootstrap = {
         "settings": scene.settings(),
@@ -105,6 +108,7 @@ class ReadyScene(NamedTuple):
             is no such path.
         stops: views of some of the photos, and the subject of the scene.
         background: red, green, blue in 0..1.
+        hiding: what the page can hide.
     """
 
     gaussians: Gaussians
@@ -112,6 +116,11 @@ class ReadyScene(NamedTuple):
     film: list[InitialView]
     stops: Stops
     background: Sequence[float]
+    hiding: Hiding
+
+    def complete(self) -> ReadyScene:
+        """Nothing is hidden at first; for levels of detail, whose coarse Gaussians are large."""
+        return self._replace(hiding=replace(self.hiding, start=0))
 
     def settings(self) -> dict[str, Any]:
         """The settings of the viewer."""
@@ -124,7 +133,9 @@ class ReadyScene(NamedTuple):
         """
         subject = self.stops.middle.tolist(), self.stops.radius
         count = count or len(self.gaussians)
-        return panel_settings(about, count, self.start, subject, self.stops.views, pictures)
+        return panel_settings(
+            about, count, self.start, subject, self.stops.views, pictures, self.hiding
+        )
 
 
 def ready(
@@ -146,7 +157,8 @@ def ready(
         level = None if up is None else _viewing_frame(up, VIEWING_DISTANCE)
         gaussians = gaussians if level is None else transform(gaussians, level)
         stops = stops_of(gaussians, (), 1.0, background)
-        return ReadyScene(gaussians, overview(gaussians), [], stops, background)
+        hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=True)
+        return ReadyScene(gaussians, overview(gaussians), [], stops, background, hiding)
     depth = _depth_ahead(gaussians, cameras[0])
     rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
     change = _viewing_frame(up_direction(rotations.numpy()), depth)
@@ -158,7 +170,9 @@ def ready(
             for camera in cameras
         ]
     stops = stops_of(gaussians, cameras, depth, background)
-    return ReadyScene(gaussians, stops.views[0], _film(cameras, depth), stops, background)
+    hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=False)
+    film = _film(cameras, depth)
+    return ReadyScene(gaussians, stops.views[0], film, stops, background, hiding)
 
 
 def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
