@@ -1,7 +1,8 @@
-"""PSNR of a scene with fewer Gaussians: dropped, merged, by PlayCanvas' converter, refined.
+"""PSNR of a scene with fewer Gaussians: dropped, merged, by PlayCanvas' converter, trained.
 
-"merged" uses the cameras of OUT, as `convert OUT` does; "merged, no cameras" is what it does with a
-scene file alone.
+"merged, no cameras" is what `convert --decimate` does with a scene file alone. With the cameras of
+OUT, Gaussians are merged, and then trained on renderings of the whole scene ("merged, distilled",
+which is `convert OUT`) or on the photos ("merged, refined", `--refine`).
 
     python benchmarks/decimate.py out/fox out/fern --images pictures
 
@@ -18,12 +19,14 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
+from snowsplat.pipeline.decimate import Decimation
 from snowsplat.pipeline.image_files import write_png
 from snowsplat.pipeline.refine import photos_of, refine
 from snowsplat.pipeline.scene_source import cameras_of, folder_around, scene_file
@@ -73,10 +76,19 @@ class Scene:
             "PlayCanvas": lambda: by_playcanvas(self.file, count),
             "merged, no cameras": lambda: simplify(self.whole, count),
             "merged": lambda: simplify(self.whole, count, self.cameras),
-            "merged, refined": lambda: refine(
-                simplify(self.whole, count, self.cameras), self.dataset, self.background
+            "merged, distilled": lambda: self.decimated(count, None),
+            "merged, refined": lambda: self.decimated(
+                count, partial(refine, dataset=self.dataset, background=self.background)
             ),
         }
+
+    def decimated(
+        self, count: int, refined: Callable[[Gaussians], Gaussians] | None
+    ) -> Gaussians:
+        """What `convert --decimate` writes for the output folder."""
+        white = float(self.background == "white")
+        decimation = Decimation(self.cameras, (white, white, white), refined)
+        return decimation.fitted(decimation.merged(self.whole, count), self.whole)
 
     def print_row(self, name: str, gaussians: Gaussians, seconds: float = 0.0) -> None:
         color = torch.full((3,), float(self.background == "white"))

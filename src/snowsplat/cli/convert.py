@@ -44,9 +44,11 @@ class Convert:
 
     Notes:
       If there are several scenes, they are merged first. Then the edits are
-      applied in this order: --crop, --rotate, --scale, --translate, --sh-degree,
-      --decimate. Coordinates are in the frame of PLY files: x right, y down, z
+      applied in this order: --crop, --sh-degree, --decimate, --rotate, --scale,
+      --translate. Coordinates are in the frame of PLY files: x right, y down, z
       forward.
+      --decimate is better with an output folder than with a scene file: the
+      result is then trained to look like the whole scene from its cameras.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE [MORE …] FILE")] = ()

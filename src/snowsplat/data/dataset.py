@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -140,7 +141,7 @@ def safe_name(path: str) -> str:
     return "/".join(part for part in parts if part not in ("", ".", "..") and ":" not in part)
 
 
-def scene_extent(cameras: list[Camera]) -> float:
+def scene_extent(cameras: Sequence[Camera]) -> float:
     """1.1 × the largest distance of a camera centre from the mean centre, in world units.
 
     This is the paper's scene extent. It scales the learning rate of positions and must not be 0,

@@ -14,16 +14,14 @@ import torch
 from snowsplat.formats import Format, GaussianArrays
 from snowsplat.formats.lod import LEVELS
 from snowsplat.formats.spz import WRITTEN_VERSIONS, write_spz
-from snowsplat.pipeline.decimate import file_size, gaussians_to_keep, write_within
+from snowsplat.pipeline.decimate import Decimation, file_size, gaussians_to_keep, write_within
 from snowsplat.pipeline.levels import write_levels
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
 from snowsplat.pipeline.scene_source import background_of, cameras_of, folder_around, scene_file
 from snowsplat.scene import edit
-from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
-from snowsplat.scene.simplify import simplify
 from snowsplat.util.errors import SettingError, UserError
 
 logger = logging.getLogger(__name__)
@@ -34,8 +32,7 @@ Box = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True)
 class Edits:
-    """Changes to a scene, applied in this order. The frame is that of a PLY: x right, y down, z
-    forward.
+    """Changes to a scene. The frame is that of a PLY: x right, y down, z forward.
 
     Attributes:
         crop: keep the Gaussians whose centres are in this box, given as x, y, z of the lower corner
@@ -45,7 +42,7 @@ class Edits:
         translate: translate by this offset.
         sh_degree: reduce the spherical harmonics to this degree, 0 to 3.
         decimate: the number of Gaussians, a percentage such as "50%", or the size of the file such
-            as "10MB". Neighbours are merged, see `simplify`.
+            as "10MB", see `Decimation`.
 
     Raises:
         UserError: a value out of its range.
@@ -72,11 +69,8 @@ class Edits:
         if self.decimate is not None and file_size(self.decimate) is None:
             gaussians_to_keep(self.decimate, 0)
 
-    def apply(self, scene: Gaussians, cameras: Sequence[Camera] = ()) -> Gaussians:
-        """The edited scene; ``scene`` is unchanged. A size in ``decimate`` is left to `convert`.
-
-        Args:
-            cameras: those of the photos of ``scene``, for merging its Gaussians; may be empty.
+    def reduced(self, scene: Gaussians) -> Gaussians:
+        """The part of the scene in the box, with the SH degree; ``scene`` is unchanged.
 
         Raises:
             UserError: no Gaussian is in the box.
@@ -86,16 +80,14 @@ class Edits:
             scene = edit.crop(scene, torch.tensor(self.crop).reshape(2, 3))
             if before and not len(scene):
                 raise SettingError("crop", "no Gaussian is in this box; see snowsplat info")
-        transform = self.transform()
-        if transform:
-            scene = edit.transform(scene, transform)
         if self.sh_degree is not None:
             scene = edit.with_sh_degree(scene, self.sh_degree)
-        if self.decimate is not None and file_size(self.decimate) is None:
-            # The cameras are not where the scene is after a transform.
-            known = () if transform else cameras
-            scene = simplify(scene, gaussians_to_keep(self.decimate, len(scene)), known)
         return scene
+
+    def placed(self, scene: Gaussians) -> Gaussians:
+        """The rotated, scaled and translated scene; ``scene`` is unchanged."""
+        transform = self.transform()
+        return edit.transform(scene, transform) if transform else scene
 
     def transform(self) -> Similarity | None:
         """Rotation, scale and translation of these edits as one transform; None: no change."""
@@ -154,15 +146,13 @@ def convert(
         raise SettingError("decimate", "a size is that of one file; use a number or a share")
     given = [sources] if isinstance(sources, Path | str) else sources
     files = [scene_file(Path(source)) for source in given]
-    refined = None if dataset is None else _refinement(edits, files[0], Path(dataset), observer)
+    decimation = _decimation(edits, files, dataset, observer)
     parts = [read_gaussians(file) for file in files]
     if len({part.antialiased for part in parts}) > 1:
         logger.warning(
             "%s: only some of the scenes are antialiased; all are marked as the first one", target
         )
-    # Cameras of one of several scenes do not show the others.
-    cameras = cameras_of(folder_around(files[0])) if len(files) == 1 else []
-    scene = edits.apply(edit.merge(parts), cameras)
+    scene = edits.reduced(edit.merge(parts))
     write = write_gaussians
     if spz_version is not None:
         write = partial(_write_spz, version=spz_version)
@@ -170,28 +160,43 @@ def convert(
         write = partial(_write_page, source=files[0])
     if format.name == LEVELS:
         write = partial(write_levels, observer=observer)
+
+    def write_placed(path: Path, gaussians: Gaussians) -> None:
+        # The scene is moved last: cameras and photos show it in its place.
+        write(path, edits.placed(gaussians))
+
     if size is not None:
-        known = [] if edits.transform() else cameras
-        write_within(size, target, scene, write, refined, known)
+        write_within(size, target, scene, write_placed, decimation)
+    elif edits.decimate is not None:
+        smaller = decimation.merged(scene, gaussians_to_keep(edits.decimate, len(scene)))
+        write_placed(target, decimation.fitted(smaller, scene))
     else:
-        write(target, refined(scene) if refined else scene)
+        write_placed(target, scene)
     return format
 
 
-def _refinement(
-    edits: Edits, scene: Path, dataset: Path, observer: Observer
-) -> Callable[[Gaussians], Gaussians]:
-    """`refine` on the photos of a dataset. Raises: UserError: they do not show the edited scene."""
+def _decimation(
+    edits: Edits, scenes: Sequence[Path], dataset: Path | str | None, observer: Observer
+) -> Decimation:
+    """What is known of the views of these scene files.
+
+    Raises:
+        UserError: the photos of ``dataset`` do not show the edited scene.
+    """
+    if dataset is None:
+        if len(scenes) != 1:  # the cameras of one of several scenes do not show the others
+            return Decimation(observer=observer)
+        folder = folder_around(scenes[0])
+        return Decimation(cameras_of(folder), background_of(folder), observer=observer)
     if edits.decimate is None:
         raise SettingError("refine", "is for decimated scenes; set `decimate` as well")
-    if edits.crop or edits.transform():
-        raise SettingError(
-            "refine", "the photos show the whole scene in its place; crop and transform it later"
-        )
+    if edits.crop:
+        raise SettingError("refine", "the photos show the whole scene; crop it later")
     from snowsplat.pipeline.refine import photos_of, refine
 
-    photos, background = photos_of(scene, dataset)
-    return partial(refine, dataset=photos, background=background, observer=observer)
+    photos, background = photos_of(scenes[0], Path(dataset))
+    refined = partial(refine, dataset=photos, background=background, observer=observer)
+    return Decimation([view.camera for view in photos.train], refined=refined)
 
 
 def _write_spz(target: Path, scene: Gaussians, version: int) -> None:

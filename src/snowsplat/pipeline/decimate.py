@@ -1,11 +1,13 @@
-"""How many Gaussians `convert` keeps: a number, a share, or as many as fit into a file."""
+"""Fewer Gaussians: how many `convert` keeps, and what makes them look like the whole scene."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.simplify import simplify
@@ -13,6 +15,8 @@ from snowsplat.util.errors import SettingError
 from snowsplat.util.files import atomic_path
 
 _UNITS = {"kb": 1000, "mb": 1000**2, "gb": 1000**3}
+# Steps of the distillation. See docs/performance.md.
+_STEPS = 60
 
 
 def gaussians_to_keep(decimate: int | str, count: int) -> int:
@@ -41,20 +45,63 @@ def file_size(decimate: int | str | None) -> int | None:
     return round(float(match[1]) * _UNITS[match[2]]) if match else None
 
 
+@dataclass(frozen=True)
+class Decimation:
+    """Makes fewer Gaussians of a scene: neighbours are merged, and the result is fitted to views.
+
+    Attributes:
+        cameras: those of the photos; empty: unknown.
+        background: the colour behind the scene.
+        refined: trains the result on the photos; None: it is trained on renderings of the whole
+            scene from the cameras.
+    """
+
+    cameras: Sequence[Camera] = ()
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    refined: Callable[[Gaussians], Gaussians] | None = None
+    observer: Observer = SILENT
+
+    def merged(self, scene: Gaussians, count: int) -> Gaussians:
+        """``count`` Gaussians, see `simplify`; fewer if the scene has fewer."""
+        return simplify(scene, count, self.cameras)
+
+    def fitted(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
+        """Merged Gaussians that look more like ``scene``, of which they were made."""
+        if not 0 < len(smaller) < len(scene):
+            return smaller
+        if self.refined:
+            return self.refined(smaller)
+        return self._distilled(smaller, scene) if self.cameras else smaller
+
+    def _distilled(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
+        import torch
+
+        from snowsplat.training.distillation import distill
+        from snowsplat.training.trainer import Progress
+
+        def report(step: int, loss: float) -> None:
+            self.observer.step(Progress(step, loss, len(smaller), _STEPS, downscale=1))
+
+        self.observer.steps_begin(0, _STEPS)
+        try:
+            whole = scene.select(scene.finite_rows())
+            color = torch.tensor(self.background)
+            return distill(smaller, whole, self.cameras, color, _STEPS, report)
+        finally:
+            self.observer.steps_end()
+
+
 def write_within(
     size: int,
     target: Path,
     scene: Gaussians,
     write: Callable[[Path, Gaussians], None],
-    refined: Callable[[Gaussians], Gaussians] | None = None,
-    cameras: Sequence[Camera] = (),
+    decimation: Decimation,
 ) -> None:
     """Write ``scene`` with so many Gaussians that the file ``target`` has at most ``size`` bytes.
 
     Args:
         write: writes a scene to a path.
-        refined: improves a scene before it is written; may change its size a little.
-        cameras: those of the photos, see `simplify`.
 
     Raises:
         SettingError: even one Gaussian needs more.
@@ -64,10 +111,11 @@ def write_within(
         # The suffix selects the format.
         path = temporary.with_name(temporary.name + target.name)
         try:
-            for improve in [None, refined] if refined else [None]:
+            # Fitting may change the size a little, and it takes longer than merging.
+            for fit in (False, True):
                 while count:
-                    smaller = simplify(scene, count, cameras)
-                    write(path, improve(smaller) if improve else smaller)
+                    smaller = decimation.merged(scene, count)
+                    write(path, decimation.fitted(smaller, scene) if fit else smaller)
                     actual = path.stat().st_size
                     if actual <= size:
                         break

@@ -10,6 +10,7 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output_folder import DatasetSettings
 from snowsplat.pipeline.scene_source import folder_around
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.distillation import MERGED_RATES
 from snowsplat.training.recipes import recipe
 from snowsplat.training.trainer import Trainer
 
@@ -54,6 +55,7 @@ def refine(
         max_gaussians=max(1, len(gaussians)),
         antialias=gaussians.antialiased,
     )
+    config = replace(config, learning_rates=replace(MERGED_RATES, anneal=0.1, anneal_from=0.7))
     trainer = Trainer(dataset, config, initial=gaussians.clone())
     observer.steps_begin(0, _STEPS)
     try:
