@@ -82,9 +82,7 @@ class Scene:
             ),
         }
 
-    def decimated(
-        self, count: int, refined: Callable[[Gaussians], Gaussians] | None
-    ) -> Gaussians:
+    def decimated(self, count: int, refined: Callable[[Gaussians], Gaussians] | None) -> Gaussians:
         """What `convert --decimate` writes for the output folder."""
         white = float(self.background == "white")
         decimation = Decimation(self.cameras, (white, white, white), refined)

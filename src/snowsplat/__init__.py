@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.scene_files import write_gaussians
     from snowsplat.pipeline.scene_source import load_trained
     from snowsplat.pipeline.train import TrainOptions, resume, train
-    from snowsplat.pipeline.training_run import TrainingStopped
+    from snowsplat.pipeline.train_result import TrainingStopped
     from snowsplat.pipeline.videos import VideoOptions, render_video
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
@@ -75,7 +75,7 @@ _MODULES = {
     "TrainConfig": "training.config",
     "TrainOptions": "pipeline.train",
     "Trainer": "training.trainer",
-    "TrainingStopped": "pipeline.training_run",
+    "TrainingStopped": "pipeline.train_result",
     "UserError": "util.errors",
     "VideoOptions": "pipeline.videos",
     "View": "data",

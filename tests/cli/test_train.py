@@ -17,7 +17,8 @@ from snowsplat.cli.config_flags import ConfigFlags
 from snowsplat.cli.train import Train
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.checkpoint_meta import Recipe
-from snowsplat.pipeline.training_run import TrainingRun, TrainResult
+from snowsplat.pipeline.train_result import TrainResult
+from snowsplat.pipeline.training_run import TrainingRun
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training import checkpoint
 from snowsplat.training.recipes import RECIPES, recipe

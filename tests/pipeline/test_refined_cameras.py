@@ -16,7 +16,7 @@ from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.refined_cameras import with_refined, write_refined
 from snowsplat.pipeline.scene_source import load_trained
 from snowsplat.pipeline.train import TrainOptions, train
-from snowsplat.pipeline.training_run import TrainResult
+from snowsplat.pipeline.train_result import TrainResult
 from snowsplat.training import pose_refinement
 from snowsplat.util.errors import UserError
 

@@ -13,8 +13,8 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.scene_source import load_trained
 from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.pipeline.train_result import TrainingStopped
 from snowsplat.pipeline.training_notes import left_out_line
-from snowsplat.pipeline.training_run import TrainingStopped
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training import overfitting, trainer
 from snowsplat.util.errors import SettingError, UserError

@@ -15,7 +15,7 @@ from snowsplat.pipeline.view import viewed_scene
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.initial_view import overview
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.web.server import FileOnDisk
+from snowsplat.viewer.web.served_file import FileOnDisk
 
 
 @pytest.fixture

@@ -26,9 +26,10 @@ from snowsplat.training.decay import DecayRates
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.losses import view_loss
 from snowsplat.training.lr_schedule import LearningRates
+from snowsplat.training.progress import Progress
 from snowsplat.training.starts import STARTS
 from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.trainer import Progress, Trainer
+from snowsplat.training.trainer import Trainer
 from snowsplat.util.errors import UserError
 
 WIDTH, HEIGHT, COUNT = 24, 20, 40

@@ -144,7 +144,7 @@ class Blocks:
     def _train(self, folder: Path) -> int:
         from snowsplat.pipeline.blocks.train import train_blocks
         from snowsplat.pipeline.compute import Compute
-        from snowsplat.pipeline.training_run import TrainingStopped
+        from snowsplat.pipeline.train_result import TrainingStopped
 
         with TerminalObserver(self.quiet) as observer:
             try:

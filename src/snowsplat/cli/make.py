@@ -15,7 +15,7 @@ from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import PageFlags
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.make import MakeOptions, make
-from snowsplat.pipeline.training_run import TrainingStopped
+from snowsplat.pipeline.train_result import TrainingStopped
 from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.training_run import TrainResult
+    from snowsplat.pipeline.train_result import TrainResult
     from snowsplat.sfm.progress import Report
-    from snowsplat.training.trainer import Progress
+    from snowsplat.training.progress import Progress
     from snowsplat.util.stages import Outcome
     from snowsplat.viewer.live.viewer import NetworkViewer
 

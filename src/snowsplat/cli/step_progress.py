@@ -16,7 +16,7 @@ from snowsplat.util.process_memory import resident_bytes
 
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.training import trainer
+    from snowsplat.training.progress import Progress as TrainingProgress
 
 _LINE_SECONDS = 5.0
 _RATE_SECONDS = 3.0  # the displayed rate is a running mean over about this time
@@ -60,7 +60,7 @@ class StepProgress:
         """Time since the first step began."""
         return time.monotonic() - self._start_time
 
-    def __call__(self, progress: trainer.Progress) -> None:
+    def __call__(self, progress: TrainingProgress) -> None:
         now = time.monotonic()
         weight = 1.0 if math.isnan(self._loss) else 1.0 / _LOSS_STEPS
         self._loss = (
@@ -99,7 +99,7 @@ class StepProgress:
         self._rate = keep * self._rate + (1.0 - keep) * rate
         self._last_time, self._last_step = now, step
 
-    def _text(self, progress: trainer.Progress) -> str:
+    def _text(self, progress: TrainingProgress) -> str:
         rate = self._rate or (progress.step - self._start_step) / max(self.seconds, 1e-9)
         left = progress.seconds_left
         if progress.step >= self.total:

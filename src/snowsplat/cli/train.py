@@ -13,7 +13,7 @@ from snowsplat.cli.train_flags import TrainFlags
 from snowsplat.pipeline import processes
 from snowsplat.pipeline.output_folder import OutputFolder
 from snowsplat.pipeline.train import follow_training, resume, train
-from snowsplat.pipeline.training_run import TrainingStopped
+from snowsplat.pipeline.train_result import TrainingStopped
 from snowsplat.util.errors import UserError
 
 

@@ -77,7 +77,7 @@ class Decimation:
         import torch
 
         from snowsplat.training.distillation import distill
-        from snowsplat.training.trainer import Progress
+        from snowsplat.training.progress import Progress
 
         def report(step: int, loss: float) -> None:
             self.observer.step(Progress(step, loss, len(smaller), _STEPS, downscale=1))

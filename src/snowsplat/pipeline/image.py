@@ -198,7 +198,7 @@ def _run(fitter: Fitter, target: Tensor, video: Path, observer: Observer) -> lis
     """Take all steps; record the moments and the video."""
     from snowsplat.evaluation.metrics import compare
     from snowsplat.image.history import Moment, recorded_steps
-    from snowsplat.training.trainer import Progress
+    from snowsplat.training.progress import Progress
     from snowsplat.trajectory.video import video_writer
 
     steps = fitter.options.steps

@@ -14,8 +14,10 @@ from snowsplat.training.distillation import MERGED_RATES
 from snowsplat.training.recipes import recipe
 from snowsplat.training.trainer import Trainer
 
-# 200 steps: 0.05 to 0.4 dB less. See docs/performance.md.
+# See docs/performance.md.
 _STEPS = 600
+# In so many steps, the means may move farther than in those of `distill`.
+_RATES = replace(MERGED_RATES, means=1.44e-4, means_final=4.8e-6, anneal=0.1, anneal_from=0.7)
 
 
 def photos_of(scene: Path, dataset: Path) -> tuple[Dataset, str]:
@@ -55,7 +57,7 @@ def refine(
         max_gaussians=max(1, len(gaussians)),
         antialias=gaussians.antialiased,
     )
-    config = replace(config, learning_rates=replace(MERGED_RATES, anneal=0.1, anneal_from=0.7))
+    config = replace(config, learning_rates=_RATES)
     trainer = Trainer(dataset, config, initial=gaussians.clone())
     observer.steps_begin(0, _STEPS)
     try:

@@ -22,7 +22,7 @@ from snowsplat.util.process_memory import reset_peak, resident_bytes
 if TYPE_CHECKING:
     from snowsplat.data import Dataset
     from snowsplat.pipeline.live_page import LivePage
-    from snowsplat.pipeline.training_run import TrainResult
+    from snowsplat.pipeline.train_result import TrainResult
     from snowsplat.training.checkpoint import Checkpoint
     from snowsplat.training.config import TrainConfig
     from snowsplat.training.shards import Shards

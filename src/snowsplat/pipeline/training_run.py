@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.processes import Announcement
 from snowsplat.pipeline.refined_cameras import write_refined
 from snowsplat.pipeline.time_budget import TimeBudget
+from snowsplat.pipeline.train_result import TrainingStopped, TrainResult
 from snowsplat.pipeline.training_notes import ended_early_line, left_out_line, moving_line
 from snowsplat.training.history import History
 from snowsplat.util.errors import UserError
@@ -25,63 +25,9 @@ if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.pipeline.live_page import LivePage
     from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.training.progress import Progress
     from snowsplat.training.time_budget.pace import Pace
-    from snowsplat.training.trainer import Progress, Trainer
-
-
-@dataclass(frozen=True)
-class TrainResult:
-    """A finished training run.
-
-    Attributes:
-        scene: the PLY file.
-        report: the HTML page about the training.
-        step: the last step.
-        first_step: the step of the checkpoint that was resumed, or 0.
-        gaussians: their number.
-        seconds: duration of the steps of this run.
-        memory: the peak memory of the steps, as text.
-        reductions: what was reduced because of the memory budget, as text.
-        evaluation: the step and the metrics of the last evaluation on held-out photos.
-        left_out: names of the training photos that were left out, because the scene does not
-            explain them; see ``TrainConfig.leave_out_after``.
-        moving: the share of each photo that is masked because something moves there, by name; see
-            ``TrainConfig.transients``.
-        ended_early: the line about a training run that ends before its last planned step, because
-            the scene overfits; otherwise None. See ``TrainConfig.stop_overfitting``.
-        poses: the line about the camera poses: how far they were refined, or that they are not
-            exact; None if there is nothing to say.
-        time: the seconds that were used, including earlier runs, and the time budget in seconds;
-            None without a time budget.
-    """
-
-    scene: Path
-    report: Path
-    step: int
-    first_step: int
-    gaussians: int
-    seconds: float
-    memory: str
-    reductions: tuple[str, ...]
-    evaluation: tuple[int, Evaluation] | None
-    left_out: tuple[str, ...]
-    moving: Mapping[str, float]
-    ended_early: str | None
-    poses: str | None
-    time: tuple[float, float] | None
-
-
-class TrainingStopped(KeyboardInterrupt):
-    """Ctrl-C during a training run.
-
-    Attributes:
-        scene: the scene file that was saved, together with a checkpoint; None if a second Ctrl-C
-            interrupted a step: then only the older checkpoints remain.
-    """
-
-    def __init__(self, message: str, scene: Path | None) -> None:
-        super().__init__(message)
-        self.scene = scene
+from snowsplat.training.trainer import Trainer
 
 
 @dataclass

@@ -18,7 +18,7 @@ from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.viewer.web.server import Served
+    from snowsplat.viewer.web.served_file import Served
 
 #: Larger scenes are shown in levels of detail. The viewer never draws more Gaussians at a time.
 _LARGE = 4_000_000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from snowsplat.training.neutral_photos import NeutralPhotos
 from snowsplat.training.optim import Adam
 from snowsplat.training.overfitting import Overfitting, OverfittingCheck
 from snowsplat.training.pose_refinement import PoseRefinement
+from snowsplat.training.progress import Progress
 from snowsplat.training.sharded_render import sharded_render
 from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.sky import Sky, find_sky
@@ -42,24 +43,6 @@ from snowsplat.util.process import interrupts_between_steps, single_threaded
 #: kind do not change the others. The names are part of the checkpoint format. The index of a name
 #: determines the seed of its generator, so the order must not change.
 GENERATORS = ("start", "views", "background", "density")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """The report of `Trainer.run` after each step.
-
-    ``downscale`` is the factor by which the photos of the step were reduced. ``metrics`` is the
-    evaluation of the test views, after the steps of ``test_iterations``; None after other steps.
-    ``seconds_left`` is an estimate that `pipeline.training_run` adds.
-    """
-
-    step: int
-    loss: float
-    gaussians: int
-    iterations: int
-    downscale: int
-    metrics: Evaluation | None = None
-    seconds_left: float | None = None
 
 
 class Trainer:

@@ -14,7 +14,8 @@ import pytest
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.hosts import is_own_host
 from snowsplat.viewer.web import server as static_server
-from snowsplat.viewer.web.server import FileOnDisk, ServedFile, StaticServer
+from snowsplat.viewer.web.served_file import FileOnDisk, ServedFile
+from snowsplat.viewer.web.server import StaticServer
 
 from .. import clients
 

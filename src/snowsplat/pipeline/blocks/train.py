@@ -15,7 +15,7 @@ from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import read_json
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.training_run import TrainResult
+    from snowsplat.pipeline.train_result import TrainResult
 
 _CHECKPOINT_SECONDS = 60.0
 

@@ -29,7 +29,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.hiding import Hiding, hiding_of
 from snowsplat.viewer.web.page import asset, content_policy, page, settings
 from snowsplat.viewer.web.panel import Description, panel_settings
-from snowsplat.viewer.web.server import FileOnDisk, Served, ServedFile
+from snowsplat.viewer.web.served_file import FileOnDisk, Served, ServedFile
 from snowsplat.viewer.web.stops import Stops, stops_of
 
 _SCENE = "scene.compressed.ply"

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import hmac
 import io
 import logging
@@ -21,18 +20,15 @@ import socketserver
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
-from pathlib import Path
 from typing import Any, cast
 
 from snowsplat.util.errors import SettingError
 from snowsplat.viewer.hosts import ANY_HOST, is_own_host, is_own_page
+from snowsplat.viewer.web.served_file import Served
 
-_BLOCK = 1 << 18  # bytes sent at once
 # Seconds after which a connection is closed:
 _IDLE_SECONDS = 60.0  # without a request
 _REQUEST_SECONDS = 10.0  # with an incomplete request
@@ -50,57 +46,6 @@ _HEAD = re.compile(
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class ServedFile:
-    """A file's bytes and its content type."""
-
-    content: bytes = field(repr=False)
-    type: str
-
-    @property
-    def size(self) -> int:
-        return len(self.content)
-
-    @cached_property
-    def etag(self) -> str:
-        return f'"{hashlib.sha256(self.content).hexdigest()[:32]}"'
-
-    def blocks(self, start: int, end: int) -> Iterator[memoryview]:
-        """The bytes from ``start`` to ``end`` in small blocks."""
-        content = memoryview(self.content)
-        for at in range(start, end, _BLOCK):
-            yield content[at : min(at + _BLOCK, end)]
-
-
-@dataclass(frozen=True)
-class FileOnDisk:
-    """A file that is read when it is requested; it must not change while it is served."""
-
-    path: Path
-    type: str
-
-    @cached_property
-    def size(self) -> int:
-        return self.path.stat().st_size
-
-    @cached_property
-    def etag(self) -> str:
-        return f'"{self.path.stat().st_mtime_ns:x}-{self.size:x}"'
-
-    def blocks(self, start: int, end: int) -> Iterator[bytes]:
-        """The same as `ServedFile.blocks`. Raises: ConnectionError: the file is shorter now."""
-        with open(self.path, "rb") as file:
-            file.seek(start)
-            for at in range(start, end, _BLOCK):
-                block = file.read(min(_BLOCK, end - at))
-                if len(block) < min(_BLOCK, end - at):
-                    raise ConnectionError(f"{self.path}: is shorter than before")
-                yield block
-
-
-Served = ServedFile | FileOnDisk
 
 
 class StaticServer:
