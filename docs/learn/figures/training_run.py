@@ -15,8 +15,8 @@ import scene
 from snowsplat import Gaussians
 from snowsplat.data.load import load_dataset
 from snowsplat.pipeline.demo import demo
-from snowsplat.training.recipes import recipe
 from snowsplat.training.progress import Progress
+from snowsplat.training.recipes import recipe
 from snowsplat.training.trainer import Trainer
 
 STEPS = 4000
