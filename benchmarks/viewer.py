@@ -17,6 +17,7 @@ import statistics
 import threading
 import time
 from pathlib import Path
+from socket import socket
 
 import msgspec
 import torch
@@ -44,18 +45,28 @@ MODES = ("color", "depth", "alpha", "normals", "points", "ellipsoids", "cost")
 class Client:
     """The protocol of a browser, without a display."""
 
-    def __init__(self, viewer: NetworkViewer, width: int, height: int) -> None:
-        address = viewer.url.replace("http", "ws")
-        protocol = [f"viser-v{viser.__version__}"]
-        self._socket = connect(address, subprotocols=protocol, max_size=None, compression=None)
+    def __init__(
+        self, viewer: NetworkViewer, width: int, height: int, through: socket | None = None
+    ) -> None:
+        """``through``: a connection to the viewer; default: a direct one."""
+        self._socket = connect(
+            viewer.url.replace("http", "ws"),
+            sock=through,
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+            compression=None,
+        )
         self._size = width, height
         self.images = 0
 
     def move(self, cam_from_world: torch.Tensor, fov: float, shift: float) -> None:
         """Set the camera, shifted by ``shift`` to the right."""
-        width, height = self._size
         rotation = cam_from_world[:, :3]
-        position = -rotation.T @ cam_from_world[:, 3] + shift * rotation[0]
+        self.move_to(rotation, fov, -rotation.T @ cam_from_world[:, 3] + shift * rotation[0])
+
+    def move_to(self, rotation: torch.Tensor, fov: float, position: torch.Tensor) -> None:
+        """Set the camera at a position (3,)."""
+        width, height = self._size
         message = messages.ViewerCameraMessage(
             *(tuple(quat_from_rotation(rotation.T).tolist()), tuple(position.tolist()), fov),
             *(0.01, 1000.0, height, width),
@@ -77,6 +88,7 @@ class Client:
             for message in window["messages"]:
                 if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
                     self.images += 1
+                    self.bytes = len(message["rgb_data"])
                     self.newest = Image.open(io.BytesIO(message["rgb_data"]))
                     return True
 

@@ -102,17 +102,20 @@ def test_the_share_while_a_camera_moves(session, clock, share):
     assert viewing / (clock.now - start) == pytest.approx(share, rel=0.2)
 
 
-def test_one_image_at_a_time_is_being_sent(session, clock):
-    """Images do not accumulate if sending is slower than rendering."""
+def test_few_images_are_on_the_way(session, clock):
+    """Images do not accumulate if the link is slower than rendering."""
     visitor, other = session.enter(1), session.enter(2)
     session.move(visitor, pose())
     request = session.next_request(0, training=False)
-    session.begin_sending(visitor)
+    for _ in range(3):
+        assert session.next_request(0, training=False).visitor is visitor
+        session.begin_sending(visitor)
     assert session.next_request(0, training=False) is None
     session.move(other, pose())
     assert session.next_request(0, training=False).visitor is other
     session.leave(2)
-    session.end_sending(request, 0.1)
+    session.record_sending(request, 0.1)
+    session.arrived(visitor, 1)
     assert session.next_request(0, training=True) is None  # sending counts as viewing time, too
     assert session.next_request(0, training=False).visitor is visitor
     clock.now += 0.11

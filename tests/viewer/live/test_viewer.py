@@ -14,7 +14,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.viewer.live.session import MOVE_SECONDS
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
-from ..clients import Visitor
+from ..clients import Visitor, camera, frame, upgrade
 
 pytestmark = pytest.mark.slow
 
@@ -42,8 +42,8 @@ def test_a_user_who_moves_at_once_leaves_the_photo(tmp_path):
             visitor.send_camera(position=[0.0, 0.5, -3.0])  # the only pose
             wait(lambda: seen.photo_view is None)
             assert time.monotonic() - arrival > 0.9 * MOVE_SECONDS
-            ((_, _, controls),) = viewer._browsers.values()
-            wait(lambda: "click one to view the scene" in controls._where.content)
+            (browser,) = viewer._browsers.values()
+            wait(lambda: "click one to view the scene" in browser.controls._where.content)
     finally:
         viewer.close()
 
@@ -83,3 +83,35 @@ def test_a_newer_scene_replaces_the_one_shown(tmp_path):
         thread.join(timeout=20.0)
         viewer.close()
     assert not thread.is_alive()
+
+
+def test_a_browser_that_receives_slowly_gets_the_newest_images(tmp_path):
+    """Without the answer to a ping, an image has not arrived, and only a few are sent."""
+    dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
+    gaussians = Gaussians.from_points(dataset.points)
+    viewer = NetworkViewer(dataset)
+
+    def images(move: Callable[[float], None], moves: int) -> int:
+        """How many images are rendered while the camera moves."""
+        rendered = 0
+        for i in range(moves):
+            move(0.01 * i)
+            end = time.monotonic() + 0.1
+            while time.monotonic() < end:
+                rendered += viewer.serve(gaussians, 0, training=False)
+                time.sleep(0.005)
+        return rendered
+
+    try:
+        with upgrade(viewer.url) as silent:
+            assert images(lambda x: silent.sendall(frame(camera(position=[x, 0.0, -3.0]))), 12) == 3
+            (seen,) = viewer.session._visitors.values()
+            assert seen.on_the_way == 3
+        wait(lambda: not viewer.session.visitors)
+        with Visitor(viewer.url) as visitor:
+            assert images(lambda x: visitor.send_camera(position=[x, 0.0, -3.0]), 12) >= 9
+            (seen,) = viewer.session._visitors.values()
+            visitor.pictures(0.5)
+            wait(lambda: seen.on_the_way == 0)
+    finally:
+        viewer.close()

@@ -11,6 +11,8 @@ that trains. Therefore `Guard.serve` starts viser's server with additional check
   server sends, the server reads no further messages of this client.
 - During training, the server may use at most a fifth of a processor core.
 
+It also tells when an image has arrived at its browser (`Connection.image_handed`).
+
 These checks run in the thread of viser's server. Images and updates of the page are sent in the
 same thread (`call_in_server_thread`), because viser's buffers are not thread-safe while browsers
 connect or disconnect.
@@ -27,6 +29,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -68,6 +71,8 @@ _log = logging.getLogger(__name__)
 _discard = logging.getLogger(f"{__name__}.connections")
 _discard.setLevel(logging.CRITICAL + 1)
 
+#: The connection that the present task serves.
+current_connection: ContextVar[Connection] = ContextVar("current_connection")
 _Answer = Callable[[ServerConnection, Request], Response | None]
 _listen = websockets.asyncio.server.serve
 
@@ -86,9 +91,9 @@ class Guard:
         self.serves = False  # whether viser has started its server through `serve`
         self.is_open = False  # whether the scene is complete, so that browsers may connect
         self._host, self._token = host, token
-        self._waiting: dict[_Connection, None] = {}  # oldest first
-        self._pages: set[_Connection] = set()
-        self._browsers: set[_Connection] = set()
+        self._waiting: dict[Connection, None] = {}  # oldest first
+        self._pages: set[Connection] = set()
+        self._browsers: set[Connection] = set()
         root = Path(viser.__file__).parent / "client" / "build"
         files = (path for path in root.rglob("*") if path.is_file())
         self._paths = {"/", *(f"/{path.relative_to(root).as_posix()}" for path in files)}
@@ -99,7 +104,7 @@ class Guard:
         answer = options["process_request"]
         options |= {
             "process_request": functools.partial(self._answer, answer),
-            "create_connection": functools.partial(_Connection, self),
+            "create_connection": functools.partial(Connection, self),
             "max_size": _MESSAGE,
             "server_header": "snowsplat",
             "logger": _discard,
@@ -110,11 +115,12 @@ class Guard:
         self, answer: _Answer, connection: ServerConnection, request: Request
     ) -> Response | None:
         """The response to a request: that of viser, or a rejection; None accepts a WebSocket."""
-        assert isinstance(connection, _Connection)
+        assert isinstance(connection, Connection)
         response = self._refusal(connection, request) or answer(connection, request)
         if response is None:
             self._waiting.pop(connection, None)
             self._browsers.add(connection)
+            current_connection.set(connection)  # the handler runs in the same task
             return None
         if response.status_code == http.HTTPStatus.OK:
             self._waiting.pop(connection, None)
@@ -164,7 +170,7 @@ class Guard:
         token = self._token.encode()
         return f"/{rest}" if hmac.compare_digest(_bytes(given), token) else None
 
-    def connected(self, connection: _Connection) -> None:
+    def connected(self, connection: Connection) -> None:
         """Called when a connection is made."""
         self._waiting[connection] = None
         if len(self._waiting) > _WAITING:
@@ -172,7 +178,7 @@ class Guard:
             del self._waiting[oldest]
             oldest.transport.abort()
 
-    def disconnected(self, connection: _Connection) -> None:
+    def disconnected(self, connection: Connection) -> None:
         """Called when a connection is closed."""
         self._waiting.pop(connection, None)
         self._pages.discard(connection)
@@ -183,8 +189,12 @@ def _bytes(path: str) -> bytes:
     return path.encode("ascii", "surrogateescape")  # inverse of the decoding in websockets
 
 
-class _Connection(ServerConnection):
-    """A connection that is closed if it exceeds the limits."""
+class Connection(ServerConnection):
+    """A connection that is closed if it exceeds the limits.
+
+    Attributes:
+        on_arrival: called when images have arrived at the browser, with their number.
+    """
 
     def __init__(self, guard: Guard, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -194,6 +204,9 @@ class _Connection(ServerConnection):
         self._budget = _BURST  # number of frames that may be received now
         self._counted = self.loop.time()  # when the budget was updated
         self._frames = 0  # number of frames of the current message
+        self.on_arrival: Callable[[int], None] = lambda images: None
+        # Numbers of images: handed to viser, sent, and arrived.
+        self._handed = self._sent = self._arrived = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -233,6 +246,25 @@ class _Connection(ServerConnection):
     def _refuse(self) -> None:
         self._refused = True
         self.transport.abort()
+
+    def image_handed(self) -> None:
+        """Record that viser will send one more image. If it gets several, it may send the last."""
+        self._handed += 1
+
+    async def send(self, message: Any, text: bool | None = None) -> None:
+        handed = self._handed
+        await super().send(message, text)
+        if handed > self._sent:
+            self._sent = handed
+            # Browsers answer a ping as soon as they have received everything before it.
+            pong = asyncio.ensure_future(await self.ping())
+            pong.add_done_callback(functools.partial(self._answered, handed))
+
+    def _answered(self, handed: int, pong: asyncio.Future[float]) -> None:
+        if pong.cancelled() or pong.exception() is not None:  # the connection is closed
+            return
+        arrived, self._arrived = handed - self._arrived, handed
+        self.on_arrival(arrived)
 
     async def recv(self, decode: bool | None = None) -> Data:  # type: ignore[override]
         while True:

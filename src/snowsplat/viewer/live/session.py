@@ -22,6 +22,8 @@ MOVE_SECONDS = 2.0  # maximum time until a browser is at the pose of a photo
 # While the camera moves, images are made so small that rendering takes at most this many seconds.
 _MOVING_SECONDS = 0.05
 _MIN_SIDE = 160  # pixels: minimum of the longer side of such an image
+# Images that may be on the way to a browser. More would wait for a slow link, and arrive late.
+_ON_THE_WAY = 3
 # An image is "requested" if a user moved the camera or changed a setting, and "idle" if only the
 # scene has changed.
 IDLE_SHARE = 0.05  # maximum share of the training time for idle images
@@ -76,7 +78,7 @@ class Visitor:
     arrived: bool = False
     photo_view_since: float = 0.0  # time when the browser was moved to the photo
     longest: int = 1280  # pixels of the longer side of a full-size image
-    sending: bool = False  # the last image is being sent
+    on_the_way: int = 0  # images that were rendered, and have not arrived at the browser
     version: int = 0  # incremented with each change of the attributes above
     changed: float = 0.0  # time of the last change
     # About the last image that was rendered:
@@ -95,7 +97,7 @@ class Visitor:
 
         ``scene``: a number that changes when the scene changes.
         """
-        if self.pose is None or self.sending:
+        if self.pose is None or self.on_the_way >= _ON_THE_WAY:
             return None
         full = fit(self.pose.width, self.pose.height, self.longest)
         moving = now - self.changed < STILL
@@ -263,16 +265,19 @@ class Session:
         self.charge(_budget_of(request), seconds)
 
     def begin_sending(self, visitor: Visitor) -> None:
-        """Record that an image is being sent. The browser gets no other one until `end_sending`."""
+        """Record that an image is on the way to a browser, until `arrived`."""
         with self._changed:
-            visitor.sending = True
+            visitor.on_the_way += 1
 
-    def end_sending(self, request: RenderRequest, seconds: float) -> None:
-        """Record that an image was sent, ``seconds`` after rendering began."""
-        self.charge(_budget_of(request), seconds)
+    def arrived(self, visitor: Visitor, images: int) -> None:
+        """Record that images have arrived at a browser, or were not sent."""
         with self._changed:
-            request.visitor.sending = False
+            visitor.on_the_way -= images
             self._notify()
+
+    def record_sending(self, request: RenderRequest, seconds: float) -> None:
+        """Record that an image was encoded, ``seconds`` after rendering began."""
+        self.charge(_budget_of(request), seconds)
 
     def charge(self, budget: Literal["requested", "idle"], seconds: float) -> None:
         """Record that ``seconds`` were used, and delay the next image of this budget accordingly.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import time
 from collections.abc import Callable, Sequence
@@ -15,7 +16,12 @@ import viser
 from snowsplat.data import Dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.viewer.live.display import Pose
-from snowsplat.viewer.live.guard import ServerTimeLimit, call_in_server_thread
+from snowsplat.viewer.live.guard import (
+    Connection,
+    ServerTimeLimit,
+    call_in_server_thread,
+    current_connection,
+)
 from snowsplat.viewer.live.key_cameras import KeyCameras
 from snowsplat.viewer.live.page import Controls, ScenePanel
 from snowsplat.viewer.live.photos import Photos, fitted_photo
@@ -48,6 +54,14 @@ class Scene:
     gaussians: Gaussians | None
     number: int
     about: list[str]
+
+
+@dataclass(frozen=True)
+class _Browser:
+    client: viser.ClientHandle
+    connection: Connection
+    visitor: Visitor
+    controls: Controls
 
 
 class NetworkViewer:
@@ -95,7 +109,7 @@ class NetworkViewer:
             self._bounds.mean(0),
             self.background,
         )
-        self._browsers: dict[int, tuple[viser.ClientHandle, Visitor, Controls]] = {}
+        self._browsers: dict[int, _Browser] = {}
         self._photos.on_click(self._clicked)
         self.server.on_client_connect(self._entered)
         self.server.on_client_disconnect(self._left)
@@ -115,7 +129,9 @@ class NetworkViewer:
         controls = Controls(client, self.session, visitor, self._photos, self._bounds)
         KeyCameras(client, visitor)
         Shortcuts(client, controls, self._bounds)
-        self._browsers[client.client_id] = client, visitor, controls
+        connection = current_connection.get()
+        connection.on_arrival = functools.partial(self.session.arrived, visitor)
+        self._browsers[client.client_id] = _Browser(client, connection, visitor, controls)
         self._photos.begin()
 
         def move(pose: Pose) -> None:
@@ -143,19 +159,23 @@ class NetworkViewer:
     def _clicked(self, client: viser.ClientHandle, index: int) -> None:
         browser = self._browsers.get(client.client_id)
         if browser is not None:
-            browser[2].go_to_photo(index)
+            browser.controls.go_to_photo(index)
 
     def _send(self, request: RenderRequest, image: np.ndarray, drawing: float) -> None:
         started = time.monotonic()
-        client = next((c for c, v, _ in self._browsers.values() if v is request.visitor), None)
+        browser = next((b for b in self._browsers.values() if b.visitor is request.visitor), None)
         try:
-            if client is not None:  # None: the browser has disconnected
-                quality = _QUALITY[request.kind]
+            if browser is not None:  # None: the browser has disconnected
+                scene, quality = browser.client.scene, _QUALITY[request.kind]
                 with self._time_limit.uncounted():
-                    client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
-                client.flush()
+                    scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
+                browser.connection.image_handed()
+                browser.client.flush()
+        except Exception:
+            self.session.arrived(request.visitor, 1)
+            raise
         finally:
-            self.session.end_sending(request, drawing + time.monotonic() - started)
+            self.session.record_sending(request, drawing + time.monotonic() - started)
 
     # The following methods run in the thread that trains or shows a scene
 
