@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from snowsplat.training.progress import Progress
     from snowsplat.training.shards import Shards
     from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.trainer import Trainer
+    from snowsplat.training.trainer import Trainer
 
 # Process 0 may compute the first Gaussians for a long time, while the others wait.
 _TIMEOUT = timedelta(hours=2)

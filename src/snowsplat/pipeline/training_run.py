@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.progress import Progress
     from snowsplat.training.time_budget.pace import Pace
-from snowsplat.training.trainer import Trainer
+    from snowsplat.training.trainer import Trainer
 
 
 @dataclass
