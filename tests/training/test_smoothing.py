@@ -7,15 +7,7 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.lr_schedule import LearningRates
-from snowsplat.training.smoothing import (
-    INTERVAL,
-    OPACITY_RATE,
-    VARIANCE,
-    SmoothingFilter,
-    compensated,
-    sampling_rates,
-)
+from snowsplat.training.smoothing import INTERVAL, VARIANCE, SmoothingFilter, sampling_rates
 from snowsplat.training.step_schedule import Schedule
 
 POSE = torch.eye(3, 4, dtype=torch.float64)
@@ -66,8 +58,3 @@ def test_nothing_changes_without_the_filter_and_between_its_steps():
     SmoothingFilter(False, [NEAR], Schedule(1000)).after_step(INTERVAL, gaussians)
     SmoothingFilter(True, [NEAR], Schedule(1000)).after_step(INTERVAL + 1, gaussians)
     assert torch.equal(gaussians.log_scales, scene().log_scales)
-
-
-def test_only_the_rate_of_the_opacities_changes():
-    rates = LearningRates()
-    assert compensated(rates) == replace(rates, opacity_logits=OPACITY_RATE * 0.05)

@@ -2,15 +2,15 @@
 // Kerbl et al. 2023, eq. 5 and 6), and the vector-Jacobian product of this map.
 //
 //   Σ  = R S Sᵀ Rᵀ            3D covariance, R from the quaternion, S = diag(exp(log_scales))
-//   Σ' = J W Σ Wᵀ Jᵀ + 0.3 I  2D covariance, W the rotation of cam_from_world, J the Jacobian of
-//                             the pinhole projection at the mean
+//   Σ' = J W Σ Wᵀ Jᵀ + d I   2D covariance, W the rotation of cam_from_world, J the Jacobian of
+//                            the pinhole projection at the mean; d = 0.3
 //
-// Σ' is computed as U Uᵀ + 0.3 I, with U = T M, T = J W (2×3) and M = R S (3×3), without the 3D
+// Σ' is computed as U Uᵀ + d I, with U = T M, T = J W (2×3) and M = R S (3×3), without the 3D
 // covariance Σ.
 //
-// The dilation by 0.3 I makes a splat larger, and so small splats too prominent. If `antialiased`,
-// the opacity is multiplied by ρ = √(det(U Uᵀ) / det Σ'), so that the integral of the splat does not
-// change (the 2D mip filter of Yu et al. 2024, with the variance that other renderers use).
+// The dilation by d I makes a splat larger, and so small splats too prominent. If `antialiased`, the
+// opacity is multiplied by ρ = √(det(U Uᵀ) / det Σ'), so that the integral of the splat does not
+// change, and d = 0.1, which is about the area of a pixel (the 2D mip filter of Yu et al. 2024).
 #pragma once
 
 #include "params.h"
@@ -25,6 +25,7 @@ struct PinholeCamera {
   T position[3];                  // camera centre in the world, -Rᵀ t
   T fx, fy, cx, cy, width, height, near;
   bool antialiased;
+  T dilation;  // d
   // Limits of x/z and y/z, 15% outside of the image. J is evaluated with the clamped values,
   // because the linear approximation of the projection is unbounded farther outside.
   T min_tx, max_tx, min_ty, max_ty;
@@ -34,7 +35,8 @@ struct PinholeCamera {
   template <class Real>
   SNOW_INLINE PinholeCamera(const CameraParams<T>& c, Real)
       : fx(T(c.fx)), fy(T(c.fy)), cx(T(c.cx)), cy(T(c.cy)), width(T(c.width)), height(T(c.height)),
-        near(T(c.near)), antialiased(c.antialiased != 0) {
+        near(T(c.near)), antialiased(c.antialiased != 0),
+        dilation(T(c.antialiased ? kMipDilation : kDilation)) {
     for (int i = 0; i < 3; i++) {
       for (int j = 0; j < 3; j++) rotation[3 * i + j] = c.cam_from_world[4 * i + j];
       translation[i] = c.cam_from_world[4 * i + 3];
@@ -126,18 +128,17 @@ SNOW_INLINE void project_gaussian(const GaussianShape<Real>& g, const PinholeCam
     for (int k = 0; k < 3; k++)
       p.U[3 * i + k] =
           p.T[3 * i] * p.M[k] + p.T[3 * i + 1] * p.M[3 + k] + p.T[3 * i + 2] * p.M[6 + k];
-  const Real* U = p.U;
-  p.cov_xx = U[0] * U[0] + U[1] * U[1] + U[2] * U[2] + Real(kDilation);
+  const Real *U = p.U, dilation(cam.dilation);
+  p.cov_xx = U[0] * U[0] + U[1] * U[1] + U[2] * U[2] + dilation;
   p.cov_xy = U[0] * U[3] + U[1] * U[4] + U[2] * U[5];
-  p.cov_yy = U[3] * U[3] + U[4] * U[4] + U[5] * U[5] + Real(kDilation);
-  // det Σ' = |U₀ × U₁|² + d (U₀·U₀ + U₁·U₁) + d², where d = 0.3 is the dilation. The formula
-  // xx·yy − xy² is inaccurate for long thin splats: in float, its error is 19% at σ = 1000 pixels,
-  // and it gives NaN for larger splats.
+  p.cov_yy = U[3] * U[3] + U[4] * U[4] + U[5] * U[5] + dilation;
+  // det Σ' = |U₀ × U₁|² + d (U₀·U₀ + U₁·U₁) + d². The formula xx·yy − xy² is inaccurate
+  // for long thin splats: in float, its error is 19% at σ = 1000 pixels, and it gives NaN for larger
+  // splats.
   Real* n = p.normal;
   n[0] = U[1] * U[5] - U[2] * U[4];
   n[1] = U[2] * U[3] - U[0] * U[5];
   n[2] = U[0] * U[4] - U[1] * U[3];
-  const Real dilation(kDilation);
   p.undilated_det = n[0] * n[0] + n[1] * n[1] + n[2] * n[2];
   p.inv_det = Real(1.f) / (p.undilated_det + dilation * (p.cov_xx + p.cov_yy - dilation));
   p.conic[0] = p.cov_yy * p.inv_det;
@@ -174,7 +175,7 @@ SNOW_INLINE void project_gaussian_vjp(const GaussianShape<Real>& g, const Pinhol
   // V = K U, where K = Σ'⁻¹ is the conic. It is computed from the identity
   // (v·v) u − (u·v) v = v × (u × v). The direct product K U is inaccurate for long thin splats, for
   // the same reason as the determinant above.
-  const Real dilation(kDilation);
+  const Real dilation(cam.dilation);
   const Real *U = p.U, *n = p.normal;
   Real X[6], V[6];  // X = det(U Uᵀ) (U Uᵀ)⁻¹ U
   for (int k = 0; k < 3; k++) {

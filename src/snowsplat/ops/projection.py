@@ -62,15 +62,16 @@ def project(
         cam_from_world: (3, 4), with the axes of OpenCV.
         fx, fy, cx, cy: in pixels.
         near: > 0, in world units.
-        antialiased: multiply the opacity by √(det(J W Σ Wᵀ Jᵀ) / det Σ'), so that the term 0.3 I
-            below does not make small splats too prominent: the 2D mip filter of Yu et al. 2024.
+        antialiased: multiply the opacity by √(det(J W Σ Wᵀ Jᵀ) / det Σ'), so that the term d I below
+            does not make small splats too prominent, and use d = 0.1: the 2D mip filter of Yu et
+            al. 2024.
 
     All tensors are float32, or all are float64.
 
-    The 2D covariance is Σ' = J W Σ Wᵀ Jᵀ + 0.3 I (Kerbl et al. 2023, eq. 5); the colour is
-    max(0, ½ + Σ c_k Y_k(direction)). A Gaussian is visible if it lies beyond `near`, the opacity of
-    its splat is at least 1/255, and the bounding box of its ellipse {α ≥ 1/255} overlaps the
-    rectangle of the pixel centres. Gradients flow to every tensor, including the camera's pose.
+    The 2D covariance is Σ' = J W Σ Wᵀ Jᵀ + d I (Kerbl et al. 2023, eq. 5), d = 0.3 pixels²; the
+    colour is max(0, ½ + Σ c_k Y_k(direction)). A Gaussian is visible if it lies beyond `near`, the
+    opacity of its splat is at least 1/255, and the bounding box of its ellipse {α ≥ 1/255} overlaps
+    the rectangle of the pixel centres. Gradients flow to every tensor, including the camera's pose.
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """

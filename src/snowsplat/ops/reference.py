@@ -38,6 +38,7 @@ from snowsplat.ops.sweep_reference import plane_sweep as plane_sweep
 from snowsplat.util.native_layout import TILE
 
 LOW_PASS = 0.3  # pixels²: blurs every splat, so that it covers at least one pixel centre
+MIP_LOW_PASS = 0.1  # pixels²: the same for antialiased scenes, about the area of a pixel
 ALPHA_MIN = 1 / 255  # smaller contributions do not change an 8-bit image and are skipped
 ALPHA_MAX = 0.99  # so that 1 − α, and with it the transmittance, is never 0
 TRANSMITTANCE_MIN = 1e-4  # a splat that would make T lower, and those behind it, are not blended
@@ -148,15 +149,15 @@ def _project_rows(
     J_rows = [fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z]
     J = torch.stack(J_rows, dim=1).reshape(-1, 2, 3)
 
-    # Σ' = J W Σ Wᵀ Jᵀ (eq. 5) plus the low-pass filter: Σ' = U Uᵀ + 0.3 I with U = J W R S.
+    # Σ' = J W Σ Wᵀ Jᵀ (eq. 5) plus the low-pass filter: Σ' = U Uᵀ + d I with U = J W R S.
+    d = MIP_LOW_PASS if antialiased else LOW_PASS
     u0, u1 = (J @ W @ RS).unbind(dim=1)  # (M, 3) each
     xx, xy, yy = (u0 * u0).sum(dim=1), (u0 * u1).sum(dim=1), (u1 * u1).sum(dim=1)
-    # det Σ' = |u0 × u1|² + 0.3 (xx + yy) + 0.3². The formula xx·yy − xy² is inaccurate for thin
-    # splats.
+    # det Σ' = |u0 × u1|² + d (xx + yy) + d². The formula xx·yy − xy² is inaccurate for thin splats.
     cross = torch.linalg.cross(u0, u1)
     undilated_det = (cross * cross).sum(dim=1)
-    det = undilated_det + LOW_PASS * (xx + yy) + LOW_PASS**2
-    xx, yy = xx + LOW_PASS, yy + LOW_PASS
+    det = undilated_det + d * (xx + yy) + d**2
+    xx, yy = xx + d, yy + d
     conics = torch.stack([yy / det, -xy / det, xx / det], dim=1)
     major = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)  # the larger eigenvalue of Σ'
     variances = torch.stack([xx, yy], dim=1)

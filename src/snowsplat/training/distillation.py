@@ -18,7 +18,6 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project, render
 from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.optim import Adam
-from snowsplat.training.smoothing import compensated
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.view_gradient import ViewGradient
 
@@ -63,7 +62,7 @@ def distill(
     student = student.clone()
     optimizer = Adam(
         student,
-        compensated(MERGED_RATES) if student.antialiased else MERGED_RATES,
+        MERGED_RATES,
         schedule=Schedule(steps),
         extent=scene_extent(cameras),
         visible_only=True,

@@ -18,22 +18,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.lr_schedule import LearningRates
 from snowsplat.training.step_schedule import Schedule
 
 #: Number of steps between two applications.
 INTERVAL = 100
 #: s: the variance of the filter, in units of the distance between samples, squared.
 VARIANCE = 0.2
-#: Factor of the learning rate of the opacities.
-OPACITY_RATE = 4.0
 #: Photos show only what is farther away, in world units: the default of `ops.project`.
 _NEAR = 0.2
 
@@ -61,14 +57,6 @@ class SmoothingFilter:
             smallest = scales.argmin(1, keepdim=True)
             raised = torch.maximum(scales, limit[:, None])
             scales.copy_(raised.scatter(1, smallest, scales.gather(1, smallest)))
-
-
-def compensated(rates: LearningRates) -> LearningRates:
-    """The learning rates for splats whose opacity is reduced where they are smaller than a pixel.
-
-    Their opacities before this reduction are larger, and so farther from those of the first step.
-    """
-    return replace(rates, opacity_logits=OPACITY_RATE * rates.opacity_logits)
 
 
 def sampling_rates(means: Tensor, cameras: Sequence[Camera]) -> Tensor:

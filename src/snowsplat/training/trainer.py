@@ -30,7 +30,6 @@ from snowsplat.training.progress import Progress
 from snowsplat.training.sharded_render import sharded_render
 from snowsplat.training.shards import ALONE, Shards
 from snowsplat.training.sky import Sky, find_sky
-from snowsplat.training.smoothing import compensated
 from snowsplat.training.step_runner import StepRunner
 from snowsplat.training.step_schedule import Schedule
 from snowsplat.training.transients import Transients, delayed
@@ -147,10 +146,9 @@ class Trainer:
                     dataset, start, neutral, self._generators["start"], self.device, self.sky
                 )
         self.gaussians = replace(shards.scattered(first), antialiased=config.antialias)
-        rates = config.learning_rates
         self._optimizer = Adam(
             self.gaussians,
-            compensated(rates) if config.antialias else rates,
+            config.learning_rates,
             schedule=self.schedule,
             extent=dataset.extent,
             visible_only=config.visible_only,

@@ -69,7 +69,7 @@ FAULTS = (
     ),
     Fault(
         "projection.h",
-        "U[2] * U[2] + Real(kDilation);",
+        "U[2] * U[2] + dilation;",
         "U[2] * U[2];",
         "low-pass filter in x",
         "project",
