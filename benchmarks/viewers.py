@@ -65,6 +65,7 @@ class Viewer:
         formats: the suffixes of the formats that it reads, and the PSNR in dB that it must reach
             with each: 2 dB below that of the first photo of the demo.
         options: the settings for a picture like ours, for ``script``.
+        antialiased: other settings for an antialiased scene; None if the viewer has none.
         sh_degree: the highest degree that it draws; the scene is reduced to it.
     """
 
@@ -73,6 +74,7 @@ class Viewer:
     script: str
     formats: dict[str, float]
     options: dict[str, Any] = field(default_factory=dict)
+    antialiased: dict[str, Any] | None = None
     sh_degree: int = 3
 
 
@@ -92,6 +94,7 @@ VIEWERS = (
             "accumExtSplats": True,
             "mesh": {"extSplats": True},
         },
+        {"preBlurAmount": 0.0, "blurAmount": 0.1},
     ),
     Viewer(
         "GaussianSplats3D",
@@ -99,6 +102,7 @@ VIEWERS = (
         "gaussian_splats_3d",
         {PLY: 36.4, COMPRESSED: 37.2, ".v2.spz": 36.7, SPLAT: 38.4},
         {"sphericalHarmonicsDegree": 2, "integerBasedSort": False},
+        {"antialiased": True, "kernel2DSize": 0.1},
         sh_degree=2,
     ),
     Viewer(
@@ -115,6 +119,7 @@ VIEWERS = (
         "playcanvas",
         {PLY: 43.6, COMPRESSED: 43.6, SOG: 43.5},
         {"minPixelSize": 0.0, "minContribution": 0.0, "lowPass": 1.2},
+        {"antiAlias": True, "lowPass": 0.4},
     ),
     Viewer(
         "Babylon.js",
@@ -122,6 +127,7 @@ VIEWERS = (
         "babylon",
         {PLY: 30.5, COMPRESSED: 30.2, SPLAT: 38.7},
         {"kernelSize": 1.2},
+        {"compensation": True, "kernelSize": 0.4},
     ),
 )
 
@@ -198,7 +204,8 @@ class Comparison:
         path = self.folder / f"scene{viewer.sh_degree}{suffix}"
         if not path.exists():
             write(path, with_sh_degree(self.gaussians, viewer.sh_degree))
-        scene = read_gaussians(path)
+        # Formats without a mark: the viewers are told, too.
+        scene = replace(read_gaussians(path), antialiased=self.gaussians.antialiased)
         values = []
         for i, camera in enumerate(self.cameras):
             ours = (render(scene, camera).image.clamp(0, 1) * 255).round() / 255
@@ -246,7 +253,10 @@ def rows(comparison: Comparison, viewers: list[Viewer], formats: list[str]) -> i
             continue
         for suffix in (s for s in viewer.formats if not formats or s in formats):
             cells = []
-            for options in ({}, viewer.options):
+            settings = viewer.options
+            if comparison.gaussians.antialiased:
+                settings = settings | (viewer.antialiased or {})
+            for options in ({}, settings):
                 try:
                     value = comparison.psnr(viewer, suffix, options)
                 except BrowserError as error:
