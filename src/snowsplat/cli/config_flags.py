@@ -54,10 +54,10 @@ class ConfigFlags:
     ] = None
     """Whether to learn a gain for each photo and colour channel, for photos with different
     exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
-    antialias: Annotated[Literal["on", "off"] | None, flag("{on,off}", default="off")] = None
-    """Whether to train a scene that also looks right in images that are much smaller or larger than
-    the photos. The scene file is marked, and viewers that know the mark show it as it was
-    trained."""
+    antialias: Annotated[Literal["on", "off"] | None, flag("{on,off}", default=RECIPE)] = None
+    """Whether to train a scene that also looks right in images that are smaller or larger than the
+    photos. The scene file is marked. off: for viewers that draw as the reference implementation
+    does, in images of the size of the photos."""
 
     sh_degree: Annotated[int | None, flag("{0,1,2,3}", default="3")] = None
     """Degree of the spherical harmonics (view-dependent colour). A lower degree needs less

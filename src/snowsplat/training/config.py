@@ -63,7 +63,7 @@ class TrainConfig:
             square root of their number, because they show a larger scene. 0: it does not grow.
         antialias: whether the scene is trained and rendered without aliasing in other resolutions
             than that of the photos: the 2D mip filter of `ops.project`, and the limit of the scales
-            and the learning rate of `smoothing`.
+            of `smoothing`.
         visible_only: whether the optimiser skips Gaussians that are not visible in the view of the
             step. In the paper, their momentum continues to change them. Skipping them is faster,
             without a measurable loss of quality.

@@ -27,8 +27,8 @@ def default() -> TrainConfig:
     training, all learning rates decrease; opacities and scales decay, so that Gaussians which no
     photo needs become transparent; Gaussians with an opacity below 0.1 are removed, and their
     places are used again; no Gaussian is much nearer to a camera than the points that it sees;
-    densification lasts longer, uses absolute gradients, and always reaches the maximum number; and
-    of the same time, more is used for Gaussians and less for steps.
+    densification lasts longer, uses absolute gradients, and always reaches the maximum number; of
+    the same time, more is used for Gaussians and less for steps; and the scene is antialiased.
     """
     config = classic()
     return replace(
@@ -43,6 +43,7 @@ def default() -> TrainConfig:
         decay=DecayRates(opacity=0.04, scale=0.02, until=0.7),
         relative_scale=0.3,
         near_limit=0.6,
+        antialias=True,
         density=replace(
             config.density,
             densify_until=0.7,
