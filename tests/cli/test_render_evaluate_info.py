@@ -53,19 +53,20 @@ def test_render_antialiased(run, trained, tmp_path):
     for flags in ((), ("--antialias", "on"), ("--antialias", "off")):
         assert run("render", trained, "--split", "test", *flags).code == 0
         images[flags] = image(renders)
-    assert np.array_equal(images[()], images["--antialias", "off"])
-    assert np.abs(images[()] - images["--antialias", "on"]).max() > 10
+    assert np.array_equal(images[()], images["--antialias", "on"])
+    assert np.abs(images[()] - images["--antialias", "off"]).max() > 10
 
-    marked = tmp_path / "marked"
-    shutil.copytree(trained, marked)
-    scene = marked / "point_cloud/iteration_60/point_cloud.ply"
+    unmarked = tmp_path / "unmarked"
+    shutil.copytree(trained, unmarked)
+    scene = unmarked / "point_cloud/iteration_60/point_cloud.ply"
     gaussians = read_gaussians(scene)
-    gaussians.antialiased = True
+    assert gaussians.antialiased
+    gaussians.antialiased = False
     write_gaussians(scene, gaussians)
-    assert run("render", marked, "--split", "test").code == 0
-    again = image(marked / "test/ours_60/renders/00000.png")
-    assert np.array_equal(again, images["--antialias", "on"])
-    assert json.loads(run("info", scene, "--json").out)["antialiased"]
+    assert run("render", unmarked, "--split", "test").code == 0
+    again = image(unmarked / "test/ours_60/renders/00000.png")
+    assert np.array_equal(again, images["--antialias", "off"])
+    assert not json.loads(run("info", scene, "--json").out)["antialiased"]
 
 
 def test_render_depth(run, trained):

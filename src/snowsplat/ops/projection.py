@@ -62,9 +62,9 @@ def project(
         cam_from_world: (3, 4), with the axes of OpenCV.
         fx, fy, cx, cy: in pixels.
         near: > 0, in world units.
-        antialiased: multiply the opacity by √(det(J W Σ Wᵀ Jᵀ) / det Σ'), so that the term d I below
-            does not make small splats too prominent, and use d = 0.1: the 2D mip filter of Yu et
-            al. 2024.
+        antialiased: multiply the opacity by √(det(J W Σ Wᵀ Jᵀ) / det Σ'), so that the term d I
+            below does not make small splats too prominent, and use d = 0.1: the 2D mip filter of Yu
+            et al. 2024.
 
     All tensors are float32, or all are float64.
 

@@ -53,7 +53,8 @@ void main() {
     vec3 jx = vec3(focal.x, 0.0, -focal.x * slope.x) / p.z;
     vec3 jy = vec3(0.0, focal.y, -focal.y * slope.y) / p.z;
     vec3 fx = jx * factor, fy = jy * factor;
-    float xx = dot(fx, fx) + 0.3, yy = dot(fy, fy) + 0.3, xy = dot(fx, fy);
+    float d = ANTIALIASED ? 0.1 : 0.3; // pixels^2
+    float xx = dot(fx, fx) + d, yy = dot(fy, fy) + d, xy = dot(fx, fy);
     if (ANTIALIASED) {
         vec3 normal = cross(fx, fy); // det(U Uᵀ) = |U₀ × U₁|²
         opacity *= sqrt(dot(normal, normal) / (xx * yy - xy * xy));
