@@ -93,7 +93,7 @@ constexpr double kMinAlpha = 1.0 / 255.0;   // contributions with a smaller alph
 constexpr double kMaxAlpha = 0.99;          // keeps 1 - alpha away from 0
 constexpr double kMinTransmittance = 1e-4;  // a pixel is finished before T falls below
 constexpr double kLog2MinAlpha = -7.994353436858858;  // log2(1/255)
-constexpr double kDilation = 0.3;  // added to the diagonal of the 2D covariance, pixels^2
+constexpr double kDilation = 0.3;     // added to the diagonal of the 2D covariance, pixels^2
 constexpr double kMipDilation = 0.1;  // instead, for antialiased scenes (Yu et al. 2024)
 
 }  // namespace snow
