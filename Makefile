@@ -123,9 +123,12 @@ pytest-best:
 	$(PYTEST) $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
 # The kernels for Arm (NEON), in an emulator. The loader of the library, which test_native.py tests, is not
-# used for them.
+# used for them. The two longest tests of threads take minutes there, and threads do not depend on the
+# instruction set.
 NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py \
-    --ignore tests/ops/test_native.py
+    --ignore tests/ops/test_native.py \
+    --deselect tests/ops/test_determinism.py::test_rasterize_in_bands \
+    --deselect tests/ops/test_determinism.py::test_training_steps
 NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
 neon: native
