@@ -112,21 +112,29 @@ def test_what_does_not_move(reason):
     assert not moving(seen, elsewhere, others, *RULE).any()
 
 
-@pytest.mark.parametrize("reason", ["found", "in a row at the border", "nothing is shown there"])
-def test_a_place_in_no_other_view_is_judged_by_its_own(reason):
+@pytest.mark.parametrize("first", [12, 15])
+@pytest.mark.parametrize("reason", ["found", "a single row", "nothing is shown there"])
+def test_a_place_in_no_other_view_is_judged_by_its_own(first, reason):
+    """What is at the border of the photo, also in one column, continues beyond it."""
     residual, elsewhere, others = cells(0.02), cells(torch.inf), cells(0.0)
-    if reason == "in a row at the border":  # where the scene ends
-        residual[0] = 0.3
-    else:
-        residual[4:8, 12:] = 0.3
+    rows = slice(4, 5 if reason == "a single row" else 8)
+    residual[rows, first:] = 0.3
     seen = view(residual)
     if reason == "nothing is shown there":
-        seen.places.inverse_depth[4:8, 12:] = 0.0
+        seen.places.inverse_depth[rows, first:] = 0.0
     found = moving(seen, elsewhere, others, *RULE[:2], True)
     expected = torch.zeros(12, 16, dtype=torch.bool)
-    expected[3:9, 11:] = reason == "found"
+    expected[3:9, first - 1 :] = reason == "found"
     assert torch.equal(found, expected)
     assert not moving(seen, elsewhere, others, *RULE).any()
+
+
+@pytest.mark.parametrize(("elsewhere", "alone"), [(0.02, True), (0.02, False), (0.15, True)])
+def test_one_other_view_judges_if_something_moves_in_several_photos(elsewhere, alone):
+    residual, others = cells(0.02), cells(1.0)
+    residual[4:8, 5:9] = 0.3
+    found = moving(view(residual), cells(elsewhere), others, *RULE[:2], alone)
+    assert found.any() == (alone and elsewhere == 0.02)
 
 
 def test_the_edges_of_a_thing_may_have_a_smaller_residual():

@@ -13,7 +13,8 @@ photo, as by a mask of the user. It is found by four properties:
   2023).
 
 If several photos have such a thing, smaller residuals are enough, and the photos are compared again
-without it. Then places that no other photos show are judged, too, by their own photo.
+without it. Then places that only one other photo shows are judged, too, and those that no other
+photo shows, by their own photo.
 
 The masks are computed anew at a few moments. A place that is masked by mistake is still trained by
 the other photos, so it is not masked the next time. As in RobustSplat (Fu et al. 2025), Gaussians
@@ -31,7 +32,7 @@ import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
@@ -68,7 +69,8 @@ _NOTABLE, _RINGS = 0.5, 3
 _LESS = 0.8
 #: It must be this many times the residual of the same place in other views, ...
 _TIMES = 3.0
-#: ... of which there must be at least this number.
+#: ... of which there must be at least this number. If something moves in several photos, one other
+#: view is enough, and with none the photo is judged alone.
 _FEWEST_OTHERS = 2
 #: The same surface in another light has at least this correlation with its rendering.
 _SAME_DETAIL = 0.5
@@ -235,18 +237,16 @@ def moving(
         others: (h, w), the number of these views.
         large: the smallest large residual.
         before: (h, w) bool, the result of the last time.
-        alone: whether places that too few other views show can be found, too.
+        alone: whether places that one or no other view shows can be found, too.
     """
     large_here = cells.residual >= large
     differs = cells.correlation < _SAME_DETAIL
-    judged = others >= _FEWEST_OTHERS
+    judged = others >= (1 if alone else _FEWEST_OTHERS)
     stands_out = judged & differs & (cells.residual >= _TIMES * elsewhere)
     unknown = ~judged & differs & (cells.places.inverse_depth > 0.0) & large_here
     confirmed = stands_out & large_here
-    found = confirmed & (_votes(confirmed, border=False) >= _VOTES)
-    if alone:
-        likely = confirmed | unknown
-        found |= likely & (_votes(likely, border=True) >= _VOTES)
+    likely = confirmed | unknown if alone else confirmed
+    found = likely & (_votes(likely) >= _VOTES)
     # Other photos need not confirm the cells around, but must not contradict.
     notable = (stands_out & (cells.residual >= _NOTABLE * large)) | unknown
     found |= before & notable
@@ -255,10 +255,12 @@ def moving(
     return _dilated(found)  # the edge of a thing lies within a cell
 
 
-def _votes(cells: Tensor, border: bool) -> Tensor:
-    """The share of the 3 × 3 cells around each cell, with those beyond the border or without."""
-    planes = cells[None].float()
-    return avg_pool2d(planes, 3, stride=1, padding=1, count_include_pad=border)[0]
+def _votes(cells: Tensor) -> Tensor:
+    """The share of the 3 × 3 cells around each cell. What is at the border of a photo is assumed to
+    continue beyond it.
+    """
+    planes = pad(cells[None].float(), (1, 1, 1, 1), mode="replicate")
+    return avg_pool2d(planes, 3, stride=1)[0]
 
 
 def _dilated(cells: Tensor) -> Tensor:

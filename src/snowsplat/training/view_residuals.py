@@ -21,7 +21,7 @@ from snowsplat.training.starts.depth_map import DepthMap
 #: Side of a cell, in pixels of the photo.
 CELL = 8
 #: A cell is compared with the cells of this number of views whose cameras are nearest.
-_NEIGHBOURS = 16
+_NEIGHBOURS = 32
 #: The usual residual of a place is this quantile of its residuals in these views. It is not the
 #: median, because gloss and shadows also change only between some of the views.
 _USUAL = 0.75
