@@ -142,7 +142,7 @@ def test_what_moves_is_masked_and_shown(tmp_path):
         with Image.open(photos / "images" / name) as image:
             image.paste((250, 20, 240), (left, 24, left + 48, 80))
             image.save(photos / "images" / name)
-    settings = {"iterations": 80, "checkpoint_every": 60, "transients": "auto"}
+    settings = {"iterations": 120, "checkpoint_every": 100}
     recorder = Recorder()
     result = train(photos, tmp_path / "out", TrainOptions(settings=settings), observer=recorder)
     most_masked = sorted(result.moving, key=lambda name: -result.moving[name])

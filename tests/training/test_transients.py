@@ -23,7 +23,7 @@ from snowsplat.util.errors import SettingError, UserError
 
 COUNT, WIDTH, HEIGHT = 36, 128, 96
 #: The photos with something in front of the camera, and where: left, upper, right, lower edge.
-BOXES = {3: (32, 24, 72, 72), 9: (8, 40, 56, 88), 14: (64, 16, 112, 56)}
+BOXES = {3: (32, 24, 72, 72), 9: (8, 40, 56, 88), 14: (64, 16, 112, 56), 20: (40, 8, 88, 56)}
 CONFIG = recipe("default", iterations=150, transients="auto")
 
 
@@ -281,10 +281,14 @@ def test_a_checkpoint_without_the_setting_is_as_before(busy):
     assert not [name for name in state if name.startswith("transients.")]
 
 
-@pytest.mark.parametrize(("mode", "views"), [("auto", 29), ("on", 7)])
-def test_with_few_photos_nothing_is_masked(busy, mode, views):
+@pytest.mark.parametrize(
+    ("mode", "views", "steps"), [("auto", 29, 150), ("auto", 31, 123), ("on", 7, 150)]
+)
+def test_with_few_photos_or_steps_nothing_is_masked(busy, mode, views, steps):
     few = replace(busy, train=busy.train[:views])
-    trainer = run(few, replace(CONFIG, iterations=30, transients=mode))
+    config = replace(CONFIG, iterations=steps, transients=mode)
+    trainer = run(few, config, until=steps // 2)
+    assert trainer.transients.complete(trainer.step)
     assert trainer.transients.found == {}
 
 

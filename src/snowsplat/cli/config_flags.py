@@ -39,7 +39,7 @@ class ConfigFlags:
     poses are probably wrong. A value with a decimal point (0.15) is a fraction of all steps; 0:
     never."""
     transients: Annotated[
-        Literal["auto", "on", "off"] | None, flag("{auto,on,off}", default="off")
+        Literal["auto", "on", "off"] | None, flag("{auto,on,off}", default=RECIPE)
     ] = None
     """Whether to mask what moves, such as people who walk past: it looks different from what the
     other photos show at this place. auto: if there are at least 30 photos and something moves in

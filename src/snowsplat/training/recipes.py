@@ -28,7 +28,8 @@ def default() -> TrainConfig:
     photo needs become transparent; Gaussians with an opacity below 0.1 are removed, and their
     places are used again; no Gaussian is much nearer to a camera than the points that it sees;
     densification lasts longer, uses absolute gradients, and always reaches the maximum number; of
-    the same time, more is used for Gaussians and less for steps; and the scene is antialiased.
+    the same time, more is used for Gaussians and less for steps; what moves in several photos is
+    masked; and the scene is antialiased.
     """
     config = classic()
     return replace(
@@ -43,6 +44,7 @@ def default() -> TrainConfig:
         decay=DecayRates(opacity=0.04, scale=0.02, until=0.7),
         relative_scale=0.3,
         near_limit=0.6,
+        transients="auto",
         antialias=True,
         density=replace(
             config.density,

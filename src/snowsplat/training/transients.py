@@ -60,6 +60,8 @@ _GROWTH = MOMENTS[1]
 #: With fewer views, nothing is masked: too few of them show the same place. With few views, much of
 #: the background is in one photo only, and the depth of its rendering is wrong.
 _FEWEST_VIEWS = {"auto": 30, "on": 8, "off": 0}
+#: With "auto", and with fewer steps for each view, the comparisons would take too much of the time.
+_STEPS_PER_VIEW = 4
 #: The residual of a cell is large if it is at least this, and at least this many times the quantile
 #: of the residuals of all cells. Early in the training, all residuals are larger.
 _LARGE, _LARGE_TIMES, _QUANTILE = 0.1, 2.0, 0.9
@@ -78,7 +80,7 @@ _SAME_DETAIL = 0.5
 _VOTES = 0.5
 #: With "auto", a photo counts if this share of its cells are found. Things move in the scene if at
 #: least this number of photos and this share of all photos count.
-_SHARE, _PHOTOS, _PHOTOS_SHARE = 0.02, 3, 0.08
+_SHARE, _PHOTOS, _PHOTOS_SHARE = 0.02, 3, 0.1
 
 
 class Transients:
@@ -108,7 +110,8 @@ class Transients:
         self._mode, self._views, self._images = mode, views, images
         self._background, self._schedule, self._shards = background, schedule, shards
         self.masks = [torch.ones(cell_size(view.camera), dtype=torch.bool) for view in views]
-        if len(views) < _FEWEST_VIEWS[mode]:
+        costly = mode == "auto" and schedule.iterations < _STEPS_PER_VIEW * len(views)
+        if costly or len(views) < _FEWEST_VIEWS[mode]:
             self._mode = "off"
 
     def after_step(
