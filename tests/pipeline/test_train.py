@@ -142,14 +142,14 @@ def test_what_moves_is_masked_and_shown(tmp_path):
         with Image.open(photos / "images" / name) as image:
             image.paste((250, 20, 240), (left, 24, left + 48, 80))
             image.save(photos / "images" / name)
-    settings = {"iterations": 120, "checkpoint_every": 100}
+    settings = {"iterations": 240, "checkpoint_every": 150}
     recorder = Recorder()
     result = train(photos, tmp_path / "out", TrainOptions(settings=settings), observer=recorder)
     most_masked = sorted(result.moving, key=lambda name: -result.moving[name])
     assert set(most_masked[:3]) == {"view_03.png", "view_06.png", "view_10.png"}
     # After so few steps, the scene is incomplete at the borders of one or two other photos.
     assert len(most_masked) <= 5
-    assert all(result.moving[name] < 0.15 for name in most_masked[3:])
+    assert all(result.moving[name] < 0.2 for name in most_masked[3:])
     count = len(most_masked)
     mean = 100 * sum(result.moving.values()) / count
     line = f"something moves in {count} of 30 photos: masked there, {mean:.1f}% of their pixels; "

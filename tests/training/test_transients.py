@@ -24,7 +24,7 @@ from snowsplat.util.errors import SettingError, UserError
 COUNT, WIDTH, HEIGHT = 36, 128, 96
 #: The photos with something in front of the camera, and where: left, upper, right, lower edge.
 BOXES = {3: (32, 24, 72, 72), 9: (8, 40, 56, 88), 14: (64, 16, 112, 56), 20: (40, 8, 88, 56)}
-CONFIG = recipe("default", iterations=150, transients="auto")
+CONFIG = recipe("default", iterations=250, transients="auto")
 
 
 @pytest.fixture(scope="module")
@@ -181,10 +181,11 @@ def test_residuals_of_the_same_places_in_other_views():
 def test_what_moves_is_found(trained):
     found = trained.transients.found
     assert set(found) >= set(BOXES)
-    # Few others, where no other photo shows the place.
+    # Small parts of a few others, where at most one other photo shows the place.
     others = [share for i, share in found.items() if i not in BOXES]
-    assert len(others) <= 4
-    assert sum(others) < 0.25
+    assert len(others) <= 8
+    assert max(others, default=0.0) < 0.2
+    assert sum(others) < 0.75
     for i, (left, upper, right, lower) in BOXES.items():
         mask = trained.transients.masks[i]
         inside = torch.zeros_like(mask)
@@ -214,6 +215,19 @@ def test_a_static_scene_changes_no_bit(still):
     masked, unmasked = (run(still, replace(CONFIG, transients=t)) for t in ("auto", "off"))
     assert masked.transients.found == {}
     assert_identical(masked.gaussians, unmasked.gaussians)
+
+
+@pytest.mark.parametrize(("moving", "compared"), [(True, 4), (False, 2)])
+def test_if_nothing_moves_the_photos_are_not_compared_again(busy, still, moving, compared):
+    trainer = Trainer(busy if moving else still, CONFIG)
+    steps = [round(moment * CONFIG.iterations) for moment in MOMENTS]
+    found = []
+    for _ in range(steps[-1]):
+        trainer.step_once()
+        if trainer.step in steps:
+            state = trainer.gaussians, 0, 1, ()
+            found.append(trainer.transients.after_step(trainer.step, *state))
+    assert found == [True] * compared + [False] * (4 - compared)
 
 
 def test_the_mask_of_the_user_remains(trained):
@@ -246,7 +260,7 @@ def test_masks_as_pictures(busy, trained):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stop", [14, 15, 60])
+@pytest.mark.parametrize("stop", [24, 25, 100])
 def test_a_resumed_run_has_the_same_masks(busy, trained, tmp_path, stop):
     first = run(busy, CONFIG, until=stop)
     path = checkpoint.save(tmp_path, stop, first.state_tensors(), {})
@@ -282,7 +296,7 @@ def test_a_checkpoint_without_the_setting_is_as_before(busy):
 
 
 @pytest.mark.parametrize(
-    ("mode", "views", "steps"), [("auto", 29, 150), ("auto", 31, 123), ("on", 7, 150)]
+    ("mode", "views", "steps"), [("auto", 29, 250), ("auto", 31, 247), ("on", 7, 250)]
 )
 def test_with_few_photos_or_steps_nothing_is_masked(busy, mode, views, steps):
     few = replace(busy, train=busy.train[:views])

@@ -73,7 +73,7 @@ class TrainConfig:
             explain them, because their camera poses are probably wrong; see `unexplained`. 0:
             never.
         transients: whether what moves is masked in the photos, such as people who walk past; see
-            `transients`. "auto": only with at least 30 views, four steps for each view, and if
+            `transients`. "auto": only with at least 30 views, eight steps for each view, and if
             something moves in several of them. "on" also delays densification until the first masks
             are known.
         stop_overfitting: whether the training ends earlier if the views between the photos become

@@ -61,7 +61,9 @@ _GROWTH = MOMENTS[1]
 #: the background is in one photo only, and the depth of its rendering is wrong.
 _FEWEST_VIEWS = {"auto": 30, "on": 8, "off": 0}
 #: With "auto", and with fewer steps for each view, the comparisons would take too much of the time.
-_STEPS_PER_VIEW = 4
+_STEPS_PER_VIEW = 8
+#: With "auto", if nothing moves after this moment, the photos are not compared again.
+_NOTHING = MOMENTS[1]
 #: The residual of a cell is large if it is at least this, and at least this many times the quantile
 #: of the residuals of all cells. Early in the training, all residuals are larger.
 _LARGE, _LARGE_TIMES, _QUANTILE = 0.1, 2.0, 0.9
@@ -134,6 +136,9 @@ class Transients:
         """
         moments = [self._schedule.step_of(moment) for moment in MOMENTS]
         if self._mode == "off" or not self._schedule.contains(step, moments):
+            return False
+        late = step > self._schedule.step_of(_NOTHING)
+        if self._mode == "auto" and late and not self.found:
             return False
 
         def with_depth(camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
