@@ -96,8 +96,8 @@ types: $(ENVIRONMENT)
 layers: $(ENVIRONMENT)
 	lint-imports --no-logo
 
-# Number of processes for tests: one more than cores, because some tests wait for browsers and servers.
-JOBS ?= $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)')
+# Number of processes for tests.
+JOBS ?= $(shell $(PYTHON) -c 'import os; print(os.cpu_count())')
 PYTEST = $(PROCESS) $(PYTHON) -m pytest $(PROCESSES)
 # A single process does not need xdist.
 PROCESS = $(if $(filter 1,$(JOBS)),OMP_NUM_THREADS=1)
@@ -112,8 +112,8 @@ REPEATED := build/pytest-repeated.log
 pytest-quick: native
 	$(PYTEST) -m '$(QUICK)'
 
-# All tests on the best instruction set. At the same time, with half as many processes and a lower
-# priority, because some of them wait: on each other instruction set and in an emulator
+# All tests on the best instruction set. Some of them wait for browsers and servers. Therefore, at the same
+# time, with half as many processes and a lower priority: on each other instruction set and in an emulator
 # of Arm, the tests that depend on it; and the GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not
 # repeated without them.
 pytest: native
