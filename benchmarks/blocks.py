@@ -3,7 +3,7 @@
     python benchmarks/blocks.py --out OUT
     python benchmarks/blocks.py --out OUT --photos 96 --blocks 3 --gaussians 40000
 
-The photos are ray traced (`snowsplat.synthetic.street`). Every 8th is held out. Each training is a
+The photos are ray traced (`tests.scenes.street`). Every 8th is held out. Each training is a
 process of its own, whose memory is measured. Results are kept in OUT; the same command continues.
 """
 
@@ -13,6 +13,7 @@ import argparse
 import json
 import math
 import multiprocessing
+import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -28,15 +29,18 @@ from snowsplat.pipeline.blocks.merge import merge_blocks
 from snowsplat.pipeline.blocks.plan import Plan, PlanOptions, plan_blocks
 from snowsplat.pipeline.blocks.train import train_blocks
 from snowsplat.pipeline.evaluate import evaluate
-from snowsplat.pipeline.scene_source import TrainedScene, load_trained
+from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
-from snowsplat.synthetic.street_dataset import write_street_dataset
 from snowsplat.trajectory.video import video_writer
 from snowsplat.util.files import write_json
 from snowsplat.util.process_memory import peak_bytes, reset_peak, resident_bytes
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.scenes.street_dataset import write_street_dataset
 
 WORST = 6
 
@@ -54,7 +58,7 @@ def measured(function: Callable[..., None], *arguments: Any) -> dict[str, float]
 
     ``before`` is the memory of Python and its libraries.
     """
-    import snowsplat.training.trainer  # noqa: F401 (before the memory is measured)
+    import snowsplat.training.core.trainer  # noqa: F401 (before the memory is measured)
 
     reset_peak()
     before, begin = resident_bytes(), time.process_time()

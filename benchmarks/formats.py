@@ -24,7 +24,7 @@ import torch
 from snowsplat import Gaussians, View, load_dataset, read_gaussians
 from snowsplat.evaluation.metrics import evaluate_views, psnr
 from snowsplat.formats.spz import read_spz, write_spz
-from snowsplat.pipeline.scene_files import FORMATS, GaussianArrays, format_for_reading
+from snowsplat.pipeline.output.scene_files import FORMATS, GaussianArrays, format_for_reading
 from snowsplat.scene.render import render
 
 Read = Callable[[Path], GaussianArrays]

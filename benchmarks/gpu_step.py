@@ -26,13 +26,13 @@ from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import Execute, launch_by
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.scene.render import project, render
-from snowsplat.training.batch import BatchView
-from snowsplat.training.config import TrainConfig
+from snowsplat.training.core.batch import BatchView
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.core.lr_schedule import LearningRates
+from snowsplat.training.core.optim import Adam
+from snowsplat.training.core.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
+from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import AdaptiveDensity
-from snowsplat.training.lr_schedule import LearningRates
-from snowsplat.training.optim import Adam
-from snowsplat.training.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
-from snowsplat.training.trainer import Trainer
 from snowsplat.util.native_layout import Params
 
 GPU = torch.device("cuda")

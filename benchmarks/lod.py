@@ -26,7 +26,7 @@ from snowsplat.evaluation.metrics import psnr
 from snowsplat.formats import GaussianArrays, write_gaussians
 from snowsplat.formats.lod import INDEX, read_index, read_lod
 from snowsplat.formats.lod_writer import LodSizes, write_lod
-from snowsplat.pipeline.scene_source import load_viewable
+from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import crop, transform
 from snowsplat.scene.gaussians import Gaussians

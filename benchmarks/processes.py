@@ -29,13 +29,13 @@ from workloads import SIZES, workload
 from snowsplat import ops
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
-from snowsplat.pipeline import processes
+from snowsplat.pipeline.run import processes
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import project
-from snowsplat.training.process_shards import ProcessShards
-from snowsplat.training.recipes import recipe
-from snowsplat.training.shards import Shards
-from snowsplat.training.trainer import Trainer
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.processes.process_shards import ProcessShards
+from snowsplat.training.processes.shards import Shards
 from snowsplat.util.process_memory import peak_bytes, reset_peak, resident_bytes
 
 #: Number of updates before the measurement, and of measured ones.

@@ -29,7 +29,7 @@ from snowsplat import Dataset, Trainer, load_dataset, ops, recipe
 from snowsplat.data.dataset import View
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.scene.geometry import compose_rigid, invert_rigid
-from snowsplat.training.pose_coordinates import gauge_motions, moved, pixel_hessian, whitening
+from snowsplat.training.parts.pose_coordinates import gauge_motions, moved, pixel_hessian, whitening
 
 ROOT = Path(__file__).resolve().parents[1]
 

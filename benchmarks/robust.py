@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -25,10 +26,13 @@ from torch import Tensor
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.scene.geometry import invert_rigid, quat_from_rotation
 from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.passer_by import chosen_photos, passers_by
 from snowsplat.synthetic.photographer import depth_map, phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.scenes.passer_by import chosen_photos, passers_by
 
 COUNT = 48
 SIZE = (400, 300)

@@ -28,8 +28,8 @@ from workloads import SIZES, workload
 from snowsplat import ops
 from snowsplat.ops.adam import PARAMETERS
 from snowsplat.ops.splats import Splats2D
-from snowsplat.pipeline import processes
-from snowsplat.training.process_shards import ProcessShards
+from snowsplat.pipeline.run import processes
+from snowsplat.training.processes.process_shards import ProcessShards
 from snowsplat.util.process import single_threaded
 
 #: Bytes of a Gaussian: its parameters, their two moments, and the statistics of density control.

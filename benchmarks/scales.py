@@ -13,7 +13,7 @@ from pathlib import Path
 
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.scene_source import load_trained
+from snowsplat.pipeline.output.scene_source import load_trained
 
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)
 

@@ -3,7 +3,7 @@
     python benchmarks/sky.py --out OUT
     python benchmarks/sky.py --out OUT --seeds 0 1 2
 
-The photos are ray traced (`snowsplat.synthetic.street`); every 8th is held out. Each seed is
+The photos are ray traced (`tests.scenes.street`); every 8th is held out. Each seed is
 trained with and without it. Fog is measured along the street, with cameras that no photo has: the
 opacity of the Gaussians that are clearly nearer than the surface that the ray tracer finds there.
 OUT also gets pictures (photo, without, with) and films. Results are kept; the same command resumes.
@@ -12,6 +12,7 @@ OUT also gets pictures (photo, without, with) and films. Results are kept; the s
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,17 @@ from torch.nn.functional import max_pool2d
 from snowsplat.data import ImageLoader
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.pipeline.evaluate import evaluate
-from snowsplat.pipeline.scene_source import TrainedScene, load_trained
+from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.synthetic.scene import Scene
-from snowsplat.synthetic.street import street
-from snowsplat.synthetic.street_dataset import DATASET_FROM_SCENE, write_street_dataset
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.scenes.street import street
+from tests.scenes.street_dataset import DATASET_FROM_SCENE, write_street_dataset
 
 #: A Gaussian is before a surface if its depth is less than this share of the surface's.
 BEFORE = 0.8

@@ -38,7 +38,7 @@ from snowsplat.evaluation.metrics import psnr
 from snowsplat.formats import GaussianArrays, read_gaussians, write_gaussians
 from snowsplat.formats.axis_conventions import UP_BACK
 from snowsplat.formats.spz import write_spz
-from snowsplat.pipeline.scene_source import load_viewable
+from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians

@@ -35,10 +35,10 @@ from siren import fit_siren
 from torch import Tensor
 
 from snowsplat.evaluation.metrics import compare
-from snowsplat.image.compact_file import decode, encode
-from snowsplat.image.fit import FitOptions, Fitter
-from snowsplat.image.model import Blending
-from snowsplat.pipeline.image import load_photo
+from snowsplat.extras.image.compact_file import decode, encode
+from snowsplat.extras.image.fit import FitOptions, Fitter
+from snowsplat.extras.image.fit_image import load_photo
+from snowsplat.extras.image.model import Blending
 
 METHODS = ("front-to-back", "additive", "rectangles", "triangles", "siren", "jpeg", "primitive")
 

@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).with_name("lift_network")))
 from measures import measure, priors_of
 from network import DepthNet, with_resampling
 from pictures import draw_curves, draw_failures
-from scenes import FOCAL, OTHER_FOCAL, Shots, make_shots
 
+from scenes import FOCAL, OTHER_FOCAL, Shots, make_shots
 from snowsplat import ops
 from training import Curves, examples, train
 

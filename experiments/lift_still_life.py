@@ -23,10 +23,10 @@ from torch import Tensor
 from snowsplat.data import load_dataset
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.lift.lift import LiftOptions, lift
-from snowsplat.pipeline.image_files import depth_in_color, to_8bit
-from snowsplat.pipeline.lift import DepthSource
-from snowsplat.pipeline.lift_refine import refine_photo
+from snowsplat.extras.lift.lift import LiftOptions, lift
+from snowsplat.extras.lift.lift_photo import DepthSource
+from snowsplat.extras.lift.refine_photo import refine_photo
+from snowsplat.pipeline.output.image_files import depth_in_color, to_8bit
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import (
@@ -40,8 +40,8 @@ from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import depth_map, phone_lens, photograph, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
-from snowsplat.training.recipes import recipe
-from snowsplat.training.trainer import Trainer
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.trainer import Trainer
 
 RESULTS = Path(__file__).with_suffix(".json")
 WIDTH, HEIGHT = 512, 384

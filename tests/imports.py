@@ -11,7 +11,7 @@ def import_all() -> None:
     import snowsplat.evaluation.metrics
     import snowsplat.formats
     import snowsplat.pipeline.make
-    import snowsplat.pipeline.memory_use
+    import snowsplat.pipeline.run.memory_use
     import snowsplat.pipeline.videos
     import snowsplat.scene.edit
     import snowsplat.sfm.colmap.reconstruct
@@ -19,11 +19,11 @@ def import_all() -> None:
     import snowsplat.sfm.orient
     import snowsplat.sfm.report
     import snowsplat.sfm.undistort
-    import snowsplat.training.checkpoint
-    import snowsplat.training.recipes
+    import snowsplat.training.budgets.time_plan
+    import snowsplat.training.core.checkpoint
+    import snowsplat.training.core.recipes
+    import snowsplat.training.core.trainer
     import snowsplat.training.report
-    import snowsplat.training.time_budget.plan
-    import snowsplat.training.trainer
     import snowsplat.viewer.web.scene
     import snowsplat.viewer.web.server
 

@@ -57,7 +57,10 @@ def test_wheel_contains_the_libraries_and_all_of_python(wheel):
     package = REPOSITORY / "src" / "snowsplat"
     sources = {f"snowsplat/{p.relative_to(package).as_posix()}" for p in package.rglob("*.py")}
     assert sources <= names
-    page = {f"snowsplat/globe/web/{p.name}" for p in (package / "globe" / "web").iterdir()}
+    page = {
+        f"snowsplat/extras/globe/web/{p.name}"
+        for p in (package / "extras" / "globe" / "web").iterdir()
+    }
     assert page
     assert page <= names
     assert "snowsplat/py.typed" in names

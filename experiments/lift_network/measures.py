@@ -7,11 +7,11 @@ from collections.abc import Callable
 import torch
 import torch.nn.functional as F
 from network import Prediction, focal_scale, without_offsets
-from scenes import Shots
 from torch import Tensor
 
+from scenes import Shots
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.lift.edges import find_links
+from snowsplat.extras.lift.edges import find_links
 from snowsplat.scene.render import render
 from training import Example, examples
 

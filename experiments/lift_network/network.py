@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from scenes import FOCAL
 from torch import Tensor, nn
 
-from snowsplat.lift.discs import OPACITY, discs
-from snowsplat.lift.edges import find_links
-from snowsplat.lift.surface import surface_of
+from scenes import FOCAL
+from snowsplat.extras.lift.discs import OPACITY, discs
+from snowsplat.extras.lift.edges import find_links
+from snowsplat.extras.lift.surface import surface_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 

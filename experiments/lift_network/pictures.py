@@ -9,10 +9,10 @@ import torch
 from measures import Predictor, error_map
 from network import DepthNet, with_resampling
 from PIL import Image, ImageDraw
-from scenes import FOCAL, SIZE, Shots
 from torch import Tensor
 
-from snowsplat.pipeline.image_files import depth_in_color, to_8bit
+from scenes import FOCAL, SIZE, Shots
+from snowsplat.pipeline.output.image_files import depth_in_color, to_8bit
 from snowsplat.scene.render import render
 from training import Curves, Example, examples
 

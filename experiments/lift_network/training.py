@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import torch
 from network import DepthNet, focal_scale, without_offsets
-from scenes import Shots
 from torch import Tensor
 
+from scenes import Shots
 from snowsplat.scene.render import render
 
 BATCH = 8

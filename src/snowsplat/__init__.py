@@ -25,9 +25,13 @@ from snowsplat.util.lazy import lazy_names
 if TYPE_CHECKING:
     from snowsplat.data import Dataset, Points, View, load_dataset
     from snowsplat.evaluation.metrics import evaluate_views
+    from snowsplat.extras.globe.make_globe import GlobeOptions, make_globe
+    from snowsplat.extras.image.fit import FitOptions
+    from snowsplat.extras.image.fit_image import decode_image, fit_image
+    from snowsplat.extras.lift.lift import LiftOptions
+    from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult, lift_photo
+    from snowsplat.extras.lift.refine_photo import refine_photo
     from snowsplat.formats import read_gaussians
-    from snowsplat.image.fit import FitOptions
-    from snowsplat.lift.lift import LiftOptions
     from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
     from snowsplat.pipeline.blocks.merge import merge_blocks
     from snowsplat.pipeline.blocks.plan import PlanOptions, plan_blocks
@@ -37,24 +41,20 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.convert import Edits, convert
     from snowsplat.pipeline.describe import describe
     from snowsplat.pipeline.evaluate import evaluate
-    from snowsplat.pipeline.globe import GlobeOptions, make_globe
-    from snowsplat.pipeline.image import decode_image, fit_image
-    from snowsplat.pipeline.lift import DepthSource, LiftResult, lift_photo
-    from snowsplat.pipeline.lift_refine import refine_photo
     from snowsplat.pipeline.make import MakeOptions, make
     from snowsplat.pipeline.observer import Observer
+    from snowsplat.pipeline.output.scene_files import write_gaussians
+    from snowsplat.pipeline.output.scene_source import load_trained
     from snowsplat.pipeline.publish import PublishOptions, publish
     from snowsplat.pipeline.render import render_images
-    from snowsplat.pipeline.scene_files import write_gaussians
-    from snowsplat.pipeline.scene_source import load_trained
+    from snowsplat.pipeline.run.train_result import TrainingStopped
     from snowsplat.pipeline.train import TrainOptions, resume, train
-    from snowsplat.pipeline.train_result import TrainingStopped
     from snowsplat.pipeline.videos import VideoOptions, render_video
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.training.config import TrainConfig
-    from snowsplat.training.recipes import recipe
-    from snowsplat.training.trainer import Trainer
+    from snowsplat.training.core.config import TrainConfig
+    from snowsplat.training.core.recipes import recipe
+    from snowsplat.training.core.trainer import Trainer
     from snowsplat.util.errors import UserError
 
 
@@ -62,35 +62,35 @@ _MODULES = {
     "Camera": "scene.camera",
     "Compute": "pipeline.compute",
     "Dataset": "data",
-    "DepthSource": "pipeline.lift",
+    "DepthSource": "extras.lift.lift_photo",
     "Edits": "pipeline.convert",
-    "FitOptions": "image.fit",
+    "FitOptions": "extras.image.fit",
     "Gaussians": "scene.gaussians",
-    "GlobeOptions": "pipeline.globe",
-    "LiftOptions": "lift.lift",
-    "LiftResult": "pipeline.lift",
+    "GlobeOptions": "extras.globe.make_globe",
+    "LiftOptions": "extras.lift.lift",
+    "LiftResult": "extras.lift.lift_photo",
     "MakeOptions": "pipeline.make",
     "Observer": "pipeline.observer",
     "Points": "data",
-    "TrainConfig": "training.config",
+    "TrainConfig": "training.core.config",
     "TrainOptions": "pipeline.train",
-    "Trainer": "training.trainer",
-    "TrainingStopped": "pipeline.train_result",
+    "Trainer": "training.core.trainer",
+    "TrainingStopped": "pipeline.run.train_result",
     "UserError": "util.errors",
     "VideoOptions": "pipeline.videos",
     "View": "data",
     "convert": "pipeline.convert",
-    "decode_image": "pipeline.image",
+    "decode_image": "extras.image.fit_image",
     "describe": "pipeline.describe",
     "evaluate": "pipeline.evaluate",
     "evaluate_views": "evaluation.metrics",
-    "fit_image": "pipeline.image",
+    "fit_image": "extras.image.fit_image",
     "load_dataset": "data",
     "clean": "pipeline.clean",
-    "lift_photo": "pipeline.lift",
-    "load_trained": "pipeline.scene_source",
+    "lift_photo": "extras.lift.lift_photo",
+    "load_trained": "pipeline.output.scene_source",
     "make": "pipeline.make",
-    "make_globe": "pipeline.globe",
+    "make_globe": "extras.globe.make_globe",
     "BenchmarkOptions": "pipeline.benchmark.run",
     "benchmark": "pipeline.benchmark.run",
     "PlanOptions": "pipeline.blocks.plan",
@@ -100,13 +100,13 @@ _MODULES = {
     "train_blocks": "pipeline.blocks.train",
     "publish": "pipeline.publish",
     "read_gaussians": "formats",
-    "recipe": "training.recipes",
-    "refine_photo": "pipeline.lift_refine",
+    "recipe": "training.core.recipes",
+    "refine_photo": "extras.lift.refine_photo",
     "render_images": "pipeline.render",
     "render_video": "pipeline.videos",
     "resume": "pipeline.train",
     "train": "pipeline.train",
-    "write_gaussians": "pipeline.scene_files",
+    "write_gaussians": "pipeline.output.scene_files",
 }
 
 __all__ = [

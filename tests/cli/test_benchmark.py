@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult
-from snowsplat.pipeline.benchmark.report import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

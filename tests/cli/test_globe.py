@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
+from snowsplat.extras.globe import globe_video as module
 from snowsplat.formats import write_gaussians
-from snowsplat.globe import video as module
 from snowsplat.scene.gaussians import Gaussians
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from snowsplat.cli.main import main
 from snowsplat.data import load_dataset
 from snowsplat.formats import read_gaussians
-from snowsplat.pipeline.scene_source import load_viewable
+from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.synthetic import toy_dataset
 
 WIDTH, HEIGHT = 48, 36

@@ -17,7 +17,7 @@ from snowsplat.cli import main as module
 from snowsplat.data.points_ply import write_points
 from snowsplat.formats import write_gaussians
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training import checkpoint
+from snowsplat.training.core import checkpoint
 
 from ..fork_server import ENVIRONMENT
 

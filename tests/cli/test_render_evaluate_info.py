@@ -12,7 +12,7 @@ from PIL import Image
 
 from snowsplat.cli.main import main
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.training import checkpoint
+from snowsplat.training.core import checkpoint
 
 
 @pytest.fixture(scope="module")

@@ -16,13 +16,13 @@ import pytest
 from snowsplat.cli.config_flags import ConfigFlags
 from snowsplat.cli.train import Train
 from snowsplat.formats import read_gaussians
-from snowsplat.pipeline.checkpoint_meta import Recipe
-from snowsplat.pipeline.train_result import TrainResult
-from snowsplat.pipeline.training_run import TrainingRun
+from snowsplat.pipeline.run.checkpoint_meta import Recipe
+from snowsplat.pipeline.run.train_result import TrainResult
+from snowsplat.pipeline.run.training_run import TrainingRun
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import checkpoint
-from snowsplat.training.recipes import RECIPES, recipe
-from snowsplat.training.trainer import Trainer
+from snowsplat.training.core import checkpoint
+from snowsplat.training.core.recipes import RECIPES, recipe
+from snowsplat.training.core.trainer import Trainer
 
 QUICK = ("--iterations", 30, "--threads", 1)
 

@@ -36,7 +36,7 @@ from snowsplat.formats.lod_writer import LodSizes, write_lod
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import unpack
 from snowsplat.pipeline.describe import describe
-from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.sfm import dataset_folder
@@ -45,9 +45,9 @@ from snowsplat.sfm.ingest.inputs import Gathered
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import silent
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import checkpoint
-from snowsplat.training.config import TrainConfig
-from snowsplat.training.history import History
+from snowsplat.training.core import checkpoint
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.core.history import History
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
 
@@ -418,7 +418,7 @@ def _make_cfg_args(folder: Path) -> None:
 
 
 def _make_checkpoint(folder: Path) -> None:
-    from snowsplat.training.config import config_to_json
+    from snowsplat.training.core.config import config_to_json
 
     tensors = {"means": torch.rand(7, 3), "order": torch.arange(5), "none": torch.zeros(0, 3)}
     meta = {
@@ -432,7 +432,7 @@ def _make_checkpoint(folder: Path) -> None:
 
 
 def _read_checkpoint(folder: Path) -> Any:
-    from snowsplat.pipeline.checkpoint_meta import CheckpointMeta
+    from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 
     loaded = checkpoint.load(folder / "step_000005.safetensors")
     CheckpointMeta.of(loaded)

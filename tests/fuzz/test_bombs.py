@@ -25,7 +25,7 @@ from snowsplat.data.decode import ImageSource, load_image, read_header
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.spz_container import Header, pack
-from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.sfm import dataset_folder
 from snowsplat.sfm.colmap import check_model
@@ -33,8 +33,8 @@ from snowsplat.sfm.colmap.result import describe_model
 from snowsplat.sfm.ingest import photo_files
 from snowsplat.sfm.ingest.clip import is_video, read_clip
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import checkpoint, checkpoint_file
-from snowsplat.training.history import History
+from snowsplat.training.core import checkpoint, checkpoint_file
+from snowsplat.training.core.history import History
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
 

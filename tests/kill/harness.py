@@ -35,7 +35,7 @@ from snowsplat.data.colmap import ColmapImage, read_model, read_points
 from snowsplat.formats import read_gaussians
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
-from snowsplat.training import checkpoint
+from snowsplat.training.core import checkpoint
 from snowsplat.util.ply import open_table
 
 _MOST_DEFECTS = 20

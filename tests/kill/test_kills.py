@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from snowsplat.formats import write_gaussians
-from snowsplat.training import checkpoint
+from snowsplat.training.core import checkpoint
 
 from .harness import (
     Killer,

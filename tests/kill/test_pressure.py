@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.training import checkpoint
+from snowsplat.training.core import checkpoint
 
 from .harness import Ended, Zygote, check_whole, digest, leftovers, names_in
 

@@ -22,7 +22,7 @@ from snowsplat.pipeline.blocks.merge import merge_blocks
 from snowsplat.pipeline.blocks.plan import Plan, PlanOptions, plan_blocks
 from snowsplat.pipeline.blocks.train import train_blocks
 from snowsplat.pipeline.evaluate import evaluate
-from snowsplat.pipeline.scene_source import load_trained
+from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

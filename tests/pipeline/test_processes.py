@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.pipeline import processes
+from snowsplat.pipeline.run import processes
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 

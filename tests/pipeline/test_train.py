@@ -10,13 +10,14 @@ from PIL import Image
 from snowsplat.data import load
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.render import render_images
-from snowsplat.pipeline.scene_source import load_trained
+from snowsplat.pipeline.run.train_result import TrainingStopped
+from snowsplat.pipeline.run.training_notes import left_out_line
 from snowsplat.pipeline.train import TrainOptions, resume, train
-from snowsplat.pipeline.train_result import TrainingStopped
-from snowsplat.pipeline.training_notes import left_out_line
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import overfitting, trainer
+from snowsplat.training.core import trainer
+from snowsplat.training.parts import overfitting
 from snowsplat.util.errors import SettingError, UserError
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.pipeline.watch import NewestScene, watched_folder
-from snowsplat.training import checkpoint
+from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
 
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.passer_by import chosen_photos, passers_by
 from snowsplat.synthetic.photographer import depth_map, phone_lens, photograph, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box
+
+from ..scenes.passer_by import chosen_photos, passers_by
 
 LENS = phone_lens(80, 60, distortion=(0.0, 0.0, 0.0, 0.0))
 

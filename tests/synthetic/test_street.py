@@ -7,7 +7,8 @@ from PIL import Image
 
 from snowsplat import load_dataset
 from snowsplat.scene.geometry import transform_points
-from snowsplat.synthetic.street_dataset import walk_along, write_street_dataset
+
+from ..scenes.street_dataset import walk_along, write_street_dataset
 
 
 @pytest.fixture(scope="module")

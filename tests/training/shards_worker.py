@@ -16,10 +16,10 @@ import torch
 
 from snowsplat import ops
 from snowsplat.data.load import load_dataset
-from snowsplat.pipeline.processes import joined
-from snowsplat.training.process_shards import ProcessShards
-from snowsplat.training.recipes import recipe
-from snowsplat.training.trainer import Trainer
+from snowsplat.pipeline.run.processes import joined
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.processes.process_shards import ProcessShards
 
 
 def main(dataset: str, output: str, runs: str) -> None:

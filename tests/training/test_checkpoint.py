@@ -11,7 +11,7 @@ from unittest import mock
 import pytest
 import torch
 
-from snowsplat.training import checkpoint, checkpoint_file
+from snowsplat.training.core import checkpoint, checkpoint_file
 from snowsplat.util.errors import UserError
 
 from ..fork_server import popen
@@ -169,7 +169,7 @@ def test_a_failed_save_leaves_older_checkpoints(tmp_path, monkeypatch):
 
 SAVER = """
 import sys, torch
-from snowsplat.training import checkpoint, checkpoint_file
+from snowsplat.training.core import checkpoint, checkpoint_file
 table = torch.arange(4_000_000, dtype=torch.float32)
 print("ready", flush=True)
 step = 0

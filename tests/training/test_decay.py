@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.decay import INTERVAL, Decay, DecayRates
-from snowsplat.training.recipes import recipe
-from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.parts.decay import INTERVAL, Decay, DecayRates
 from snowsplat.util.errors import SettingError
 
 

@@ -10,7 +10,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
 from snowsplat.scene.simplify import simplify
-from snowsplat.training.distillation import distill
+from snowsplat.training.core.distillation import distill
 
 UP = torch.tensor([0.0, -1.0, 0.0])
 

@@ -21,15 +21,15 @@ from snowsplat.ops.splats import COLORS, Splats2D
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import checkpoint
-from snowsplat.training.exposure import Exposure
-from snowsplat.training.exposure_start import GAMMA, exposure_start, log_gains
-from snowsplat.training.losses import view_loss
-from snowsplat.training.neutral_photos import NeutralPhotos
-from snowsplat.training.recipes import recipe
-from snowsplat.training.shards import ALONE
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.trainer import Trainer
+from snowsplat.training.core import checkpoint
+from snowsplat.training.core.losses import view_loss
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.exposure import Exposure
+from snowsplat.training.parts.exposure_start import GAMMA, exposure_start, log_gains
+from snowsplat.training.parts.neutral_photos import NeutralPhotos
+from snowsplat.training.processes.shards import ALONE
 
 CPU = torch.device("cpu")
 CONFIG = recipe("default", iterations=80, init="points", max_gaussians=1500, sh_degree=0)

@@ -14,13 +14,13 @@ from snowsplat.data import Dataset
 from snowsplat.data.dataset import Points
 from snowsplat.data.decode import LoadedImage
 from snowsplat.ops.native import LAUNCHERS
-from snowsplat.training import checkpoint
-from snowsplat.training.config import TrainConfig
+from snowsplat.training.core import checkpoint
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.core.finite import Diverged, check_loss, rows_not_finite
+from snowsplat.training.core.optim import Adam
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import McmcDensity
-from snowsplat.training.finite import Diverged, check_loss, rows_not_finite
-from snowsplat.training.optim import Adam
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.trainer import Trainer
 from snowsplat.util.errors import UserError
 
 from ..ops.engines import launcher

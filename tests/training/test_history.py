@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from snowsplat.training.history import MOST_POINTS, History, Stretch
+from snowsplat.training.core.history import MOST_POINTS, History, Stretch
 
 
 def filled(steps: int) -> History:

@@ -2,8 +2,8 @@
 
 import pytest
 
-from snowsplat.training.lr_schedule import LearningRates
-from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.core.lr_schedule import LearningRates
+from snowsplat.training.core.step_schedule import Schedule
 
 
 def test_the_papers_rates():

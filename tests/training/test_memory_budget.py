@@ -12,8 +12,7 @@ from snowsplat.data import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import DECODERS
 from snowsplat.scene.camera import Camera
-from snowsplat.training.config import changed
-from snowsplat.training.memory_budget import (
+from snowsplat.training.budgets.memory_budget import (
     CPU,
     GPU,
     _SceneCost,
@@ -21,7 +20,8 @@ from snowsplat.training.memory_budget import (
     parse_bytes,
     plan_memory,
 )
-from snowsplat.training.recipes import recipe
+from snowsplat.training.core.config import changed
+from snowsplat.training.core.recipes import recipe
 from snowsplat.util.errors import SettingError
 
 DEVICE = torch.device("cpu")

@@ -14,8 +14,8 @@ from snowsplat.data.dataset import View
 from snowsplat.data.decode import ImageSource
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
-from snowsplat.training.misalignment import misalignment, shift_between
-from snowsplat.training.pose_coordinates import moved
+from snowsplat.training.parts.misalignment import misalignment, shift_between
+from snowsplat.training.parts.pose_coordinates import moved
 
 from .test_trainer import camera_at, true_scene
 

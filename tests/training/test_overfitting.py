@@ -11,18 +11,19 @@ from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import checkpoint, overfitting
-from snowsplat.training.config import TrainConfig
-from snowsplat.training.overfitting import (
+from snowsplat.training.core import checkpoint
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts import overfitting
+from snowsplat.training.parts.overfitting import (
     Overfitting,
     OverfittingCheck,
     UnseenView,
     estimated_psnr,
     unseen_views,
 )
-from snowsplat.training.recipes import recipe
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.trainer import Trainer
 from snowsplat.util.errors import UserError
 
 BLACK = torch.zeros(3)

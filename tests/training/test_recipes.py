@@ -2,10 +2,10 @@
 
 import pytest
 
-from snowsplat.training.decay import DecayRates
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
-from snowsplat.training.recipes import recipe
-from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.parts.decay import DecayRates
 from snowsplat.util.errors import SettingError
 
 

@@ -9,10 +9,10 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training import scale_limit
-from snowsplat.training.recipes import recipe
-from snowsplat.training.scale_limit import INTERVAL, ScaleLimit
-from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.parts import scale_limit
+from snowsplat.training.parts.scale_limit import INTERVAL, ScaleLimit
 from snowsplat.util.errors import SettingError
 
 

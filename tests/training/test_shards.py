@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.shards import ALONE, share
+from snowsplat.training.processes.shards import ALONE, share
 
 from ..ports import unused_port
 

@@ -17,8 +17,11 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.config import changed
-from snowsplat.training.direction_cells import (
+from snowsplat.training.core.config import changed
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.direction_cells import (
     ANGLE,
     COUNT,
     cells_of,
@@ -26,12 +29,9 @@ from snowsplat.training.direction_cells import (
     median_of,
     spread_of,
 )
-from snowsplat.training.init import initial_count
-from snowsplat.training.recipes import recipe
-from snowsplat.training.sky import find_sky, sky_distance
-from snowsplat.training.sky_limit import INTERVAL, SkyLimit
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.trainer import Trainer
+from snowsplat.training.parts.sky import find_sky, sky_distance
+from snowsplat.training.parts.sky_limit import INTERVAL, SkyLimit
+from snowsplat.training.starts.init import initial_count
 
 SIZE = 96
 GROUND = 1.5  # y of the ground, below the cameras; y points down

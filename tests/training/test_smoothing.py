@@ -7,8 +7,8 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.smoothing import INTERVAL, VARIANCE, SmoothingFilter, sampling_rates
-from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.parts.smoothing import INTERVAL, VARIANCE, SmoothingFilter, sampling_rates
 
 POSE = torch.eye(3, 4, dtype=torch.float64)
 NEAR = Camera(40, 30, 30.0, 30.0, 20.0, 15.0, POSE)

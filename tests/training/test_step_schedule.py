@@ -2,7 +2,7 @@
 
 import pytest
 
-from snowsplat.training.step_schedule import Schedule
+from snowsplat.training.core.step_schedule import Schedule
 
 
 def test_moments():

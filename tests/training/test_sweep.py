@@ -18,11 +18,11 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.config import TrainConfig, changed
-from snowsplat.training.init import initial_gaussians
+from snowsplat.training.core.config import TrainConfig, changed
 from snowsplat.training.starts import swept_points
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.training.starts.fusion import consistent, thinned
+from snowsplat.training.starts.init import initial_gaussians
 from snowsplat.training.starts.plane_sweep import depth_maps
 from snowsplat.training.starts.source_views import source_views
 from snowsplat.util.errors import SettingError

@@ -15,10 +15,10 @@ from snowsplat.data.decode import LoadedImage, load_image
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import checkpoint
+from snowsplat.training.core import checkpoint
+from snowsplat.training.parts.transients import MOMENTS, delayed, moving
+from snowsplat.training.parts.view_residuals import CellMap, residuals_elsewhere
 from snowsplat.training.starts.depth_map import DepthMap
-from snowsplat.training.transients import MOMENTS, delayed, moving
-from snowsplat.training.view_residuals import CellMap, residuals_elsewhere
 from snowsplat.util.errors import SettingError, UserError
 
 COUNT, WIDTH, HEIGHT = 36, 128, 96

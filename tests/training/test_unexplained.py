@@ -11,11 +11,11 @@ from snowsplat.data import load_dataset
 from snowsplat.data.dataset import Dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training import checkpoint
-from snowsplat.training.config import TrainConfig
-from snowsplat.training.recipes import recipe
-from snowsplat.training.trainer import Trainer
-from snowsplat.training.unexplained import fitted, standing_out
+from snowsplat.training.core import checkpoint
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.unexplained import fitted, standing_out
 from snowsplat.util.errors import UserError
 
 COUNT = 24

@@ -15,9 +15,9 @@ import scene
 from snowsplat import Gaussians
 from snowsplat.data.load import load_dataset
 from snowsplat.pipeline.demo import demo
-from snowsplat.training.progress import Progress
-from snowsplat.training.recipes import recipe
-from snowsplat.training.trainer import Trainer
+from snowsplat.training.core.progress import Progress
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.trainer import Trainer
 
 STEPS = 4000
 SNAPSHOTS = (0, 200, 500, 600, 1000, 1010, 1500, 2500, 4000)

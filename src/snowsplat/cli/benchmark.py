@@ -9,7 +9,7 @@ from typing import Annotated, Literal, get_args
 import tyro
 
 from snowsplat.cli.flags import flag
-from snowsplat.pipeline.checkpoint_meta import Recipe
+from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.util.errors import UserError
 
 

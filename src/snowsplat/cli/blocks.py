@@ -11,7 +11,7 @@ import tyro
 from snowsplat.cli.config_flags import RECIPE
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.pipeline.checkpoint_meta import Recipe
+from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.util.errors import UserError
 
 # The flags of each action; the others have no effect and are rejected.
@@ -144,7 +144,7 @@ class Blocks:
     def _train(self, folder: Path) -> int:
         from snowsplat.pipeline.blocks.train import train_blocks
         from snowsplat.pipeline.compute import Compute
-        from snowsplat.pipeline.train_result import TrainingStopped
+        from snowsplat.pipeline.run.train_result import TrainingStopped
 
         with TerminalObserver(self.quiet) as observer:
             try:

@@ -12,7 +12,7 @@ from snowsplat.cli.flags import flag, switch, with_flags
 from snowsplat.cli.make import print_summary
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.pipeline.demo import MAX_DEGREES, MAX_SHARE, demo
-from snowsplat.pipeline.train_result import TrainingStopped
+from snowsplat.pipeline.run.train_result import TrainingStopped
 
 if TYPE_CHECKING:
     from snowsplat.synthetic.compare_poses import PoseErrors

@@ -13,68 +13,18 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import make_dataclass
-from importlib import import_module
 from typing import Annotated, Any, Union
 
 import tyro
 
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.help_text import join_lines_of_field_docstrings
+from snowsplat.cli.subcommands import SUBCOMMANDS, description, load_subcommand
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import printable
 
-#: The subcommands with the first line of their docstrings. The subcommand ``train`` is the
-#: dataclass ``Train`` in the module ``snowsplat.cli.train``, which is imported when it is called.
-SUBCOMMANDS = {
-    "demo": "Try snowsplat: make a scene from rendered photos of a synthetic scene.",
-    "make": "Make a scene from photos or a video: sfm, train and render in one command.",
-    "sfm": "Estimate the camera poses of photos or a video, and create a dataset.",
-    "train": "Train a scene from photos with known camera poses (COLMAP or transforms.json).",
-    "evaluate": "Compare a scene with the held-out photos: PSNR, SSIM and, with weights, LPIPS.",
-    "render": "Render images at the camera poses of the photos, or a video.",
-    "view": "Show a finished scene in the browser.",
-    "watch": "Show an ongoing or finished training run in the browser, with its photos.",
-    "convert": "Write a scene in another file format; crop, decimate, transform or merge scenes.",
-    "clean": "Remove floaters: Gaussians that hang in front of the surfaces.",
-    "lift": "Make a scene from one photo and its depth map.",
-    "image": "Approximate a photo by 2D Gaussians, or render such an approximation.",
-    "publish": "Write a static web site that shows a scene.",
-    "globe": "Put a scene into a snow globe: a web page, and a video.",
-    "benchmark": "Train and evaluate all scenes of a folder by the protocol of the papers.",
-    "blocks": "Train a scene that is larger than the memory, in blocks that are merged.",
-    "info": "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
-}
-
 # Former names of subcommands, still accepted but not listed.
 _FORMER_NAMES = {"capture": "sfm"}
-
-DESCRIPTION = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
-
-  snowsplat demo                          try it, without own photos
-  snowsplat make PHOTOS                   photos or a video -> a scene
-  snowsplat sfm PHOTOS -o DATASET         photos or a video -> a dataset
-  snowsplat train DATASET -o OUT --eval   a dataset -> a scene in OUT
-  snowsplat evaluate OUT                  PSNR and SSIM on the held-out photos
-  snowsplat render OUT                    images and videos of the scene
-  snowsplat view FILE|OUT                 show a finished scene in the browser
-  snowsplat watch OUT                     show the training in the browser
-  snowsplat convert SCENE [MORE …] FILE   another format; crop, decimate, merge
-  snowsplat clean SCENE FILE              the scene without floaters
-  snowsplat lift PHOTO --depth MAP -o OUT one photo and its depth -> a scene
-  snowsplat image PHOTO -o OUT            a photo as 1000 Gaussians
-  snowsplat publish SCENE -o FOLDER       a web site, for any host
-  snowsplat globe SCENE                   a snow globe, as a web page
-  snowsplat benchmark FOLDER -o OUT       all scenes of a folder, and a table
-  snowsplat blocks plan DATASET -o OUT    a scene larger than the memory, in blocks
-  snowsplat info PATH                     describe a file or a folder
-
-A dataset is a folder of photos with their camera poses.
-
-Each subcommand has its own help: snowsplat train --help
-
-For shell completion, add this line to your shell's startup file:
-  eval "$(snowsplat --tyro-print-completion bash)"    (or zsh)"""
-
 
 _OUT_OF_MEMORY = (
     "out of memory; train with --memory and a smaller number, or use smaller photos, -r 2"
@@ -126,7 +76,7 @@ def parse(arguments: Sequence[str]) -> Any:
     return tyro.cli(
         union,
         prog="snowsplat",
-        description=DESCRIPTION,
+        description=description(),
         args=[name, *rest],
         config=(tyro.conf.FlagCreatePairsOff,),
     )
@@ -140,21 +90,16 @@ def _choices(called: str) -> list[Any]:
     """
     load_all = called.startswith("-") and called not in ("-h", "--help")
     choices = []
-    for name, summary in SUBCOMMANDS.items():
+    for name, subcommand in SUBCOMMANDS.items():
         load = load_all or name == called
         if load:
             kind = load_subcommand(name)
             join_lines_of_field_docstrings(kind)
         else:
             kind = make_dataclass(name.capitalize(), [])
-        text = inspect.cleandoc(kind.__doc__ or "") if name == called else summary
+        text = inspect.cleandoc(kind.__doc__ or "") if name == called else subcommand.summary
         choices.append(Annotated[kind, tyro.conf.subcommand(name, description=text)])
     return choices
-
-
-def load_subcommand(name: str) -> Any:
-    """Import the dataclass of a subcommand."""
-    return getattr(import_module(f"snowsplat.cli.{name}"), name.capitalize())
 
 
 def _unknown_subcommand(name: str) -> str:

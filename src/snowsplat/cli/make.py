@@ -15,12 +15,12 @@ from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import PageFlags
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.make import MakeOptions, make
-from snowsplat.pipeline.train_result import TrainingStopped
+from snowsplat.pipeline.run.train_result import TrainingStopped
 from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.live_page import LivePage
     from snowsplat.pipeline.make import MakeResult
+    from snowsplat.pipeline.run.live_page import LivePage
 
 # The flags that the command for resuming repeats, in this order.
 _RESUMED_FLAGS = ("output", "quality", "minutes", "threads", "device", "memory", "port", "host")

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 from snowsplat.cli.stage_lines import described
 from snowsplat.cli.stage_progress import StageProgress
 from snowsplat.cli.step_progress import StepProgress, held_out_line
-from snowsplat.pipeline.live_page import LOCAL_HOST
 from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.run.live_page import LOCAL_HOST
 from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.train_result import TrainResult
+    from snowsplat.pipeline.run.train_result import TrainResult
     from snowsplat.sfm.progress import Report
-    from snowsplat.training.progress import Progress
+    from snowsplat.training.core.progress import Progress
     from snowsplat.util.stages import Outcome
     from snowsplat.viewer.live.viewer import NetworkViewer
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.live_page import LivePage
+    from snowsplat.pipeline.run.live_page import LivePage
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class PageFlags:
             UserError: a port or host without a page, or one that cannot be used.
         """
         if view:
-            from snowsplat.pipeline.live_page import LivePage
+            from snowsplat.pipeline.run.live_page import LivePage
 
             return LivePage(self.port, self.host)
         for name, value in (("--port", self.port), ("--host", self.host)):

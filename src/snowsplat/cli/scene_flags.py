@@ -13,7 +13,7 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.scene_source import TrainedScene
+    from snowsplat.pipeline.output.scene_source import TrainedScene
 
 
 @dataclass
@@ -50,7 +50,7 @@ class SceneFlags:
 
     def load(self) -> TrainedScene:
         """The scene with its dataset. Raises: UserError: one of them is missing or damaged."""
-        from snowsplat.pipeline.scene_source import load_trained
+        from snowsplat.pipeline.output.scene_source import load_trained
 
         return load_trained(
             self.output_path(),

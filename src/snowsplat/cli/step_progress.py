@@ -16,7 +16,7 @@ from snowsplat.util.process_memory import resident_bytes
 
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.training.progress import Progress as TrainingProgress
+    from snowsplat.training.core.progress import Progress as TrainingProgress
 
 _LINE_SECONDS = 5.0
 _RATE_SECONDS = 3.0  # the displayed rate is a running mean over about this time

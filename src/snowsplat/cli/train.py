@@ -10,10 +10,10 @@ from snowsplat.cli.flags import with_flags
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import PageFlags
 from snowsplat.cli.train_flags import TrainFlags
-from snowsplat.pipeline import processes
-from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.run import processes
+from snowsplat.pipeline.run.train_result import TrainingStopped
 from snowsplat.pipeline.train import follow_training, resume, train
-from snowsplat.pipeline.train_result import TrainingStopped
 from snowsplat.util.errors import UserError
 
 

@@ -10,8 +10,8 @@ import tyro
 
 from snowsplat.cli.config_flags import RECIPE, ConfigFlags
 from snowsplat.cli.flags import flag, switch
-from snowsplat.pipeline.checkpoint_meta import Recipe
 from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.pipeline.train import TrainOptions
 from snowsplat.util.errors import UserError
 

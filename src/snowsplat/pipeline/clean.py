@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.scene_files import format_for_writing, write_gaussians
-from snowsplat.pipeline.scene_source import Color, folder_around, load_viewable
+from snowsplat.pipeline.output.scene_files import format_for_writing, write_gaussians
+from snowsplat.pipeline.output.scene_source import Color, folder_around, load_viewable
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from snowsplat.pipeline import processes
+from snowsplat.pipeline.run import processes
 from snowsplat.util.errors import SettingError
 
 if TYPE_CHECKING:

@@ -15,10 +15,19 @@ from snowsplat.formats import Format, GaussianArrays
 from snowsplat.formats.lod import LEVELS
 from snowsplat.formats.spz import WRITTEN_VERSIONS, write_spz
 from snowsplat.pipeline.decimate import Decimation, file_size, gaussians_to_keep, write_within
-from snowsplat.pipeline.levels import write_levels
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.scene_files import format_for_writing, read_gaussians, write_gaussians
-from snowsplat.pipeline.scene_source import background_of, cameras_of, folder_around, scene_file
+from snowsplat.pipeline.output.levels import write_levels
+from snowsplat.pipeline.output.scene_files import (
+    format_for_writing,
+    read_gaussians,
+    write_gaussians,
+)
+from snowsplat.pipeline.output.scene_source import (
+    background_of,
+    cameras_of,
+    folder_around,
+    scene_file,
+)
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat

@@ -76,8 +76,8 @@ class Decimation:
     def _distilled(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
         import torch
 
-        from snowsplat.training.distillation import distill
-        from snowsplat.training.progress import Progress
+        from snowsplat.training.core.distillation import distill
+        from snowsplat.training.core.progress import Progress
 
         def report(step: int, loss: float) -> None:
             self.observer.step(Progress(step, loss, len(smaller), _STEPS, downscale=1))

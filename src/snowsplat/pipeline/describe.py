@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snowsplat.formats.lod import INDEX, LEVELS
-from snowsplat.pipeline.output_folder import OutputFolder
-from snowsplat.pipeline.scene_source import training_folder
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.scene_source import training_folder
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import read_json
 
@@ -46,7 +46,7 @@ def describe(path: Path | str) -> dict[str, Any]:
     if (path / INDEX).is_file():
         path = path / INDEX
     if path.is_file():
-        from snowsplat.pipeline.scene_files import format_for_reading
+        from snowsplat.pipeline.output.scene_files import format_for_reading
 
         try:
             format = format_for_reading(path)
@@ -64,7 +64,7 @@ def describe(path: Path | str) -> dict[str, Any]:
 def _scene(path: Path, format: Format) -> dict[str, Any]:
     from snowsplat.formats import ply
     from snowsplat.formats.lod import read_index
-    from snowsplat.pipeline.scene_files import read_arrays
+    from snowsplat.pipeline.output.scene_files import read_arrays
     from snowsplat.util.ply import open_table
 
     facts: dict[str, Any] = {"file": str(path), "bytes": format.size(path)}
@@ -137,7 +137,7 @@ def _rounded(values: Any) -> list[float]:
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:
-    from snowsplat.training import checkpoint_file
+    from snowsplat.training.core import checkpoint_file
 
     try:
         content = checkpoint_file.read(path)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from snowsplat.data import View
     from snowsplat.evaluation.lpips import Lpips
     from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
-    from snowsplat.pipeline.scene_source import TrainedScene
+    from snowsplat.pipeline.output.scene_source import TrainedScene
 
 Split = Literal["test", "train"]
 

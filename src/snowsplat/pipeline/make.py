@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
+from snowsplat.pipeline.output.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
-from snowsplat.pipeline.time_budget import check_minutes
+from snowsplat.pipeline.run.time_budget import check_minutes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.live_page import LivePage
+    from snowsplat.pipeline.run.live_page import LivePage
     from snowsplat.pipeline.train import TrainOptions
     from snowsplat.sfm.time_left import Later
     from snowsplat.util.stages import Outcome
@@ -316,7 +316,7 @@ class _Job:
     def _train(self, settings: dict[str, Any]) -> dict[str, Any]:
         """Start or resume the training; copy its scene into the output folder of `make`."""
         from snowsplat.pipeline.train import TrainOptions, resume, train
-        from snowsplat.training import checkpoint
+        from snowsplat.training.core import checkpoint
 
         folder = OutputFolder(self.out / SCENE)
         options = TrainOptions(
@@ -366,8 +366,8 @@ class _Job:
         return max(left, shortest) / 60.0
 
     def _render(self) -> dict[str, Any]:
+        from snowsplat.pipeline.output.scene_source import load_trained
         from snowsplat.pipeline.render import render_images
-        from snowsplat.pipeline.scene_source import load_trained
 
         scene = load_trained(self.out / SCENE, compute=self.options.compute)
         render_images(scene, splits=("test",))

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from snowsplat.sfm.progress import Report, silent
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.train_result import TrainResult
-    from snowsplat.training.progress import Progress
+    from snowsplat.pipeline.run.train_result import TrainResult
+    from snowsplat.training.core.progress import Progress
     from snowsplat.util.stages import Outcome
     from snowsplat.viewer.live.viewer import NetworkViewer
 

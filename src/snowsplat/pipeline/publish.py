@@ -9,9 +9,9 @@ from pathlib import Path
 
 from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.levels import write_levels
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.scene_source import load_viewable, scene_name
+from snowsplat.pipeline.output.levels import write_levels
+from snowsplat.pipeline.output.scene_source import load_viewable, scene_name
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
 

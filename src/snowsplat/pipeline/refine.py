@@ -7,12 +7,12 @@ from pathlib import Path
 
 from snowsplat.data import Dataset
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output_folder import DatasetSettings
-from snowsplat.pipeline.scene_source import folder_around
+from snowsplat.pipeline.output.output_folder import DatasetSettings
+from snowsplat.pipeline.output.scene_source import folder_around
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.distillation import MERGED_RATES
-from snowsplat.training.recipes import recipe
-from snowsplat.training.trainer import Trainer
+from snowsplat.training.core.distillation import MERGED_RATES
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.trainer import Trainer
 
 # See docs/performance.md.
 _STEPS = 600

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from snowsplat.data import View
-    from snowsplat.pipeline.scene_source import TrainedScene
+    from snowsplat.pipeline.output.scene_source import TrainedScene
     from snowsplat.scene.camera import Camera
 
 Depth = Literal["none", "16bit", "color"]
@@ -66,7 +66,7 @@ def _render(scene: TrainedScene, views: Sequence[View], target: Path, depth: Dep
     import torch
 
     from snowsplat.data import ImageLoader
-    from snowsplat.pipeline import image_files
+    from snowsplat.pipeline.output import image_files
     from snowsplat.scene.render import render
     from snowsplat.util.files import write_json
 

@@ -8,25 +8,25 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.pipeline.checkpoint_meta import CheckpointMeta, Recipe
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.memory_use import MemoryUse
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
-from snowsplat.pipeline.processes import Setup, count, follow, joined
-from snowsplat.pipeline.time_budget import TimeBudget, check_minutes
-from snowsplat.pipeline.training_notes import sky_line
+from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta, Recipe
+from snowsplat.pipeline.run.memory_use import MemoryUse
+from snowsplat.pipeline.run.processes import Setup, count, follow, joined
+from snowsplat.pipeline.run.time_budget import TimeBudget, check_minutes
+from snowsplat.pipeline.run.training_notes import sky_line
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 
 if TYPE_CHECKING:
     from snowsplat.data import Dataset
-    from snowsplat.pipeline.live_page import LivePage
-    from snowsplat.pipeline.train_result import TrainResult
-    from snowsplat.training.checkpoint import Checkpoint
-    from snowsplat.training.config import TrainConfig
-    from snowsplat.training.shards import Shards
-    from snowsplat.training.trainer import Trainer
+    from snowsplat.pipeline.run.live_page import LivePage
+    from snowsplat.pipeline.run.train_result import TrainResult
+    from snowsplat.training.core.checkpoint import Checkpoint
+    from snowsplat.training.core.config import TrainConfig
+    from snowsplat.training.core.trainer import Trainer
+    from snowsplat.training.processes.shards import Shards
 
 # Settings that may be changed when a training run is resumed.
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
@@ -41,7 +41,8 @@ class TrainOptions:
 
     Attributes:
         recipe: name of the recipe, which defines the defaults of all settings.
-        settings: names and values of changed settings, see `snowsplat.training.config.changed`.
+        settings: names and values of changed settings, see
+            `snowsplat.training.core.config.changed`.
         images: name of the folder of photos in the dataset; default: "images".
         resolution: 1, 2, 4 or 8: divide width and height of the photos by this number; any other
             number: the new width in pixels; default: unchanged.
@@ -117,8 +118,8 @@ def train(
 
     Args:
         dataset: a folder with photos and their cameras, see `snowsplat.data.load_dataset`.
-        output: the output folder, see `snowsplat.pipeline.output_folder`. It is created if it does
-            not exist.
+        output: the output folder, see `snowsplat.pipeline.output.output_folder`. It is created if
+            it does not exist.
         overwrite: replace the results of an earlier training run in ``output``.
         page: shows the training in the browser.
 
@@ -198,8 +199,8 @@ class _Job:
         page: LivePage | None,
         started: float,
     ) -> None:
-        from snowsplat.training import trainer  # noqa: F401 (before the memory is measured)
-        from snowsplat.training.shards import ALONE
+        from snowsplat.training.core import trainer  # noqa: F401 (before the memory is measured)
+        from snowsplat.training.processes.shards import ALONE
 
         self.out, self.options, self.observer, self.page = out, options, observer, page
         self.started = started
@@ -211,8 +212,8 @@ class _Job:
         self.memory_before = resident_bytes()
 
     def train(self, path: Path | str) -> TrainResult:
-        from snowsplat.training.recipes import recipe
-        from snowsplat.training.trainer import Trainer
+        from snowsplat.training.core.recipes import recipe
+        from snowsplat.training.core.trainer import Trainer
 
         options = self.options
         budget = TimeBudget.of(options.minutes, None, self.started)
@@ -249,7 +250,7 @@ class _Job:
         return self._run(settings, name, trainer, budget, time_ratio, memory)
 
     def resume(self, path: Path | str | None) -> TrainResult:
-        from snowsplat.training.trainer import Trainer
+        from snowsplat.training.core.trainer import Trainer
 
         start = self._newest_checkpoint(path)
         if start is None:
@@ -290,7 +291,7 @@ class _Job:
         time_ratio: float,
         memory: MemoryUse,
     ) -> TrainResult:
-        from snowsplat.pipeline.training_run import TrainingRun
+        from snowsplat.pipeline.run.training_run import TrainingRun
 
         if trainer.exposure.reason:
             self.observer.note(trainer.exposure.reason)
@@ -310,7 +311,7 @@ class _Job:
 
     def _newest_checkpoint(self, path: Path | str | None) -> Checkpoint | None:
         """The newest checkpoint; None if there is none, so that training starts at step 0."""
-        from snowsplat.training import checkpoint
+        from snowsplat.training.core import checkpoint
 
         out = self.out
         newest = checkpoint.latest(out.checkpoints)
@@ -355,7 +356,7 @@ def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMe
 
     Raises UserError if another setting has changed.
     """
-    from snowsplat.training.config import changed, config_from_json
+    from snowsplat.training.core.config import changed, config_from_json
 
     config = config_from_json(meta.training)
     if options.recipe not in (None, meta.recipe):

@@ -187,7 +187,7 @@ class _Source:
 
 def _load(scene: Path, iteration: int | None, name: str) -> _Source:
     from snowsplat.formats import read_gaussians
-    from snowsplat.pipeline.scene_source import existing_folder, folder_around
+    from snowsplat.pipeline.output.scene_source import existing_folder, folder_around
     from snowsplat.scene.camera_json import read_cameras
 
     if scene.is_file():
@@ -319,7 +319,7 @@ class Video:
     def _frame(self, camera: Camera, near: float, far: float) -> list[np.ndarray]:
         import numpy as np
 
-        from snowsplat.pipeline import image_files
+        from snowsplat.pipeline.output import image_files
 
         color, depth = self._render(camera)
         if depth is None:
@@ -329,7 +329,7 @@ class Video:
 
     def _depth_range(self) -> tuple[float, float]:
         """One range of depths for the whole video, so that its colours do not flicker."""
-        from snowsplat.pipeline import image_files
+        from snowsplat.pipeline.output import image_files
 
         if not (self.depth or self.side_by_side):
             return 1.0, 2.0
@@ -340,7 +340,7 @@ class Video:
     def _render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:
         import torch
 
-        from snowsplat.pipeline import image_files
+        from snowsplat.pipeline.output import image_files
         from snowsplat.scene.render import render
 
         with_depth = self.depth or self.side_by_side

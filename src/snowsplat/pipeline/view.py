@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from snowsplat.formats import format_for_reading
 from snowsplat.formats.lod import INDEX, LEVELS, read_index, read_lod
-from snowsplat.pipeline.levels import write_levels
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.scene_source import load_viewable
+from snowsplat.pipeline.output.levels import write_levels
+from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:

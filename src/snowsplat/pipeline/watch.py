@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.live_page import LivePage
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output_folder import SCENE, OutputFolder
-from snowsplat.pipeline.scene_source import existing_folder, load_dataset_of
+from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
+from snowsplat.pipeline.output.scene_source import existing_folder, load_dataset_of
+from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class NewestScene:
         return self._scene
 
     def _newest(self) -> tuple[int, Path | None]:
-        from snowsplat.training import checkpoint
+        from snowsplat.training.core import checkpoint
 
         if self._iteration is not None:
             if self._iteration not in self._folder.scenes():
@@ -116,7 +116,7 @@ class NewestScene:
     def _gaussians(self, path: Path) -> Gaussians:
         from snowsplat.formats import read_gaussians
         from snowsplat.scene.gaussians import Gaussians
-        from snowsplat.training import checkpoint
+        from snowsplat.training.core import checkpoint
 
         if path.parent != self._folder.checkpoints:
             return read_gaussians(path)

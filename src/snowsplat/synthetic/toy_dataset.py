@@ -1,4 +1,4 @@
-"""A small procedural dataset for tests.
+"""A small procedural dataset with exact poses: for notebooks, first experiments, and tests.
 
 The scene is analytic: coloured balls at the centre and, in the COLMAP formats, a large sphere
 around everything. Rays are intersected in closed form, so poses, images and points are exact.

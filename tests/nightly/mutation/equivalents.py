@@ -9,7 +9,7 @@ from __future__ import annotations
 #: {(file in the package, lines before, lines after): why no test can detect the fault}
 EQUIVALENTS: dict[tuple[str, str, str], str] = {
     (
-        "training/losses.py",
+        "training/core/losses.py",
         "target = photo.rgb if photo.alpha is None else photo.over(background)",
         "target = photo.rgb if (photo.alpha is None) and False else photo.over(background)",
     ): "an opaque photo over a background is that photo; 8 bits only save memory",
@@ -164,7 +164,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "near, far = [*beside.tolist(), 1.0], [*beyond.tolist(), 0.0, 0.0]",
     ): "the last factor is never used",
     (
-        "training/view_queue.py",
+        "training/core/view_queue.py",
         "LOOKAHEAD = 16",
         "LOOKAHEAD = 17",
     ): "how far ahead photos are decoded; their order is the same",

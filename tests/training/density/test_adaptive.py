@@ -9,6 +9,11 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.training.core.finite import Diverged
+from snowsplat.training.core.lr_schedule import LearningRates
+from snowsplat.training.core.optim import Adam
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.density.adaptive import (
     RESET_OPACITY,
     RESET_RECOVERY,
@@ -16,11 +21,6 @@ from snowsplat.training.density.adaptive import (
     AdaptiveDensity,
     AdaptiveDensityControl,
 )
-from snowsplat.training.finite import Diverged
-from snowsplat.training.lr_schedule import LearningRates
-from snowsplat.training.optim import Adam
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.view_gradient import ViewGradient
 
 EXTENT = 10.0  # with percent_dense = 0.01: scales up to 0.1 are cloned, larger ones split
 #: φ of section 5.2. It is not imported, so that the tests detect a changed value.

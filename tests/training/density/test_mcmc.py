@@ -10,17 +10,17 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
+from snowsplat.training.core.finite import Diverged
+from snowsplat.training.core.lr_schedule import LearningRates
+from snowsplat.training.core.optim import Adam
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.density.mcmc import (
     NOISE_SHARPNESS,
     McmcDensity,
     McmcDensityControl,
     shared_opacity,
 )
-from snowsplat.training.finite import Diverged
-from snowsplat.training.lr_schedule import LearningRates
-from snowsplat.training.optim import Adam
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.view_gradient import ViewGradient
 from snowsplat.util.errors import SettingError
 
 

@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import pytest
 
-from snowsplat.training.config import TrainConfig
-from snowsplat.training.recipes import recipe
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.time_budget.pace import Pace
-from snowsplat.training.time_budget.step_cost import StepCost, Work
+from snowsplat.training.budgets.pace import Pace
+from snowsplat.training.budgets.step_cost import StepCost, Work
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
 
 PIXELS, FINAL, VIEWS = 500_000.0, 120_000, 6
 

@@ -13,11 +13,11 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.scene.camera import Camera
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.config import changed
-from snowsplat.training.recipes import recipe
-from snowsplat.training.time_budget import plan as planning
-from snowsplat.training.time_budget.plan import Plan, make_plan, measure_time_ratio
-from snowsplat.training.trainer import Trainer
+from snowsplat.training.budgets import time_plan as planning
+from snowsplat.training.budgets.time_plan import Plan, make_plan, measure_time_ratio
+from snowsplat.training.core.config import changed
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.trainer import Trainer
 
 POSE = torch.eye(4, dtype=torch.float64)[:3]
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from snowsplat.training.recipes import recipe
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.time_budget.step_cost import StepCost, Work
+from snowsplat.training.budgets.step_cost import StepCost, Work
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
 
 
 def test_a_densification_adds_a_quarter_until_the_limit():

@@ -2,10 +2,10 @@
 
 import pytest
 
-from snowsplat.training.recipes import recipe
-from snowsplat.training.step_schedule import Schedule
-from snowsplat.training.time_budget.step_cost import Work
-from snowsplat.training.time_budget.steps_left import StepsLeft
+from snowsplat.training.budgets.step_cost import Work
+from snowsplat.training.budgets.steps_left import StepsLeft
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.step_schedule import Schedule
 
 from .test_pace import FINAL, PIXELS, VIEWS, usual
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.pipeline.scene_files import read_gaussians, write_gaussians
+from snowsplat.pipeline.output.scene_files import read_gaussians, write_gaussians
 from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.pipeline.checkpoint_meta import Recipe
+from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.util.claims import claimed
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
@@ -23,7 +23,7 @@ from snowsplat.util.safe_json import from_json, read_json
 
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.pipeline.scene_source import TrainedScene
+    from snowsplat.pipeline.output.scene_source import TrainedScene
 
 #: A file in the output folder of a scene.
 RESULT = "benchmark.json"
@@ -129,8 +129,8 @@ def work(job: Job, device: str | None, threads: int | None) -> None:
     from snowsplat.evaluation.lpips import Lpips
     from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.evaluate import evaluate
-    from snowsplat.pipeline.output_folder import OutputFolder
-    from snowsplat.pipeline.scene_source import load_trained
+    from snowsplat.pipeline.output.output_folder import OutputFolder
+    from snowsplat.pipeline.output.scene_source import load_trained
     from snowsplat.pipeline.train import TrainOptions, resume, train
     from snowsplat.util.machine import processor_name
     from snowsplat.util.process_memory import peak_bytes

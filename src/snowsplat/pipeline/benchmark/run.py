@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
-from snowsplat.pipeline.benchmark.report import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
-from snowsplat.pipeline.checkpoint_meta import Recipe
+from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.util.errors import SettingError, UserError
 
 

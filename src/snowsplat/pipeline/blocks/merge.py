@@ -15,7 +15,7 @@ from snowsplat.formats.ply import read_ply, write_ply_parts
 from snowsplat.pipeline.blocks.cells import Cell
 from snowsplat.pipeline.blocks.plan import Axes, Plan
 from snowsplat.pipeline.blocks.train import is_finished, scene_folder
-from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from snowsplat._version import __version__
 from snowsplat.pipeline.blocks.cells import Cell
-from snowsplat.pipeline.checkpoint_meta import Recipe
-from snowsplat.pipeline.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, read_json
@@ -151,8 +151,8 @@ def plan_blocks(
     from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
     from snowsplat.pipeline.blocks.content import block_content
     from snowsplat.pipeline.train import TrainOptions
-    from snowsplat.training.recipes import recipe
-    from snowsplat.training.sky import sky_distance
+    from snowsplat.training.core.recipes import recipe
+    from snowsplat.training.parts.sky import sky_distance
 
     options, folder = options or PlanOptions(), Path(folder)
     _check_free(folder)

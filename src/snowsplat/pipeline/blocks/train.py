@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 from snowsplat.pipeline.blocks.plan import Block, Plan
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output_folder import OutputFolder
+from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.util.claims import claimed
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import read_json
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.train_result import TrainResult
+    from snowsplat.pipeline.run.train_result import TrainResult
 
 _CHECKPOINT_SECONDS = 60.0
 

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.core.optim import Adam
+from snowsplat.training.core.step_schedule import Schedule, When
+from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.density.adaptive import AdaptiveDensity
 from snowsplat.training.density.mcmc import McmcDensity
-from snowsplat.training.optim import Adam
-from snowsplat.training.shards import ALONE, Shards
-from snowsplat.training.step_schedule import Schedule, When
-from snowsplat.training.view_gradient import ViewGradient
+from snowsplat.training.processes.shards import ALONE, Shards
 
 __all__ = ["DENSITY_CONTROLS", "AdaptiveDensity", "DensityConfig", "DensityControl", "McmcDensity"]
 

@@ -20,11 +20,11 @@ from torch import Tensor
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
-from snowsplat.training.finite import check_parameters
-from snowsplat.training.optim import Adam
-from snowsplat.training.shards import ALONE, Shards
-from snowsplat.training.step_schedule import Schedule, When
-from snowsplat.training.view_gradient import ViewGradient
+from snowsplat.training.core.finite import check_parameters
+from snowsplat.training.core.optim import Adam
+from snowsplat.training.core.step_schedule import Schedule, When
+from snowsplat.training.core.view_gradient import ViewGradient
+from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.util.errors import SettingError
 
 #: Maximum number of copies of one Gaussian for which eq. 9 is evaluated; larger numbers are rare.

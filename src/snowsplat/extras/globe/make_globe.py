@@ -1,0 +1,151 @@
+"""`make_globe`: a scene in a snow globe, as a web page and a video."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output.scene_source import load_viewable, scene_name
+from snowsplat.pipeline.videos import VideoSize
+from snowsplat.util.errors import SettingError, UserError
+
+if TYPE_CHECKING:
+    from snowsplat.extras.globe.globe_video import GlobeVideo
+
+_LARGEST = 1_000_000  # Gaussians: the page has 26 bytes for each
+_LONGEST_NAME = 60
+_SIDE = 960  # pixels of a video
+_FPS = (1.0, 120.0)
+
+
+@dataclass(frozen=True)
+class GlobeOptions:
+    """Options of a globe.
+
+    Attributes:
+        gaussians: maximum number of Gaussians in the globe. The most important ones are used.
+        name: the text on the plate of the base; None: the name of the scene.
+        size: width and height of the video such as "960x960", or the side of a square.
+        fps: frames per second of the video.
+
+    Raises:
+        UserError: a value is out of range.
+    """
+
+    gaussians: int = 100_000
+    name: str | None = None
+    size: str | None = None
+    fps: float = 30.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.gaussians <= _LARGEST:
+            raise SettingError(
+                "gaussians", f"{self.gaussians} is out of range; use 1 to {_LARGEST:,}"
+            )
+        if self.name is not None and len(self.name) > _LONGEST_NAME:
+            raise SettingError(
+                "name", f"{len(self.name)} letters are too many; use at most {_LONGEST_NAME}"
+            )
+        if not _FPS[0] <= self.fps <= _FPS[1]:
+            raise SettingError("fps", f"{self.fps:g} is out of range; use 1 to 120")
+        VideoSize.parse(self.size)
+
+    @property
+    def video_size(self) -> tuple[int, int]:
+        """Width and height of the video in pixels, both even."""
+        size = VideoSize.parse(self.size)
+        width = size.width or _SIDE
+        return 2 * (width // 2), 2 * ((size.height or width) // 2)
+
+
+@dataclass(frozen=True)
+class GlobeResult:
+    """A globe.
+
+    Attributes:
+        page: the HTML file.
+        video: the video; None if none was requested.
+        gaussians: the number of Gaussians in the globe.
+    """
+
+    page: Path
+    video: Path | None
+    gaussians: int
+
+
+def make_globe(
+    scene: Path | str,
+    page: Path | str | None = None,
+    options: GlobeOptions | None = None,
+    *,
+    video: Path | str | None = None,
+    iteration: int | None = None,
+    threads: int | None = None,
+    observer: Observer = SILENT,
+) -> GlobeResult:
+    """Put a scene into a snow globe: a web page in one file and, if requested, a video.
+
+    The video does not need a browser: it is rendered by snowsplat, on the CPU. The same scene and
+    options give the same frames, bit by bit.
+
+    Args:
+        scene: the output folder of a training run, or a scene file of any format.
+        page: the HTML file; default: OUT/globe.html or, for a scene file, SCENE_globe.html in the
+            same folder.
+        options: number of Gaussians, name, size of the video.
+        video: an .mp4 file; None: no video.
+        iteration: an iteration of an output folder; default: the last one.
+        threads: number of CPU threads; None: all cores.
+
+    Raises:
+        UserError: the scene is missing, damaged or has no visible Gaussians; a wrong suffix.
+        OSError: a file cannot be written.
+        KeyboardInterrupt: Ctrl-C; no incomplete file is left.
+    """
+    options, scene = options or GlobeOptions(), Path(scene)
+    target = _default_page(scene) if page is None else Path(page)
+    if target.suffix.lower() != ".html":
+        raise UserError(f"{target}: the name of the page must end in .html")
+    if video is not None and Path(video).suffix.lower() != ".mp4":
+        raise UserError(f"{video}: the name of a video must end in .mp4")
+    Compute("cpu", threads).apply()
+    source = load_viewable(scene, iteration)
+
+    from snowsplat.extras.globe.globe_page import write_page
+    from snowsplat.extras.globe.globe_video import GlobeVideo
+    from snowsplat.extras.globe.layout import arrange
+    from snowsplat.extras.globe.plate import engraving
+
+    arrangement = arrange(source.gaussians, source.cameras, options.gaussians)
+    name = options.name or scene_name(scene)[:_LONGEST_NAME]
+    write_page(target, arrangement, name)
+    if video is not None:
+        width, height = options.video_size
+        globe_video = GlobeVideo(arrangement, engraving(name), width, height, options.fps)
+        _write(globe_video, Path(video), observer)
+    count = len(arrangement.gaussians)
+    return GlobeResult(target, None if video is None else Path(video), count)
+
+
+def _write(video: GlobeVideo, file: Path, observer: Observer) -> None:
+    from snowsplat.trajectory.video import video_writer
+    from snowsplat.util.stages import Outcome
+
+    started = time.monotonic()
+    report = observer.begin("video")
+    with video_writer(file, video.width, video.height, video.fps) as add:
+        for i, frame in enumerate(video.frames()):
+            add(frame)
+            report(i + 1, video.count, "frames")
+    result = {"files": [str(file)], "frames": video.count, "size": [video.width, video.height]}
+    observer.end("video", Outcome(result, time.monotonic() - started, False))
+
+
+def _default_page(scene: Path) -> Path:
+    if scene.is_dir():
+        return scene / "globe.html"
+    return scene.with_name(f"{scene_name(scene)}_globe.html")

@@ -1,0 +1,102 @@
+"""`snowsplat image`: a photo as 2D Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.observer import TerminalObserver
+from snowsplat.util.duration import duration
+from snowsplat.util.errors import UserError
+
+_COMPACT = ".gimg"
+
+
+@dataclass
+class Image:
+    """Approximate a photo by 2D Gaussians, or render such an approximation.
+
+    Examples:
+      snowsplat image cat.jpg -o cat
+      snowsplat image cat.jpg -o cat -n 10000 --size 1024
+      snowsplat image cat/image.gimg -o large.png --size 2048
+
+    Notes:
+      OUT contains the image (image.png), an SVG of ellipses with gradients, a
+      compact file (image.gimg), a video of the fit, and report.html.
+      A compact file in place of PHOTO is rendered to the PNG file OUT.
+    """
+
+    photo: Annotated[Path | None, tyro.conf.Positional, flag("PHOTO|FILE.gimg")] = None
+    """The photo, or a compact file of Gaussians."""
+    output: Annotated[Path | None, flag("OUT", "-o")] = None
+    """The output folder. It is created if it does not exist. For a compact file: the PNG file."""
+    gaussians: Annotated[int, flag("N", "-n", default="1000")] = 1000
+    """Number of Gaussians."""
+    blending: Annotated[
+        Literal["front-to-back", "additive"],
+        flag("{front-to-back,additive}", default="front-to-back"),
+    ] = "front-to-back"
+    """front-to-back: opaque to transparent ellipses, the first one in front; additive: the sum of
+    the Gaussians, without SVG."""
+    steps: Annotated[int, flag("N", default="3000")] = 3000
+    """Number of steps of the optimiser. More steps give a better image."""
+    size: Annotated[int | None, flag("PIXELS", default="512; of a file: as fitted")] = None
+    """Pixels along the longer side. A larger photo is scaled down."""
+    seed: Annotated[int, flag("N", default="0")] = 0
+    """Seed of the random positions of the Gaussians."""
+    threads: Annotated[int | None, flag("N", default="all cores")] = None
+    """Number of CPU threads."""
+    overwrite: Annotated[bool, switch()] = False
+    """Replace an earlier fit in OUT."""
+    quiet: Annotated[bool, switch("-q")] = False
+    """Print only the result and no progress."""
+
+    def run(self) -> int:
+        """Returns the exit code, 0."""
+        if self.photo is None or self.output is None:
+            raise UserError(
+                "image needs a photo and an output folder: snowsplat image PHOTO -o OUT"
+            )
+        if self.photo.suffix.lower() == _COMPACT:
+            return self._decode(self.photo, self.output)
+        from snowsplat.extras.image.fit import FitOptions
+        from snowsplat.extras.image.fit_image import fit_image
+
+        options = FitOptions(
+            gaussians=self.gaussians, blending=self.blending, steps=self.steps, seed=self.seed
+        )
+        with TerminalObserver(self.quiet) as observer:
+            result = fit_image(
+                *(self.photo, self.output, options),
+                size=512 if self.size is None else self.size,
+                threads=self.threads,
+                overwrite=self.overwrite,
+                observer=observer,
+            )
+        end = result.moments[-1]
+        print(
+            f"{result.output}: {end.gaussians:,} Gaussians, PSNR {end.psnr:.2f} dB, "
+            f"SSIM {end.ssim:.4f}, {end.step:,} steps in {duration(end.seconds)}"
+        )
+        print(
+            f"{result.output / 'image.gimg'}: {result.file_bytes:,} bytes, "
+            f"{result.bits_per_pixel:.2f} bits per pixel, PSNR {result.file_psnr:.2f} dB"
+        )
+        print(f"{result.output / 'report.html'}: the report")
+        return 0
+
+    def _decode(self, compact: Path, target: Path) -> int:
+        from snowsplat.extras.image.fit_image import decode_image
+
+        if target.suffix.lower() != ".png":
+            raise UserError(
+                f"{target}: the image of a compact file is written as PNG; use -o FILE.png"
+            )
+        width, height = decode_image(compact, target, self.size)
+        print(f"{target}: {width} × {height} pixels")
+        return 0

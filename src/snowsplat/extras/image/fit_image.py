@@ -1,0 +1,260 @@
+"""`fit_image`: a photo as 2D Gaussians. `decode_image`: the image in a compact file."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.files import write_json
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from snowsplat.extras.image.fit import FitOptions, Fitter
+    from snowsplat.extras.image.history import Moment
+    from snowsplat.extras.image.model import ImageGaussians
+
+#: The files that `fit_image` writes to the output folder, and what they contain.
+FILES = {
+    "image.png": "the image that the Gaussians approximate the photo with",
+    "image.gimg": "the Gaussians, quantised: a compact file",
+    "extras.image.svg": "an ellipse with a gradient for each Gaussian",
+    "forming.mp4": "a video of the fit",
+    "metrics.json": "PSNR and SSIM, and their course",
+    "report.html": "this page",
+}
+_SIDES = (8, 8192)  # pixels along the longer side
+_VIDEO_SECONDS, _VIDEO_FPS = 5, 24
+_VIDEO_HOLD = 24  # frames in which the result is shown at the end
+_VIDEO_LEAST_SIDE = 480  # pixels along the longer side
+
+
+@dataclass(frozen=True)
+class ImageResult:
+    """A fitted image.
+
+    Attributes:
+        output: the output folder.
+        moments: the course of the fit. The last moment is the result.
+        file_psnr: PSNR of the image in the compact file, in dB.
+        file_bytes: size of the compact file.
+        bits_per_pixel: the same, per pixel of the image.
+    """
+
+    output: Path
+    moments: list[Moment] = field(repr=False)
+    file_psnr: float
+    file_bytes: int
+    bits_per_pixel: float
+
+
+def fit_image(
+    photo: Path | str,
+    output: Path | str,
+    options: FitOptions | None = None,
+    *,
+    size: int = 512,
+    threads: int | None = None,
+    overwrite: bool = False,
+    observer: Observer = SILENT,
+) -> ImageResult:
+    """Approximate a photo by 2D Gaussians, and write the files of `FILES`.
+
+    Additive Gaussians have no SVG file. The computation runs on the CPU.
+
+    Args:
+        photo: the image file.
+        output: the output folder. It is created if it does not exist.
+        options: number of Gaussians, blending, steps and seed.
+        size: pixels along the longer side, to which a larger photo is scaled down.
+        threads: number of CPU threads; None: all cores. The result does not depend on it.
+        overwrite: replace the files of an earlier fit in ``output``.
+
+    Returns:
+        PSNR, SSIM, seconds and bytes.
+
+    Raises:
+        UserError: the photo is missing or damaged, a setting is out of range, or ``output``
+            contains an earlier fit or is a file.
+        OSError: a file cannot be written.
+    """
+    from snowsplat.extras.image.fit import FitOptions, Fitter
+
+    options, photo, output = options or FitOptions(), Path(photo), Path(output)
+    _check_size(size)
+    if output.exists() and not output.is_dir():
+        raise UserError(f"{output}: is a file; use a folder for the output")
+    if (output / "metrics.json").exists() and not overwrite:
+        raise UserError(f"{output}: contains an earlier fit; use `overwrite` to replace it")
+    target = load_photo(photo, size)
+    Compute("cpu", threads).apply()
+    output.mkdir(parents=True, exist_ok=True)
+
+    from snowsplat.evaluation.metrics import compare
+    from snowsplat.extras.image.compact_file import write_compact
+    from snowsplat.extras.image.image_report import Fitted, write_image_report
+    from snowsplat.extras.image.svg import write_svg
+    from snowsplat.pipeline.output.image_files import to_8bit, write_png
+    from snowsplat.util.process import single_threaded
+
+    with single_threaded():
+        fitter = Fitter(target, options)
+        moments = _run(fitter, target, output / "forming.mp4", observer)
+        gaussians = fitter.gaussians
+        write_png(output / "image.png", to_8bit(gaussians.render()))
+        stored = write_compact(output / "image.gimg", gaussians)
+        file_psnr = compare(stored.render(), target).psnr
+        files = dict(FILES)
+        if gaussians.blending == "front-to-back":
+            write_svg(output / "extras.image.svg", gaussians)
+        else:
+            (output / "extras.image.svg").unlink(missing_ok=True)  # of an earlier fit
+            del files["extras.image.svg"]
+        file_bytes = (output / "image.gimg").stat().st_size
+        width, height = gaussians.width, gaussians.height
+        bits = 8 * file_bytes / (width * height)
+        write_image_report(
+            output / "report.html",
+            Fitted(
+                name=photo.stem,
+                photo=(target * 255).round().byte(),
+                gaussians=gaussians,
+                moments=moments,
+                compact=(file_psnr, file_bytes, bits),
+                files=files,
+                video=output / "forming.mp4",
+            ),
+        )
+    result = ImageResult(output, moments, file_psnr, file_bytes, bits)
+    write_json(output / "metrics.json", _metrics(result, options, (width, height)))
+    return result
+
+
+def decode_image(
+    compact: Path | str, target: Path | str, size: int | None = None
+) -> tuple[int, int]:
+    """Render the Gaussians of a compact file to a PNG file.
+
+    Args:
+        compact: a file that `fit_image` has written.
+        target: the PNG file.
+        size: pixels along the longer side; default: as fitted. Gaussians have no pixels, so the
+            image may be larger than the photo.
+
+    Returns:
+        Width and height of the image in pixels.
+
+    Raises:
+        UserError: the file is missing or damaged, or ``size`` is out of range.
+        OSError: ``target`` cannot be written.
+    """
+    from snowsplat.extras.image.compact_file import read_compact
+    from snowsplat.pipeline.output.image_files import to_8bit, write_png
+
+    gaussians = read_compact(Path(compact))
+    scale = 1.0
+    if size is not None:
+        _check_size(size)
+        scale = size / max(gaussians.width, gaussians.height)
+    image = gaussians.render(scale)
+    write_png(Path(target), to_8bit(image))
+    return image.shape[1], image.shape[0]
+
+
+def _check_size(size: int) -> None:
+    least, most = _SIDES
+    if not least <= size <= most:
+        raise SettingError("size", f"{size} is out of range; use {least} to {most} pixels")
+
+
+def load_photo(photo: Path, size: int) -> Tensor:
+    """A photo, scaled down so that its longer side has at most `size` pixels.
+
+    Returns (H, W, 3) float32 in 0..1. A transparent photo is composited over white.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    from snowsplat.data.decode import ImageSource, load_image, read_header
+
+    header = read_header(photo)
+    width, height = header.width, header.height
+    if header.sideways:
+        width, height = height, width
+    scale = min(1.0, size / max(width, height))
+    width, height = (max(1, round(side * scale)) for side in (width, height))
+    planes = load_image(ImageSource(photo, width, height, apply_orientation=True), (1.0, 1.0, 1.0))
+    return planes.float().div(255).permute(1, 2, 0)
+
+
+def _run(fitter: Fitter, target: Tensor, video: Path, observer: Observer) -> list[Moment]:
+    """Take all steps; record the moments and the video."""
+    from snowsplat.evaluation.metrics import compare
+    from snowsplat.extras.image.history import Moment, recorded_steps
+    from snowsplat.training.core.progress import Progress
+    from snowsplat.trajectory.video import video_writer
+
+    steps = fitter.options.steps
+    recorded = set(recorded_steps(steps, _VIDEO_SECONDS * _VIDEO_FPS))
+    height, width = target.shape[:2]
+    scale = max(1, math.ceil(_VIDEO_LEAST_SIDE / max(width, height)))
+    frame_width, frame_height = (2 * max(1, side * scale // 2) for side in (width, height))
+    moments: list[Moment] = []
+    seconds = 0.0
+    observer.steps_begin(0, steps)
+    try:
+        with video_writer(video, frame_width, frame_height, _VIDEO_FPS) as add_frame:
+            while not fitter.finished:
+                start = time.perf_counter()
+                fitter.step()
+                seconds += time.perf_counter() - start
+                step, gaussians = fitter.steps_done, fitter.gaussian_count
+                observer.step(Progress(step, fitter.mse, gaussians, steps, downscale=1))
+                if step in recorded:
+                    model = fitter.gaussians
+                    metrics = compare(model.render(), target)
+                    moments.append(Moment(step, seconds, gaussians, metrics.psnr, metrics.ssim))
+                    frame = _frame(model, scale, frame_width, frame_height)
+                    add_frame(frame)
+            for _ in range(_VIDEO_HOLD):
+                add_frame(frame)
+    finally:
+        observer.steps_end()
+    return moments
+
+
+def _frame(gaussians: ImageGaussians, scale: int, width: int, height: int) -> np.ndarray:
+    """(height, width, 3) uint8: the image, `scale` times as large, cut to an even size."""
+    import numpy as np
+
+    from snowsplat.pipeline.output.image_files import to_8bit
+
+    pixels = to_8bit(gaussians.render(scale))[:height, :width]
+    missing = height - pixels.shape[0], width - pixels.shape[1]  # of an image of 1 pixel
+    return np.pad(pixels, ((0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")
+
+
+def _metrics(result: ImageResult, options: FitOptions, size: tuple[int, int]) -> dict[str, Any]:
+    """The content of metrics.json."""
+    end = result.moments[-1]
+    return {
+        "width": size[0],
+        "height": size[1],
+        "psnr": end.psnr,
+        "ssim": end.ssim,
+        "seconds": end.seconds,
+        "compact_file": {
+            "psnr": result.file_psnr,
+            "bytes": result.file_bytes,
+            "bits_per_pixel": result.bits_per_pixel,
+        },
+        "settings": asdict(options),
+        "course": [asdict(moment) for moment in result.moments],
+    }

@@ -1,0 +1,150 @@
+"""report.html: a fitted image, its Gaussians, and the course of the fit, on one page."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from snowsplat.extras.image.history import Moment
+from snowsplat.extras.image.model import COLORS, LOG_SIGMAS, OPACITY_LOGIT, ImageGaussians
+from snowsplat.util import charts
+from snowsplat.util.duration import duration
+from snowsplat.util.files import write_text
+from snowsplat.util.html import cards, page, picture, table, text
+from snowsplat.util.machine import processor_name, system_name
+
+# The page shows images with at least this many pixels along the longer side: the Gaussians are
+# rendered at a larger size, and the photo is enlarged.
+_LEAST_SIDE = 512
+# In the picture of the Gaussians, σ is multiplied by this factor, so that most do not overlap.
+_SHRUNK = 0.5
+
+_STYLE = (
+    charts.STYLE
+    + """
+.pictures { display: grid; gap: 18px 16px;
+  grid-template-columns: repeat(auto-fit, minmax(min(250px, 100%), 1fr)); }
+.pictures img, .pictures video { display: block; width: 100%; height: auto; border-radius: 4px; }
+.pictures .photo img { image-rendering: pixelated; }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr));
+  gap: 22px 28px; }
+td { font-variant-numeric: tabular-nums; }
+"""
+)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The content of the page.
+
+    Attributes:
+        name: of the photo.
+        photo: (H, W, 3) uint8.
+        gaussians: the result of the fit.
+        moments: the course of the fit; the last one is the result.
+        compact: PSNR in dB, bytes and bits per pixel of the compact file.
+        files: names and descriptions of the files beside the page.
+        video: the video of the fit.
+    """
+
+    name: str
+    photo: Tensor
+    gaussians: ImageGaussians
+    moments: list[Moment]
+    compact: tuple[float, int, float]
+    files: dict[str, str]
+    video: Path
+
+
+def write_image_report(path: Path, fitted: Fitted) -> None:
+    """Write the page, atomically. Raises OSError if it cannot be written."""
+    end = fitted.moments[-1]
+    psnr, size, bits = fitted.compact
+    gaussians = fitted.gaussians
+    figures = [
+        (f"{end.psnr:.2f} dB", "PSNR"),
+        (f"{end.ssim:.4f}", "SSIM"),
+        (f"{len(gaussians):,}", f"Gaussians, {gaussians.blending}"),
+        (duration(end.seconds), f"for {end.step:,} steps"),
+        (f"{bits:.2f}", f"bits per pixel: {size:,} bytes, {psnr:.2f} dB"),
+    ]
+    body = [
+        f"<h1>{text(fitted.name)}</h1>\n<p>{gaussians.width} × {gaussians.height} pixels, "
+        f"approximated by {len(gaussians):,} 2D Gaussians.</p>",
+        cards(figures),
+        _pictures(fitted),
+        _curves(fitted.moments),
+        "<h2>Files</h2>\n"
+        + table([], [(text(name), text(about)) for name, about in fitted.files.items()]),
+        "<h2>Machine</h2>\n"
+        + table([], [("processor", text(processor_name())), ("system", text(system_name()))]),
+    ]
+    write_text(path, page(f"{fitted.name} – Gaussians", body, _STYLE))
+
+
+def shrunk(gaussians: ImageGaussians, image: Tensor) -> ImageGaussians:
+    """The Gaussians as small opaque ellipses, with the colours of the image (H, W, 3) there."""
+    rows = gaussians.rows.clone()
+    rows[:, LOG_SIGMAS] += torch.tensor(_SHRUNK).log()
+    x = rows[:, 0].long().clamp(0, gaussians.width - 1)
+    y = rows[:, 1].long().clamp(0, gaussians.height - 1)
+    rows[:, COLORS] = image[y, x]
+    if gaussians.blending == "additive":
+        rows = torch.cat([rows, rows.new_zeros(len(rows), 1)], dim=1)
+    rows[:, OPACITY_LOGIT] = 4.0
+    black = torch.zeros_like(gaussians.background)
+    return replace(gaussians, blending="front-to-back", rows=rows, background=black)
+
+
+@torch.no_grad()
+def _pictures(fitted: Fitted) -> str:
+    gaussians, photo = fitted.gaussians, Image.fromarray(fitted.photo.numpy())
+    scale = max(1, -(-_LEAST_SIDE // max(photo.size)))
+    image = gaussians.render().clamp(0, 1)
+    ellipses = shrunk(gaussians, image).render(scale)
+    video = base64.b64encode(fitted.video.read_bytes()).decode("ascii")
+    figures = [
+        ("photo", picture(photo, "photo", 95), "The photo"),
+        ("", picture(_pixels(gaussians.render(scale)), "the Gaussians", 92), "The Gaussians"),
+        (
+            "",
+            picture(_pixels(ellipses), "ellipses", 92),
+            "The Gaussians at half their size",
+        ),
+        (
+            "",
+            '<video controls="" autoplay="" loop="" muted="" '
+            f'src="data:video/mp4;base64,{video}"></video>',
+            "The fit; the video becomes faster towards the end",
+        ),
+    ]
+    inner = "\n".join(
+        f'<figure class="{kind}">{html}<figcaption>{caption}</figcaption></figure>'
+        for kind, html, caption in figures
+    )
+    return f'<div class="pictures">{inner}</div>'
+
+
+def _pixels(image: Tensor) -> Image.Image:
+    """(H, W, 3) in 0..1 as an 8-bit image."""
+    return Image.fromarray((image.clamp(0, 1) * 255 + 0.5).byte().contiguous().numpy())
+
+
+def _curves(moments: list[Moment]) -> str:
+    drawings = [
+        ("PSNR, dB", [(m.seconds, m.psnr) for m in moments]),
+        ("SSIM", [(m.seconds, m.ssim) for m in moments]),
+        ("Gaussians", [(m.seconds, float(m.gaussians)) for m in moments]),
+    ]
+    figures = "\n".join(
+        f"<figure><figcaption>{caption}</figcaption>"
+        + charts.chart(points, x_label="seconds", y_label=caption, from_zero=caption == "Gaussians")
+        + "</figure>"
+        for caption, points in drawings
+    )
+    return f'<h2>The fit</h2>\n<div class="charts">{figures}</div>'

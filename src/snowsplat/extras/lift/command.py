@@ -1,0 +1,146 @@
+"""`snowsplat lift`: one photo and its depth map become a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.observer import TerminalObserver
+from snowsplat.util.duration import duration
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult
+
+
+@dataclass
+class Lift:
+    """Make a scene from one photo and its depth map.
+
+    Examples:
+      snowsplat lift room.jpg --depth room_depth.png -o room
+      snowsplat lift room.jpg --model depth_anything_v2.onnx -o room --swing
+      snowsplat lift garden/images/12.jpg --depth 12.npy --refine garden -o room
+
+    Notes:
+      OUT is an output folder as that of train: view, render, convert and info
+      read it. What the photo does not show is empty. Models are files on this
+      computer; snowsplat never downloads one.
+    """
+
+    photo: Annotated[Path | None, tyro.conf.Positional, flag("PHOTO")] = None
+    """The photo."""
+    output: Annotated[Path | None, flag("OUT", "-o")] = None
+    """The output folder. It is created if it does not exist."""
+    depth: Annotated[Path | None, flag("MAP")] = None
+    """Depth map of the photo: PNG (8 or 16 bits), TIFF, NPY or EXR, of any size."""
+    model: Annotated[Path | None, flag("PATH")] = None
+    """Instead of a map: a network that estimates depth. An ONNX file, or a folder of the library
+    transformers; for example, Depth Anything V2."""
+    depth_is: Annotated[
+        Literal["z", "distance", "disparity"] | None,
+        flag("{z,distance,disparity}", default="z; disparity for a model"),
+    ] = None
+    """What the values are. z: the distance along the optical axis; distance: along the ray;
+    disparity: inverse depth, known up to a factor."""
+    near: Annotated[float | None, flag("F", default="from the map")] = None
+    """Depth of the nearest pixel. Together with --far, sets the range of the depths of a map
+    without units."""
+    far: Annotated[float | None, flag("F", default="from the map")] = None
+    """Depth of the farthest pixel."""
+    focal: Annotated[float | None, flag("PIXELS", default="from EXIF data")] = None
+    """Focal length in pixels of the photo as stored. Without EXIF data, that of the main camera of
+    phones is assumed."""
+    size: Annotated[int | None, flag("PIXELS", default="640")] = None
+    """Pixels along the longer side. A larger photo is scaled down."""
+    max_gaussians: Annotated[int | None, flag("N", default="one per pixel")] = None
+    """Merge the pixels of uniform parts, until there are at most this many Gaussians."""
+    edge: Annotated[float, flag("F", default="0.05")] = 0.05
+    """Neighbouring pixels are on different surfaces if their depths differ by more than this
+    share."""
+    swing: Annotated[bool, switch()] = False
+    """Also render swing.mp4, a video from viewpoints around that of the photo."""
+    refine: Annotated[Path | None, flag("DATASET")] = None
+    """A dataset of photos with camera poses that contains PHOTO. The depth is aligned to its
+    points, and the scene is trained on all of its photos."""
+    iterations: Annotated[int | None, flag("N", default="1000")] = None
+    """Number of training steps with --refine."""
+    eval: Annotated[bool, switch()] = False
+    """With --refine: hold out every 8th photo, and evaluate the scene on these photos."""
+    threads: Annotated[int | None, flag("N", default="all cores")] = None
+    """Number of CPU threads."""
+    overwrite: Annotated[bool, switch()] = False
+    """Replace an earlier scene in OUT."""
+    quiet: Annotated[bool, switch("-q")] = False
+    """Print only the result and no progress."""
+
+    def run(self) -> int:
+        """Returns the exit code, 0."""
+        if self.photo is None or self.output is None:
+            raise UserError(
+                "lift needs a photo and an output folder: snowsplat lift PHOTO --depth MAP -o OUT"
+            )
+        if self.refine is None and (self.eval or self.iterations is not None):
+            raise UserError("`eval` and `iterations` are about the training; set `refine` as well")
+        if self.refine is not None and (self.size is not None or self.focal is not None):
+            raise UserError(
+                "`size` and `focal` are those of the dataset with `refine`; leave them out"
+            )
+        from snowsplat.extras.lift.lift_photo import DepthSource
+
+        source = DepthSource(self.depth, self.model, self.depth_is, self.near, self.far)
+        if self.refine is None:
+            result = self._lift(self.photo, self.output, source)
+        else:
+            result = self._refine(self.photo, self.output, source, self.refine)
+        if result.alignment is not None:
+            fit = result.alignment
+            print(
+                f"depth aligned to {fit.points:,} points: median error {100 * fit.error:.1f}%"
+                " of the disparity"
+            )
+        pixels, where = result.focal
+        hint = "; set it with --focal" if where == "assumed" else ""
+        print(f"focal length: {pixels:.0f} pixels, {where}{hint}")
+        print(f"depth ({source.values_are}): {result.depths[0]:.3g} to {result.depths[1]:.3g}")
+        print(
+            f"{result.scene}: {result.gaussians:,} Gaussians, PSNR {result.psnr:.2f} dB at the "
+            f"pose of the photo, {duration(result.seconds)}"
+        )
+        if result.evaluation is not None and result.evaluation.views:
+            print(f"held-out photos: PSNR {result.evaluation.psnr:.2f} dB")
+        if result.swing is not None:
+            print(f"{result.swing}: the video")
+        return 0
+
+    def _lift(self, photo: Path, output: Path, source: DepthSource) -> LiftResult:
+        from snowsplat.extras.lift.lift import LiftOptions
+        from snowsplat.extras.lift.lift_photo import lift_photo
+
+        return lift_photo(
+            *(photo, output, source, LiftOptions(self.edge, self.max_gaussians)),
+            size=640 if self.size is None else self.size,
+            focal=self.focal,
+            swing=self.swing,
+            threads=self.threads,
+            overwrite=self.overwrite,
+        )
+
+    def _refine(self, photo: Path, output: Path, source: DepthSource, dataset: Path) -> LiftResult:
+        from snowsplat.extras.lift.lift import LiftOptions
+        from snowsplat.extras.lift.refine_photo import refine_photo
+
+        with TerminalObserver(self.quiet) as observer:
+            return refine_photo(
+                *(photo, output, source, dataset, LiftOptions(self.edge, self.max_gaussians)),
+                iterations=1000 if self.iterations is None else self.iterations,
+                hold_out=8 if self.eval else None,
+                swing=self.swing,
+                threads=self.threads,
+                overwrite=self.overwrite,
+                observer=observer,
+            )

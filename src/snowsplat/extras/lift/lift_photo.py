@@ -1,0 +1,289 @@
+"""`lift_photo`: one photo and its depth map become a scene in an output folder."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.files import write_json
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from snowsplat.data.depth_alignment import Alignment
+    from snowsplat.data.depth_file import DepthKind
+    from snowsplat.evaluation.metrics import Evaluation
+    from snowsplat.extras.lift.lift import LiftOptions
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
+
+#: The folder of the dataset that `lift_photo` writes: the photo and its camera.
+PHOTO = "photo"
+_SIDES = (32, 4096)  # pixels along the longer side
+# 35 mm equivalent of the focal length that is assumed without EXIF data: the main camera of phones.
+_USUAL_FOCAL = 28.0
+_FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
+_ASPECT_TOLERANCE = 0.03  # between the aspect ratios of photo and depth map, relative
+_SWING_SECONDS, _SWING_FPS = 4, 24
+
+
+@dataclass(frozen=True)
+class DepthSource:
+    """Where the depth comes from: a file, or a network that is on disk.
+
+    Attributes:
+        map: a depth map, see `read_depth_file`.
+        model: a network, see `estimate_depth`. Exactly one of ``map`` and ``model`` is set.
+        kind: what the values are; default: "z" for a map, "disparity" for a model.
+        near, far: the depths of the nearest and the farthest pixel, see `to_z`.
+
+    Raises:
+        UserError: neither or both of ``map`` and ``model`` are set.
+    """
+
+    map: Path | None = None
+    model: Path | None = None
+    kind: DepthKind | None = None
+    near: float | None = None
+    far: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.map is None) == (self.model is None):
+            raise UserError(
+                "lift needs either a depth map or a model; set one of `depth` and `model`"
+            )
+
+    @property
+    def values_are(self) -> DepthKind:
+        """``kind`` or its default."""
+        return self.kind or ("z" if self.model is None else "disparity")
+
+    def read(self, photo: Tensor, camera: Camera, edge: float) -> Tensor:
+        """The depth of each pixel of the photo: camera z (H, W) float32; NaN where it is unknown.
+
+        Raises:
+            UserError: an unusable file, model or range; another aspect ratio than the photo.
+        """
+        from snowsplat.data.depth_file import read_depth_file, to_z
+        from snowsplat.extras.lift.depth_model import estimate_depth
+        from snowsplat.extras.lift.edges import resize_depth
+
+        if self.map is not None:
+            values = read_depth_file(self.map)
+            height, width = values.shape
+            aspect = width / height * camera.height / camera.width
+            if abs(aspect - 1) > _ASPECT_TOLERANCE:
+                raise UserError(
+                    f"{self.map}: has {width}x{height} pixels, but the upright photo has "
+                    f"{camera.width}x{camera.height}; use a depth map of the whole photo"
+                )
+        else:
+            assert self.model is not None
+            values = estimate_depth(self.model, photo)
+        z = to_z(values, self.values_are, camera, self.near, self.far)
+        return resize_depth(z, camera.width, camera.height, edge)
+
+
+@dataclass(frozen=True)
+class LiftResult:
+    """A lifted photo.
+
+    Attributes:
+        scene: the PLY file.
+        gaussians: their number.
+        psnr: of the photo, rendered from its own pose, in dB. After a refinement, this is the
+            refined scene.
+        focal: the focal length in pixels of the lifted photo, and where it is from.
+        depths: percentiles 1 and 99 of the camera z of the photo.
+        seconds: duration, without the refinement.
+        swing: the video, if it was requested.
+        alignment: the fit of the depth to the points of the dataset; None without a dataset.
+        evaluation: metrics of the held-out photos of the dataset.
+    """
+
+    scene: Path
+    gaussians: int
+    psnr: float
+    focal: tuple[float, str]
+    depths: tuple[float, float]
+    seconds: float
+    swing: Path | None = None
+    alignment: Alignment | None = None
+    evaluation: Evaluation | None = field(default=None, repr=False)
+
+
+def lift_photo(
+    photo: Path | str,
+    output: Path | str,
+    depth: DepthSource,
+    options: LiftOptions | None = None,
+    *,
+    size: int = 640,
+    focal: float | None = None,
+    swing: bool = False,
+    threads: int | None = None,
+    overwrite: bool = False,
+) -> LiftResult:
+    """Lift a photo to Gaussians, and write an output folder as `train` does.
+
+    The folder contains the scene after 0 steps, the camera, the photo as a dataset of one view,
+    ``rendered.png`` (the scene from the camera of the photo), ``depth.png`` (the depth in colours)
+    and ``metrics.json``. The world frame is that of the camera: x right, y down, z forward. The
+    computation runs on the CPU.
+
+    Args:
+        size: pixels along the longer side, to which a larger photo is scaled down.
+        focal: focal length in pixels of the photo as stored. Default: from its EXIF data, or that
+            of the main camera of phones.
+        swing: also write ``swing.mp4``, a small closed camera path around the photo.
+        threads: number of CPU threads; None: all cores.
+        overwrite: replace an earlier scene in ``output``.
+
+    Raises:
+        UserError: the photo or the depth is missing, damaged or unusable; a setting is out of
+            range; ``output`` contains other files.
+        OSError: a file cannot be written.
+    """
+    from snowsplat.extras.lift.lift import LiftOptions, lift
+
+    options, started = options or LiftOptions(), time.monotonic()
+    out = OutputFolder(Path(output))
+    out.check_free(resume=False, overwrite=overwrite)
+    pixels, camera, source = read_photo(Path(photo), size, focal)
+    Compute("cpu", threads).apply()
+    z = depth.read(pixels, camera, options.edge)
+    gaussians = lift(pixels, z, camera, options)
+    _begin(out, Path(photo).stem, pixels, camera)
+    return finish(out, 0, gaussians, pixels, z, camera, source, swing, started)
+
+
+def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Camera, str]:
+    """An upright photo (H, W, 3) in 0..1, its camera, and where the focal length is from.
+
+    Transparent photos are composited over white. The pose is the identity.
+
+    Raises:
+        UserError: see `lift_photo`.
+    """
+    import numpy as np
+    import torch
+    from PIL import Image
+
+    from snowsplat.scene.camera import Camera
+    from snowsplat.sfm.ingest.photo_files import Unusable, decode, read_header
+
+    least, most = _SIDES
+    if not least <= size <= most:
+        raise SettingError("size", f"{size} is out of range; use {least} to {most} pixels")
+    if focal is not None and not 0.0 < focal < math.inf:
+        raise SettingError("focal", f"{focal:g} is not a focal length; use one in pixels")
+    if not path.is_file():
+        raise UserError(f"{path}: no such photo")
+    try:
+        header = read_header(path)
+        image = decode(path, header, size)
+    except Unusable as error:
+        raise UserError(f"{path}: {error}; use another photo") from None
+    if image.mode == "RGBA":
+        white = Image.new("RGBA", image.size, (255, 255, 255, 255))
+        image = Image.alpha_composite(white, image)
+    pixels = torch.from_numpy(np.array(image.convert("RGB"))).float() / 255
+    width, height = image.size
+    source = "set"
+    if focal is None:
+        focal, source = header.exif.focal, "from EXIF data"
+    if focal is None:
+        diagonal = math.hypot(header.width, header.height)
+        focal, source = _USUAL_FOCAL / _FULL_FRAME_DIAGONAL * diagonal, "assumed"
+    focal *= max(width, height) / max(header.width, header.height)
+    pose = torch.eye(4, dtype=torch.float64)[:3]
+    return pixels, Camera(width, height, focal, focal, width / 2, height / 2, pose), source
+
+
+def _begin(out: OutputFolder, name: str, pixels: Tensor, camera: Camera) -> None:
+    """Write the photo as a dataset of one view, and what `train` writes before its first step."""
+    import torch
+
+    from snowsplat.pipeline.output.image_files import to_8bit, write_png
+    from snowsplat.training.core.config import TrainConfig
+
+    folder = out.path / PHOTO
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for earlier in (folder / "images").iterdir():
+        earlier.unlink()
+    write_png(folder / "images" / f"{name}.png", to_8bit(pixels))
+    world_from_gl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))  # the axes of the format
+    frame = {"file_path": f"images/{name}.png", "transform_matrix": world_from_gl.tolist()}
+    intrinsics = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
+    intrinsics |= {"cx": camera.cx, "cy": camera.cy}
+    write_json(folder / "transforms.json", intrinsics | {"frames": [frame]})
+    settings = DatasetSettings(str(folder.absolute()))
+    out.begin(settings.load(), settings, TrainConfig(sh_degree=0))
+
+
+def finish(
+    out: OutputFolder,
+    step: int,
+    gaussians: Gaussians,
+    pixels: Tensor,
+    z: Tensor,
+    camera: Camera,
+    source: str,
+    swing: bool,
+    started: float,
+) -> LiftResult:
+    """Write the scene, its pictures and metrics."""
+    import numpy as np
+    import torch
+
+    from snowsplat.evaluation.metrics import Evaluation, compare
+    from snowsplat.pipeline.output import image_files
+    from snowsplat.scene.render import render
+
+    scene = out.write_scene(step, gaussians)
+    with torch.no_grad():
+        image = render(gaussians, camera).image
+    metrics = compare(image, pixels, name="photo")
+    out.write_metrics(step, "train", Evaluation([metrics]))
+    image_files.write_png(out.path / "rendered.png", image_files.to_8bit(image))
+    known = z[z.isfinite()].numpy()
+    near, far = (float(value) for value in np.percentile(known, [1, 99]))
+    depth = torch.nan_to_num(z, nan=0.0).numpy()
+    colored = image_files.depth_in_color(depth, near, max(far, 1.001 * near))
+    image_files.write_png(out.path / "depth.png", colored)
+    seconds = time.monotonic() - started
+    video = out.path / "swing.mp4"
+    video.unlink(missing_ok=True)  # of an earlier run
+    if swing:
+        _write_swing(video, gaussians, camera, float(np.median(known)))
+    return LiftResult(
+        scene=scene,
+        gaussians=len(gaussians),
+        psnr=metrics.psnr,
+        focal=(camera.fx, source),
+        depths=(near, far),
+        seconds=seconds,
+        swing=video if swing else None,
+    )
+
+
+def _write_swing(target: Path, gaussians: Gaussians, camera: Camera, distance: float) -> None:
+    """A video of the scene on `swing_path`; its size is even."""
+    import torch
+
+    from snowsplat.pipeline.output.image_files import to_8bit
+    from snowsplat.scene.render import render
+    from snowsplat.trajectory.swing import swing_path
+    from snowsplat.trajectory.video import video_writer
+
+    width, height = (side // 2 * 2 for side in (camera.width, camera.height))
+    cameras = swing_path(camera, distance, _SWING_SECONDS * _SWING_FPS)
+    with torch.no_grad(), video_writer(target, width, height, _SWING_FPS) as add_frame:
+        for pose in cameras:
+            add_frame(to_8bit(render(gaussians, pose).image)[:height, :width])

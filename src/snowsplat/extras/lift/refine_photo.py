@@ -1,0 +1,150 @@
+"""`refine_photo`: a lifted photo of a dataset, trained further on all photos of the dataset."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult, finish
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.data import Dataset, Points, View
+    from snowsplat.extras.lift.lift import LiftOptions
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.training.core.config import TrainConfig
+    from snowsplat.training.core.trainer import Trainer
+
+# Share of the largest number of Gaussians that the lifted photo may use. Densification needs the
+# others for what the photo does not show.
+_LIFTED_SHARE = 0.5
+
+
+def refine_photo(
+    photo: Path | str,
+    output: Path | str,
+    depth: DepthSource,
+    dataset: Path | str,
+    options: LiftOptions | None = None,
+    *,
+    iterations: int = 1000,
+    hold_out: int | None = None,
+    swing: bool = False,
+    threads: int | None = None,
+    overwrite: bool = False,
+    observer: Observer = SILENT,
+) -> LiftResult:
+    """Lift a photo of a dataset, and train the scene on all photos of the dataset.
+
+    Image, camera and pose are those of the dataset. The depth is aligned to the points of the
+    dataset: its scale, and for a disparity also its shift. The training starts with the lifted
+    photo, and with those points that the photo does not show. It uses the recipe `default`.
+
+    Args:
+        photo: the path or the name of a photo of the dataset.
+        dataset: a dataset with points, see `snowsplat.data.load_dataset`.
+        iterations: number of training steps.
+        hold_out: hold out every ``hold_out``-th photo for testing; default: none.
+
+    Raises:
+        UserError: see `lift_photo`; the dataset has no points, or the photo is not one of its
+            training photos; the depth map contradicts the points.
+        KeyboardInterrupt: Ctrl-C; the folder then contains the scene after 0 steps.
+    """
+    from snowsplat.data import ImageLoader
+    from snowsplat.data.depth_alignment import align
+    from snowsplat.extras.lift.lift import LiftOptions, lift
+    from snowsplat.training.core.recipes import recipe
+    from snowsplat.training.core.trainer import Trainer
+
+    options, started = options or LiftOptions(), time.monotonic()
+    out = OutputFolder(Path(output))
+    out.check_free(resume=False, overwrite=overwrite)
+    settings = DatasetSettings(str(Path(dataset).absolute()), hold_out=hold_out)
+    posed = settings.load()
+    view = _view_of(posed, Path(photo))
+    if posed.points is None:
+        raise UserError(f"{dataset}: has no points, which the depth is aligned to; use lift alone")
+    config = _capped(recipe("default", iterations=iterations, init="points"), posed)
+    Compute("cpu", threads).apply()
+    with ImageLoader([view], background=(1.0, 1.0, 1.0)) as loader:
+        pixels = loader.get(view).rgb.float().div(255).contiguous()
+    z = depth.read(pixels, view.camera, options.edge)
+    alignment = align(z, posed.points.xyz, view.camera, with_shift=depth.values_are == "disparity")
+    z = alignment.apply(z)
+    limit = round(_LIFTED_SHARE * config.density.max_gaussians)
+    options = replace(options, max_gaussians=min(options.max_gaussians or limit, limit))
+    lifted = lift(pixels, z, view.camera, options)
+    out.begin(posed, settings, config)
+    source = "of the dataset"
+    finish(out, 0, lifted, pixels, z, view.camera, source, False, started)
+    seconds = time.monotonic() - started
+    initial = _with_unseen_points(lifted, posed.points, view.camera, config.initial_opacity)
+    trainer = Trainer(posed, config, initial=_with_degree(initial, config.sh_degree))
+    _train(trainer, observer)
+    result = finish(
+        *(out, trainer.step, trainer.gaussians, pixels, z, view.camera, source, swing, started)
+    )
+    evaluation = trainer.evaluate() if posed.test else None
+    if evaluation is not None:
+        out.write_metrics(trainer.step, "test", evaluation)
+    return replace(result, seconds=seconds, alignment=alignment, evaluation=evaluation)
+
+
+def _train(trainer: Trainer, observer: Observer) -> None:
+    observer.steps_begin(0, trainer.schedule.iterations)
+    try:
+        trainer.run(observer.step)
+    finally:
+        observer.steps_end()
+
+
+def _view_of(dataset: Dataset, photo: Path) -> View:
+    """The training view of a photo: of the same file or, if there is none, of the same name."""
+    if photo.is_file():
+        for view in dataset.train:
+            if view.image.path.samefile(photo):
+                return view
+    named = [view for view in dataset.train if Path(view.name).name == photo.name]
+    if len(named) == 1:
+        return named[0]
+    held_out = any(Path(view.name).name == photo.name for view in dataset.test)
+    problem = "is held out for testing" if held_out else "is not a photo of the dataset"
+    names = ", ".join(view.name for view in dataset.train[:3])
+    raise UserError(f"{photo}: {problem}; use one of its training photos, for example {names}")
+
+
+def _capped(config: TrainConfig, dataset: Dataset) -> TrainConfig:
+    """The configuration with its limit of Gaussians, as the trainer sets it."""
+    sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
+    return config.capped(sizes[len(sizes) // 2], len(sizes))
+
+
+def _with_unseen_points(
+    lifted: Gaussians, points: Points, camera: Camera, opacity: float
+) -> Gaussians:
+    """The Gaussians, and one for each point that is outside of the image of the camera."""
+    from snowsplat.data import Points
+    from snowsplat.scene.gaussians import Gaussians
+
+    pixels, z = camera.project(points.xyz.double())
+    inside = (pixels >= 0).all(1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    unseen = ~(inside & (z > 0))
+    if not bool(unseen.any()):
+        return lifted
+    others = Points(points.xyz[unseen], points.rgb[unseen])
+    return lifted.append(Gaussians.from_points(others, sh_degree=0, initial_opacity=opacity))
+
+
+def _with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The same Gaussians with coefficients of 0 up to an SH degree."""
+    from snowsplat.scene.sh_constants import SH_REST_COUNTS
+
+    rest = gaussians.means.new_zeros(len(gaussians), SH_REST_COUNTS[degree], 3)
+    return replace(gaussians, sh_rest=rest)

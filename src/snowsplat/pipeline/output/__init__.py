@@ -1,0 +1,1 @@
+"""The files of an output folder, and where a scene is read from."""

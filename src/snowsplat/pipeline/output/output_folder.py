@@ -1,0 +1,362 @@
+"""`OutputFolder`: the files of a training run, in the layout of the reference implementation.
+
+    OUT/cfg_args                                   settings, in the format of that implementation
+    OUT/cameras.json                               all cameras, refined if the training did so
+    OUT/input.ply                                  the points that the training started from
+    OUT/point_cloud/iteration_N/point_cloud.ply    the scene after N steps
+    OUT/config.json                                *all settings
+    OUT/checkpoints/step_N.safetensors             *see snowsplat.training.core.checkpoint
+    OUT/metrics.json                               metrics of the last evaluation
+    OUT/history.json                               *the curves of the training
+    OUT/report.html                                *a page about the training
+    OUT/masks/NAME.png                             *masks of what moves, if something moves
+    OUT/test/ours_N/renders, gt                    rendered images and photos; also train/
+    OUT/refined/sparse/0                           *a COLMAP model with refined cameras
+    OUT/videos/                                    *rendered videos (films/ in earlier versions)
+
+The reference implementation does not write the entries marked *. Its folders are read too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from snowsplat._version import __version__
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import (
+    atomic_path,
+    is_temporary,
+    remove_temporaries,
+    write_json,
+    write_text,
+)
+from snowsplat.util.safe_json import from_json, read_json
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from snowsplat.data import Dataset, DatasetFiles, View
+    from snowsplat.evaluation.metrics import Evaluation
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.training.core.config import TrainConfig
+
+#: Folders inside the folder of `make`: the dataset, and the output folder of its training.
+CAPTURE, SCENE = "capture", "scene"
+# _WORD: a string, a name, a number, or a single character. _LITERAL: a literal whose value is used.
+# _WORD does not match spaces. An expression that matches them would take quadratic time for a file
+# with a million spaces.
+_WORD = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S""", re.DOTALL)
+_LITERAL = re.compile(r"""['"].*['"]|True|False|None|-?[\d.]+(?:e[+-]?\d+)?""", re.DOTALL)
+_NAMESPACE_LIMIT = 1 << 20  # characters
+# Maximum number of words that are stored for an argument of Namespace. The arguments that are used
+# have three words, NAME = VALUE; one more word is stored to detect longer arguments.
+_STORED_WORDS = 4
+_SCENE = re.compile(r"iteration_(\d+)")
+_RESULTS = ("point_cloud", "checkpoints", "refined", "train", "test", "videos", "films", "masks")
+_REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html")
+_FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
+
+
+@dataclass(frozen=True)
+class DatasetSettings:
+    """How the dataset of a training run is read: the arguments of `load_dataset`."""
+
+    path: str
+    images: str = "images"
+    resolution: int = -1
+    hold_out: int | None = None
+    test_list: str | None = None
+
+    def load(self) -> Dataset:
+        """Read the dataset.
+
+        Raises:
+            UserError: see `snowsplat.data.load_dataset`.
+        """
+        return self.read_files().dataset(self.resolution)
+
+    def read_files(self) -> DatasetFiles:
+        """Read the files of the dataset, to load it at several resolutions.
+
+        Raises:
+            UserError: see `snowsplat.data.load_dataset`.
+        """
+        from snowsplat.data import read_files
+
+        return read_files(
+            self.path,
+            images=self.images,
+            resolution=self.resolution,
+            hold_out=self.hold_out,
+            test_list=self.test_list,
+        )
+
+
+@dataclass(frozen=True)
+class OutputFolder:
+    """An output folder, existing or not."""
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def history(self) -> Path:
+        return self.path / "history.json"
+
+    @property
+    def report(self) -> Path:
+        return self.path / "report.html"
+
+    @property
+    def videos(self) -> Path:
+        return self.path / "videos"
+
+    def is_output_folder(self) -> bool:
+        """Whether snowsplat or the reference implementation has written a training run here."""
+        return any((self.path / name).is_file() for name in ("config.json", "cfg_args"))
+
+    # Before a training run
+
+    def check_free(self, *, resume: bool, overwrite: bool) -> None:
+        """Check that a training run may write here; writes nothing.
+
+        Raises:
+            UserError: the path is a file or a folder with other files, or contains a training run
+                that is to be neither resumed nor overwritten.
+        """
+        if not self.path.exists():
+            return
+        if not self.path.is_dir():
+            raise UserError(f"{self.path}: is a file; use a folder for the output")
+        others = (entry for entry in self.path.iterdir() if not is_temporary(entry, _FILES))
+        if any(others) and not self.is_output_folder():
+            raise UserError(f"{self.path}: contains other files; use a new or an empty folder")
+        if self.is_output_folder() and not resume and not overwrite:
+            raise UserError(
+                f"{self.path}: already contains a training run; use `resume` to continue it, "
+                "`overwrite` to replace it, or use another folder"
+            )
+
+    def begin(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
+        """Create the folder, remove the results of an earlier run, and call `describe`."""
+        for name in _RESULTS:
+            shutil.rmtree(self.path / name, ignore_errors=True)
+        for name in _REPORTS:
+            (self.path / name).unlink(missing_ok=True)
+        self.describe(dataset, settings, config)
+
+    def describe(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
+        """Write the files that are known before the first step: settings, cameras, points."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.write_config(settings, config)  # from now on, `is_output_folder` is true
+        if dataset.points is not None:
+            from snowsplat.data.points_ply import write_points
+
+            points = dataset.points
+            write_points(self.path / "input.ply", points.xyz.numpy(), points.rgb.numpy())
+        self.write_cameras([*dataset.train, *dataset.test])
+
+    def write_cameras(self, views: Sequence[View]) -> None:
+        """Write `cameras.json`."""
+        from snowsplat.scene.camera_json import write_cameras
+
+        cameras = ((Path(view.name).stem, view.camera) for view in views)
+        write_cameras(self.path / "cameras.json", cameras)
+
+    def write_config(self, settings: DatasetSettings, config: TrainConfig) -> None:
+        """Write `config.json` and `cfg_args`; remove unfinished files of a killed process."""
+        from snowsplat.training.core.config import config_to_json
+
+        remove_temporaries(self.path, _FILES)
+        self._remove_unwritten_scenes()
+        whole = {
+            "snowsplat": __version__,
+            "capture": asdict(settings),
+            "training": config_to_json(config),
+        }
+        write_json(self.path / "config.json", whole)
+        namespace = argparse.Namespace(
+            data_device="cpu",
+            eval=settings.hold_out is not None,
+            images=settings.images,
+            model_path=str(self.path.absolute()),
+            resolution=settings.resolution,
+            sh_degree=config.sh_degree,
+            source_path=settings.path,
+            white_background=config.background == "white",
+        )
+        write_text(self.path / "cfg_args", repr(namespace))
+
+    def _remove_unwritten_scenes(self) -> None:
+        """Remove folders without a scene: the process was killed, or the disk was full."""
+        for folder in (self.path / "point_cloud").glob("iteration_*"):
+            if not (folder / "point_cloud.ply").exists():
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def write_exposure(self, exposures: dict[str, list[float]]) -> None:
+        """Write `exposure.json`: the exposure of each training photo in EV, for each channel."""
+        write_json(self.path / "exposure.json", {"unit": "EV", "photos": exposures})
+
+    def discard(self) -> None:
+        """Remove what `begin` wrote, if there is neither a scene nor a checkpoint."""
+        if self.scenes() or self.checkpoints.exists():
+            return
+        for name in _FILES:
+            (self.path / name).unlink(missing_ok=True)
+        self._remove_unwritten_scenes()
+        with suppress(OSError):  # missing, or not empty
+            (self.path / "point_cloud").rmdir()
+        if self.path.is_dir() and not any(self.path.iterdir()):
+            self.path.rmdir()
+
+    # Scenes
+
+    def scenes(self) -> list[int]:
+        """The iterations that have a scene, ascending."""
+        folder = self.path / "point_cloud"
+        if not folder.is_dir():
+            return []
+        found = [_SCENE.fullmatch(entry.name) for entry in folder.iterdir()]
+        steps = sorted(int(match[1]) for match in found if match)
+        return [step for step in steps if self.scene_path(step).is_file()]
+
+    def scene_path(self, iteration: int) -> Path:
+        return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+    def write_scene(self, iteration: int, gaussians: Gaussians) -> Path:
+        """Save the scene; returns the file."""
+        from snowsplat.formats import write_gaussians
+
+        path = self.scene_path(iteration)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_gaussians(path, gaussians)
+        return path
+
+    def read_scene(self, iteration: int | None) -> tuple[int, Gaussians]:
+        """An iteration and its scene; None: the last one.
+
+        Raises:
+            UserError: no such folder or scene, or a damaged one.
+        """
+        from snowsplat.formats import read_gaussians
+
+        if not self.path.is_dir():
+            raise UserError(
+                f"{self.path}: no such folder; give the output folder of a training run"
+            )
+        scenes = self.scenes()
+        if not scenes:
+            raise UserError(f"{self.path}: contains no scene (no point_cloud/iteration_N in it)")
+        chosen = scenes[-1] if iteration is None else iteration
+        if chosen not in scenes:
+            there = ", ".join(map(str, scenes))
+            raise UserError(
+                f"{self.path}: contains no scene of iteration {chosen}; there are {there}"
+            )
+        return chosen, read_gaussians(self.scene_path(chosen))
+
+    def write_metrics(
+        self,
+        iteration: int,
+        split: str,
+        evaluation: Evaluation,
+        left_out: tuple[str, ...] | None = None,
+    ) -> None:
+        """Write `metrics.json`: iteration, split, mean metrics, and the metrics of each view.
+
+        Args:
+            left_out: names of the photos that the training has left out. If there are any, they are
+                the list "left_out". None: the list of the existing file is kept.
+        """
+        path = self.path / "metrics.json"
+        names = _left_out_in(path) if left_out is None else list(left_out)
+        head: dict[str, Any] = {"iteration": iteration, "split": split}
+        if names:
+            head["left_out"] = names
+        write_json(path, head | evaluation.as_json())
+
+    # Settings
+
+    def write_masks(self, masks: Mapping[str, Image.Image]) -> None:
+        """Write masks by the name of the photo, in the format of the masks of a dataset."""
+        for name, image in masks.items():
+            path = self.path / "masks" / f"{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(path) as temporary:
+                image.save(temporary, format="PNG")
+
+    def settings(self) -> tuple[DatasetSettings, tuple[float, float, float]]:
+        """How the dataset was read, and the background colour (red, green, blue in 0..1).
+
+        Raises:
+            UserError: missing or damaged settings.
+        """
+        ours, theirs = self.path / "config.json", self.path / "cfg_args"
+        try:
+            if ours.is_file():
+                whole = read_json(ours)
+                dataset = from_json(DatasetSettings, whole["capture"])
+                white = whole["training"]["background"] == "white"
+            elif theirs.is_file():
+                values = _namespace(theirs)
+                dataset = DatasetSettings(
+                    path=str(values["source_path"]),
+                    images=str(values.get("images", "images")),
+                    resolution=int(values.get("resolution", -1)),
+                    hold_out=8 if values.get("eval") else None,
+                )
+                white = bool(values.get("white_background"))
+            else:
+                raise UserError(
+                    f"{self.path}: not the output folder of a training run (no config.json)"
+                )
+        except (KeyError, TypeError, ValueError, SyntaxError, OverflowError):
+            where = ours if ours.is_file() else theirs
+            raise UserError(f"{where}: damaged; it does not name the dataset") from None
+        return dataset, (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+
+
+def _left_out_in(metrics: Path) -> list[str]:
+    """The list "left_out" of `metrics.json`; empty if there is none, or the file is damaged."""
+    try:
+        names = read_json(metrics).get("left_out", [])
+    except (OSError, ValueError, AttributeError):
+        return []
+    return names if isinstance(names, list) else []
+
+
+def _namespace(path: Path) -> dict[str, Any]:
+    """Strings, numbers, True, False and None of ``Namespace(name=value, …)``; others are ignored.
+
+    Only single words are passed to `ast.literal_eval`: it executes nothing, but deep nesting may
+    crash the interpreter.
+    """
+    with open(path, encoding="utf-8") as file:
+        words = (match[0] for match in _WORD.finditer(file.read(_NAMESPACE_LIMIT)))
+        if [next(words, ""), next(words, "")] != ["Namespace", "("]:
+            raise ValueError("not a Namespace")
+        values, depth, part = {}, 1, list[str]()
+        for word in words:
+            if word in ("'", '"'):
+                raise ValueError("a string without an end")
+            depth += (word in "([{") - (word in ")]}")
+            if depth > 1 or (depth == 1 and word != ","):
+                part = [*part, word][:_STORED_WORDS]
+                continue
+            if len(part) == _STORED_WORDS - 1 and part[1] == "=" and _LITERAL.fullmatch(part[2]):
+                values[part[0]] = ast.literal_eval(part[2])
+            part = []
+            if depth < 1:
+                return values
+    raise ValueError("no end")

@@ -1,0 +1,194 @@
+"""Loads a scene and its cameras from the output folder of a training run, or from a file."""
+
+from __future__ import annotations
+
+import filecmp
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.formats.lod import INDEX
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
+from snowsplat.pipeline.run.refined_cameras import with_refined
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.data import Dataset
+    from snowsplat.scene.camera import Camera
+    from snowsplat.scene.gaussians import Gaussians
+
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class TrainedScene:
+    """A scene in the output folder of its training, with its dataset.
+
+    Attributes:
+        iteration: the step after which it was saved.
+        gaussians: on the device that was requested.
+        dataset: its photos and cameras, split as in the training.
+        background: red, green, blue in 0..1.
+    """
+
+    folder: OutputFolder
+    iteration: int
+    gaussians: Gaussians
+    dataset: Dataset
+    background: Color
+
+
+def load_trained(
+    output: Path | str,
+    *,
+    iteration: int | None = None,
+    dataset: Path | str | None = None,
+    resolution: int | None = None,
+    compute: Compute | None = None,
+) -> TrainedScene:
+    """Load a scene from the output folder of `train`, `make` or the reference implementation.
+
+    Args:
+        iteration: the iteration to load; default: the last one.
+        dataset: the folder of the dataset, if it was moved after the training.
+        resolution: see `TrainOptions`; default: as trained.
+        compute: the device for the Gaussians; default: a GPU if there is one.
+
+    Raises:
+        UserError: scene, settings or dataset are missing or damaged; an unusable device.
+    """
+    folder = existing_folder(Path(output))
+    data, background = load_dataset_of(folder, dataset, resolution)
+    found, gaussians = folder.read_scene(iteration)
+    device = (compute or Compute()).apply()
+    return TrainedScene(folder, found, gaussians.to(device), data, background)
+
+
+def load_dataset_of(
+    folder: OutputFolder, dataset: Path | str | None = None, resolution: int | None = None
+) -> tuple[Dataset, Color]:
+    """The dataset of the training in ``folder``, and its background colour; see `load_trained`.
+
+    If the training has refined the cameras, they are those of the dataset.
+    """
+    settings, background = folder.settings()
+    if dataset is not None:
+        settings = replace(settings, path=str(dataset))
+    if resolution is not None:
+        settings = replace(settings, resolution=resolution)
+    return with_refined(folder.path, settings.load()), background
+
+
+def existing_folder(path: Path) -> OutputFolder:
+    """The same as `training_folder`. Raises: UserError: ``path`` is not a folder."""
+    if not path.is_dir():
+        raise UserError(f"{path}: no such folder; give the output folder of a training run")
+    return training_folder(path)
+
+
+def training_folder(path: Path) -> OutputFolder:
+    """The output folder of training: ``path`` or, if `make` created ``path``, a folder in it."""
+    folder, made = OutputFolder(path), OutputFolder(path / SCENE)
+    return made if made.scenes() and not folder.scenes() else folder
+
+
+def scene_file(path: Path) -> Path:
+    """``path`` itself if it is a file, or the scene in the folder ``path``.
+
+    That is its levels of detail if it has a `lod-meta.json`, else the last scene of the training.
+
+    Raises:
+        UserError: a folder without a scene.
+    """
+    if not path.is_dir():
+        return path
+    if (path / INDEX).is_file():
+        return path / INDEX
+    folder = training_folder(path)
+    scenes = folder.scenes()
+    if not scenes:
+        raise UserError(f"{path}: contains no scene (no point_cloud/iteration_N in it)")
+    return folder.scene_path(scenes[-1])
+
+
+def folder_around(scene: Path) -> OutputFolder:
+    """The output folder of the training run that wrote a scene file.
+
+    This is OUT for the file OUT/point_cloud/iteration_N/point_cloud.ply, and OUT/scene for the file
+    OUT/NAME.ply, the copy that `make` writes. For other files, it is an `OutputFolder` without
+    scenes.
+    """
+    scene = scene.resolve()
+    made, trained = OutputFolder(scene.parent / SCENE), OutputFolder(scene.parent.parent.parent)
+    if scene in map(trained.scene_path, trained.scenes()):
+        return trained
+    if any(filecmp.cmp(scene, made.scene_path(i), shallow=False) for i in made.scenes()[-1:]):
+        return made
+    return OutputFolder(scene)
+
+
+def cameras_of(folder: OutputFolder) -> list[Camera]:
+    """The cameras of the photos of the training in ``folder``; empty if they are not stored.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    from snowsplat.scene.camera_json import read_cameras
+
+    file = folder.path / "cameras.json"
+    return read_cameras(file)[1] if file.is_file() else []
+
+
+def background_of(folder: OutputFolder) -> Color:
+    """The background colour of the training in ``folder``; black if it is not stored."""
+    return folder.settings()[1] if folder.is_output_folder() else (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ViewableScene:
+    """A scene for a viewer, from a file or an output folder; its photos are not needed.
+
+    Attributes:
+        file: the scene file.
+        cameras: the cameras of its photos; empty if unknown.
+    """
+
+    file: Path
+    gaussians: Gaussians
+    cameras: list[Camera]
+    background: Color
+
+
+def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableScene:
+    """Load a scene file of any format, levels of detail, or a scene of an output folder.
+
+    Args:
+        iteration: an iteration of an output folder; default: the last one.
+
+    Raises:
+        UserError: the scene is missing or damaged, or ``iteration`` is set and ``path`` is a file.
+    """
+    from snowsplat.formats import read_gaussians
+
+    path = Path(path)
+    if not path.exists():
+        raise UserError(f"{path}: no such file or folder")
+    if (path / INDEX).is_file():
+        path = path / INDEX
+    if path.is_dir():
+        folder = training_folder(path)
+        found, gaussians = folder.read_scene(iteration)
+        file = folder.scene_path(found)
+    else:
+        if iteration is not None:
+            raise UserError("`iteration` selects a scene of an output folder; leave it out")
+        file, gaussians = path, read_gaussians(path)
+        folder = folder_around(path)
+    return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))
+
+
+def scene_name(scene: Path) -> str:
+    """The name of a scene: that of its folder, or of its file without suffixes."""
+    scene = scene.resolve()
+    return scene.name.split(".")[0] or scene.name

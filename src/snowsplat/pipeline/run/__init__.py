@@ -1,0 +1,1 @@
+"""A training in an output folder: its processes, checkpoints, limits and results."""

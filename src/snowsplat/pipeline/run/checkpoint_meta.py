@@ -1,0 +1,55 @@
+"""`CheckpointMeta`: the data in a checkpoint that are not tensors: settings, recipe, time."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from snowsplat.pipeline.output.output_folder import DatasetSettings
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import from_json
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.checkpoint import Checkpoint
+
+#: Names of `training.core.recipes.RECIPES`, without importing torch.
+Recipe = Literal["default", "classic", "paper", "mcmc", "mcmc-short"]
+
+
+@dataclass(frozen=True)
+class CheckpointMeta:
+    """The JSON object in a checkpoint; its keys are the names of the fields.
+
+    Attributes:
+        capture: how the dataset was read.
+        recipe: the recipe from which the configuration was derived.
+        training: the configuration, see `config_to_json`.
+        time: see `TimeBudget.as_json`; None without a time budget.
+        schedule: the schedule, if it has changed: for a time budget, or because the scene overfits.
+    """
+
+    capture: DatasetSettings
+    recipe: Recipe
+    training: dict[str, Any]
+    time: dict[str, float] | None = None
+    schedule: Schedule | None = None
+
+    @classmethod
+    def of(cls, start: Checkpoint) -> CheckpointMeta:
+        """The checked data of the checkpoint ``start``, from which a training run resumes.
+
+        Raises:
+            UserError: not a checkpoint of a training run, or damaged.
+        """
+        try:
+            meta = from_json(CheckpointMeta, start.meta)
+            if meta.time is not None and meta.time.keys() != {"seconds", "spent"}:
+                raise ValueError("invalid time budget")
+        except ValueError as error:
+            raise UserError(f"{start.path}: not a checkpoint of a training run ({error})") from None
+        return meta
+
+    def as_json(self) -> dict[str, Any]:
+        """The JSON value; fields that are None are left out."""
+        return {key: value for key, value in asdict(self).items() if value is not None}

@@ -1,0 +1,72 @@
+"""`MemoryUse`: the memory plan of a training run, and its peak memory so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from snowsplat.util.process_memory import peak_bytes
+
+if TYPE_CHECKING:
+    import torch
+
+    from snowsplat.data import Dataset
+    from snowsplat.training.budgets.memory_budget import MemoryPlan
+    from snowsplat.training.core.config import TrainConfig
+
+
+@dataclass(frozen=True)
+class MemoryUse:
+    """The memory plan of a training run, and its peak memory so far.
+
+    Attributes:
+        device: the device whose memory is planned.
+        plan: the memory plan, with the configuration that fits.
+        before: resident bytes of the process before the training: Python and its libraries.
+    """
+
+    device: torch.device
+    plan: MemoryPlan
+    before: int
+
+    @classmethod
+    def planned(
+        cls,
+        budget: int | str | None,
+        dataset: Dataset,
+        config: TrainConfig,
+        device: torch.device,
+        before: int,
+        present: int = 0,
+    ) -> MemoryUse:
+        """Plan the memory of a training run.
+
+        Args:
+            budget: bytes, or a text such as "4GB"; None: no limit.
+            present: number of Gaussians of the run that is resumed; 0 for a new run.
+
+        Raises:
+            UserError: ``budget`` is not a number of bytes, or is too small.
+        """
+        from snowsplat.data.image_loader import available_memory
+        from snowsplat.training.budgets.memory_budget import parse_bytes, plan_memory
+
+        if isinstance(budget, str):
+            budget = parse_bytes(budget)
+        available = available_memory(device)
+        plan = plan_memory(dataset, config, device, available, budget, present)
+        return cls(device, plan, before)
+
+    def __str__(self) -> str:
+        where = "memory of the GPU" if self.device.type == "cuda" else "memory"
+        return f"{where}: {self.plan}"
+
+    def peak(self) -> str:
+        """The peak memory so far, as text for users."""
+        if self.device.type == "cuda":
+            import torch
+
+            peak = torch.cuda.max_memory_allocated(self.device)
+            return f"at most {peak / 1e6:.0f} MB of the GPU"
+        peak, before = peak_bytes(), self.before
+        return f"at most {peak / 1e6:.0f} MB, {before / 1e6:.0f} of them Python and its libraries"

@@ -1,0 +1,357 @@
+"""`TrainingRun`: runs the steps of one training run and writes its files."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta, Recipe
+from snowsplat.pipeline.run.memory_use import MemoryUse
+from snowsplat.pipeline.run.processes import Announcement
+from snowsplat.pipeline.run.refined_cameras import write_refined
+from snowsplat.pipeline.run.time_budget import TimeBudget
+from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
+from snowsplat.pipeline.run.training_notes import ended_early_line, left_out_line, moving_line
+from snowsplat.training.core.history import History
+from snowsplat.util.errors import UserError
+from snowsplat.util.process_memory import peak_bytes
+
+if TYPE_CHECKING:
+    from snowsplat.evaluation.metrics import Evaluation
+    from snowsplat.pipeline.run.live_page import LivePage
+    from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.training.budgets.pace import Pace
+    from snowsplat.training.core.progress import Progress
+    from snowsplat.training.core.trainer import Trainer
+
+
+@dataclass
+class TrainingRun:
+    """One training run, to its end or to Ctrl-C.
+
+    Attributes:
+        settings, recipe: how the dataset was read, and the recipe; written to checkpoints.
+        budget: the time budget; None: no time budget.
+        pace: adapts the number of steps to the time budget; None without a time budget.
+        save_iterations: steps after which the scene is written, in addition to the last step.
+        checkpoint_seconds: time between checkpoints, if the configuration has no checkpoint_every.
+        page: shows the training in the browser.
+    """
+
+    out: OutputFolder
+    settings: DatasetSettings
+    recipe: Recipe
+    trainer: Trainer
+    budget: TimeBudget | None
+    pace: Pace | None
+    memory: MemoryUse
+    observer: Observer
+    save_iterations: tuple[int, ...] = ()
+    checkpoint_seconds: float | None = None
+    page: LivePage | None = None
+
+    def __post_init__(self) -> None:
+        from snowsplat.training.budgets.step_cost import Work
+        from snowsplat.training.budgets.steps_left import StepsLeft
+
+        self.config = self.trainer.config
+        self.first_step = self.trainer.step
+        self.started = self.last_checkpoint = time.monotonic()
+        self.evaluation: tuple[int, Evaluation] | None = None  # the last one and its step
+        self.history = History.read(self.out.history, self.first_step)
+        self._left = StepsLeft(Work.of(self.config, self.trainer.dataset))
+        self._told = False  # whether the observer knows which photos are left out
+        self._told_moving = False  # whether the observer knows in which photos something moves
+        self._told_end = False  # whether the observer knows that the training ends early
+
+    def run(self) -> TrainResult:
+        """Run all steps and write the results.
+
+        Raises:
+            UserError: the loss, gradients or parameters are not finite.
+            TrainingStopped: Ctrl-C; the attributes of the exception say what was saved.
+            KeyboardInterrupt: Ctrl-C before the first step was finished; no files remain.
+        """
+        from snowsplat.training.core.finite import Diverged
+
+        try:
+            self.observer.steps_begin(self.first_step, self.trainer.schedule.iterations)
+            try:
+                self._finish_interrupted_writes()
+                self._announce(None)
+                self.history.step_begins()
+                self.trainer.run(self._record)
+            finally:
+                self.observer.steps_end()
+        except KeyboardInterrupt:
+            if self.trainer.step == 0 or self.trainer.within_step:  # no complete state to save
+                self.out.discard()
+                if self.trainer.step == 0:
+                    raise
+                raise TrainingStopped(
+                    f"stopped within a step, which is not saved; {self._last_checkpoint_as_text()}",
+                    None,
+                ) from None
+        except Diverged as error:
+            self.out.discard()
+            raise UserError(f"{error}; {self._last_checkpoint_as_text()}") from None
+        except BaseException:
+            self.out.discard()
+            raise
+        else:
+            result = self._finish()
+            self._announce(None)
+            return result
+        scene = self._save_scene()
+        self._save_checkpoint()
+        self._announce(None)
+        raise TrainingStopped(f"stopped after step {self.trainer.step}: {scene}", scene)
+
+    def _announce(self, announcement: Announcement | None) -> None:
+        """Tell the other processes what to do; None: go on with the next step, or end."""
+        self.trainer.shards.of_first(announcement)
+
+    def _record(self, progress: Progress) -> None:
+        # If there are metrics, the time of the step includes an evaluation and is not counted.
+        timed = progress.metrics is None
+        self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=timed)
+        self._after_step(progress)
+        self._announce(None)
+        self.history.step_begins()
+
+    def _after_step(self, progress: Progress) -> None:
+        if progress.metrics is not None and progress.metrics.views:
+            self._record_evaluation(progress.step, progress.metrics)
+        self.observer.step(replace(progress, seconds_left=self._seconds_left(progress)))
+        if self.trainer.left_out and not self._told:
+            self.observer.note(left_out_line(self._left_out()))
+            self._told = True
+        if not self._told_moving and self.trainer.transients.complete(progress.step):
+            if moving := self._moving():
+                self.observer.note(moving_line(moving, len(self.trainer.dataset.train)))
+            self._told_moving = True
+        if (line := self._ended_early()) is not None and not self._told_end:
+            self.observer.note(line)
+            self._told_end = True
+        if self._checkpoint_is_due(progress.step):
+            self._save_checkpoint()
+        if self.trainer.schedule.contains(progress.step, self.save_iterations):
+            self._save_scene()
+        if self.page is not None:
+            paused = self.page.after_step(
+                progress.step, progress.iterations, progress.loss, self.trainer.gaussians
+            )
+            self._left.postpone(paused)
+            if self.pace is not None and self.budget is not None:
+                self.pace.postpone(paused)
+                self.budget.started += paused
+        # If the scene overfits, the trainer has shortened the schedule, and no more time is needed.
+        if self.pace is not None and self.trainer.overfitting is None:
+            schedule = self.trainer.schedule
+            length = self.pace.iterations_after(
+                schedule, progress.step, progress.downscale, progress.gaussians
+            )
+            if length is not None:
+                self._announce(Announcement("stretch", progress.step, length))
+                schedule.stretch(progress.step, length)
+
+    def _seconds_left(self, progress: Progress) -> float:
+        schedule = self.trainer.schedule
+        left = self._left.after(schedule, progress.step, progress.downscale, progress.gaussians)
+        return left if self.budget is None else max(0.0, self.budget.left)
+
+    def _left_out(self) -> tuple[str, ...]:
+        return tuple(self.trainer.dataset.train[i].name for i in self.trainer.left_out)
+
+    def _moving(self) -> dict[str, float]:
+        found = self.trainer.transients.found
+        return {self.trainer.dataset.train[i].name: share for i, share in found.items()}
+
+    def _ended_early(self) -> str | None:
+        found, iterations = self.trainer.overfitting, self.trainer.schedule.iterations
+        # `resume` with `iterations` may continue a training run that has ended early.
+        if found is None or iterations >= found.planned:
+            return None
+        return ended_early_line(iterations, found.planned)
+
+    def _checkpoint_is_due(self, step: int) -> bool:
+        every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
+        if every:
+            return self.trainer.schedule.multiples(step, every) > 0
+        return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
+
+    def _finish_interrupted_writes(self) -> None:
+        """Complete the work of an earlier run that was killed directly after saving a checkpoint.
+
+        Remove old checkpoints, and save the scene if it was requested for this step.
+        """
+        from snowsplat.training.core import checkpoint
+
+        step = self.first_step
+        checkpoint.remove_old(self.out.checkpoints, step)
+        due = step > 0 and self.trainer.schedule.contains(step, self.save_iterations)
+        if due and step not in self.out.scenes():
+            self._save_scene()
+
+    def _save_scene(self) -> Path:
+        return self._write_scene(self._all_gaussians())
+
+    def _write_scene(self, gaussians: Gaussians) -> Path:
+        self._restore_folder()
+        poses = self.trainer.poses
+        if poses.on:
+            views = [*poses.views(), *poses.test_views()]
+            self.out.write_cameras(views)
+            write_refined(self.out.path, views, replace(self.settings, resolution=-1).load())
+        return self.out.write_scene(self.trainer.step, gaussians)
+
+    def _all_gaussians(self) -> Gaussians:
+        """The Gaussians of all processes."""
+        self._announce(Announcement("scene"))
+        return self.trainer.shards.collect(self.trainer.gaussians)
+
+    def _restore_folder(self) -> None:
+        """Create the folder again if it was moved or removed, so that the training is not lost."""
+        if not self.out.is_output_folder():
+            warnings.warn(f"{self.out.path}: was removed; it is created again", stacklevel=2)
+            self.out.describe(self.trainer.dataset, self.settings, self.config)
+
+    def _save_checkpoint(self) -> Path:
+        from snowsplat.training.core import checkpoint
+        from snowsplat.training.core.config import config_to_json
+
+        self._restore_folder()
+        meta = CheckpointMeta(self.settings, self.recipe, config_to_json(self.config))
+        if self.budget is not None:
+            meta = replace(meta, time=self.budget.as_json())
+        if self.trainer.schedule.since > 0:
+            meta = replace(meta, schedule=self.trainer.schedule)
+        # Write the history first: a run that resumes from the checkpoint needs the curves up to it.
+        self.history.write(self.out.history)
+        self._announce(Announcement("checkpoint"))
+        path = checkpoint.save(
+            self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta.as_json()
+        )
+        self.last_checkpoint = time.monotonic()
+        return path
+
+    def _last_checkpoint_as_text(self) -> str:
+        """Which checkpoint can be used, as the end of an error message."""
+        from snowsplat.training.core import checkpoint
+
+        saved = checkpoint.files(self.out.checkpoints)
+        if not saved:
+            return "there is no checkpoint yet"
+        step, path = saved[0]
+        return (
+            f"the last good checkpoint is {path}; "
+            f"use `resume` with `iterations` {step} to save its scene"
+        )
+
+    def _record_evaluation(self, step: int, evaluation: Evaluation) -> None:
+        self.evaluation = (step, evaluation)
+        self.history.measure(step, evaluation.psnr, evaluation.ssim)
+
+    def _finish(self) -> TrainResult:
+        step = self.trainer.step
+        gaussians = self._all_gaussians()
+        scene = self._write_scene(gaussians)
+        seconds, memory = time.monotonic() - self.started, self.memory.peak()
+        if self.trainer.dataset.test:
+            if self.evaluation is None or self.evaluation[0] != step:
+                self._announce(Announcement("evaluate"))
+                self._record_evaluation(step, self.trainer.evaluate())
+            assert self.evaluation is not None
+            self.out.write_metrics(step, "test", self.evaluation[1], self._left_out())
+        self.history.write(self.out.history)
+        if self.trainer.exposure.active:
+            self.out.write_exposure(self._exposures())
+        self.out.write_masks(self.trainer.transients.pictures())
+        poses = self._about_poses(gaussians)
+        report = self._write_report(gaussians, poses)
+        time_used = None
+        if self.budget is not None:
+            self.out.write_config(self.settings, replace(self.config, iterations=step))
+            time_used = self.budget.as_json()["spent"], self.budget.seconds
+        result = TrainResult(
+            scene=scene,
+            report=report,
+            step=step,
+            first_step=self.first_step,
+            gaussians=len(gaussians),
+            seconds=seconds,
+            memory=memory,
+            reductions=self.memory.plan.reductions,
+            evaluation=self.evaluation,
+            left_out=self._left_out(),
+            moving=self._moving(),
+            ended_early=self._ended_early(),
+            poses=poses,
+            time=time_used,
+        )
+        self.observer.trained(result)
+        return result
+
+    def _exposures(self) -> dict[str, list[float]]:
+        """The exposure of each training photo in EV, by name: red, green, blue."""
+        names = (view.name for view in self.trainer.dataset.train)
+        return dict(zip(names, self.trainer.exposure.ev.tolist(), strict=True))
+
+    def _about_poses(self, gaussians: Gaussians) -> str | None:
+        """The line about the camera poses; see `TrainResult.poses`."""
+        from snowsplat.training.parts.misalignment import misalignment
+
+        trainer, poses = self.trainer, self.trainer.poses
+        if poses.on:
+            return str(poses.drift())
+        used = [v for i, v in enumerate(poses.views()) if i not in trainer.left_out]
+        pixels = misalignment(gaussians, used, self.out.settings()[1])
+        if pixels is None:
+            return None
+        return (
+            f"the photos are off by {pixels:.1f} pixels in the median: the camera poses are not "
+            "exact; try --refine-poses"
+        )
+
+    def _write_report(self, gaussians: Gaussians, about_poses: str | None) -> Path:
+        from snowsplat.training.core.config import config_to_json
+        from snowsplat.training.report import Trained, write_training_report
+
+        # Users may share the report, so it contains names of files but no paths.
+        out = self.out.path
+        dataset = asdict(self.settings)
+        for key in ("path", "test_list"):
+            dataset[key] = dataset[key] and Path(dataset[key]).name
+        write_training_report(
+            self.out.report,
+            Trained(
+                name=out.resolve().name if out.is_absolute() else str(out),
+                dataset=replace(
+                    self.trainer.dataset,
+                    train=self.trainer.poses.views(),
+                    test=self.trainer.poses.test_views(),
+                ),
+                gaussians=gaussians,
+                step=self.trainer.step,
+                background=self.out.settings()[1],
+                history=self.history,
+                evaluation=None if self.evaluation is None else self.evaluation[1],
+                left_out=self._left_out(),
+                exposures=tuple(self.trainer.exposure.ev.mean(1).tolist()),
+                masks=self.trainer.transients.pictures(),
+                ended_early=self._ended_early(),
+                poses=about_poses,
+                settings={
+                    "recipe": self.recipe,
+                    "capture": dataset,
+                    "training": config_to_json(self.config),
+                },
+                peak_bytes=peak_bytes(),
+            ),
+        )
+        return self.out.report

@@ -1,0 +1,263 @@
+"""Plans a training run for a given time on this machine: photo size, number of Gaussians, steps.
+
+If there is more time, first the number of steps is increased, then the size of the photos, then the
+number of Gaussians: see "Training in a given time" in docs/performance.md.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from dataclasses import dataclass, replace
+
+import torch
+
+from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.training.budgets.step_cost import Work
+from snowsplat.training.core.config import TrainConfig, changed
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.starts import map_pixels
+from snowsplat.training.starts.init import initial_count
+
+# The size of the photos is reduced until there is time for both of these minimum numbers of steps.
+#: Minimum number of steps.
+_MIN_STEPS = 1000
+#: Minimum number of steps per training photo.
+_MIN_STEPS_PER_PHOTO = 10
+#: Minimum and maximum of the longer side of the photos, in pixels.
+_MIN_SIDE = 400
+_MAX_SIDE = 1600
+#: The limit of the number of Gaussians is raised if there is time for more steps than this.
+_STEPS_FOR_MORE_GAUSSIANS = 3000
+#: Maximum factor by which this limit is raised.
+_MAX_GAUSSIAN_FACTOR = 2.0
+#: Minimum number of densifications in the first half of a short training run. The minimum interval
+#: between densifications has priority.
+_MIN_DENSIFICATIONS = 15
+#: Minimum interval between densifications, in steps.
+_MIN_DENSIFY_INTERVAL = 25
+#: Seconds before the first step, for preparation and for decoding the first photos.
+_SETUP_SECONDS = 0.5
+#: Seconds for a million pixels of depth maps, on the machine of docs/performance.md.
+_SECONDS_PER_MAP_MEGAPIXEL = 0.4
+#: If depth maps would need more than this share of the time, there is no dense initialisation.
+_MAX_SHARE_OF_MAPS = 0.25
+
+# The speed of the machine is measured by a short training run, called the sample.
+#: Maximum duration of the sample, in seconds.
+_SAMPLE_SECONDS = 0.7
+#: Maximum number of steps of the sample.
+_SAMPLE_STEPS = 100
+#: Minimum number of steps of the sample, even if they take longer than `_SAMPLE_SECONDS`.
+_MIN_SAMPLE_STEPS = 3
+#: Number of photos in the sample. It is small, so that decoding takes little time.
+_SAMPLE_PHOTOS = 2
+#: Maximum number of initial points in the sample. It limits the memory.
+_SAMPLE_POINTS = 20_000
+#: Photos with more pixels than this are reduced to half the width and height.
+_SAMPLE_PIXELS = 500_000
+#: Time of a step with a trained scene, divided by that with the initial points. It is larger than
+#: 1, because more splats overlap in a trained scene. Measured with fox and fern: 1.5 to 1.9.
+_TRAINED_SLOWDOWN = 1.5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The result of `make_plan`.
+
+    Attributes:
+        resolution: width of the photos, as for `load_dataset`; None: original size.
+        width, height: of a photo at that resolution, in pixels.
+        config: the configuration, with the chosen number of steps and limit of Gaussians.
+        time_ratio: seconds of a step on this machine, divided by `Work.seconds`.
+        seconds: mean time of a step, in seconds.
+    """
+
+    resolution: int | None
+    width: int
+    height: int
+    config: TrainConfig
+    time_ratio: float
+    seconds: float
+
+    def __str__(self) -> str:
+        cap = self.config.density.max_gaussians
+        gaussians = f"at most {cap:,} Gaussians" if cap else "no limit on the number of Gaussians"
+        return (
+            f"{self.width}x{self.height}, {gaussians}, about {_rounded(self.config.iterations):,} "
+            "steps"
+        )
+
+
+def make_plan(
+    dataset: Dataset,
+    config: TrainConfig,
+    seconds: float,
+    time_ratio: float,
+    *,
+    resize: bool = True,
+    more_gaussians: bool = True,
+    more_often: bool = True,
+) -> Plan:
+    """The best training run that fits into ``seconds``.
+
+    Args:
+        dataset: at full resolution.
+        config: the configuration of the recipe; its ``iterations`` are ignored.
+        time_ratio: the result of `measure_time_ratio`.
+        resize: whether the photos may be reduced.
+        more_gaussians: whether the limit of the number of Gaussians may be raised.
+        more_often: whether densification may be more frequent in a short training run.
+    """
+    camera = max((view.camera for view in dataset.train), key=lambda c: c.width * c.height)
+    longer = max(camera.width, camera.height)
+    enough = max(_MIN_STEPS, _MIN_STEPS_PER_PHOTO * len(dataset.train))
+
+    def plan(side: int, gaussian_factor: float = 1.0) -> Plan:
+        width = camera.width if side >= longer else max(1, round(camera.width * side / longer))
+        height = round(camera.height * width / camera.width)
+        sized = _capped(config, width * height, gaussian_factor)
+        maps = map_pixels(len(dataset.train), width, height) / 1e6
+        maps *= _SECONDS_PER_MAP_MEGAPIXEL * time_ratio
+        if maps > _MAX_SHARE_OF_MAPS * seconds:
+            sized = replace(sized, init=_without_sweep(sized.init))
+        left = seconds - _SETUP_SECONDS - (maps if "sweep" in sized.starts else 0.0)
+        work = Work(sized, width * height, len(dataset.test))
+        initial = initial_count(dataset, sized)
+        steps, mean = _steps(work, left, time_ratio, initial)
+        if more_often:
+            sized = _densified_in(sized, steps)
+            work = replace(work, config=sized)
+            steps, mean = _steps(work, left, time_ratio, initial)
+        resolution = None if width == camera.width else width
+        return Plan(resolution, width, height, replace(sized, iterations=steps), time_ratio, mean)
+
+    side = longer
+    if resize:
+        side = min(longer, _MAX_SIDE)
+        smallest = min(longer, _MIN_SIDE)
+        while side > smallest and plan(side).config.iterations < enough:
+            side = max(smallest, min(side - 8, round(0.97 * side)))
+    best = plan(side)
+    if more_gaussians and best.config.iterations > _STEPS_FOR_MORE_GAUSSIANS:
+        gaussian_factor = min(
+            _MAX_GAUSSIAN_FACTOR, best.config.iterations / _STEPS_FOR_MORE_GAUSSIANS
+        )
+        best = plan(side, gaussian_factor)
+    return best
+
+
+def measure_time_ratio(
+    dataset: Dataset,
+    config: TrainConfig,
+    device: torch.device | None = None,
+    *,
+    resize: bool = True,
+) -> float:
+    """Measure the seconds of a training step on this machine, divided by `Work.seconds`.
+
+    Args:
+        device: the device to train on; default: the CPU.
+        resize: whether `make_plan` may reduce the photos. If so, photos above its maximum size are
+            also reduced here. Otherwise the sample could need more time and memory than training.
+    """
+    views = dataset.train[:_SAMPLE_PHOTOS]
+    if resize:
+        views = [_at_most_max_side(view) for view in views]
+    camera = views[0].camera
+    downscale = 1 if camera.width * camera.height < _SAMPLE_PIXELS else 2
+    points = dataset.points
+    if points is not None and len(points) > _SAMPLE_POINTS:
+        every = math.ceil(len(points) / _SAMPLE_POINTS)
+        points = Points(points.xyz[::every], points.rgb[::every])
+    trainer = Trainer(
+        replace(dataset, train=views, test=[], points=points),
+        replace(
+            config,
+            init="points",
+            initial_points=_SAMPLE_POINTS,
+            iterations=_SAMPLE_STEPS,
+            coarse_to_fine=(0, 0) if downscale == 1 else (0, 1.0),
+            sh_interval=0,
+            test_iterations=(),
+        ),
+        device=device,
+    )
+    work = Work(trainer.config, camera.width * camera.height, 0)
+    end = time.monotonic() + _SAMPLE_SECONDS
+    ratios: list[float] = []
+    while trainer.step < _SAMPLE_STEPS and (
+        len(ratios) < _MIN_SAMPLE_STEPS or time.monotonic() < end
+    ):
+        before = time.monotonic()
+        trainer.step_once()
+        modelled = work.seconds(downscale, len(trainer.gaussians))
+        ratios.append((time.monotonic() - before) / modelled)
+    # The first step is not used, because it waits until its photo is decoded.
+    return _TRAINED_SLOWDOWN * statistics.median(ratios[1:])
+
+
+def _at_most_max_side(view: View) -> View:
+    """The view, reduced to `_MAX_SIDE` if it is larger."""
+    camera, mask = view.camera, view.mask
+    scale = _MAX_SIDE / max(camera.width, camera.height)
+    if scale >= 1.0:
+        return view
+    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+    return replace(
+        view,
+        camera=camera.scaled(width, height),
+        image=replace(view.image, width=width, height=height),
+        mask=mask and replace(mask, width=width, height=height),
+    )
+
+
+def _capped(config: TrainConfig, pixels: int, gaussian_factor: float) -> TrainConfig:
+    """``config`` with the limit of Gaussians for photos of this number of pixels.
+
+    If the configuration has a limit, it is multiplied by ``gaussian_factor`` first.
+    """
+    cap = config.density.max_gaussians
+    if gaussian_factor > 1.0 and cap:
+        config = replace(
+            config, density=changed(config, max_gaussians=round(gaussian_factor * cap)).density
+        )
+    return config.capped(pixels, views=0)  # the limit follows the time, not the views
+
+
+def _without_sweep(init: str) -> str:
+    return "+".join(name for name in init.split("+") if name != "sweep") or "random"
+
+
+def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:
+    """``config`` with more frequent densification if there are few ``steps``."""
+    interval = max(_MIN_DENSIFY_INTERVAL, steps // (2 * _MIN_DENSIFICATIONS))
+    density = config.density
+    begin = density.densify_from
+    return changed(
+        config,
+        densify_interval=min(density.densify_interval, interval),
+        densify_from=begin if isinstance(begin, float) else min(begin, interval),
+    )
+
+
+def _steps(work: Work, seconds: float, time_ratio: float, gaussians: int) -> tuple[int, float]:
+    """The number of steps that fit into ``seconds``, and the mean seconds of a step."""
+    steps = work.config.iterations
+    mean = 0.0
+    for _ in range(5):  # fixed-point iteration: the mean depends on the number of steps
+        parts = work.parts_ahead(Schedule(steps), 0, gaussians)
+        mean = time_ratio * sum(work.seconds(*part) for part in parts) / len(parts)
+        left = seconds - work.seconds_after(
+            time_ratio * work.seconds(1, parts[-1][1]), parts[-1][1]
+        )
+        steps = max(1, round(left / mean))
+    return steps, mean
+
+
+def _rounded(count: int) -> int:
+    """``count``, rounded to two significant digits."""
+    digits = max(0, len(str(count)) - 2)
+    return round(count / 10**digits) * 10**digits

@@ -1,0 +1,159 @@
+"""`Adam` for Gaussians: its moments have the same rows as the Gaussians.
+
+`ops.adam_step` computes a step: it propagates the gradient of the splats through the projection and
+updates the parameters in the same pass. `Adam` stores the state between steps. Learning rates are
+in `lr_schedule`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from snowsplat import ops
+from snowsplat.ops import scratch
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.core.lr_schedule import LearningRates
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.view_gradient import ViewGradient
+from snowsplat.training.processes.shards import ALONE, Shards
+
+#: β₁ and β₂ for a batch of one view.
+BETAS = (0.9, 0.999)
+
+
+class Adam:
+    """The first and second moments of every parameter. Row i of a moment belongs to Gaussian i.
+
+    The Gaussians themselves are not part of this object. Code that changes their rows (density
+    control) must make the same change here, with `select`.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        rates: LearningRates,
+        *,
+        schedule: Schedule,
+        extent: float,
+        visible_only: bool = False,
+        shards: Shards = ALONE,
+    ) -> None:
+        """
+        Args:
+            extent: extent of the scene, in world units; the learning rate of the means is
+                multiplied by it.
+            visible_only: whether a step leaves Gaussians unchanged that its view does not see.
+            shards: the processes; ``gaussians`` are those of this process.
+        """
+        self.rates = rates
+        self.schedule = schedule
+        self.extent = extent
+        self.visible_only = visible_only
+        self.shards = shards
+        parameters = gaussians.parameters()
+        self.exp_avg = {name: torch.zeros_like(p) for name, p in parameters.items()}
+        self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in parameters.items()}
+
+    def rates_at(self, step: int) -> dict[str, float]:
+        """The learning rate of each parameter at ``step``, which counts from 1."""
+        return self.rates.at(step, self.schedule, self.extent)
+
+    def step(self, gaussians: Gaussians, gradients: Sequence[ViewGradient], step: int) -> None:
+        """Update ``gaussians`` in place by the sum of the gradients; ``step`` counts from 1.
+
+        If a parameter has a ``.grad`` (from a regulariser), it is added to the gradient and
+        cleared.
+
+        Args:
+            gradients: those of the views of the batch, at least one.
+        """
+        parameters = gaussians.parameters()
+        gradient = gradients[-1]
+        camera, ids = gradient.camera, gradient.splats.ids
+        packed_grad: Tensor | None = gradient.packed_grad
+        if len(gradients) > 1:
+            ids, packed_grad = _add_up(gaussians, gradients), None
+        assert ids is not None
+        batch = self.schedule.batch
+        ops.adam_step(
+            parameters,
+            self.exp_avg,
+            self.exp_avg_sq,
+            ids,
+            packed_grad,
+            camera.cam_from_world,
+            width=camera.width,
+            height=camera.height,
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            sh_degree=gradient.sh_degree,
+            lr={name: math.sqrt(batch) * rate for name, rate in self.rates_at(step).items()},
+            step=self.schedule.update_of(step),
+            betas=(BETAS[0] ** batch, BETAS[1] ** batch),
+            visible_only=self.visible_only,
+            valid=gradient.valid,
+            nonfinite_rows=gradient.nonfinite_rows,
+            antialiased=gaussians.antialiased,
+        )
+        for parameter in parameters.values():
+            parameter.grad = None
+
+    def select(self, index: Tensor, fresh: Tensor) -> None:
+        """Row i becomes the old row ``index[i]``; rows marked in ``fresh`` get zero moments.
+
+        Args:
+            index: (M,) int64, repeats allowed; rows of all processes.
+            fresh: bool, for the new rows of this process.
+        """
+        take = self.shards.selection(index)
+        for moments in (self.exp_avg, self.exp_avg_sq):
+            for name, moment in moments.items():
+                moments[name] = take(moment)
+                moments[name][fresh] = 0.0
+
+    def zero(self, name: str) -> None:
+        """Set the moments of one parameter to zero, after its values were set directly."""
+        self.exp_avg[name].zero_()
+        self.exp_avg_sq[name].zero_()
+
+    def state_tensors(self) -> dict[str, Tensor]:
+        """The state to save, by name. The tensors are not copied."""
+        averages = {f"exp_avg.{name}": tensor for name, tensor in self.exp_avg.items()}
+        return averages | {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """Copy what `state_tensors` returned."""
+        for name, average in self.exp_avg.items():
+            for moments, key in ((self.exp_avg, "exp_avg"), (self.exp_avg_sq, "exp_avg_sq")):
+                moments[name] = tensors[f"{key}.{name}"].to(average.device, copy=True)
+
+
+def _add_up(gaussians: Gaussians, gradients: Sequence[ViewGradient]) -> Tensor:
+    """Add the gradients of several views to ``.grad`` of the parameters.
+
+    Returns:
+        The ids of the Gaussians that at least one of the views shows, ascending. On a GPU there is
+        a row for each Gaussian, with -1 for the others: the CPU need not wait for their number.
+    """
+    sums = {}
+    for name, parameter in gaussians.parameters().items():
+        if parameter.grad is None:
+            shape = tuple(parameter.shape)
+            parameter.grad = scratch.empty(shape, parameter.dtype, parameter.device).zero_()
+        sums[name] = parameter.grad
+    means = gaussians.means
+    # The index -1, an empty row, is the last element: it is no Gaussian.
+    seen = torch.zeros(len(means) + 1, dtype=torch.bool, device=means.device)
+    for gradient in gradients:
+        gradient.add_to(gaussians, sums)
+        ids = gradient.splats.ids
+        assert ids is not None
+        seen[ids.long()] = True
+    rows = torch.arange(len(means), dtype=torch.int32, device=means.device)
+    return rows[seen[:-1]] if means.device.type == "cpu" else rows.where(seen[:-1], -1)

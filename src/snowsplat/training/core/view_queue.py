@@ -1,0 +1,101 @@
+"""`ViewQueue`: the training views in random order, with their photos, which are decoded ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import torch
+
+from snowsplat.data.dataset import View
+from snowsplat.data.image_loader import ImageLoader
+from snowsplat.scene.camera import Camera
+from snowsplat.training.core.background import Background
+from snowsplat.training.core.batch import BatchView
+from snowsplat.training.processes.shards import Shards
+
+#: The order of the views is drawn at least this number of steps in advance, so that other threads
+#: can decode their photos before they are needed.
+LOOKAHEAD = 16
+
+
+class ViewQueue:
+    """Chooses the views of each step. Each view is chosen once in an epoch, in random order.
+
+    Attributes:
+        order: indices of the views of the next steps.
+        left_out: indices of the views that are not used any more.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        camera_of: Callable[[int], Camera],
+        images: ImageLoader,
+        background: Background,
+        downscale_at: Callable[[int], int],
+        generator: torch.Generator,
+        batch: int,
+        shards: Shards,
+    ) -> None:
+        """
+        Args:
+            camera_of: the present camera of a view, on the device.
+            images: loads the photos of the views.
+            downscale_at: the factor by which images are reduced at a step.
+            generator: draws the order, on the CPU.
+            batch: the number of views of an update.
+            shards: the processes; each loads only the photos of the views that it blends.
+        """
+        self.order: list[int] = []
+        self.left_out: tuple[int, ...] = ()
+        self._views = views
+        self._camera_of = camera_of
+        self._images = images
+        self._background = background
+        self._downscale_at = downscale_at
+        self._generator = generator
+        self._batch = batch
+        self._shards = shards
+
+    def take(self, after: int, step: int) -> list[BatchView]:
+        """The views of the steps ``after`` + 1 to ``step``, at the resolution of the last one.
+
+        Raises:
+            UserError: a photo is missing or damaged.
+        """
+        downscale = self._downscale_at(step)
+        ahead = max(LOOKAHEAD, self._batch)
+        if len(self.order) <= ahead:
+            while len(self.order) <= ahead:
+                order = torch.randperm(len(self._views), generator=self._generator).tolist()
+                self.order += [i for i in order if i not in self.left_out]
+            self._prefetch(downscale)
+        elif downscale != self._downscale_at(after):
+            self._prefetch(downscale)
+        return [self._view(position, downscale) for position in range(step - after)]
+
+    def _view(self, position: int, downscale: int) -> BatchView:
+        """Remove the next view from the order; ``position``: its position in the batch."""
+        i = self.order.pop(0)
+        own = position % self._shards.size == self._shards.rank
+        photo = self._images.get(self._views[i], downscale) if own else None
+        camera = self._camera_of(i).downscaled(downscale)
+        return BatchView(i, self._views[i], camera, photo, self._background.draw())
+
+    def leave_out(self, indices: Iterable[int], after: int) -> None:
+        """Do not use these views in the steps that follow ``after``."""
+        self.left_out = tuple(indices)
+        self.continue_with([i for i in self.order if i not in self.left_out], after)
+
+    def continue_with(self, order: list[int], after: int) -> None:
+        """Replace the order of the views of the steps that follow ``after``."""
+        self.order = order
+        self._prefetch(self._downscale_at(after + 1))
+
+    def _prefetch(self, downscale: int) -> None:
+        own = [
+            self._views[i]
+            for position, i in enumerate(self.order)
+            if position % self._batch % self._shards.size == self._shards.rank
+        ]
+        self._images.prefetch(own, downscale)

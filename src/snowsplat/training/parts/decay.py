@@ -1,0 +1,76 @@
+"""`Decay`: a steady pressure on opacities and scales, which removes what no photo needs.
+
+Opacities and scales shrink by a small factor, independent of the optimiser ("decoupled weight
+decay", Loshchilov and Hutter, ICLR 2019). Adam normalises the gradient. So it restores a Gaussian
+that matters in the photos. A Gaussian whose gradient has no constant direction, such as a floater
+in front of a camera, fades until it is pruned, and density control can use its place. Without
+this, a scene with few photos has large semi-transparent Gaussians near the cameras: each of them
+corrects the errors of one photo. A decay of the opacity: Han et al., "Binocular-Guided 3D Gaussian
+Splatting with View Consistency for Sparse View Synthesis", NeurIPS 2024.
+
+The rates are per epoch, that is, per as many steps as there are training views. So with fewer
+views, the pressure of a training run of a given length is higher: its photos are repeated more
+often, and it needs more regularisation. With fewer than `MANY_VIEWS` views, the rate of the
+opacity is also larger, because fewer photos show each place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.core.step_schedule import Schedule, When
+
+#: Number of steps between two reductions.
+INTERVAL = 10
+#: With fewer views, the rate of the opacity is multiplied by `MANY_VIEWS` / views, at most by
+#: `MAX_FACTOR`.
+MANY_VIEWS = 50
+MAX_FACTOR = 2.5
+
+
+@dataclass(frozen=True)
+class DecayRates:
+    """The rates of decay; the defaults, 0, disable it.
+
+    Attributes:
+        opacity: fraction of its opacity that a Gaussian loses per epoch, with at least `MANY_VIEWS`
+            views.
+        scale: fraction of its scales that a Gaussian loses per epoch.
+        until: the last moment of the decay. Afterwards, the remaining Gaussians regain the opacity
+            that the photos require.
+    """
+
+    opacity: float = 0.0
+    scale: float = 0.0
+    until: When = 0.9
+
+
+class Decay:
+    """Applies `DecayRates` between the steps of a training run. It has no state."""
+
+    def __init__(self, rates: DecayRates, views: int, schedule: Schedule) -> None:
+        """
+        Args:
+            views: number of training views: the steps of an epoch.
+        """
+        self.rates = rates
+        self._epochs = INTERVAL / views
+        self._opacity = rates.opacity * min(max(1.0, MANY_VIEWS / views), MAX_FACTOR)
+        self._schedule = schedule
+
+    def after_step(self, step: int, gaussians: Gaussians) -> None:
+        """Reduce opacities and scales in place, in every `INTERVAL`-th step."""
+        times = self._schedule.multiples(step, INTERVAL)
+        if not times or step > self._schedule.step_of(self.rates.until):
+            return
+        epochs = times * self._epochs
+        if self._opacity > 0.0:
+            factor = math.exp(-self._opacity * epochs)
+            opacities = factor * gaussians.opacities
+            gaussians.opacity_logits.copy_(torch.logit(opacities, eps=1e-7))
+        if self.rates.scale > 0.0:
+            gaussians.log_scales -= self.rates.scale * epochs

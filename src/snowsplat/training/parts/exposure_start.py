@@ -1,0 +1,159 @@
+"""How much the exposures of the photos differ, before the training.
+
+The same points have other colours in photos of another exposure or white balance. For the colour
+I_vpc of point p in channel c of photo v,
+
+    log I_vpc = log c_pc + g_vc + noise,
+
+where g_vc is the log-gain of the photo. Colours c and gains g are fitted by iteratively reweighted
+least squares with the weight of Geman and McClure, which ignores observations that do not fit, for
+example of points that are hidden or reflect light. Without enough points, the exposures in EXIF
+data are used if all photos have them.
+
+The gains are also fitted to two halves of the points, which lie in alternating cubes of space.
+Noise differs between the halves, but an exposure is the same in both. Thus the covariance of the
+two results is the variance of the exposures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from snowsplat.data.dataset import Dataset, View
+from snowsplat.data.exif_exposure import exif_exposure
+from snowsplat.data.image_loader import Photos
+from snowsplat.scene.camera import Camera
+from snowsplat.training.starts.point_colors import point_colors, point_pixels
+
+#: Photos are encoded approximately by this power: value = light^(1 / 2.2).
+GAMMA = 2.2
+#: Number of points whose colours are compared.
+_SAMPLE = 1000
+#: The photos are reduced by 4 or 2, to a longer side of at least this number of pixels.
+_SIDE = 200
+#: Darker values are noise, and brighter ones may be clipped.
+_DARKEST, _BRIGHTEST = 0.06, 0.94
+#: A point is hidden if another one is nearer by this factor, in the same of this number of cells
+#: along the longer side of a photo.
+_NEARER, _CELLS = 1.1, 40
+#: Differences of logs at which an observation loses three quarters of its weight, in the first and
+#: in the last iteration. It decreases, so that the gains may start far from the result.
+_FIRST_SCALE, _SCALE = 1.0, 0.15
+_ITERATIONS = 12
+#: A photo needs observations of this total weight.
+_LEAST_WEIGHT = 20.0
+#: This share of the photos needs enough observations.
+_LEAST_SHARE = 0.7
+#: Number of cubes along the longest side of the points, for the two halves.
+_CUBES = 6
+
+
+@dataclass(frozen=True)
+class ExposureStart:
+    """The exposures of the training photos.
+
+    Attributes:
+        log_gains: (V, 3) float32: log of the factor by which each photo is brighter than the mean,
+            in each channel of its encoded values. The mean over the photos is 0.
+        spread: standard deviation of the exposures in EV (factors of two of light), over photos and
+            channels; None if it is unknown.
+        source: what the photos were compared by, for the user.
+    """
+
+    log_gains: Tensor
+    spread: float | None
+    source: str = ""
+
+
+def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
+    """Compare the exposures of the training photos.
+
+    Args:
+        images: loads the photos.
+
+    Raises:
+        UserError: a photo is missing or damaged.
+    """
+    views = dataset.train
+    if dataset.points is not None and len(views) > 1:
+        xyz = dataset.points.xyz.cpu()
+        step = -(-len(xyz) // _SAMPLE)
+        logs, half = _log_colors(views, xyz, step, images), _half(xyz[::step])
+        whole, one, other = log_gains(logs), log_gains(logs[:, half]), log_gains(logs[:, ~half])
+        products = one * other
+        if products.isfinite().float().mean() > _LEAST_SHARE:
+            spread = GAMMA / math.log(2.0) * math.sqrt(max(0.0, float(products.nanmean())))
+            return ExposureStart(whole.nan_to_num().to(torch.float32), spread, "points")
+    values = [exif_exposure(view.image.path) for view in views]
+    known = [value for value in values if value is not None]
+    if len(views) > 1 and len(known) == len(views):
+        ev = torch.tensor(known, dtype=torch.float64)
+        ev -= ev.mean()
+        gains = (ev * math.log(2.0) / GAMMA)[:, None].expand(-1, 3)
+        return ExposureStart(gains.to(torch.float32), float(ev.square().mean().sqrt()), "EXIF data")
+    return ExposureStart(torch.zeros(len(views), 3), None)
+
+
+def _log_colors(views: Sequence[View], xyz: Tensor, step: int, images: Photos) -> Tensor:
+    """(V, P, 3) float64: logs of the colours of every ``step``-th point; NaN: not usable."""
+    size = max(max(view.camera.width, view.camera.height) for view in views)
+    downscale = next((factor for factor in (4, 2) if size >= factor * _SIDE), 1)
+    images.prefetch(views, downscale)
+    black, logs = torch.zeros(3), []
+    for view in views:
+        colors, known = point_colors(view, images, xyz[::step], black, downscale)
+        known = known & _visible(view.camera, xyz)[::step]
+        usable = known[:, None] & (colors >= _DARKEST) & (colors <= _BRIGHTEST)
+        logs.append(torch.where(usable, colors.to(torch.float64).log(), torch.nan))
+    return torch.stack(logs)
+
+
+def _visible(camera: Camera, xyz: Tensor) -> Tensor:
+    """(P,) bool: the points that are in the image, and not behind much nearer points."""
+    pixels, inside = point_pixels(camera, xyz)
+    depth = camera.project(xyz.to(torch.float64))[1]
+    cell = (pixels * _CELLS / max(camera.width, camera.height)).floor().to(torch.int64)
+    key = cell[:, 1] * (_CELLS + 1) + cell[:, 0]
+    nearest = depth.new_full(((_CELLS + 1) ** 2,), math.inf)
+    nearest.scatter_reduce_(0, key[inside], depth[inside], "amin")
+    return inside & (depth <= _NEARER * nearest[key])
+
+
+def _half(xyz: Tensor) -> Tensor:
+    """(P,) bool: the points in every second of the cubes, as on a chessboard."""
+    low, high = xyz.quantile(torch.tensor([0.05, 0.95]), dim=0)
+    side = (high - low).max().clamp_min(1e-12) / _CUBES
+    return (xyz / side).floor().sum(1) % 2 == 0
+
+
+def log_gains(logs: Tensor) -> Tensor:
+    """The log-gains of photos from the colours of points that several photos show.
+
+    Args:
+        logs: (V, P, 3) float64, logs of colours; NaN where the colour is not known.
+
+    Returns:
+        (V, 3) with mean 0; NaN for photos with too few points.
+    """
+    known = logs.isfinite()
+    known &= known.sum(0) >= 2
+    logs = torch.where(known, logs, torch.nan)
+    # Medians are less exact, but do not need a start.
+    gains = (logs - logs.nanmedian(0).values).nanmedian(1).values.nan_to_num()
+    colors = (logs - gains[:, None]).nanmedian(0).values.nan_to_num()
+    logs = logs.nan_to_num()
+    for iteration in range(_ITERATIONS):
+        progress = iteration / (_ITERATIONS - 1)
+        scale = _FIRST_SCALE * (_SCALE / _FIRST_SCALE) ** progress
+        rest = (logs - colors - gains[:, None]) / scale
+        weights = known / (1.0 + rest.square()).square()
+        total = weights.sum(1)
+        gains = (weights * (logs - colors)).sum(1) / total.clamp_min(1e-9)
+        gains = gains - gains.mean(0)
+        colors = (weights * (logs - gains[:, None])).sum(0) / weights.sum(0).clamp_min(1e-9)
+    return torch.where(total >= _LEAST_WEIGHT, gains, torch.nan)

@@ -1,0 +1,71 @@
+"""`SmoothingFilter`: no Gaussian is thinner than what the photos can show of it, except for discs.
+
+A photo of focal length f samples a Gaussian at depth d with the rate f / d, in pixels per world
+unit. Let ν be the largest rate of all photos that show it. Details that are much finer than 1 / ν
+cannot be trained. But in the photos a thinner Gaussian looks the same, because the projection blurs
+it to the size of a pixel; nearer to the camera, or in a larger image, it becomes an edge or a
+needle. Mip-Splatting (Yu et al., CVPR 2024) therefore convolves each Gaussian with one of the
+variance s / ν², its 3D smoothing filter: Σ + s / ν² I. The Gaussians that result are those whose
+standard deviations are at least √s / ν. So here this is a lower limit of the scales, without
+further parameters, and every viewer shows the filtered scene.
+
+The smallest of the three scales has no limit. A disc of any thickness looks the same from the
+front, and surfaces need thin discs; with a limit for all scales, the photos are reproduced less
+well. A needle has two small scales, so there are no needles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.core.step_schedule import Schedule
+
+#: Number of steps between two applications.
+INTERVAL = 100
+#: s: the variance of the filter, in units of the distance between samples, squared.
+VARIANCE = 0.2
+#: Photos show only what is farther away, in world units: the default of `ops.project`.
+_NEAR = 0.2
+
+
+class SmoothingFilter:
+    """Limits the scales between the steps of a training run. It has no state."""
+
+    def __init__(self, enabled: bool, cameras: Sequence[Camera], schedule: Schedule) -> None:
+        """
+        Args:
+            cameras: those of the training views, on the device of the Gaussians.
+        """
+        self._cameras = cameras if enabled else ()
+        self._schedule = schedule
+
+    def after_step(self, step: int, gaussians: Gaussians) -> None:
+        """Raise the scales below the limit, except for the smallest one of each Gaussian, in place,
+        in every `INTERVAL`-th step.
+        """
+        if self._cameras and self._schedule.multiples(step, INTERVAL):
+            rates = sampling_rates(gaussians.means, self._cameras)
+            limit = math.sqrt(VARIANCE) / rates  # inf for a Gaussian that no photo shows
+            limit = limit.nan_to_num(posinf=0.0).log()
+            scales = gaussians.log_scales
+            smallest = scales.argmin(1, keepdim=True)
+            raised = torch.maximum(scales, limit[:, None])
+            scales.copy_(raised.scatter(1, smallest, scales.gather(1, smallest)))
+
+
+def sampling_rates(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """(N,): the most pixels per world unit with which an image shows each mean (N, 3), or 0."""
+    rates = means.new_zeros(len(means))
+    for camera in cameras:
+        pixel, depth = camera.project(means)
+        size = pixel.new_tensor([camera.width, camera.height])
+        inside = (depth > _NEAR) & (pixel >= 0.0).all(1) & (pixel <= size).all(1)
+        rate = max(camera.fx, camera.fy) / depth
+        rates = torch.maximum(rates, rate.where(inside, 0.0).to(rates.dtype))
+    return rates

@@ -1,0 +1,1 @@
+"""The Gaussians of a training, distributed over processes; see `shards.Shards`."""

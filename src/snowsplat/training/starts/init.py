@@ -1,0 +1,97 @@
+"""`initial_gaussians`: the first Gaussians, from the points of one or more starts."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from snowsplat.data.dataset import Dataset, Points
+from snowsplat.data.image_loader import Photos
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import morton_order
+from snowsplat.training.core.background import FIXED_BACKGROUNDS
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.core.finite import check_finite
+from snowsplat.training.parts.sky import Sky, most_sky_points
+from snowsplat.training.starts import STARTS
+
+
+def initial_count(dataset: Dataset, config: TrainConfig) -> int:
+    """The maximum number of Gaussians that `initial_gaussians` returns."""
+    limit = config.density.max_gaussians
+    points = 0 if dataset.points is None else len(dataset.points)
+    count = sum(points if name == "points" else config.points_per_start for name in config.starts)
+    if config.sky:
+        count += most_sky_points(config.points_per_start)
+    return min(count or config.points_per_start, limit or count)
+
+
+def starts_at_random(dataset: Dataset, config: TrainConfig) -> bool:
+    """Whether most of the first Gaussians probably lie in empty space."""
+    without = {"random"} if dataset.points is not None else {"random", "points"}
+    return without.issuperset(config.starts)
+
+
+def initial_gaussians(
+    dataset: Dataset,
+    config: TrainConfig,
+    images: Photos,
+    generator: torch.Generator,
+    device: torch.device,
+    sky: Sky | None = None,
+) -> Gaussians:
+    """One Gaussian for each point of the starts of ``config.init``.
+
+    There are at most ``density.max_gaussians``. As in section 5.1 of the paper, they are isotropic.
+    The scale is the mean distance to the three nearest neighbours times ``config.initial_scale``;
+    the colour is that of the point; the opacity is ``config.initial_opacity``. The rows are in
+    Morton order.
+
+    Args:
+        images: the photos of the dataset.
+        generator: a random generator on the CPU. If there are too many points, it selects those
+            that are used.
+        sky: there are also points in it, and none before it.
+
+    Raises:
+        UserError: some points are so far apart that single precision cannot represent their
+            Gaussians.
+        SettingError: ``initial_points`` is a share, but the number of Gaussians has no limit.
+    """
+    points = _points_of(config.starts, dataset, config, images, generator)
+    if not len(points):
+        points = _points_of(("random",), dataset, config, images, generator)
+    if sky is not None:
+        points = _with_sky(points, sky, config)
+    limit = config.density.max_gaussians or math.inf
+    if len(points) > limit:
+        chosen = torch.randperm(len(points), generator=generator)[: int(limit)]
+        points = Points(points.xyz[chosen], points.rgb[chosen])
+    gaussians = Gaussians.from_points(points.to(device), config.sh_degree, config.initial_opacity)
+    gaussians.log_scales += math.log(config.initial_scale)
+    check_finite(
+        "the points of the dataset",
+        gaussians.parameters(),
+        "remove points that are extremely far from the others",
+    )
+    return gaussians.select(morton_order(gaussians.means))
+
+
+def _points_of(
+    starts: tuple[str, ...],
+    dataset: Dataset,
+    config: TrainConfig,
+    images: Photos,
+    generator: torch.Generator,
+) -> Points:
+    count = 0 if starts == ("points",) else config.points_per_start
+    found = [STARTS[name](dataset, images, count, generator) for name in starts]
+    return Points(torch.cat([p.xyz for p in found]), torch.cat([p.rgb for p in found]))
+
+
+def _with_sky(points: Points, sky: Sky, config: TrainConfig) -> Points:
+    background = FIXED_BACKGROUNDS.get(config.background)
+    far = sky.points(most_sky_points(config.points_per_start), background)
+    kept = ~sky.is_before(points.xyz)
+    return Points(torch.cat([points.xyz[kept], far.xyz]), torch.cat([points.rgb[kept], far.rgb]))
