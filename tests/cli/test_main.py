@@ -33,7 +33,8 @@ def replace_run(monkeypatch):
 def test_help_lists_the_subcommands_and_each_has_help(run):
     result = run()
     assert result.code == 0
-    for name, summary in module.SUBCOMMANDS.items():
+    for name, subcommand in module.SUBCOMMANDS.items():
+        summary = subcommand.summary
         assert f"snowsplat {name}" in result.out
         assert " ".join(summary.split()[:4]) in result.out
         assert inspect.getdoc(module.load_subcommand(name)).splitlines()[0] == summary
@@ -85,7 +86,7 @@ def imported_by(*commands: list[object]) -> list[set[str]]:
         check=True,
     )
     lines = done.stderr.splitlines()
-    subcommands = {f"snowsplat.cli.{name}" for name in module.SUBCOMMANDS}
+    subcommands = {subcommand.module for subcommand in module.SUBCOMMANDS.values()}
     relevant = {"torch", "numpy", "PIL"} | subcommands
     found = [set(before.split()) & relevant for before, line in pairwise(lines) if line == "end"]
     assert len(found) == len(commands)
