@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,17 +15,21 @@ from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta, Recipe
 from snowsplat.pipeline.run.memory_use import MemoryUse
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.time_budget import TimeBudget, check_minutes
-from snowsplat.pipeline.run.training_notes import sky_line
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from snowsplat.data import Dataset
     from snowsplat.pipeline.run.live_page import LivePage
     from snowsplat.pipeline.run.train_result import TrainResult
     from snowsplat.training.core.checkpoint import Checkpoint
     from snowsplat.training.core.config import TrainConfig
+    from snowsplat.training.core.run import Loss
+    from snowsplat.training.core.step_schedule import Schedule
     from snowsplat.training.core.trainer import Trainer
+    from snowsplat.training.parts.part import Part
     from snowsplat.training.processes.shards import Shards
 
 # Settings that may be changed when a training run is resumed.
@@ -113,6 +117,8 @@ def train(
     overwrite: bool = False,
     observer: Observer = SILENT,
     page: LivePage | None = None,
+    parts: Sequence[Part] = (),
+    loss: Loss | None = None,
 ) -> TrainResult:
     """Train a scene from a dataset.
 
@@ -122,6 +128,9 @@ def train(
             it does not exist.
         overwrite: replace the results of an earlier training run in ``output``.
         page: shows the training in the browser.
+        parts: further parts of the training, after those of the configuration; see
+            `snowsplat.training.parts.part.Part`.
+        loss: compares an image with a photo, instead of L1 and D-SSIM; see `Trainer`.
 
     Returns:
         The files of the scene, and statistics of the training run.
@@ -136,7 +145,7 @@ def train(
     options = options or TrainOptions()
     out = OutputFolder(Path(output))
     out.check_free(resume=False, overwrite=overwrite)
-    job = _Job(out, options, observer, page, started)
+    job = _Job(out, options, observer, page, started, parts, loss)
     with joined(job.device) as job.shards:
         return job.train(dataset)
 
@@ -148,6 +157,8 @@ def resume(
     dataset: Path | str | None = None,
     observer: Observer = SILENT,
     page: LivePage | None = None,
+    parts: Sequence[Part] = (),
+    loss: Loss | None = None,
 ) -> TrainResult:
     """Continue a training run from its newest checkpoint. The result is the same as without the
     interruption (on a GPU: only with `Compute.deterministic`).
@@ -159,6 +170,7 @@ def resume(
             the same as before.
         dataset: the folder of the dataset, if it was moved. If there is no checkpoint yet, the
             training starts at step 0 with this dataset.
+        parts, loss: new objects of the same kinds as before.
 
     Returns:
         As `train`.
@@ -172,20 +184,23 @@ def resume(
     options = options or TrainOptions()
     out = OutputFolder(Path(output))
     out.check_free(resume=True, overwrite=False)
-    job = _Job(out, options, observer, page, started)
+    job = _Job(out, options, observer, page, started, parts, loss)
     with joined(job.device) as job.shards:
         return job.resume(dataset)
 
 
-def follow_training(compute: Compute) -> None:
+def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | None = None) -> None:
     """Take part in the training of process 0; for the other processes. Returns at its end.
+
+    Args:
+        parts, loss: as those of process 0.
 
     Raises:
         ProcessLost: process 0 or another process has ended with an error.
     """
     device = compute.apply()
     with joined(device) as shards:
-        follow(shards, device)
+        follow(shards, device, parts, loss)
 
 
 class _Job:
@@ -198,12 +213,15 @@ class _Job:
         observer: Observer,
         page: LivePage | None,
         started: float,
+        parts: Sequence[Part],
+        loss: Loss | None,
     ) -> None:
         from snowsplat.training.core import trainer  # noqa: F401 (before the memory is measured)
         from snowsplat.training.processes.shards import ALONE
 
         self.out, self.options, self.observer, self.page = out, options, observer, page
         self.started = started
+        self.parts, self.loss = parts, loss
         self.shards: Shards = ALONE
         if page is not None and count() > 1:
             raise UserError("the page needs one process; leave out `view`, and use snowsplat watch")
@@ -213,7 +231,6 @@ class _Job:
 
     def train(self, path: Path | str) -> TrainResult:
         from snowsplat.training.core.recipes import recipe
-        from snowsplat.training.core.trainer import Trainer
 
         options = self.options
         budget = TimeBudget.of(options.minutes, None, self.started)
@@ -244,14 +261,12 @@ class _Job:
         if "sweep" in config.starts:
             self.observer.note("computing depth maps for the initialisation")
         self.shards.of_first(Setup(settings, memory.plan.config))
-        trainer = Trainer(dataset, memory.plan.config, device=self.device, shards=self.shards)
+        trainer = self._trainer(dataset, memory.plan.config)
         self.out.begin(dataset, settings, memory.plan.config)
         time_ratio = 1.0 if plan is None else plan.time_ratio
         return self._run(settings, name, trainer, budget, time_ratio, memory)
 
     def resume(self, path: Path | str | None) -> TrainResult:
-        from snowsplat.training.core.trainer import Trainer
-
         start = self._newest_checkpoint(path)
         if start is None:
             assert path is not None
@@ -266,16 +281,35 @@ class _Job:
         dataset = settings.load()
         memory = self._memory(dataset, config, _gaussians_in(start))
         self.shards.of_first(Setup(settings, memory.plan.config, schedule, start.path))
-        trainer = Trainer(
-            *(dataset, memory.plan.config, schedule, self.device, start.tensors),
-            shards=self.shards,
-        )
+        trainer = self._trainer(dataset, memory.plan.config, schedule, start.tensors)
         start.tensors.clear()  # the trainer has a copy, which is the one in the memory plan
         self.out.write_config(settings, memory.plan.config)
         self.observer.note(_described(dataset))
         iterations = trainer.schedule.iterations
         self.observer.note(f"resuming from {start.path}, step {start.step} of {iterations}")
         return self._run(settings, meta.recipe, trainer, budget, 1.0, memory)
+
+    def _trainer(
+        self,
+        dataset: Dataset,
+        config: TrainConfig,
+        schedule: Schedule | None = None,
+        state: dict[str, Tensor] | None = None,
+    ) -> Trainer:
+        from snowsplat.training.core.config import parts_of
+        from snowsplat.training.core.trainer import Trainer
+
+        return Trainer(
+            dataset,
+            config,
+            schedule,
+            self.device,
+            state,
+            shards=self.shards,
+            parts=[*parts_of(config), *self.parts],
+            loss=self.loss,
+            note=self.observer.note,
+        )
 
     def _memory(self, dataset: Dataset, config: TrainConfig, present: int = 0) -> MemoryUse:
         return MemoryUse.planned(
@@ -293,10 +327,6 @@ class _Job:
     ) -> TrainResult:
         from snowsplat.pipeline.run.training_run import TrainingRun
 
-        if trainer.exposure.reason:
-            self.observer.note(trainer.exposure.reason)
-        if trainer.sky is not None:
-            self.observer.note(sky_line(trainer.sky.share))
         self.observer.note(str(memory))
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(

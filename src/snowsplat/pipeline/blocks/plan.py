@@ -152,7 +152,7 @@ def plan_blocks(
     from snowsplat.pipeline.blocks.content import block_content
     from snowsplat.pipeline.train import TrainOptions
     from snowsplat.training.core.recipes import recipe
-    from snowsplat.training.parts.sky import sky_distance
+    from snowsplat.training.parts.found_sky import sky_distance
 
     options, folder = options or PlanOptions(), Path(folder)
     _check_free(folder)

@@ -2,7 +2,7 @@
 
 `launch` starts processes on this computer. `torchrun` starts them on one or several computers; it
 sets the same environment variables. Process 0 runs a training as a single process does. Before each
-operation that needs the others, it announces the operation; `follow` runs in the other processes.
+operation that needs the others, it tells them (`Collective`). They run `follow`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
     from snowsplat.pipeline.output.output_folder import DatasetSettings
     from snowsplat.training.core.config import TrainConfig
-    from snowsplat.training.core.progress import Progress
+    from snowsplat.training.core.run import Loss
     from snowsplat.training.core.step_schedule import Schedule
-    from snowsplat.training.core.trainer import Trainer
+    from snowsplat.training.parts.part import Part
     from snowsplat.training.processes.shards import Shards
 
 # Process 0 may compute the first Gaussians for a long time, while the others wait.
@@ -62,19 +62,6 @@ class Setup:
     config: TrainConfig
     schedule: Schedule | None = None
     checkpoint: Path | None = None
-
-
-@dataclass(frozen=True)
-class Announcement:
-    """An operation that needs all processes: "scene", "checkpoint", "evaluate" or "stretch".
-
-    Attributes:
-        step, iterations: the arguments of `Schedule.stretch`.
-    """
-
-    operation: str
-    step: int = 0
-    iterations: int = 0
 
 
 def count() -> int:
@@ -123,42 +110,39 @@ def joined(device: torch.device) -> Iterator[Shards]:
             dist.destroy_process_group()
 
 
-def follow(shards: Shards, device: torch.device) -> None:
-    """Take part in the training of process 0, until it ends."""
+def follow(
+    shards: Shards, device: torch.device, parts: Sequence[Part] = (), loss: Loss | None = None
+) -> None:
+    """Take part in the training of process 0, until it ends.
+
+    Args:
+        parts, loss: as those of process 0.
+    """
+    from snowsplat.pipeline.run.collective import Collective
     from snowsplat.training.core.checkpoint import load
+    from snowsplat.training.core.config import parts_of
     from snowsplat.training.core.finite import Diverged
     from snowsplat.training.core.trainer import Trainer
 
     setup = shards.of_first(None)
     assert isinstance(setup, Setup)
     state = None if setup.checkpoint is None else load(setup.checkpoint).tensors
-    dataset = setup.settings.load()
-    trainer = Trainer(dataset, setup.config, setup.schedule, device, state, shards=shards)
-
-    def after_step(_: Progress | None = None) -> None:
-        _do_what_is_announced(trainer)
-
+    trainer = Trainer(
+        setup.settings.load(),
+        setup.config,
+        setup.schedule,
+        device,
+        state,
+        shards=shards,
+        parts=[*parts_of(setup.config), *parts],
+        loss=loss,
+    )
+    together = Collective(trainer)
     with suppress(KeyboardInterrupt, Diverged):  # process 0 has the same one, and reports it
-        after_step()
-        trainer.run(after_step)
+        together.follow()
+        trainer.run(lambda progress: together.follow())
     if not trainer.within_step:
-        after_step()
-
-
-def _do_what_is_announced(trainer: Trainer) -> None:
-    shards = trainer.shards
-    while True:
-        announced: Announcement | None = shards.of_first(None)
-        if announced is None:
-            return
-        if announced.operation == "scene":
-            shards.collect(trainer.gaussians)
-        elif announced.operation == "checkpoint":
-            trainer.state_tensors()
-        elif announced.operation == "evaluate":
-            trainer.evaluate()
-        else:
-            trainer.schedule.stretch(announced.step, announced.iterations)
+        together.follow()
 
 
 def launch(processes: int, arguments: Sequence[str]) -> int:

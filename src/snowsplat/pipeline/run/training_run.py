@@ -6,28 +6,37 @@ import time
 import warnings
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from PIL.Image import Image
+
+from snowsplat.evaluation.metrics import Evaluation
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta, Recipe
+from snowsplat.pipeline.run.collective import Collective
+from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.memory_use import MemoryUse
-from snowsplat.pipeline.run.processes import Announcement
 from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
-from snowsplat.pipeline.run.training_notes import ended_early_line, left_out_line, moving_line
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.budgets.pace import Pace
+from snowsplat.training.budgets.step_cost import Work
+from snowsplat.training.budgets.steps_left import StepsLeft
+from snowsplat.training.core import checkpoint
+from snowsplat.training.core.config import config_to_json
+from snowsplat.training.core.finite import Diverged
 from snowsplat.training.core.history import History
+from snowsplat.training.core.progress import Progress
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.exposure import Exposure
+from snowsplat.training.parts.misalignment import misalignment
+from snowsplat.training.parts.overfitting import OverfittingCheck
+from snowsplat.training.parts.pose_refinement import PoseRefinement
+from snowsplat.training.parts.transients import Transients
+from snowsplat.training.report import Trained, write_training_report
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import peak_bytes
-
-if TYPE_CHECKING:
-    from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.pipeline.run.live_page import LivePage
-    from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.training.budgets.pace import Pace
-    from snowsplat.training.core.progress import Progress
-    from snowsplat.training.core.trainer import Trainer
 
 
 @dataclass
@@ -56,18 +65,16 @@ class TrainingRun:
     page: LivePage | None = None
 
     def __post_init__(self) -> None:
-        from snowsplat.training.budgets.step_cost import Work
-        from snowsplat.training.budgets.steps_left import StepsLeft
-
         self.config = self.trainer.config
         self.first_step = self.trainer.step
         self.started = self.last_checkpoint = time.monotonic()
         self.evaluation: tuple[int, Evaluation] | None = None  # the last one and its step
         self.history = History.read(self.out.history, self.first_step)
         self._left = StepsLeft(Work.of(self.config, self.trainer.dataset))
-        self._told = False  # whether the observer knows which photos are left out
-        self._told_moving = False  # whether the observer knows in which photos something moves
-        self._told_end = False  # whether the observer knows that the training ends early
+        self.together = Collective(self.trainer)
+        self.transients = self.trainer.part(Transients)
+        self.overfitting = self.trainer.part(OverfittingCheck)
+        self.poses = self.trainer.part(PoseRefinement)
 
     def run(self) -> TrainResult:
         """Run all steps and write the results.
@@ -77,13 +84,11 @@ class TrainingRun:
             TrainingStopped: Ctrl-C; the attributes of the exception say what was saved.
             KeyboardInterrupt: Ctrl-C before the first step was finished; no files remain.
         """
-        from snowsplat.training.core.finite import Diverged
-
         try:
             self.observer.steps_begin(self.first_step, self.trainer.schedule.iterations)
             try:
                 self._finish_interrupted_writes()
-                self._announce(None)
+                self.together.proceed()
                 self.history.step_begins()
                 self.trainer.run(self._record)
             finally:
@@ -105,39 +110,25 @@ class TrainingRun:
             raise
         else:
             result = self._finish()
-            self._announce(None)
+            self.together.proceed()
             return result
         scene = self._save_scene()
         self._save_checkpoint()
-        self._announce(None)
+        self.together.proceed()
         raise TrainingStopped(f"stopped after step {self.trainer.step}: {scene}", scene)
-
-    def _announce(self, announcement: Announcement | None) -> None:
-        """Tell the other processes what to do; None: go on with the next step, or end."""
-        self.trainer.shards.of_first(announcement)
 
     def _record(self, progress: Progress) -> None:
         # If there are metrics, the time of the step includes an evaluation and is not counted.
         timed = progress.metrics is None
         self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=timed)
         self._after_step(progress)
-        self._announce(None)
+        self.together.proceed()
         self.history.step_begins()
 
     def _after_step(self, progress: Progress) -> None:
         if progress.metrics is not None and progress.metrics.views:
             self._record_evaluation(progress.step, progress.metrics)
         self.observer.step(replace(progress, seconds_left=self._seconds_left(progress)))
-        if self.trainer.left_out and not self._told:
-            self.observer.note(left_out_line(self._left_out()))
-            self._told = True
-        if not self._told_moving and self.trainer.transients.complete(progress.step):
-            if moving := self._moving():
-                self.observer.note(moving_line(moving, len(self.trainer.dataset.train)))
-            self._told_moving = True
-        if (line := self._ended_early()) is not None and not self._told_end:
-            self.observer.note(line)
-            self._told_end = True
         if self._checkpoint_is_due(progress.step):
             self._save_checkpoint()
         if self.trainer.schedule.contains(progress.step, self.save_iterations):
@@ -150,15 +141,15 @@ class TrainingRun:
             if self.pace is not None and self.budget is not None:
                 self.pace.postpone(paused)
                 self.budget.started += paused
-        # If the scene overfits, the trainer has shortened the schedule, and no more time is needed.
-        if self.pace is not None and self.trainer.overfitting is None:
+        # If the scene overfits, the schedule was shortened, and no more time is needed.
+        overfits = self.overfitting is not None and self.overfitting.found is not None
+        if self.pace is not None and not overfits:
             schedule = self.trainer.schedule
             length = self.pace.iterations_after(
                 schedule, progress.step, progress.downscale, progress.gaussians
             )
             if length is not None:
-                self._announce(Announcement("stretch", progress.step, length))
-                schedule.stretch(progress.step, length)
+                self.together.stretch(progress.step, length)
 
     def _seconds_left(self, progress: Progress) -> float:
         schedule = self.trainer.schedule
@@ -168,16 +159,11 @@ class TrainingRun:
     def _left_out(self) -> tuple[str, ...]:
         return tuple(self.trainer.dataset.train[i].name for i in self.trainer.left_out)
 
-    def _moving(self) -> dict[str, float]:
-        found = self.trainer.transients.found
-        return {self.trainer.dataset.train[i].name: share for i, share in found.items()}
-
     def _ended_early(self) -> str | None:
-        found, iterations = self.trainer.overfitting, self.trainer.schedule.iterations
-        # `resume` with `iterations` may continue a training run that has ended early.
-        if found is None or iterations >= found.planned:
-            return None
-        return ended_early_line(iterations, found.planned)
+        return None if self.overfitting is None else self.overfitting.line()
+
+    def _masks(self) -> dict[str, Image]:
+        return {} if self.transients is None else self.transients.pictures()
 
     def _checkpoint_is_due(self, step: int) -> bool:
         every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
@@ -190,8 +176,6 @@ class TrainingRun:
 
         Remove old checkpoints, and save the scene if it was requested for this step.
         """
-        from snowsplat.training.core import checkpoint
-
         step = self.first_step
         checkpoint.remove_old(self.out.checkpoints, step)
         due = step > 0 and self.trainer.schedule.contains(step, self.save_iterations)
@@ -199,21 +183,15 @@ class TrainingRun:
             self._save_scene()
 
     def _save_scene(self) -> Path:
-        return self._write_scene(self._all_gaussians())
+        return self._write_scene(self.together.scene())
 
     def _write_scene(self, gaussians: Gaussians) -> Path:
         self._restore_folder()
-        poses = self.trainer.poses
-        if poses.on:
-            views = [*poses.views(), *poses.test_views()]
+        if self.poses is not None:
+            views = [*self.poses.views(), *self.poses.test_views()]
             self.out.write_cameras(views)
             write_refined(self.out.path, views, replace(self.settings, resolution=-1).load())
         return self.out.write_scene(self.trainer.step, gaussians)
-
-    def _all_gaussians(self) -> Gaussians:
-        """The Gaussians of all processes."""
-        self._announce(Announcement("scene"))
-        return self.trainer.shards.collect(self.trainer.gaussians)
 
     def _restore_folder(self) -> None:
         """Create the folder again if it was moved or removed, so that the training is not lost."""
@@ -222,9 +200,6 @@ class TrainingRun:
             self.out.describe(self.trainer.dataset, self.settings, self.config)
 
     def _save_checkpoint(self) -> Path:
-        from snowsplat.training.core import checkpoint
-        from snowsplat.training.core.config import config_to_json
-
         self._restore_folder()
         meta = CheckpointMeta(self.settings, self.recipe, config_to_json(self.config))
         if self.budget is not None:
@@ -233,17 +208,14 @@ class TrainingRun:
             meta = replace(meta, schedule=self.trainer.schedule)
         # Write the history first: a run that resumes from the checkpoint needs the curves up to it.
         self.history.write(self.out.history)
-        self._announce(Announcement("checkpoint"))
         path = checkpoint.save(
-            self.out.checkpoints, self.trainer.step, self.trainer.state_tensors(), meta.as_json()
+            self.out.checkpoints, self.trainer.step, self.together.state(), meta.as_json()
         )
         self.last_checkpoint = time.monotonic()
         return path
 
     def _last_checkpoint_as_text(self) -> str:
         """Which checkpoint can be used, as the end of an error message."""
-        from snowsplat.training.core import checkpoint
-
         saved = checkpoint.files(self.out.checkpoints)
         if not saved:
             return "there is no checkpoint yet"
@@ -259,19 +231,18 @@ class TrainingRun:
 
     def _finish(self) -> TrainResult:
         step = self.trainer.step
-        gaussians = self._all_gaussians()
+        gaussians = self.together.scene()
         scene = self._write_scene(gaussians)
         seconds, memory = time.monotonic() - self.started, self.memory.peak()
         if self.trainer.dataset.test:
             if self.evaluation is None or self.evaluation[0] != step:
-                self._announce(Announcement("evaluate"))
-                self._record_evaluation(step, self.trainer.evaluate())
+                self._record_evaluation(step, self.together.evaluate())
             assert self.evaluation is not None
             self.out.write_metrics(step, "test", self.evaluation[1], self._left_out())
         self.history.write(self.out.history)
-        if self.trainer.exposure.active:
-            self.out.write_exposure(self._exposures())
-        self.out.write_masks(self.trainer.transients.pictures())
+        if exposures := self._exposures():
+            self.out.write_exposure(exposures)
+        self.out.write_masks(self._masks())
         poses = self._about_poses(gaussians)
         report = self._write_report(gaussians, poses)
         time_used = None
@@ -289,7 +260,7 @@ class TrainingRun:
             reductions=self.memory.plan.reductions,
             evaluation=self.evaluation,
             left_out=self._left_out(),
-            moving=self._moving(),
+            moving={} if self.transients is None else self.transients.shares(),
             ended_early=self._ended_early(),
             poses=poses,
             time=time_used,
@@ -298,18 +269,21 @@ class TrainingRun:
         return result
 
     def _exposures(self) -> dict[str, list[float]]:
-        """The exposure of each training photo in EV, by name: red, green, blue."""
+        """The exposure of each training photo in EV, by name: red, green, blue; empty if no gains
+        were learnt.
+        """
+        exposure = self.trainer.part(Exposure)
+        if exposure is None or not exposure.active:
+            return {}
         names = (view.name for view in self.trainer.dataset.train)
-        return dict(zip(names, self.trainer.exposure.ev.tolist(), strict=True))
+        return dict(zip(names, exposure.ev.tolist(), strict=True))
 
     def _about_poses(self, gaussians: Gaussians) -> str | None:
         """The line about the camera poses; see `TrainResult.poses`."""
-        from snowsplat.training.parts.misalignment import misalignment
-
-        trainer, poses = self.trainer, self.trainer.poses
-        if poses.on:
-            return str(poses.drift())
-        used = [v for i, v in enumerate(poses.views()) if i not in trainer.left_out]
+        if self.poses is not None:
+            return str(self.poses.drift())
+        views = self.trainer.dataset.train
+        used = [view for i, view in enumerate(views) if i not in self.trainer.left_out]
         pixels = misalignment(gaussians, used, self.out.settings()[1])
         if pixels is None:
             return None
@@ -319,9 +293,6 @@ class TrainingRun:
         )
 
     def _write_report(self, gaussians: Gaussians, about_poses: str | None) -> Path:
-        from snowsplat.training.core.config import config_to_json
-        from snowsplat.training.report import Trained, write_training_report
-
         # Users may share the report, so it contains names of files but no paths.
         out = self.out.path
         dataset = asdict(self.settings)
@@ -333,8 +304,8 @@ class TrainingRun:
                 name=out.resolve().name if out.is_absolute() else str(out),
                 dataset=replace(
                     self.trainer.dataset,
-                    train=self.trainer.poses.views(),
-                    test=self.trainer.poses.test_views(),
+                    train=self.trainer.cameras.views(),
+                    test=self.trainer.cameras.test_views(),
                 ),
                 gaussians=gaussians,
                 step=self.trainer.step,
@@ -342,8 +313,8 @@ class TrainingRun:
                 history=self.history,
                 evaluation=None if self.evaluation is None else self.evaluation[1],
                 left_out=self._left_out(),
-                exposures=tuple(self.trainer.exposure.ev.mean(1).tolist()),
-                masks=self.trainer.transients.pictures(),
+                exposures=tuple(sum(ev) / 3 for ev in self._exposures().values()),
+                masks=self._masks(),
                 ended_early=self._ended_early(),
                 poses=about_poses,
                 settings={

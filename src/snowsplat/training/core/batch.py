@@ -13,16 +13,15 @@ from snowsplat.data.decode import LoadedImage
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import project
+from snowsplat.scene.render import RenderOutput, project
 from snowsplat.training.core.step_runner import StepRunner
 from snowsplat.training.core.view_gradient import ViewGradient
-from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.processes.shards import Shards
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BatchView:
-    """A view of a batch, at the resolution of the step.
+    """A view of a batch, at the resolution of the step. Each one is different from any other.
 
     ``index`` is that of the view in the training views of the dataset. ``photo`` is None if another
     process blends this view.
@@ -46,8 +45,8 @@ def batch_gradients(
     runner: StepRunner,
     shards: Shards,
     sh_degree: int,
-    exposure: Exposure,
-    loss_of: Callable[[Tensor, BatchView], Tensor],
+    background_of: Callable[[BatchView], Tensor],
+    loss_of: Callable[[BatchView, RenderOutput], Tensor],
 ) -> list[ViewGradient]:
     """The gradients of the mean loss of the batch with respect to the splats of each view.
 
@@ -55,8 +54,8 @@ def batch_gradients(
         gaussians: those of this process.
         batch: the views, the same in every process.
         runner: rasterizes, and runs the backward pass.
-        exposure: the exposures of the photos.
-        loss_of: the loss of an image (H, W, 3) of a view whose photo this process has.
+        background_of: the colour (3,) over which a view is rendered.
+        loss_of: the loss of a view whose photo this process has, and of its rendering.
     """
     found: list[tuple[Splats2D, BatchView]] = []
     views = rounds(batch, shards.size)
@@ -68,9 +67,10 @@ def batch_gradients(
         loss = None
         if blended is not None:
             own = group[shards.rank]
-            background = exposure.begin_view(own.background, own.index)
             with torch.enable_grad():  # `project` is outside: the optimiser computes its gradient
-                loss = loss_of(runner.rasterize(blended, own.camera, background), own)
+                rendered = runner.rasterize(blended, own.camera, background_of(own))
+                loss = loss_of(own, rendered)
+                del rendered
         runner.backward(loss, last=number == len(views) - 1)
         del loss  # and with it the image and the tiles
         if blended is not None:

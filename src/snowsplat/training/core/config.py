@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.step_schedule import Schedule, When
@@ -14,6 +14,9 @@ from snowsplat.training.parts.transients import TransientsMode
 from snowsplat.training.starts import STARTS
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import from_json
+
+if TYPE_CHECKING:
+    from snowsplat.training.parts.part import Part
 
 #: The generators are seeded with four times the seed, which has to fit into 64 bits.
 _SEED_LIMIT = 2**61
@@ -234,6 +237,40 @@ class TrainConfig:
     def sh_degree_at(self, step: int) -> int:
         """The degree of the spherical harmonics in use at this step."""
         return min(self.sh_degree, step // self.sh_interval) if self.sh_interval else self.sh_degree
+
+
+def parts_of(config: TrainConfig) -> list[Part]:
+    """What takes part in a training with these settings, in order. This is the only list of parts.
+
+    A new option is a field of `TrainConfig`, a part in its own file, and a line here.
+    """
+    # The settings can be read without the parts.
+    from snowsplat.training.parts.decay import Decay
+    from snowsplat.training.parts.densification import Densification
+    from snowsplat.training.parts.exposure import Exposure
+    from snowsplat.training.parts.near_limit import NearLimit
+    from snowsplat.training.parts.overfitting import OverfittingCheck
+    from snowsplat.training.parts.pose_refinement import PoseRefinement
+    from snowsplat.training.parts.scale_limit import ScaleLimit
+    from snowsplat.training.parts.sky import SkyPart
+    from snowsplat.training.parts.smoothing import SmoothingFilter
+    from snowsplat.training.parts.transients import Transients
+    from snowsplat.training.parts.unexplained import Unexplained
+
+    parts: list[tuple[bool, Part]] = [
+        (config.exposure != "off", Exposure(config.exposure)),
+        (config.leave_out_after > 0, Unexplained(config.leave_out_after)),
+        (config.refine_poses, PoseRefinement()),
+        (config.stop_overfitting, OverfittingCheck()),
+        (config.transients != "off", Transients(config.transients)),
+        (config.near_limit > 0, NearLimit(config.near_limit)),
+        (config.sky, SkyPart(config.sky_distance)),
+        (True, Densification(late=config.transients == "on")),
+        (True, Decay(config.decay)),
+        (config.relative_scale > 0, ScaleLimit(config.relative_scale)),
+        (config.antialias, SmoothingFilter()),
+    ]
+    return [part for used, part in parts if used]
 
 
 def changed(config: TrainConfig, **settings: Any) -> TrainConfig:

@@ -57,7 +57,7 @@ def check_state(
 
     Args:
         rows: the part of the state of the trainer with one row for each Gaussian.
-        common: the other part. Only ``order`` and ``left_out`` may have another size.
+        common: the other part. Only ``order`` and the views left out may have another size.
         given: the state to load.
         views: number of training views of the trainer.
 
@@ -74,11 +74,11 @@ def check_state(
     fits = fits and all(
         common[name].shape == given[name].shape
         for name in common
-        if name not in ("order", "left_out")
+        if name not in ("order", "unexplained.left_out")
     )
     every = set(range(views))
-    if fits and "left_out" in given:
-        left_out = set(given["left_out"].tolist())
+    if fits and "unexplained.left_out" in given:
+        left_out = set(given["unexplained.left_out"].tolist())
         fits = left_out < every
         every -= left_out
     if not fits or int(given["step"]) < 0 or not set(given["order"].tolist()) <= every:

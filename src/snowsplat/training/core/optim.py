@@ -30,6 +30,10 @@ class Adam:
 
     The Gaussians themselves are not part of this object. Code that changes their rows (density
     control) must make the same change here, with `select`.
+
+    Attributes:
+        rows: further tensors with one row for each Gaussian of this process, which `select` keeps
+            in the same order; see `Run.rows`.
     """
 
     def __init__(
@@ -54,6 +58,7 @@ class Adam:
         self.extent = extent
         self.visible_only = visible_only
         self.shards = shards
+        self.rows: dict[str, Tensor] = {}
         parameters = gaussians.parameters()
         self.exp_avg = {name: torch.zeros_like(p) for name, p in parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in parameters.items()}
@@ -105,17 +110,17 @@ class Adam:
             parameter.grad = None
 
     def select(self, index: Tensor, fresh: Tensor) -> None:
-        """Row i becomes the old row ``index[i]``; rows marked in ``fresh`` get zero moments.
+        """Row i becomes the old row ``index[i]``; rows marked in ``fresh`` become zero.
 
         Args:
             index: (M,) int64, repeats allowed; rows of all processes.
             fresh: bool, for the new rows of this process.
         """
         take = self.shards.selection(index)
-        for moments in (self.exp_avg, self.exp_avg_sq):
-            for name, moment in moments.items():
-                moments[name] = take(moment)
-                moments[name][fresh] = 0.0
+        for tensors in (self.exp_avg, self.exp_avg_sq, self.rows):
+            for name, tensor in tensors.items():
+                tensors[name] = take(tensor)
+                tensors[name][fresh] = 0
 
     def zero(self, name: str) -> None:
         """Set the moments of one parameter to zero, after its values were set directly."""

@@ -39,6 +39,7 @@ from snowsplat.ops.readback import Readback
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import RenderOutput
 from snowsplat.training.core import finite
 from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
@@ -60,7 +61,7 @@ class StepRunner:
         def optimize() -> None:
             splats = project(gaussians, camera, sh_degree)
             with torch.enable_grad():
-                image = runner.rasterize(splats, camera, background)
+                image = runner.rasterize(splats, camera, background).image
                 loss = view_loss(image, photo, background, ssim_weight)
             runner.backward(loss)
             gradient = runner.gradient(splats, camera, sh_degree)
@@ -80,6 +81,8 @@ class StepRunner:
         abs_grad: bool = False,
         batch: int = 1,
         shards: Shards = ALONE,
+        *,
+        with_depth: bool = False,
     ) -> None:
         """
         Args:
@@ -87,12 +90,13 @@ class StepRunner:
             abs_grad: whether the backward pass computes ``abs_grad`` of the splats.
             batch: the largest number of views of a step.
             shards: the processes; a step is valid if it is valid in each of them.
+            with_depth: whether the depth is rendered, too.
         """
         # The CPU allocates what a frame requires, and ignores the capacity.
         on_cpu = device.type == "cpu"
         instances = sys.maxsize if on_cpu else INITIAL_INSTANCES_PER_GAUSSIAN * gaussians
         self.capacity = Capacity(instances, torch.zeros(1, dtype=torch.int64, device=device))
-        self.abs_grad = abs_grad
+        self.abs_grad, self.with_depth = abs_grad, with_depth
         self._shards = shards
         self._nonfinite_rows = torch.zeros(len(PARAMETERS), dtype=torch.int32, device=device)
         self._own_views = -(-batch // shards.size)  # at most, of a step
@@ -103,21 +107,24 @@ class StepRunner:
         numbers = self._own_views + 2 + len(PARAMETERS)
         self._readback = Readback(shards.size * numbers, device)
 
-    def rasterize(self, splats: Splats2D, camera: Camera, background: Tensor) -> Tensor:
+    def rasterize(self, splats: Splats2D, camera: Camera, background: Tensor) -> RenderOutput:
         """Rasterize with the current capacity; gradients flow to ``splats.packed``.
 
         Args:
             background: (3,) colour in 0..1.
-
-        Returns:
-            (H, W, 3) image.
         """
         splats.packed.requires_grad_()
         if self.abs_grad:
             splats.abs_grad = splats.packed.new_zeros(len(splats), 2)
-        size = camera.width, camera.height
-        image, _, _ = ops.rasterize(splats, *size, background, capacity=self.capacity)
-        return image
+        image, alpha, depth = ops.rasterize(
+            splats,
+            camera.width,
+            camera.height,
+            background,
+            with_depth=self.with_depth,
+            capacity=self.capacity,
+        )
+        return RenderOutput(image, alpha, depth, splats)
 
     def backward(self, loss: Tensor | None, *, last: bool = True) -> None:
         """Run the backward pass from the loss of a view to its splats.

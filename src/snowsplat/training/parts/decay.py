@@ -18,11 +18,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
-from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.step_schedule import Schedule, When
+from snowsplat.training.core.step_schedule import When
+from snowsplat.training.parts.part import Part
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.run import Run
 
 #: Number of steps between two reductions.
 INTERVAL = 10
@@ -49,28 +53,25 @@ class DecayRates:
     until: When = 0.9
 
 
-class Decay:
-    """Applies `DecayRates` between the steps of a training run. It has no state."""
+class Decay(Part):
+    """Applies `DecayRates`. It has no state."""
 
-    def __init__(self, rates: DecayRates, views: int, schedule: Schedule) -> None:
-        """
-        Args:
-            views: number of training views: the steps of an epoch.
-        """
+    name = "decay"
+
+    def __init__(self, rates: DecayRates) -> None:
         self.rates = rates
-        self._epochs = INTERVAL / views
-        self._opacity = rates.opacity * min(max(1.0, MANY_VIEWS / views), MAX_FACTOR)
-        self._schedule = schedule
 
-    def after_step(self, step: int, gaussians: Gaussians) -> None:
+    def between(self, run: Run) -> None:
         """Reduce opacities and scales in place, in every `INTERVAL`-th step."""
-        times = self._schedule.multiples(step, INTERVAL)
-        if not times or step > self._schedule.step_of(self.rates.until):
+        times = run.schedule.multiples(run.step, INTERVAL)
+        if not times or run.step > run.schedule.step_of(self.rates.until):
             return
-        epochs = times * self._epochs
-        if self._opacity > 0.0:
-            factor = math.exp(-self._opacity * epochs)
-            opacities = factor * gaussians.opacities
-            gaussians.opacity_logits.copy_(torch.logit(opacities, eps=1e-7))
+        views = len(run.dataset.train)  # the steps of an epoch
+        epochs = times * (INTERVAL / views)
+        opacity = self.rates.opacity * min(max(1.0, MANY_VIEWS / views), MAX_FACTOR)
+        if opacity > 0.0:
+            factor = math.exp(-opacity * epochs)
+            opacities = factor * run.gaussians.opacities
+            run.gaussians.opacity_logits.copy_(torch.logit(opacities, eps=1e-7))
         if self.rates.scale > 0.0:
-            gaussians.log_scales -= self.rates.scale * epochs
+            run.gaussians.log_scales -= self.rates.scale * epochs

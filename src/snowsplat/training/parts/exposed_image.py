@@ -27,7 +27,7 @@ class ExposedImages:
     def __init__(self) -> None:
         self._kept: dict[tuple[int, int], Tensor] = {}
 
-    def of(self, image: Tensor, log_gains: Tensor, photo: LoadedImage, index: int) -> Tensor:
+    def exposed(self, image: Tensor, log_gains: Tensor, photo: LoadedImage, index: int) -> Tensor:
         """exp(log_gains) · image, at most 1 where the photo is overexposed; differentiable.
 
         Args:
@@ -51,7 +51,7 @@ class ExposedImages:
 
 
 class _Exposed(torch.autograd.Function):
-    """The image that `ExposedImages.of` returns; ``at`` is from `_positions`."""
+    """The image that `ExposedImages.exposed` returns; ``at`` is from `_positions`."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, log_gains: Tensor, at: Tensor) -> Tensor:

@@ -20,17 +20,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from snowsplat.data.dataset import Dataset
 from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import Photos
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.parts.exposed_image import ExposedImages
 from snowsplat.training.parts.exposure_start import GAMMA, ExposureStart, exposure_start
-from snowsplat.training.processes.shards import Shards
+from snowsplat.training.parts.neutral_photos import NeutralPhotos
+from snowsplat.training.parts.part import Part
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.batch import BatchView
+    from snowsplat.training.core.run import Run
 
 #: With a smaller spread, in EV, the gains are not learnt.
 LEAST_SPREAD = 0.05
@@ -42,54 +45,47 @@ _EPSILON = 1e-12
 _PRIOR, _SMALL = 1e-3, 0.3
 
 
-class Exposure:
+class Exposure(Part):
     """The gains of the training photos.
 
     Attributes:
         active: whether gains are learnt.
         log_gains: (V, 3) float32 on the device; all zero if they are not learnt.
         start: (V, 3) the log-gains before the first step, on the CPU.
-        reason: why they are learnt or not, as a line for the user; empty if the setting is "off".
     """
 
-    def __init__(
-        self,
-        setting: str,
-        dataset: Dataset,
-        images: Photos,
-        schedule: Schedule,
-        device: torch.device,
-        shards: Shards,
-        resumed: bool,
-        black: bool = False,
-    ) -> None:
+    name = "exposure"
+
+    def __init__(self, setting: str) -> None:
         """
         Args:
-            setting: "auto", "on" or "off", see ``TrainConfig.exposure``.
-            resumed: whether `load_state` follows, so that the photos need not be compared.
-            black: whether each background is black, which saves a pass over the image.
+            setting: "auto" or "on", see ``TrainConfig.exposure``.
+        """
+        self._setting = setting
+        # (3,) log-gains, with their gradients, of the views of this process in the present step.
+        self._present: dict[BatchView, Tensor] = {}
+        self._images = ExposedImages()
+
+    def prepare(self, run: Run) -> None:
+        """Compare the photos, unless a state follows. Then `Run.photos` have equal exposures.
 
         Raises:
             UserError: a photo is missing or damaged.
         """
-        start = ExposureStart(torch.zeros(len(dataset.train), 3), None)
-        if setting != "off" and not resumed:
-            start = shards.of_first(exposure_start(dataset, images) if not shards.rank else None)
+        views, first = run.dataset.train, run.shards.rank == 0
+        start = ExposureStart(torch.zeros(len(views), 3), None)
+        if not run.resumed:
+            start = run.shards.of_first(exposure_start(run.dataset, run.images) if first else None)
         learnt = start.spread is not None and start.spread >= LEAST_SPREAD
-        self.active = setting == "on" or (setting == "auto" and learnt)
-        self.reason = "" if setting == "off" or resumed else _reason(start, self.active)
+        self.active = self._setting == "on" or learnt
+        if not run.resumed:
+            run.note(_reason(start, self.active))
         self.start = start.log_gains * self.active
-        self.log_gains = self.start.to(device, copy=True)
+        self.log_gains = self.start.to(run.device, copy=True)
         self._mean = torch.zeros_like(self.log_gains)  # the moments of Adam
         self._square = torch.zeros_like(self.log_gains)
-        self._updates = torch.zeros(len(dataset.train), dtype=torch.int64)
-        self._setting = setting
-        self._black = black
-        self._schedule = schedule
-        self._shards = shards
-        # (3,) log-gains, with their gradients, of the views of this process in the present step.
-        self._present: list[Tensor] = []
-        self._images = ExposedImages()
+        self._updates = torch.zeros(len(views), dtype=torch.int64)
+        run.photos = NeutralPhotos(run.images, views, self.start)
 
     @property
     def ev(self) -> Tensor:
@@ -97,48 +93,36 @@ class Exposure:
         rows = self.log_gains if self.active else self.log_gains[:0]
         return GAMMA / math.log(2.0) * rows.cpu()
 
-    def begin_step(self) -> None:
-        """Forget the gradients of the last attempt."""
-        self._present = []
-
-    def begin_view(self, background: Tensor, index: int) -> Tensor:
-        """The colour (3,) over which the training view ``index`` is rendered.
-
-        Args:
-            background: (3,) colour in 0..1 behind the photo.
-        """
+    def background(self, run: Run, view: BatchView, color: Tensor) -> Tensor:
+        """The colour (3,) that becomes ``color`` when it is exposed."""
         if not self.active:
-            return background
-        log_gains = self.log_gains[index].clone().requires_grad_()
-        self._present.append(log_gains)
-        if self._black:
-            return background
-        with torch.enable_grad():
-            return background * (-log_gains).exp()
+            return color
+        # If a step is repeated, this replaces the gradient of the last attempt.
+        self._present[view] = log_gains = self.log_gains[view.index].clone().requires_grad_()
+        if run.config.background == "black":  # saves a pass over the image
+            return color
+        return color * (-log_gains).exp()
 
-    def exposed(self, image: Tensor, photo: LoadedImage, index: int) -> Tensor:
-        """The image (H, W, 3) of the view of `begin_view` as its camera exposes it."""
+    def image(self, run: Run, view: BatchView, image: Tensor, photo: LoadedImage) -> Tensor:
+        """The image (H, W, 3) as the camera of the view exposes it."""
         if not self.active:
             return image
-        return self._images.of(image, self._present[-1], photo, index)
+        return self._images.exposed(image, self._present[view], photo, view.index)
 
-    def after_step(self, step: int, indices: Sequence[int]) -> None:
-        """Update the gains of the photos of a step.
-
-        Args:
-            indices: of the training views of the batch.
-        """
+    def after_step(self, run: Run, step: int, batch: Sequence[BatchView]) -> None:
+        """Update the gains of the photos of the batch."""
         if not self.active:
             return
-        size = self._shards.size
-        own = self.log_gains.new_zeros(-(-len(indices) // size), 3)
-        for row, log_gains in zip(own, self._present, strict=False):
+        size = run.shards.size
+        own = self.log_gains.new_zeros(-(-len(batch) // size), 3)
+        for row, log_gains in zip(own, self._present.values(), strict=False):
             assert log_gains.grad is not None
             row += log_gains.grad
-        table = self._shards.table(own.flatten()).view(size, -1, 3)
-        rate = _RATE * (_LAST_RATE / _RATE) ** (step / self._schedule.iterations)
-        for position, i in enumerate(indices):  # in each round, process r has view r
-            self._update(i, table[position % size, position // size], rate)
+        self._present.clear()
+        table = run.shards.table(own.flatten()).view(size, -1, 3)
+        rate = _RATE * (_LAST_RATE / _RATE) ** (step / run.schedule.iterations)
+        for position, view in enumerate(batch):  # in each round, process r has view r
+            self._update(view.index, table[position % size, position // size], rate)
         self.log_gains -= self.log_gains.mean(0)
 
     def _update(self, i: int, gradient: Tensor, rate: float) -> None:
@@ -150,10 +134,8 @@ class Exposure:
         square = self._square[i].lerp_(gradient.square(), 1.0 - b2) / (1.0 - b2**n)
         gain -= rate * mean / (square.sqrt() + _EPSILON)
 
-    def state_tensors(self) -> dict[str, Tensor]:
-        """The state on which the next steps depend; empty if the setting is "off"."""
-        if self._setting == "off":
-            return {}
+    def state(self) -> dict[str, Tensor]:
+        """The gains and the moments of Adam."""
         return {
             "active": torch.tensor(self.active),
             "start": self.start,
@@ -163,10 +145,8 @@ class Exposure:
             "updates": self._updates,
         }
 
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Copy a state of `state_tensors`."""
-        if self._setting == "off":
-            return
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """See `Part.load`."""
         self.active = bool(tensors["active"])
         self.start.copy_(tensors["start"])
         self.log_gains.copy_(tensors["log_gains"])

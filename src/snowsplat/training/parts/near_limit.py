@@ -18,15 +18,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.parts.part import REMOVED, Part
 from snowsplat.training.parts.unseen_cameras import beside
 from snowsplat.training.starts.source_views import source_views
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.run import Run
 
 #: Number of steps between two applications.
 INTERVAL = 100
@@ -42,29 +45,28 @@ _PAIRING, _POINTS = 1000, 10_000
 _QUANTILE = 0.02
 #: Cameras that see fewer points have no limit.
 _FEWEST_POINTS = 50
-#: The opacity of a removed Gaussian, as a logit. It is too transparent to be visible, so the
-#: optimiser does not restore it, and density control removes it or uses it elsewhere.
-REMOVED = -10.0
 #: This number of Gaussians is processed at a time, to limit the memory.
 _ROWS = 1 << 14
 
 
-class NearLimit:
-    """Removes Gaussians between the steps of a training run. It has no state."""
+class NearLimit(Part):
+    """Removes Gaussians that are too near to a camera. It has no state."""
 
-    def __init__(
-        self, share: float, cameras: Sequence[Camera], points: Tensor | None, schedule: Schedule
-    ) -> None:
+    name = "near_limit"
+
+    def __init__(self, share: float) -> None:
         """
         Args:
-            share: the nearest depth of a Gaussian, relative to that of the points; 0: no limit.
-            cameras: those of the training views, on the device of the Gaussians.
-            points: (P, 3) of the dataset, in the world frame; None: no limit.
+            share: the nearest depth of a Gaussian, relative to that of the points.
         """
-        self._schedule = schedule
-        self._views: Tensor | None = None
-        if share <= 0.0 or points is None or not cameras:
+        self.share = share
+        self._views: Tensor | None = None  # None: no limit
+
+    def begin(self, run: Run) -> None:
+        """Compute the limits, from the points of the dataset; without points, there are none."""
+        if run.dataset.points is None:
             return
+        cameras, points = run.dataset_cameras, run.dataset.points.xyz
         device = cameras[0].cam_from_world.device
         cpu = torch.device("cpu")
         used = [camera.to(cpu) for camera in cameras[:: math.ceil(len(cameras) / _CAMERAS)]]
@@ -73,15 +75,15 @@ class NearLimit:
         for camera in used + unseen_cameras(used, _sample(points, _PAIRING)):
             depth = nearest_depth(camera, _sample(points, _POINTS))
             if depth > 0.0:
-                views.append(_row(camera, share * depth))
+                views.append(_row(camera, self.share * depth))
         if views:
             self._views = torch.stack(views).to(device, torch.float32)
 
-    def after_step(self, step: int, gaussians: Gaussians) -> None:
+    def between(self, run: Run) -> None:
         """Make the Gaussians that are too near transparent, in every `INTERVAL`-th step."""
-        if self._views is not None and self._schedule.multiples(step, INTERVAL):
-            near = torch.cat([self._is_near(means) for means in gaussians.means.split(_ROWS)])
-            gaussians.opacity_logits.masked_fill_(near, REMOVED)
+        if self._views is not None and run.schedule.multiples(run.step, INTERVAL):
+            near = torch.cat([self._is_near(means) for means in run.gaussians.means.split(_ROWS)])
+            run.gaussians.opacity_logits.masked_fill_(near, REMOVED)
 
     def _is_near(self, means: Tensor) -> Tensor:
         """(M,) bool: which of the means (M, 3) are in front of the limit of a view."""

@@ -27,19 +27,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from snowsplat.data.dataset import Dataset, View
+from snowsplat.data.dataset import View
 from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.unseen_cameras import beside
 from snowsplat.training.starts.point_colors import point_colors, point_pixels, sampled
 from snowsplat.training.starts.source_views import source_views
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.run import Run
 
 #: The first and the last moment of an estimate, and the distance between two, in percent of the
 #: schedule. Before the first one, the recipes use small photos. After the last one, few steps could
@@ -84,78 +88,78 @@ class Overfitting:
     planned: int
 
 
-class OverfittingCheck:
+class OverfittingCheck(Part):
     """Computes estimates between the steps of a training run, and shortens its schedule.
 
     Attributes:
         found: None as long as the scene does not overfit.
     """
 
-    def __init__(
-        self,
-        dataset: Dataset,
-        images: Photos,
-        schedule: Schedule,
-        background: Tensor,
-        render: Renderer = render,
-    ) -> None:
-        """
-        Args:
-            images: the photos of the training views.
-            background: (3,) colour in 0..1, on the device of the Gaussians.
-            render: renders the scene.
-        """
+    name = "overfitting"
+
+    def __init__(self) -> None:
         self.found: Overfitting | None = None
-        self._dataset = dataset
-        self._images = images
-        self._schedule = schedule
-        self._background = background
-        self._render = render
+        self._run: Run
         self._unseen: list[UnseenView] | None = None  # computed at the first estimate
         self._estimates = 0  # number of estimates until now
         self._best = 0.0  # dB
         self._worse = 0  # number of estimates since the last one that was not worse
 
-    def after_step(
-        self, step: int, gaussians: Gaussians, sh_degree: int, left_out: Sequence[int]
-    ) -> None:
-        """Estimate if it is time; shorten the schedule if the scene overfits.
+    def begin(self, run: Run) -> None:
+        """Remember the run, whose schedule may be shortened."""
+        self._run = run
 
-        Args:
-            sh_degree: degree of the spherical harmonics in use.
-            left_out: indices of training views that are not used.
+    def between(self, run: Run) -> None:
+        """Estimate if it is time; shorten the schedule if the scene overfits.
 
         Raises:
             UserError: a photo is missing or damaged.
         """
+        step, schedule, dataset = run.step, run.schedule, run.dataset
         percent = _FIRST + _EVERY * self._estimates
-        moment = self._schedule.step_of(percent / 100.0)
+        moment = schedule.step_of(percent / 100.0)
         if self.found is not None or percent > _LAST or step < moment:
             return
-        if self._schedule.iterations * _EVERY < 100 * len(self._dataset.train):
+        if schedule.iterations * _EVERY < 100 * len(dataset.train):
             return
         self._estimates += 1
+        background = run.background.evaluation
         if self._unseen is None:
-            views = [v for i, v in enumerate(self._dataset.train) if i not in left_out]
-            points = self._dataset.points
-            xyz = torch.zeros(0, 3) if points is None else points.xyz.cpu()
-            self._unseen = unseen_views(views, xyz, self._images, self._background.cpu())
+            views = [v for i, v in enumerate(dataset.train) if i not in run.left_out]
+            xyz = torch.zeros(0, 3) if dataset.points is None else dataset.points.xyz.cpu()
+            self._unseen = unseen_views(views, xyz, run.photos, background.cpu())
         if not self._unseen:
             return
         estimate = estimated_psnr(
-            gaussians, self._unseen, self._background, sh_degree, self._render
+            run.gaussians, self._unseen, background, run.sh_degree, run.render
         )
         self._best = max(self._best, estimate)
         self._worse = self._worse + 1 if estimate <= self._best - _DIFFERENCE else 0
         if self._worse < _PATIENCE:
             return
-        planned = self._schedule.iterations
+        planned = schedule.iterations
         rest = math.ceil((planned - step) / _SHORTENING)
         if step + rest < planned:
             self.found = Overfitting(step, planned)
-            self._schedule.stretch(step, step + rest)
+            schedule.stretch(step, step + rest)
+            self._tell()
 
-    def state_tensors(self) -> dict[str, Tensor]:
+    def line(self) -> str | None:
+        """The line about a training run that ends early; None if it does not."""
+        iterations = self._run.schedule.iterations
+        # A resumed training run with more steps may continue, although it has ended early before.
+        if self.found is None or iterations >= self.found.planned:
+            return None
+        return (
+            f"stopped after {iterations} of {self.found.planned} steps: the views between the "
+            "photos became worse"
+        )
+
+    def _tell(self) -> None:
+        if (line := self.line()) is not None:
+            self._run.note(line)
+
+    def state(self) -> dict[str, Tensor]:
         """The state on which the next checks depend, besides dataset and schedule."""
         found = self.found or Overfitting(0, 0)
         counts = [self._estimates, self._worse, found.step, found.planned]
@@ -164,11 +168,12 @@ class OverfittingCheck:
             "best": torch.tensor(self._best, dtype=torch.float64),
         }
 
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Replace the state by one of `state_tensors`."""
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """See `Part.load`."""
         self._estimates, self._worse, step, planned = tensors["counts"].tolist()
         self._best = float(tensors["best"])
         self.found = Overfitting(step, planned) if step > 0 else None
+        self._tell()
 
 
 def unseen_views(

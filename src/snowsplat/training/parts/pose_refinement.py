@@ -24,21 +24,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from snowsplat.data.dataset import Dataset, View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.dataset import View
 from snowsplat.ops import camera_gradient
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import Renderer, render
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.parts.misalignment import shift_of
+from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.pose_coordinates import Gauge, moved, pixel_hessian, whitening
-from snowsplat.training.processes.shards import ALONE, Shards
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.batch import BatchView
+    from snowsplat.training.core.run import Run
+    from snowsplat.training.core.view_gradient import ViewGradient
 
 #: The first fraction of the steps, in which the scene is still too blurred to move cameras.
 BEGIN = 0.2
@@ -54,43 +55,19 @@ FIRST_LIMIT, LAST_LIMIT = 1e-3, 2e-4
 _LEAST_ENERGY = 1e-6
 
 
-class PoseRefinement:
-    """The cameras of the training views. If it is off, they are those of the dataset.
+class PoseRefinement(Part):
+    """The cameras of the training views. Each process computes the same cameras."""
 
-    Attributes:
-        on: whether the cameras are refined.
-    """
+    name = "poses"
 
-    def __init__(
-        self,
-        on: bool,
-        dataset: Dataset,
-        cameras: Sequence[Camera],
-        images: ImageLoader,
-        schedule: Schedule,
-        background: Tensor,
-        render: Renderer = render,
-        shards: Shards = ALONE,
-    ) -> None:
-        """
-        Args:
-            cameras: those of the training views of ``dataset``, on the device of the Gaussians.
-            images: the photos of these views.
-            background: (3,) colour in 0..1.
-            render: renders the scene.
-            shards: the processes; each of them computes the same cameras.
-        """
-        self.on = on
-        self._first = list(cameras)
-        self._schedule = schedule
-        self._shards = shards
-        self._dataset = dataset
-        self._images = images
-        self._background = background
-        self._render = render
+    def __init__(self) -> None:
         self._energies: dict[tuple[int, int], float] = {}  # of `_energy`
-        if not on:
-            return
+
+    def prepare(self, run: Run) -> None:
+        """Replace the cameras of the run; at first, they are the same."""
+        run.cameras = self
+        self._dataset = dataset = run.dataset
+        self._first = cameras = run.dataset_cameras
         device = cameras[0].cam_from_world.device
         keys = [_intrinsics(camera) for camera in cameras]
         self._groups = {key: i for i, key in enumerate(dict.fromkeys(keys))}
@@ -126,8 +103,6 @@ class PoseRefinement:
     def camera(self, view: int) -> Camera:
         """The present camera of a training view."""
         first = self._first[view]
-        if not self.on:
-            return first
         motion = self._units[view] @ self._state["motions"][view]
         factor = self._factors[self._group[view]]
         pose = moved(first.cam_from_world, motion)
@@ -135,8 +110,6 @@ class PoseRefinement:
 
     def views(self) -> list[View]:
         """The training views with their present cameras, on the CPU."""
-        if not self.on:
-            return self._dataset.train
         cpu = torch.device("cpu")
         return [
             replace(view, camera=self.camera(i).to(cpu))
@@ -145,8 +118,6 @@ class PoseRefinement:
 
     def test_views(self) -> list[View]:
         """The test views. Their poses do not change; their focal lengths do, with the camera."""
-        if not self.on:
-            return self._dataset.test
         return [replace(view, camera=self._with_focal(view.camera)) for view in self._dataset.test]
 
     def _with_focal(self, camera: Camera) -> Camera:
@@ -154,72 +125,64 @@ class PoseRefinement:
         factor = 1.0 if group is None else self._factors[group]
         return replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
 
-    def after_step(self, step: int, gaussians: Gaussians, sh_degree: int) -> None:
+    def between(self, run: Run) -> None:
         """Decide once, after the first part of the training, whether the poses are exact.
-
-        Args:
-            sh_degree: degree of the spherical harmonics in use.
 
         Raises:
             UserError: a photo is missing or damaged.
         """
-        if not self.on or self._exact != 0.0 or step < self._schedule.step_of(BEGIN):
+        if self._exact != 0.0 or run.step < run.schedule.step_of(BEGIN):
             return
-        shift = shift_of(
-            gaussians, self.views(), self._background.tolist(), self._render, sh_degree
-        )
+        background = run.background.evaluation.tolist()
+        shift = shift_of(run.gaussians, self.views(), background, run.render, run.sh_degree)
         self._state["exact"].fill_(1.0 if shift < EXACT else -1.0)
         self._read_state()
 
-    def after_backward(
+    def gradients(
         self,
+        run: Run,
         step: int,
-        gaussians: Gaussians,
-        views: Sequence[int],
+        batch: Sequence[BatchView],
         gradients: Sequence[ViewGradient],
     ) -> None:
-        """Move the cameras of a batch, before the Gaussians are updated.
-
-        Args:
-            views: the indices of the training views of the batch.
-            gradients: one for each of them.
-        """
-        if not self.on or self._exact >= 0.0:
+        """Move the cameras of a batch, before the Gaussians are updated."""
+        if self._exact >= 0.0:
             return
-        done = (self._schedule.share(step) - BEGIN) / (1.0 - BEGIN)
+        done = (run.schedule.share(step) - BEGIN) / (1.0 - BEGIN)
         limit = self._diagonal * FIRST_LIMIT * (LAST_LIMIT / FIRST_LIMIT) ** done
-        for view, gradient in zip(views, gradients, strict=True):
-            d_motion, d_focal = self._gradient(view, gaussians, gradient)
+        for view, gradient in zip([each.index for each in batch], gradients, strict=True):
+            d_motion, d_focal = self._gradient(run, view, gradient)
             downscale = round(self._first[view].width / gradient.camera.width)
             # The loss of a batch is the mean over its views.
-            gain = GAIN * len(views) / self._energy(view, downscale)
+            gain = GAIN * len(batch) / self._energy(run, view, downscale)
             self._update("motions", view, gain * (d_motion @ self._units[view]), limit, gradient)
             self._state["focals.sum"][self._group[view]] += gain * d_focal
         motions = self._state["motions"]
         motions -= self._gauge.part(motions)
-        if self._schedule.multiples(step, len(self._first)):
+        if run.schedule.multiples(step, len(self._first)):
             self._update_focals(limit)
 
-    def _energy(self, view: int, downscale: int) -> float:
+    def _energy(self, run: Run, view: int, downscale: int) -> float:
         """The mean square of the derivative of a reduced photo by a shift of one original pixel."""
         key = view, downscale
         if key not in self._energies:
-            photo = self._images.get(self._dataset.train[view], downscale)
+            photo = run.images.get(self._dataset.train[view], downscale)
             planes = photo.planes[:3].float() / 255.0
             squares = [planes.diff(dim=axis).square().mean() for axis in (1, 2)]
             mean = 0.5 * float(squares[0] + squares[1]) if min(planes.shape) > 1 else 0.0
             self._energies[key] = max(mean, _LEAST_ENERGY) / downscale**2
         return self._energies[key]
 
-    def _gradient(
-        self, view: int, gaussians: Gaussians, gradient: ViewGradient
-    ) -> tuple[Tensor, Tensor]:
+    def _gradient(self, run: Run, view: int, gradient: ViewGradient) -> tuple[Tensor, Tensor]:
         """(6,) with respect to (ω, τ), to first order, and () with respect to log f; finite."""
         camera, splats = gradient.camera, gradient.splats
         assert splats.ids is not None
-        over = self._over_processes if self._shards.size > 1 else None
+
+        def over_processes(sums: Tensor) -> Tensor:
+            return run.shards.table(sums).sum(0)
+
         d_pose, d_focal = camera_gradient(
-            gaussians.parameters(),
+            run.gaussians.parameters(),
             splats.ids,
             gradient.packed_grad,
             camera.cam_from_world,
@@ -230,8 +193,8 @@ class PoseRefinement:
             cx=camera.cx,
             cy=camera.cy,
             sh_degree=gradient.sh_degree,
-            antialiased=gaussians.antialiased,
-            over_processes=over,
+            antialiased=run.gaussians.antialiased,
+            over_processes=over_processes if run.shards.size > 1 else None,
         )
         motion = self._units[view] @ self._state["motions"][view]
         turned = camera.cam_from_world.double() - torch.nn.functional.pad(motion[3:, None], (3, 0))
@@ -249,9 +212,6 @@ class PoseRefinement:
         if gradient.valid is not None:
             d_focal = torch.where(gradient.valid[0], d_focal, 0.0)
         return d_motion.nan_to_num(0.0, 0.0, 0.0), d_focal.nan_to_num(0.0, 0.0, 0.0)
-
-    def _over_processes(self, sums: Tensor) -> Tensor:
-        return self._shards.table(sums).sum(0)
 
     def _update(
         self, name: str, row: int, step: Tensor, limit: float, gradient: ViewGradient | None = None
@@ -291,16 +251,15 @@ class PoseRefinement:
             focals=factors - 1.0,
         )
 
-    def state_tensors(self) -> dict[str, Tensor]:
-        """The state of the cameras and of their optimiser. The tensors are not copied."""
-        return self._state if self.on else {}
+    def state(self) -> dict[str, Tensor]:
+        """The state of the cameras and of their optimiser."""
+        return self._state
 
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Copy what `state_tensors` returned."""
-        if self.on:
-            for name, tensor in self._state.items():
-                tensor.copy_(tensors[name])
-            self._read_state()
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """See `Part.load`."""
+        for name, tensor in self._state.items():
+            tensor.copy_(tensors[name])
+        self._read_state()
 
 
 @dataclass(frozen=True)

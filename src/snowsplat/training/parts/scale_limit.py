@@ -14,13 +14,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.parts.part import Part
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.run import Run
 
 #: Number of steps between two applications.
 INTERVAL = 100
@@ -30,33 +33,37 @@ _CAMERAS = 64
 _ROWS = 1 << 14
 
 
-class ScaleLimit:
-    """Limits the scales between the steps of a training run. It has no state."""
+class ScaleLimit(Part):
+    """Limits the scales. It has no state."""
 
-    def __init__(self, ratio: float, cameras: Sequence[Camera], schedule: Schedule) -> None:
+    name = "scale_limit"
+
+    def __init__(self, ratio: float) -> None:
         """
         Args:
-            ratio: largest scale, in units of the distance to the nearest camera; 0: no limit.
-            cameras: those of the training views, on the device of the Gaussians.
+            ratio: largest scale, in units of the distance to the nearest camera.
         """
         self.ratio = ratio
-        self._schedule = schedule
-        used = cameras[:: math.ceil(len(cameras) / _CAMERAS)]
-        self._centres = torch.stack([camera.position for camera in used]).to(torch.float32)
 
-    def after_step(self, step: int, gaussians: Gaussians) -> None:
+    def between(self, run: Run) -> None:
         """Reduce the scales that exceed the limit, in place, in every `INTERVAL`-th step."""
-        if self.ratio > 0.0 and self._schedule.multiples(step, INTERVAL):
-            limit = (self.ratio * self._distances(gaussians.means)).log()
-            gaussians.log_scales.copy_(torch.minimum(gaussians.log_scales, limit[:, None]))
+        if run.schedule.multiples(run.step, INTERVAL):
+            distances = distances_to_cameras(run.gaussians.means, run.dataset_cameras)
+            limit = (self.ratio * distances).log()
+            scales = run.gaussians.log_scales
+            scales.copy_(torch.minimum(scales, limit[:, None]))
 
-    def _distances(self, means: Tensor) -> Tensor:
-        """(N,): the distance of each mean (N, 3) to the nearest camera, in world units."""
-        # A product of matrices would be inaccurate for short distances.
-        exact = "donot_use_mm_for_euclid_dist"
-        nearest = [
-            torch.cdist(part, self._centres, compute_mode=exact).amin(1)
-            for part in means.split(_ROWS)
-        ]
-        # A mean may be in the centre of a camera.
-        return torch.cat(nearest).clamp_min(torch.finfo(torch.float32).tiny)
+
+def distances_to_cameras(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """(N,): the distance of each mean (N, 3) to the nearest of at most 64 cameras, in world units;
+    not 0.
+    """
+    used = cameras[:: math.ceil(len(cameras) / _CAMERAS)]
+    centres = torch.stack([camera.position for camera in used]).to(torch.float32)
+    # A product of matrices would be inaccurate for short distances.
+    exact = "donot_use_mm_for_euclid_dist"
+    nearest = [
+        torch.cdist(part, centres, compute_mode=exact).amin(1) for part in means.split(_ROWS)
+    ]
+    # A mean may be in the centre of a camera.
+    return torch.cat(nearest).clamp_min(torch.finfo(torch.float32).tiny)

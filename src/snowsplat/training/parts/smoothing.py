@@ -18,13 +18,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.parts.part import Part
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.run import Run
 
 #: Number of steps between two applications.
 INTERVAL = 100
@@ -34,26 +37,20 @@ VARIANCE = 0.2
 _NEAR = 0.2
 
 
-class SmoothingFilter:
-    """Limits the scales between the steps of a training run. It has no state."""
+class SmoothingFilter(Part):
+    """Limits the scales. It has no state."""
 
-    def __init__(self, enabled: bool, cameras: Sequence[Camera], schedule: Schedule) -> None:
-        """
-        Args:
-            cameras: those of the training views, on the device of the Gaussians.
-        """
-        self._cameras = cameras if enabled else ()
-        self._schedule = schedule
+    name = "smoothing"
 
-    def after_step(self, step: int, gaussians: Gaussians) -> None:
+    def between(self, run: Run) -> None:
         """Raise the scales below the limit, except for the smallest one of each Gaussian, in place,
         in every `INTERVAL`-th step.
         """
-        if self._cameras and self._schedule.multiples(step, INTERVAL):
-            rates = sampling_rates(gaussians.means, self._cameras)
+        if run.schedule.multiples(run.step, INTERVAL):
+            rates = sampling_rates(run.gaussians.means, run.dataset_cameras)
             limit = math.sqrt(VARIANCE) / rates  # inf for a Gaussian that no photo shows
             limit = limit.nan_to_num(posinf=0.0).log()
-            scales = gaussians.log_scales
+            scales = run.gaussians.log_scales
             smallest = scales.argmin(1, keepdim=True)
             raised = torch.maximum(scales, limit[:, None])
             scales.copy_(raised.scatter(1, smallest, scales.gather(1, smallest)))

@@ -24,9 +24,9 @@ moves before it is found.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -35,28 +35,25 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
 from snowsplat import ops
-from snowsplat.data.dataset import View
 from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.density import DensityConfig
+from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.view_residuals import (
     CellMap,
     cell_map,
     cell_size,
     residuals_elsewhere,
 )
-from snowsplat.training.processes.shards import Shards
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.batch import BatchView
+    from snowsplat.training.core.run import Run
 
 TransientsMode = Literal["auto", "on", "off"]
 
 #: When masks are computed, as fractions of the schedule.
 MOMENTS = (0.1, 0.2, 0.3, 0.4)
-#: With "on", the first moment at which Gaussians are added.
-_GROWTH = MOMENTS[1]
 #: With fewer views, nothing is masked: too few of them show the same place. With few views, much of
 #: the background is in one photo only, and the depth of its rendering is wrong.
 _FEWEST_VIEWS = {"auto": 30, "on": 8, "off": 0}
@@ -85,7 +82,7 @@ _VOTES = 0.5
 _SHARE, _PHOTOS, _PHOTOS_SHARE = 0.02, 3, 0.1
 
 
-class Transients:
+class Transients(Part):
     """The masks of what moves, computed between the steps of a training run.
 
     Attributes:
@@ -93,77 +90,71 @@ class Transients:
             False where something moves.
     """
 
-    def __init__(
-        self,
-        mode: TransientsMode,
-        views: Sequence[View],
-        images: Photos,
-        background: Tensor,
-        schedule: Schedule,
-        shards: Shards,
-    ) -> None:
+    name = "transients"
+
+    def __init__(self, mode: TransientsMode) -> None:
         """
         Args:
             mode: "auto": only if something moves in several photos; see ``TrainConfig.transients``.
-            views: the training views.
-            images: their photos.
-            background: (3,) colour in 0..1, on the device of the Gaussians.
         """
-        self._mode, self._views, self._images = mode, views, images
-        self._background, self._schedule, self._shards = background, schedule, shards
+        self._mode = mode
+        self._run: Run
+        self.masks: list[Tensor] = []
+
+    def begin(self, run: Run) -> None:
+        """Begin with empty masks, and decide whether there are enough photos and steps."""
+        self._run, views = run, run.dataset.train
         self.masks = [torch.ones(cell_size(view.camera), dtype=torch.bool) for view in views]
-        costly = mode == "auto" and schedule.iterations < _STEPS_PER_VIEW * len(views)
-        if costly or len(views) < _FEWEST_VIEWS[mode]:
+        few_steps = run.schedule.iterations < _STEPS_PER_VIEW * len(views)
+        if (self._mode == "auto" and few_steps) or len(views) < _FEWEST_VIEWS[self._mode]:
             self._mode = "off"
 
-    def after_step(
-        self,
-        step: int,
-        gaussians: Gaussians,
-        sh_degree: int,
-        downscale: int,
-        left_out: Collection[int],
-    ) -> bool:
-        """Compute the masks, after the steps of `MOMENTS`; whether this was such a step.
-
-        Args:
-            sh_degree: degree of the spherical harmonics in use.
-            downscale: the factor by which the photos of the step are reduced.
-            left_out: indices of views that are not used.
+    def between(self, run: Run) -> None:
+        """Compute the masks, after the steps of `MOMENTS`.
 
         Raises:
             UserError: a photo is missing or damaged.
         """
-        moments = [self._schedule.step_of(moment) for moment in MOMENTS]
-        if self._mode == "off" or not self._schedule.contains(step, moments):
-            return False
-        late = step > self._schedule.step_of(_NOTHING)
-        if self._mode == "auto" and late and not self.found:
-            return False
+        moments = [run.schedule.step_of(moment) for moment in MOMENTS]
+        if self._mode == "off" or not run.schedule.contains(run.step, moments):
+            return
+        late = run.step > run.schedule.step_of(_NOTHING)
+        if self._mode == "auto" and late and not self.shares():
+            return
+        self._compute(run)
+        if run.step >= moments[-1]:
+            self._tell()
+        run.queue.continue_with(run.queue.order, run.step)
+
+    def _compute(self, run: Run) -> None:
+        background, downscale = run.background.evaluation, run.downscale_at(run.step)
 
         def with_depth(camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-            camera = camera.to(gaussians.means.device)
-            splats = self._shards.everywhere(project(gaussians, camera, sh_degree))
-            size = camera.width, camera.height
-            image, alpha, depth = ops.rasterize(splats, *size, self._background, with_depth=True)
+            splats = project(run.gaussians, camera.to(run.device), run.sh_degree)
+            image, alpha, depth = ops.rasterize(
+                run.shards.everywhere(splats),
+                camera.width,
+                camera.height,
+                background,
+                with_depth=True,
+            )
             assert depth is not None
             return image, alpha, depth
 
-        used = [i for i in range(len(self._views)) if i not in left_out]
-        self._images.prefetch([self._views[i] for i in used], downscale)
+        views = run.dataset.train
+        used = [i for i in range(len(views)) if i not in run.left_out]
+        run.photos.prefetch([views[i] for i in used], downscale)
         maps = []
         for i in used:
-            view = self._views[i]
-            photo = self._images.get(view, downscale)
-            maps.append(cell_map(view.camera, photo, downscale, self._background, with_depth))
+            photo = run.photos.get(views[i], downscale)
+            maps.append(cell_map(views[i].camera, photo, downscale, background, with_depth))
         found = _moving_cells(maps, [~self.masks[i] for i in used], self._mode)
         for i, cells in zip(used, found, strict=True):
             self.masks[i] = ~cells
-        return True
 
-    def masked(self, view: int, photo: LoadedImage) -> LoadedImage:
-        """The photo of a view, at any size, with the mask of the user and that of what moves."""
-        cells = self.masks[view]
+    def target(self, run: Run, view: BatchView, photo: LoadedImage) -> LoadedImage:
+        """The photo, at any size, with the mask of the user and that of what moves."""
+        cells = self.masks[view.index]
         if self._mode == "off" or bool(cells.all()):
             return photo
         size = photo.planes.shape[1:]
@@ -171,47 +162,44 @@ class Transients:
         mask = mask.to(photo.planes.device)
         return replace(photo, mask=mask if photo.mask is None else mask & photo.mask)
 
-    def complete(self, step: int) -> bool:
-        """Whether the masks do not change any more after ``step``."""
-        return self._mode == "off" or step > self._schedule.step_of(MOMENTS[-1])
-
-    @property
-    def found(self) -> dict[int, float]:
-        """The masked share of the photo, by the index of each view in which something moves."""
-        shares = {i: 1.0 - float(mask.float().mean()) for i, mask in enumerate(self.masks)}
-        return {i: share for i, share in shares.items() if share > 0.0}
+    def shares(self) -> dict[str, float]:
+        """The masked share of the photo, by the name of each view in which something moves."""
+        views = zip(self._run.dataset.train, self.masks, strict=True)
+        shares = {view.name: 1.0 - float(mask.float().mean()) for view, mask in views}
+        return {name: share for name, share in shares.items() if share > 0.0}
 
     def pictures(self) -> dict[str, Image.Image]:
         """The masks of these views by name, of the size of the photo: 0 where something moves."""
         return {
-            self._views[i].name: Image.fromarray(
-                (255 * self.masks[i].numpy()).astype(np.uint8)
-            ).resize(
-                (self._views[i].camera.width, self._views[i].camera.height),
-                Image.Resampling.NEAREST,
+            view.name: Image.fromarray((255 * mask.numpy()).astype(np.uint8)).resize(
+                (view.camera.width, view.camera.height), Image.Resampling.NEAREST
             )
-            for i in self.found
+            for view, mask in zip(self._run.dataset.train, self.masks, strict=True)
+            if not bool(mask.all())
         }
 
-    def state_tensors(self) -> dict[str, Tensor]:
+    def _tell(self) -> None:
+        shares, photos = self.shares().values(), len(self.masks)
+        if shares:
+            mean = 100.0 * sum(shares) / len(shares)
+            self._run.note(
+                f"something moves in {len(shares)} of {photos} photos: masked there, {mean:.1f}% "
+                "of their pixels; see the report"
+            )
+
+    def state(self) -> dict[str, Tensor]:
         """The masks, one after the other."""
         return {"masks": torch.cat([mask.flatten() for mask in self.masks])}
 
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Replace the masks by those of `state_tensors`."""
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """See `Part.load`."""
         counts = [mask.numel() for mask in self.masks]
         parts = tensors["masks"].split(counts)
         self.masks = [
             part.clone().reshape(mask.shape) for part, mask in zip(parts, self.masks, strict=True)
         ]
-
-
-def delayed(density: DensityConfig) -> DensityConfig:
-    """The density control that adds no Gaussians before the masks are known."""
-    begin = density.densify_from
-    # A number of steps is that of a long schedule, whose first masks are later.
-    late = not isinstance(begin, float) or begin < _GROWTH
-    return replace(density, densify_from=_GROWTH) if late else density
+        if self._run.step > self._run.schedule.step_of(MOMENTS[-1]):
+            self._tell()
 
 
 def _moving_cells(
@@ -222,7 +210,7 @@ def _moving_cells(
 
     def found(ignored: Sequence[Tensor], large: float, alone: bool) -> list[Tensor]:
         return [
-            moving(cells, *elsewhere, large, last, alone)
+            cells_that_move(cells, *elsewhere, large, last, alone)
             for cells, elsewhere, last in zip(
                 maps, residuals_elsewhere(maps, ignored), before, strict=True
             )
@@ -234,7 +222,7 @@ def _moving_cells(
     return [torch.zeros_like(cells) for cells in first] if mode == "auto" else first
 
 
-def moving(
+def cells_that_move(
     cells: CellMap, elsewhere: Tensor, others: Tensor, large: float, before: Tensor, alone: bool
 ) -> Tensor:
     """(h, w) bool: the cells in which something moves, and the cells around them.

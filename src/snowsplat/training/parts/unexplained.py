@@ -1,4 +1,6 @@
-"""Training views that the scene does not explain, because their camera poses are wrong.
+"""`Unexplained`: leaves out training views that the scene does not explain.
+
+Their camera poses are wrong.
 
 A photo with a wrong pose does not show what the other photos show at this place. The scene explains
 the other photos. It can reproduce the photo with the wrong pose only by fog in front of the camera.
@@ -10,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,6 +23,11 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.evaluation.color_alignment import color_fit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
+from snowsplat.training.core.step_schedule import When
+from snowsplat.training.parts.part import Part
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.run import Run
 
 #: Width and height of the photos are divided by this number. More pixels do not help to
 #: distinguish wrong poses from correct ones. In the first steps of the recipes, the photos have
@@ -49,6 +57,76 @@ _LOW_PSNR = 20.0
 _HIGHEST_PSNR = 60.0
 #: If more than this share of the views stand out, the scene is unsuitable for this comparison.
 _MOST = 0.25
+#: Largest number of photos that a line names.
+_LISTED = 10
+
+
+class Unexplained(Part):
+    """Decides once which views are used from then on."""
+
+    name = "unexplained"
+
+    def __init__(self, after: When) -> None:
+        """
+        Args:
+            after: the moment of the decision.
+        """
+        self.after = after
+        self._decided = False
+        self._run: Run
+
+    def begin(self, run: Run) -> None:
+        """Remember the run, whose queue has the views that are left out."""
+        self._run = run
+
+    def between(self, run: Run) -> None:
+        """Decide, at the first step from the moment on.
+
+        Raises:
+            UserError: a photo is missing or damaged.
+        """
+        if self._decided or run.step < run.schedule.step_of(self.after):
+            return
+        left_out = unexplained_views(
+            run.gaussians,
+            run.cameras.views(),
+            run.images,
+            background=run.background.evaluation,
+            sh_degree=run.sh_degree,
+            render=run.render,
+        )
+        self._decided = True
+        run.queue.leave_out(left_out, run.step)
+        self._tell()
+
+    def _tell(self) -> None:
+        if self._run.left_out:
+            names = [self._run.dataset.train[i].name for i in self._run.left_out]
+            self._run.note(left_out_line(names))
+
+    def state(self) -> dict[str, Tensor]:
+        """Whether it is decided, and the indices of the views that are left out."""
+        left_out = torch.tensor(self._run.left_out, dtype=torch.int64)
+        return {"checked": torch.tensor(self._decided), "left_out": left_out}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """See `Part.load`."""
+        self._decided = bool(tensors["checked"])
+        self._run.queue.left_out = tuple(tensors["left_out"].tolist())
+        self._tell()
+
+
+def left_out_line(names: Sequence[str]) -> str:
+    """The line about photos that the scene does not explain; at least one name."""
+    one = len(names) == 1
+    photos, poses = ("photo is", "pose is") if one else ("photos are", "poses are")
+    listed = ", ".join(names[:_LISTED])
+    if len(names) > _LISTED:
+        listed += f" and {len(names) - _LISTED} more"
+    return (
+        f"{len(names)} {photos} not explained by the scene and left out of the training: {listed}; "
+        f"{'its' if one else 'their'} camera {poses} probably wrong"
+    )
 
 
 @torch.no_grad()

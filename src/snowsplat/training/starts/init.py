@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 
@@ -10,10 +11,9 @@ from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.image_loader import Photos
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
-from snowsplat.training.core.background import FIXED_BACKGROUNDS
 from snowsplat.training.core.config import TrainConfig
 from snowsplat.training.core.finite import check_finite
-from snowsplat.training.parts.sky import Sky, most_sky_points
+from snowsplat.training.parts.found_sky import most_sky_points
 from snowsplat.training.starts import STARTS
 
 
@@ -39,7 +39,7 @@ def initial_gaussians(
     images: Photos,
     generator: torch.Generator,
     device: torch.device,
-    sky: Sky | None = None,
+    adapted: Callable[[Points], Points] = lambda points: points,
 ) -> Gaussians:
     """One Gaussian for each point of the starts of ``config.init``.
 
@@ -52,7 +52,7 @@ def initial_gaussians(
         images: the photos of the dataset.
         generator: a random generator on the CPU. If there are too many points, it selects those
             that are used.
-        sky: there are also points in it, and none before it.
+        adapted: changes the points of the starts; see `Part.points`.
 
     Raises:
         UserError: some points are so far apart that single precision cannot represent their
@@ -62,8 +62,7 @@ def initial_gaussians(
     points = _points_of(config.starts, dataset, config, images, generator)
     if not len(points):
         points = _points_of(("random",), dataset, config, images, generator)
-    if sky is not None:
-        points = _with_sky(points, sky, config)
+    points = adapted(points)
     limit = config.density.max_gaussians or math.inf
     if len(points) > limit:
         chosen = torch.randperm(len(points), generator=generator)[: int(limit)]
@@ -88,10 +87,3 @@ def _points_of(
     count = 0 if starts == ("points",) else config.points_per_start
     found = [STARTS[name](dataset, images, count, generator) for name in starts]
     return Points(torch.cat([p.xyz for p in found]), torch.cat([p.rgb for p in found]))
-
-
-def _with_sky(points: Points, sky: Sky, config: TrainConfig) -> Points:
-    background = FIXED_BACKGROUNDS.get(config.background)
-    far = sky.points(most_sky_points(config.points_per_start), background)
-    kept = ~sky.is_before(points.xyz)
-    return Points(torch.cat([points.xyz[kept], far.xyz]), torch.cat([points.rgb[kept], far.rgb]))

@@ -1,0 +1,147 @@
+"""`Part`: what takes part in a training besides the loop.
+
+A training is a loop (`trainer.Trainer`) and a list of parts. The loop calls the methods of the
+parts in the order of the list, and `Part.gradients` in the reverse order. Every option of
+`TrainConfig` that is more than a number is a part in its own file; `parts_of` makes the list for a
+configuration. A user can add more:
+
+    class DepthLoss(Part):
+        with_depth = True
+
+        def loss(self, run, view, rendered):
+            return 0.1 * (rendered.depth - self.depths[view.index]).abs().mean()
+
+    Trainer(dataset, config, parts=[*parts_of(config), DepthLoss()])
+
+A part does not know any other part. What several parts need is in the `Run`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from torch import Tensor
+
+from snowsplat.data.dataset import Points
+from snowsplat.data.decode import LoadedImage
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import RenderOutput
+
+if TYPE_CHECKING:  # these modules import this one
+    from snowsplat.training.core.batch import BatchView
+    from snowsplat.training.core.run import Run
+    from snowsplat.training.core.view_gradient import ViewGradient
+
+#: The opacity of a removed Gaussian, as a logit. It is too transparent to be visible, so the
+#: optimiser does not restore it, and density control removes it or uses it elsewhere.
+REMOVED = -10.0
+
+
+class Part:
+    """The base class of all parts. A part overrides the methods that it needs.
+
+    A part belongs to one training run. Methods that return something return their argument, or
+    nothing, if they are not overridden. Autograd is off, except in `background`, `target`, `image`,
+    `loss` and `regularizer`. With several processes, each of them calls the same methods in the
+    same order.
+
+    Attributes:
+        name: of the part in checkpoints and messages; default: the name of the class.
+        with_depth: whether the part uses ``rendered.depth``. Rendering it takes time.
+        abs_grad: whether the part uses ``gradient.splats.abs_grad``.
+    """
+
+    name: ClassVar[str]
+    with_depth: bool = False
+    abs_grad: bool = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "name" not in vars(cls):
+            cls.name = cls.__name__
+
+    # Once, before the first step
+
+    def prepare(self, run: Run) -> None:
+        """Called before the first Gaussians exist, for example to look at the photos."""
+
+    def points(self, run: Run, points: Points) -> Points:
+        """The points (P,) from which the first Gaussians are made, on the CPU; in process 0 only.
+        Not called if the training is resumed, or starts from given Gaussians.
+        """
+        return points
+
+    def begin(self, run: Run) -> None:
+        """Called when the first Gaussians exist, before the state of a checkpoint is loaded."""
+
+    # In each step, in this order
+
+    def between(self, run: Run) -> None:
+        """Called between two steps, after step ``run.step``: may change the Gaussians in place,
+        assign ``run.gaussians``, ``run.cameras`` or ``run.queue.order``, stretch ``run.schedule``.
+
+        If it adds, removes or reorders Gaussians, it must do the same in ``run.optimizer``, by
+        `Adam.select`.
+        """
+
+    def background(self, run: Run, view: BatchView, color: Tensor) -> Tensor:
+        """The colour (3,) over which a view is rendered; at first, ``view.background``."""
+        return color
+
+    def target(self, run: Run, view: BatchView, photo: LoadedImage) -> LoadedImage:
+        """What the image of a view is compared with; at first, ``view.photo``."""
+        return photo
+
+    def image(self, run: Run, view: BatchView, image: Tensor, photo: LoadedImage) -> Tensor:
+        """What is compared with the photo: (H, W, 3) in 0..1; at first, ``rendered.image``.
+
+        Args:
+            photo: the result of `target`.
+        """
+        return image
+
+    def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:
+        """A term () that is added to the loss of a view. It can be differentiated with respect to
+        the image, the alpha and, if `with_depth`, the depth.
+        """
+        return None
+
+    def gradients(
+        self,
+        run: Run,
+        step: int,
+        batch: Sequence[BatchView],
+        gradients: Sequence[ViewGradient],
+    ) -> None:
+        """Called before the optimiser: may read or change the gradient of each view of the batch,
+        ``gradient.packed_grad``, in place. It must not wait for a GPU, and must not change the
+        state of the part if ``gradient.valid`` is False on the device; see `ViewGradient`.
+        """
+
+    def regularizer(self, run: Run, gaussians: Gaussians) -> Tensor | None:
+        """A term () that is added to the loss of the batch. It can be differentiated with respect
+        to the parameters of the Gaussians. With several processes, each has some of the Gaussians,
+        and the terms are added.
+        """
+        return None
+
+    def after_step(self, run: Run, step: int, batch: Sequence[BatchView]) -> None:
+        """Called after the optimiser, when the step is known to be valid."""
+
+    # In checkpoints
+
+    def state(self) -> dict[str, Tensor]:
+        """The state on which the next steps depend, by name. The tensors are not copied. They are
+        the same in all processes.
+        """
+        return {}
+
+    def row_state(self) -> dict[str, Tensor]:
+        """Further state, with one row for each Gaussian of this process. The part keeps the rows in
+        the order of the Gaussians; ``run.rows`` does this for tensors that are stored there.
+        """
+        return {}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Copy what `state` and `row_state` returned."""
